@@ -76,7 +76,7 @@ class Credential:
 
     @property
     def bearer(self) -> str | TokenFile | None:
-        """The token, or the file in which it may be replaced while a program runs."""
+        """The token; or, if it was read from a file, the file, which may get a new token while the program runs."""
         return self.token if self.file is None else TokenFile(self.file)
 
 

@@ -181,8 +181,9 @@ def merge_keyframes(
 ) -> tuple[LabelledFrame, ...] | LabelClash[LabelledFrame]:
     """Combine the keyframes that two sides have added and removed.
 
-    The result has the keyframes that both sides have kept, and those that one side has added. If both sides have
-    removed a keyframe, the added keyframes with the same frame or the same label must be the same on both sides.
+    The result has the keyframes that both sides have kept, and those that one side has added. Changes exclude each
+    other if both sides have removed the same keyframe of the base, and have added different keyframes in its place:
+    keyframes with the frame or the label of the removed one.
 
     Returns
     -------

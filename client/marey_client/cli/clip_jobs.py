@@ -87,7 +87,7 @@ def align(
 ) -> None:
     """Align clips of one action with each other, as a job.
 
-    `--reference` also accepts the address of a clip.
+    `--reference` also accepts the address of the clip with which all others are aligned.
     """
     from marey_schemas.kinds import Kind
 

@@ -51,8 +51,8 @@ def create_token(
     label: Annotated[
         list[str] | None,
         typer.Option(
-            help="Only with the scope work: label, as name=value, that a worker with this token may announce; may be "
-            "repeated. Default: the labels of your own token; if it has none, any label."
+            help="Label that a worker with this token may announce, as name=value; repeatable. Allowed only if the "
+            "token has the scope work. Default: the labels of your own token; if it has none, any label."
         ),
     ] = None,
     output: Annotated[

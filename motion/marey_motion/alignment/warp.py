@@ -85,11 +85,11 @@ def inverse(times: Floats) -> Floats:
 
     Parameters
     ----------
-    times : (N,) float64    source frame of each canonical frame, up to M - 1
+    times : (N,) float64    source frame of each of N canonical frames, increasing; the last one is M - 1
 
     Returns
     -------
-    (M,) float64    canonical frame of each source frame
+    (M,) float64    fractional canonical frame of each of the M source frames
     """
     return np.interp(np.arange(round(times[-1]) + 1, dtype=np.float64), times, np.arange(len(times), dtype=np.float64))
 

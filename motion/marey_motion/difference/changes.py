@@ -120,7 +120,10 @@ def path_change(
 
 
 def _exceeding(changes: Floats, course: Course, threshold: float) -> dict[str, object]:
-    """Compute mean and maximum of the changes, the frame of the maximum, and the ranges above the threshold."""
+    """Summarise changes (n,) in matched frames, as fields of a `JointChange` or `PathChange`.
+
+    The fields are mean and maximum of the changes, the frame of the maximum, and the ranges above the threshold.
+    """
     at = int(np.argmax(changes))
     return {
         "mean": float(changes.mean()),

@@ -94,7 +94,7 @@ def compare_clips(
 
 
 def _carrier(before: Clip, after: Clip, pairing: JointPairs) -> int:
-    """Return the index, among the paired joints, of the first joint that moves, whose path is used as the body's."""
+    """Return the index, in the lists of `pairing`, of the first joint that moves; its path is used as the body's."""
     if any(float(np.ptp(clip.root_translations, axis=0).max()) > STILL_M for clip in (before, after)):
         return 0
     for place, joints in enumerate(zip(pairing.before, pairing.after, strict=True)):
@@ -112,9 +112,10 @@ def _poses(clip: Clip, joints: tuple[int, ...], carrier: int) -> Poses:
 
 
 def _compare_moved(before: Poses, after: Poses, rate_ratio: float) -> tuple[Timing, Move | None]:
-    """Match the frames. If the whole clip was moved, apply the movement to the old clip, and match again.
+    """Match the frames of two clips. If the whole clip was moved, apply the movement to the old clip, and match again.
 
-    Returns the timing, and the movement, which is None if there is none.
+    `rate_ratio` is the frame rate of the new clip divided by that of the old clip. Returns the timing, and the movement
+    of the whole clip, or None if there is none.
     """
     timing = compare_timing(before, after, rate_ratio)
     move = whole_move(*_paths(timing, after, None))
@@ -152,7 +153,10 @@ def _translated(clip: Clip) -> tuple[str, ...]:
 def _translation_changes(
     before: Clip, after: Clip, joints: JointPairs, timing: Timing, course: Course, threshold_cm: float
 ) -> tuple[JointChange, ...]:
-    """Compare the translations of joints that are translated in either clip; offsets replace missing translations."""
+    """Compare the translations of the joints that either clip translates.
+
+    In a clip that does not translate the joint, the joint's offset is compared instead.
+    """
     moved = [
         (old, new)
         for old, new in zip(joints.before, joints.after, strict=True)

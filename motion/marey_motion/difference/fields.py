@@ -129,7 +129,8 @@ def compare_models(before: Mapping[str, Any], after: Mapping[str, Any]) -> Model
 
     Returns
     -------
-    ModelDifference    added and removed examples, and both mean log likelihoods, None where a model does not store it
+    ModelDifference    added and removed examples, and the mean log likelihood of both models; None if a model does not
+        store it
     """
     old, new = _examples(before), _examples(after)
     return ModelDifference(

@@ -91,7 +91,19 @@ def similar_lags(before: Poses, after: Poses, unmatched: AnyInts) -> tuple[int, 
 
 
 def _window_distances(window: Floats, spectrum: Complexes, energy: Floats, size: int) -> Floats:
-    """Return the squared distances of a window to every place where it fits entirely into the other clip."""
+    """Compute the squared distance of a window (w, C) to each range of w consecutive frames of another clip.
+
+    Parameters
+    ----------
+    window : (w, C) features of the window's frames
+    spectrum : Fourier transform of the features of the other clip, padded with zeros to `size` frames
+    energy : (F + 1,) cumulative sums of the squared features of the other clip's F frames
+    size : number of frames of the Fourier transform
+
+    Returns
+    -------
+    (F + 1 - w,) float64    squared distance, by first frame of the range
+    """
     length = len(window)
     places = len(energy) - length
     products = np.fft.irfft(spectrum * np.conj(np.fft.rfft(window, size, axis=0)), size, axis=0)[:places]
@@ -144,7 +156,10 @@ def _stretched(window: Floats, count: int) -> Floats:
 
 
 def _features(poses: Poses) -> Floats:
-    """Return columns (F, `CHANNELS` + 4): random projections of the rotations, the root's height, and its steps."""
+    """Compute features (F, `CHANNELS` + 4) of F poses.
+
+    They are random projections of the rotations, the height of the root, and the step of the root to each frame.
+    """
     rotations = poses.rotations * np.where(poses.rotations[..., :1] < 0.0, -1.0, 1.0)
     flat = rotations.reshape(poses.frame_count, -1).astype(np.float64)
     projection = np.random.default_rng(0).normal(size=(flat.shape[1], CHANNELS)) / np.sqrt(CHANNELS)
@@ -161,7 +176,7 @@ def _body_hashes(poses: Poses) -> NDArray[np.uint64]:
 
 
 def _one_sided(rotations: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return rotations as rows (F, 4·J); quaternions with a negative w are negated."""
+    """Return rotations (F, J, 4) as rows (F, 4·J); quaternions with a negative w are negated."""
     signs = np.where(rotations[..., :1] < 0.0, np.float32(-1.0), np.float32(1.0))
     return np.asarray(rotations * signs, dtype=np.float32).reshape(len(rotations), -1)
 

@@ -71,9 +71,10 @@ def _of_keyframes(annotation: Annotation) -> list[Segment]:
 
 
 def _match(before: Sequence[Segment], after: Sequence[Segment]) -> list[tuple[int | None, int | None]]:
-    """Match the entries of two ordered lists; return the indices of each pair, with None where an entry has no match.
+    """Match the entries of two ordered lists; return the indices of each pair.
 
-    The entries that both lists have in common at their beginning and at their end are not returned.
+    An entry without a match is paired with None. Entries that both lists have in common at their beginning or at their
+    end are left out.
     """
     shortest = min(len(before), len(after))
     head = next((place for place in range(shortest) if before[place] != after[place]), shortest)
@@ -96,7 +97,7 @@ def _match(before: Sequence[Segment], after: Sequence[Segment]) -> list[tuple[in
 
 
 def _pair_costs(before: Ints, after: Ints) -> Floats:
-    """Return the costs (n, m) of pairing n with m entries, given as rows of label number, start and end."""
+    """Compute the costs (n, m) of pairing n entries with m entries, given as rows (label number, start, end)."""
     same = before[:, None, 0] == after[None, :, 0]
     costs = np.minimum(
         _range_costs(before, after), SHIFTED + _range_costs(before + _common_shift(before, after), after)
@@ -105,7 +106,7 @@ def _pair_costs(before: Ints, after: Ints) -> Floats:
 
 
 def _range_costs(before: Ints, after: Ints) -> Floats:
-    """Return, for each pair of ranges, 1 minus the share of frames that they have in common."""
+    """Compute (n, m) values: 1 minus the share of frames that the ranges of two entries have in common."""
     common = np.minimum(before[:, None, 2], after[None, :, 2]) - np.maximum(before[:, None, 1], after[None, :, 1])
     whole = np.maximum(before[:, None, 2], after[None, :, 2]) - np.minimum(before[:, None, 1], after[None, :, 1])
     return np.asarray(1.0 - np.maximum(common, 0) / whole, dtype=np.float64)

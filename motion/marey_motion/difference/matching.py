@@ -37,7 +37,7 @@ class Matching(NamedTuple):
     Parameters
     ----------
     pairs : (n, 2) int    frames of the old clip and matched frames of the new clip, both increasing
-    costs : (n,) float64    costs of the pairs
+    costs : (n,) float64    cost of each pair, from 0 for equal frames; see `frame_costs`
     total : float    cost of the matching, including removed and inserted frames
     """
 
@@ -78,7 +78,7 @@ def _poorly_matched(matching: Matching, count: int) -> Ints:
 class _Diagonal(NamedTuple):
     """All pairs of frames with the same lag; the frames of the old clip are [start, stop).
 
-    `costs` are the cumulative costs of the pairs, from 0 to the sum of all.
+    `costs` (stop - start + 1,) are the cumulative costs of the pairs, from 0 to the sum of all.
     """
 
     lag: int
@@ -125,9 +125,10 @@ def _end_cost(one: _Diagonal, count_before: int, count_after: int) -> float:
 
 
 def _entered(diagonals: Sequence[_Diagonal], reached: Sequence[Floats], place: int) -> Floats:
-    """Return the least costs of paths that change from another diagonal to diagonal `place`.
+    """Compute the least costs of paths that change from another diagonal to the diagonal with index `place`.
 
-    There is one cost for each frame of the diagonal, for a change just before that frame, and one for its end.
+    `reached` contains, for each diagonal, the least cost of a path to each of its pairs, and to its end. Returns the
+    costs (stop - start + 1,) of a change just before each pair of the diagonal, and at its end; infinite if impossible.
     """
     one = diagonals[place]
     least = np.full(len(one.costs), np.inf)
@@ -144,7 +145,10 @@ def _entered(diagonals: Sequence[_Diagonal], reached: Sequence[Floats], place: i
 
 
 def _traced(diagonals: Sequence[_Diagonal], reached: Sequence[Floats], place: int, total: float) -> Matching:
-    """Follow the cheapest path from its end to its start and collect its pairs."""
+    """Follow the cheapest path from its end to its start and collect its pairs.
+
+    The path ends on the diagonal with index `place` and costs `total`; `reached` are the costs as in `_entered`.
+    """
     stop = diagonals[place].stop
     pieces: list[tuple[Ints, Floats]] = []
     while True:
@@ -164,9 +168,10 @@ def _traced(diagonals: Sequence[_Diagonal], reached: Sequence[Floats], place: in
 
 
 def _origin(diagonals: Sequence[_Diagonal], reached: Sequence[Floats], place: int, frame: int) -> tuple[int, int]:
-    """Find where the cheapest path comes from that enters diagonal `place` at `frame`.
+    """Find the diagonal that the cheapest path leaves in order to enter diagonal `place` at `frame` of the old clip.
 
-    Returns the index of the previous diagonal, and the frame of the old clip at which the path leaves that diagonal.
+    `reached` are the costs as in `_entered`. Returns the index of the diagonal that is left, and the frame of the old
+    clip at which the path leaves it.
     """
     one = diagonals[place]
     best, origin = np.inf, (place, frame)

@@ -137,7 +137,10 @@ def time_offsets(before: Poses, after: Poses, pairs: AnyInts) -> tuple[Floats, F
 
 
 def _steps(first: Poses, second: Poses, rows: AnyInts, others: AnyInts) -> NDArray[np.float32]:
-    """Return the differences (n, J, 4) of quaternions; the sign of the second one is chosen to make them small."""
+    """Compute differences (n, J, 4) of quaternions: `second` at frames `others` minus `first` at frames `rows`.
+
+    A quaternion and its negative are the same rotation; the sign that makes the difference small is used.
+    """
     a, b = first.rotations[rows], second.rotations[others]
     signs = np.where(np.einsum("fjc,fjc->fj", a, b) < 0.0, np.float32(-1.0), np.float32(1.0))
     return np.asarray(b * signs[..., None] - a, dtype=np.float32)

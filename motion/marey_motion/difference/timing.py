@@ -107,7 +107,10 @@ def _paces(count_before: int, count_after: int, rate_ratio: float) -> list[float
 
 
 def _better(best: Timing, before: Poses, after: Poses, pace: float, *, search: bool = False) -> Timing:
-    """Match the frames at another pace, and refine it; return `best` unless the new timing is much better."""
+    """Match the frames at another pace, and refine that pace; return `best` unless the new timing is much better.
+
+    `search` is whether to search for similar frames while refining, see `match_frames`.
+    """
     if pace == 1.0:
         tried = _at_pace(before, after, Pace(1.0), search=True)
         return tried if _share(tried, after) < MUCH_BETTER * _share(best, after) else best
@@ -154,7 +157,10 @@ def _refined(before: Poses, after: Poses, timing: Timing, *, search: bool) -> Ti
 
 
 def _rounded(start: float, step: float, count: int) -> Pace:
-    """Convert start and slope of a line to a pace; values that are nearly simple numbers are rounded to these."""
+    """Convert a line to a pace: frame n of the new clip is at place `start` + n·`step` of the old clip.
+
+    Values that are nearly simple fractions are rounded to these, if this moves no sample of `count` frames noticeably.
+    """
     pace = 1.0 / step
     simple = float(Fraction(pace).limit_denominator(1000))
     if abs(simple - pace) * count <= ROUNDED_FRAMES * pace:
@@ -203,7 +209,10 @@ def _run_count(timing: Timing) -> int:
 
 
 def _share(timing: Timing, after: Poses) -> float:
-    """Return the cost of a matching, from 0 to 1, without the cost of the frames by which one clip is longer."""
+    """Return the cost of a matching, relative to that of entirely different frames: from 0 to 1.
+
+    The cost of the frames by which one clip is longer than the other is left out.
+    """
     counts = timing.before.frame_count, after.frame_count
     return (timing.matching.total - UNMATCHED * abs(counts[0] - counts[1])) / (2.0 * UNMATCHED * min(counts))
 
@@ -241,7 +250,7 @@ def _unmatched(before: tuple[int, int], after: tuple[int, int]) -> list[FrameRun
 
 
 def _edges(timing: Timing, count_before: int) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Return the ranges of each run of matched frames in both clips, in frames of the stored clips."""
+    """List the ranges of each run of matched frames: in the old and in the new clip, in frames of the stored clips."""
     pairs = timing.matching.pairs
     if not len(pairs):
         return []
@@ -255,7 +264,10 @@ def _edges(timing: Timing, count_before: int) -> list[tuple[tuple[int, int], tup
 
 
 def _stored(frames: Ints, timing: Timing, count: int) -> Ints:
-    """Convert starts or ends of runs, in frames of the sampled clip, to frames of the stored clip."""
+    """Convert starts or ends of runs, in frames of the sampled old clip, to frames of that clip as stored.
+
+    `count` is the number of frames of the stored clip.
+    """
     if timing.pace == Pace(1.0):
         return frames
     borders = np.clip(np.round(timing.pace.places(frames)), 0, count)

@@ -162,7 +162,10 @@ def _residuals(skeleton: Skeleton, motion: Motion, constraint: Constraint) -> Fl
 def _clusters(
     skeleton: Skeleton, constraints: Sequence[Constraint], together: bool
 ) -> tuple[tuple[Constraint, ...], ...]:
-    """Group the constraints that must be solved together because one of them turns a joint that affects another."""
+    """Group the constraints that must be solved together because one of them turns a joint that affects another.
+
+    If `together` is true, all constraints are in one group.
+    """
     clusters: list[tuple[set[int], set[int], list[Constraint]]] = []
     for constraint in constraints:
         turning = set(constraint.joints)
@@ -221,7 +224,7 @@ class _Cluster:
         return displace(motion, frames, changed, windows_around(frames, blend_frames, motion.frame_count))
 
     def _solve(self, given: Motion, frames: Ints, constraints: Sequence[Constraint]) -> Motion:
-        """Solve the given frames of a motion, in all of which the same constraints apply."""
+        """Solve the given frames of a motion, in all of which the same constraints apply; return only these frames."""
         limb = constraints[0].limb if all(one.limb == constraints[0].limb for one in constraints) else None
         joints = tuple(sorted({joint for one in constraints for joint in one.joints}))
         self.budget.spend(self._work(len(frames), constraints, limb, joints))

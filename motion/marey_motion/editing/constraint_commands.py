@@ -195,7 +195,7 @@ def _target(rig: _Rig, joint: int, asked: AnyConstraint, start: int, stop: int) 
 
 
 def _looking_axis(rig: _Rig, joint: int) -> NDArray[np.float64]:
-    """Choose the look-at axis in the joint's frame: the front of head or trunk, or the direction of another bone."""
+    """Choose the axis (3,), in the joint's frame, that looks: the front of head or trunk, or the bone's direction."""
     try:
         axes = rig.axes_of(joint)
     except MappingError as error:

@@ -147,7 +147,10 @@ def spread_displacements(frames: AnyInts, values: Floats, window: Window) -> Flo
 
 
 def _evened(frames: AnyInts, values: Floats, reach: float) -> Floats:
-    """Smooth values (n, c) along consecutive frames (n,); constant values stay constant, and end slopes decrease."""
+    """Smooth values (n, c) along runs of consecutive frames (n,), over about `reach` frames.
+
+    Constant values stay constant, and slopes at the ends of runs decrease.
+    """
     from scipy.ndimage import gaussian_filter1d
 
     rows = np.split(values, np.flatnonzero(np.diff(frames) > 1) + 1)
@@ -190,8 +193,9 @@ def _curve(frames: AnyInts, values: Floats, window: Window, swing: float) -> Flo
 
 
 def _energy(count: int, window: Window, swing: float) -> Floats:
-    """Compute lower diagonals (4, count) of the quadratic form of bending and tension of `count` control points.
+    """Compute the bending and tension of a curve with `count` control points, as a quadratic form of these.
 
+    Returns the lower diagonals (4, count) of the matrix of the form; `swing` is as in `_curve`.
     Beyond a smooth end all control points are zero; beyond an end that is not smooth there are no control points.
     """
     bands = np.zeros((4, count))
@@ -212,7 +216,10 @@ def _rotation_vectors(before: Floats, after: Floats) -> Floats:
 
 
 def _continued(values: Floats, joints: int) -> Floats:
-    """Let rotation vectors (n, 3·joints + 3) exceed half a turn where this makes them continuous."""
+    """Let rotation vectors exceed half a turn where this makes them continuous.
+
+    `values` (n, 3 + 3·joints) are displacements of the root and rotation vectors of `joints` joints.
+    """
     vectors = values[:, : 3 * joints].reshape(len(values), joints, 3)
     if np.linalg.norm(vectors, axis=-1).max(initial=0.0) < 0.5 * np.pi:
         return values

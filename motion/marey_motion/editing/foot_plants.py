@@ -71,7 +71,10 @@ class PlantedMotion:
 
 
 class _Plan(NamedTuple):
-    """Target of a foot: ankle (F, 3), the ankle's rotation in the world (F, 4), weight of the plant (F,)."""
+    """Targets of a foot in each frame, in the world: position (F, 3) and rotation (F, 4) of the ankle.
+
+    `firmness` (F,) is 1 in frames in which the foot is planted, and decreases to 0 around them.
+    """
 
     ankle: Floats
     rotation: Floats
@@ -178,7 +181,11 @@ def _slide(positions: Floats, feet: Sequence[Foot], contacts: Sequence[FootConta
 
 
 def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, blend: int) -> _Plan:
-    """Compute the targets of a foot: planted toes and heels stay in place, and the ankle follows the toe otherwise."""
+    """Compute the targets of a foot: planted toes and heels stay in place, and the ankle follows the toe otherwise.
+
+    `positions` (F, J, 3) and `spins` (F, J, 4) are those of the joints in the world. The targets are blended in and out
+    over `blend` frames.
+    """
     ankle, toe = positions[:, foot.leg.end], positions[:, foot.toe]
     places = toe.copy()
     for start, stop in runs(contacts.toe):
@@ -242,7 +249,10 @@ def _turn_between(before: Floats, after: Floats) -> Floats:
 
 
 def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], zone: float, blend: int) -> Floats:
-    """Compute distances (F,), in metres, to lower the root so that planted feet are in reach with bent knees."""
+    """Compute distances (F,), in metres, to lower the root so that planted feet are in reach with bent knees.
+
+    `zone` is the angle from the straight leg, in radians, in which knees are damped (see `solve_two_bone`).
+    """
     from marey_motion.editing.inverse_kinematics import two_bone_kernels
 
     wanted = np.zeros(len(positions))
@@ -272,7 +282,10 @@ def _enveloped(values: Floats, blend: int) -> Floats:
 def _with_leg(
     skeleton: Skeleton, planted: Motion, motion: Motion, foot: Foot, plan: _Plan, lowering: Floats, zone: float
 ) -> Motion:
-    """Move the leg to its planned targets in the frames in which these targets or the root differ from the motion."""
+    """Move a leg to its planned targets in the frames in which these targets or the root differ from `motion`.
+
+    `planted` is the motion with the root lowered by `lowering` (F,) metres; `zone` is as in `_lowering`.
+    """
     ankle = foot.leg.end
     now = motion.positions(skeleton)[:, ankle]
     frames = np.flatnonzero((np.abs(plan.ankle - now).max(axis=1) > 0.0) | (lowering > 0.0))

@@ -121,9 +121,10 @@ def _same_rate(take: Take, source: str) -> Take:
 
 
 def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
-    """Find the rotation and shift on the ground that attach one clip to the end of the other.
+    """Find the rotation and shift on the ground that attach the clip `after` to the end of `before`.
 
-    Overlapping clips are matched at the middle of the overlap.
+    If the last `overlap` frames of one are blended with the first frames of the other, they are matched at the middle
+    of this overlap.
     """
     if overlap:
         there, here = before.frame_count - overlap + overlap // 2, overlap // 2

@@ -60,7 +60,10 @@ def paste(take: Take, command: Paste) -> Take:
 
 
 def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> list[int]:
-    """Find the indices in `source` of the target's `joints`, by name. Raises `UnknownJoint`, `EditError`."""
+    """Find the indices in `source` of the target's `joints`, by name.
+
+    Raises `UnknownJoint` if a joint is missing, and `EditError` if its axes differ.
+    """
     origins = [source.index_of(target.joint_names[joint]) for joint in joints]
     apart = quaternions.angle_between(target.rest_rotations[list(joints)], source.rest_rotations[origins])
     odd = np.flatnonzero(apart > SAME_AXES_RAD)
@@ -86,7 +89,10 @@ def _stretched(take: Take, clip: Clip, frames: tuple[int, int | None] | None, co
 
 
 def _with_more_translations(take: Take, targets: Sequence[int], origins: Sequence[int], copied: Motion) -> Motion:
-    """Add translations for joints that are translated in the source only."""
+    """Add translations to the take's motion for joints that only the copied motion translates.
+
+    `targets` and `origins` are the indices of the same joints in the take and in the copied motion.
+    """
     added = (target for target, origin in zip(targets, origins, strict=True) if origin in copied.translated_joints)
     joints = tuple(sorted({*take.motion.translated_joints, *added}))
     return translated(take.motion, take.skeleton, joints)

@@ -60,7 +60,10 @@ def close_loop(take: Take, command: CloseLoop) -> Take:
 
 
 def _in_place(motion: Motion, places: Floats, seam: LoopSeam) -> Motion:
-    """Remove travel and turn of one cycle, given pelvis positions (F, 3); each frame turns about its own position."""
+    """Remove the travel and turn of one cycle, `seam`, evenly over the frames.
+
+    `places` (F, 3) are the positions of the pelvis; each frame is turned about its own.
+    """
     shares = np.arange(motion.frame_count) / motion.frame_count
     start = places[0, [0, 2]]
     travel = rotated(start, seam.turn_rad) + seam.shift_m - start
@@ -69,7 +72,10 @@ def _in_place(motion: Motion, places: Floats, seam: LoopSeam) -> Motion:
 
 
 def _closed(motion: Motion, seam: LoopSeam, life: float, velocity_life: float) -> Motion:
-    """Remove the difference between the last and the first pose, half of it at each end."""
+    """Remove the difference in pose and velocity between end and start, half of it at each of them.
+
+    `life` and `velocity_life` are the numbers of frames over which the correction of pose and of velocity decays.
+    """
     frames = motion.frame_count
     following = moved_over(motion.sliced(0, 2), seam)
     arrival = step_of(motion, frames - 2)

@@ -22,7 +22,7 @@ VELOCITY_S = 0.15
 
 
 class PoseOffset(NamedTuple):
-    """Difference of two poses of the same joints, or its change per frame.
+    """Difference of two poses of the same joints, or the change of such a difference per frame.
 
     Parameters
     ----------

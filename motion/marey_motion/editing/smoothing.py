@@ -115,13 +115,19 @@ def _smooth_rotations(take: Take, rotations: Floats, weights: Floats, joints: Se
 
 
 def _reflected(end: Floats, rotations: Floats) -> Floats:
-    """Reflect rotations (n, J, 4) through an end frame's rotations (J, 4): by the same angle in the other direction."""
+    """Reflect rotations (n, J, 4) through the rotations `end` (J, 4) of an end frame.
+
+    A reflected rotation differs from that of the end frame by the same angle in the opposite direction.
+    """
     back = quaternions.multiply(end, quaternions.multiply(quaternions.conjugate(rotations), end))
     return np.asarray(back, dtype=np.float64)
 
 
 def _averaged(padded: Floats, weights: Floats) -> Floats:
-    """Compute the weighted means (F, ...) of values (n + F + n, ...), by weights (2 n + 1,)."""
+    """Compute weighted means (F, ...) over time of values that are continued by n frames at both ends.
+
+    `padded` (n + F + n, ...) are these values; `weights` (2 n + 1,) are those of the frames around each frame.
+    """
     from scipy.ndimage import correlate1d
 
     reach = len(weights) // 2

@@ -214,7 +214,9 @@ def _trial_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[T
 
 
 def _places(results: Iterable[EvaluationResult]) -> list[list[NDArray[np.int64]]]:
-    """Find the clip and frame (T, 2) displayed at each tick, per result and trial; equal uids get equal numbers."""
+    """List, for each result and each of its trials, the clip and frame (T, 2) displayed at each tick.
+
+    Clips with the same uid have the same number in all results."""
     numbers: dict[str, int] = {}
     return [[_clip_frames(result, record, numbers) for record in result.records] for result in results]
 

@@ -16,7 +16,7 @@ RECEIVED, SMOOTHED = 0, 1
 
 @compiled
 def _estimate(take, smoother, frame, column):  # type: ignore[no-untyped-def]
-    """Smooth one column of `take.raw` at a frame, by the polynomial fitted to the frames around it."""
+    """Smooth one column of `take.raw` at a frame, with the matrix `smoother` (see `live_windows.smoother`)."""
     width = smoother.shape[0]
     first = max(min(frame - width // 2, take.counters[RECEIVED] - width), 0)
     total = 0.0
@@ -27,7 +27,9 @@ def _estimate(take, smoother, frame, column):  # type: ignore[no-untyped-def]
 
 @compiled
 def _add_step(take, place, left, ahead, length):  # type: ignore[no-untyped-def]
-    """Replace the oldest step in the ring buffer, and update the sums of the steps.
+    """Replace the oldest step in the ring buffer, which is at `place`, and update the sums of the steps.
+
+    `left` and `ahead` are the parts of the step relative to the facing direction; `length` is its length.
 
     The sums are recomputed once per cycle of the buffer, so that rounding errors do not accumulate.
     """
@@ -60,7 +62,10 @@ def _move_to(take, x, z, heading):  # type: ignore[no-untyped-def]
 
 @compiled
 def _smooth(take, filters, frame, shortest_mean):  # type: ignore[no-untyped-def]
-    """Compute the smoothed position and heading of the root at a frame, and store them as the current ones."""
+    """Compute the smoothed position and heading of the root at a frame, and store them as the current ones.
+
+    If the smoothed facing direction is shorter than `shortest_mean`, the direction of the frame itself is used.
+    """
     x = _estimate(take, filters.positions, frame, 0)
     z = _estimate(take, filters.positions, frame, 1)
     facing_x = _estimate(take, filters.directions, frame, 2)
@@ -86,7 +91,11 @@ def newest_window(take, duration_s, window):  # type: ignore[no-untyped-def]
 
 @compiled
 def receive(take, filters, frames, duration_s, shortest_mean, windows):  # type: ignore[no-untyped-def]
-    """Process raw frames (n, 4); write the windows that they complete to `windows` and return their number."""
+    """Process raw frames (n, 4), with columns as in `LiveTake.raw`.
+
+    The windows that the frames complete are written to `windows`; their number is returned. `duration_s` is the
+    duration of a window, and `shortest_mean` as in `_smooth`.
+    """
     width = take.raw.shape[0]
     written = 0
     for index in range(frames.shape[0]):
@@ -105,7 +114,10 @@ def receive(take, filters, frames, duration_s, shortest_mean, windows):  # type:
 
 @compiled
 def finish(take, filters, duration_s, shortest_mean, windows):  # type: ignore[no-untyped-def]
-    """Smooth the last frames of a take; write the windows that they complete and return their number."""
+    """Smooth the last frames of a take; write the windows that they complete and return their number.
+
+    The parameters are those of `receive`.
+    """
     written = 0
     for frame in range(take.counters[SMOOTHED], take.counters[RECEIVED]):
         _smooth(take, filters, frame, shortest_mean)

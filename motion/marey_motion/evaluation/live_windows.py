@@ -198,5 +198,8 @@ def smoother(window: int) -> Floats:
 
 
 def _shortened(matrix: Floats, frame_count: int) -> Floats:
-    """Make the smoother for a take that is shorter than the window, over the largest odd number of its frames."""
+    """Return the smoother for a take of `frame_count` frames.
+
+    If the take is shorter than the window of `matrix`, the smoother's window is the largest odd number of its frames.
+    """
     return matrix if frame_count >= len(matrix) else smoother(frame_count - (frame_count + 1) % 2)

@@ -184,7 +184,7 @@ def _speed_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None
 
 
 def _pooled_spread(values: Floats, regimes: NDArray[np.int8]) -> float | None:
-    """Compute one standard deviation over all regimes, from deviations about each regime's own mean."""
+    """Compute the standard deviation of values around the mean of their own regime; None if there are no values."""
     if not len(values):
         return None
     squares = 0.0
@@ -237,7 +237,10 @@ def _hold_steps(series: TrialSeries) -> int:
 
 
 def _response_s(series: TrialSeries, first: int, stop: int) -> float | None:
-    """Compute the seconds from a speed switch until the speed stays correct; None if the next switch comes first."""
+    """Compute the seconds from a speed switch, at step `first`, until the speed stays correct.
+
+    Returns None if the next switch, at step `stop`, comes first.
+    """
     wanted = series.wanted_speeds_m_s[first:stop]
     right = np.abs(series.speeds_m_s[first:stop] - wanted) < RESPONSE_SHARE * wanted
     hold = _hold_steps(series)

@@ -182,7 +182,7 @@ def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float =
 
 
 def _pieces(trial: Trial, end_s: float) -> tuple[Floats, Floats, Floats]:
-    """Compute start time, speed and turn rate of each piece of constant speed and turn rate."""
+    """Compute start times, speeds and turn rates (P,) of the pieces of constant speed and turn rate up to `end_s`."""
     circles = 1
     if trial.family == "switching":
         circles += max(0, int((end_s - trial.approach_s) / trial.switch_every_s))
@@ -195,7 +195,7 @@ def _pieces(trial: Trial, end_s: float) -> tuple[Floats, Floats, Floats]:
 
 
 def _piece_origins(starts: Floats, speeds: Floats, turn_rates: Floats) -> tuple[Floats, Floats]:
-    """Compute position (P, 2) and heading (P,) at the start of each piece from the ends of all earlier ones."""
+    """Compute positions (P, 2) and headings (P,) at the starts of the pieces; each starts where the last one ended."""
     durations = np.diff(starts)
     headings = np.concatenate(([0.0], np.cumsum(turn_rates[:-1] * durations)))
     steps, _ = _arc(speeds[:-1], turn_rates[:-1], headings[:-1], durations)

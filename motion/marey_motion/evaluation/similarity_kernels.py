@@ -9,9 +9,10 @@ from marey_motion.kernels import compiled
 
 @compiled
 def nearest_of_others(queries, query_groups, points, groups, found):  # type: ignore[no-untyped-def]
-    """Fill found (Q,) with the summed distance of each query (Q, P, 3) from the nearest of points (N, P, 3).
+    """Fill `found` (Q,) with the distance of each query (Q, P, 3) from the nearest of N poses (N, P, 3).
 
-    Only poses of another group are compared; the result is infinite if there are none. The pose that was nearest to the
+    The distance of two poses is the sum over their P points. A query is compared only with poses whose `groups` (N,)
+    differ from its own, `query_groups` (Q,); the result is infinite if there are none. The pose that was nearest to the
     previous query is tried first, so that most other poses are ruled out early.
     """
     before = 0

@@ -58,7 +58,7 @@ def walk_graph(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) ->
 
 
 def _runs(clips: Sequence[DatabaseClip], record: TrialRecord) -> Ints:
-    """Find each run of consecutive frames of one clip: its first tick, first row and length."""
+    """List the runs (R, 3) of consecutive frames of one clip: first tick, first row and number of frames of each."""
     rows = record.rows.astype(np.int64)
     owners = clips_of_rows(clips, rows)
     firsts = np.concatenate(([0], np.flatnonzero((np.diff(rows) != 1) | (np.diff(owners) != 0)) + 1))

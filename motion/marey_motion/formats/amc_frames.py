@@ -132,7 +132,7 @@ def _scan(text, names, name_ends, first_columns, values, seen, long_tokens, stat
 
 @compiled
 def _next_word(text, state):  # type: ignore[no-untyped-def]
-    """Find the first byte of the next word, and count the lines that are passed."""
+    """Return the position of the next word, and count the lines that are passed, in `state`."""
     i = state[_POSITION]
     while i < text.size and text[i] <= 32:
         if text[i] == 10 or (text[i] == 13 and not (i + 1 < text.size and text[i + 1] == 10)):
@@ -186,7 +186,10 @@ def _bone_called(text, start, stop, names, name_ends, expected):  # type: ignore
 
 @compiled
 def _read_bone(text, i, first_columns, values, long_tokens, state):  # type: ignore[no-untyped-def]
-    """Read the numbers up to the end of the line; return the position after them, or -1 if a number is malformed."""
+    """Read the numbers of a bone, from position `i` to the end of the line, into `values`.
+
+    Returns the position after them, or -1 if a number is malformed.
+    """
     bone, frame = state[_BONE], state[_FRAME]
     state[_FOUND] = 0
     while i < text.size and text[i] != 10 and text[i] != 13:

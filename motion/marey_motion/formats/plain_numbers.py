@@ -54,7 +54,7 @@ def _word(text, i):  # type: ignore[no-untyped-def]
 
 @compiled
 def _bytes_before(marks):  # type: ignore[no-untyped-def]
-    """Count the bytes before the first one that is marked in its highest bit; 7 if none is."""
+    """Count the bytes of a word before the first byte whose highest bit is set; 7 if no byte has it."""
     first = marks & (~marks + _ONE)
     return ((((first - _ONE) & _ONES) * _ONES) >> _SEVEN_BYTES) - _ONE
 
@@ -72,7 +72,7 @@ def _length(first, second):  # type: ignore[no-untyped-def]
 
 @compiled
 def _digits(word):  # type: ignore[no-untyped-def]
-    """Return the number of digits at the start of the eight bytes, and the integer that these digits form."""
+    """Return the number of digits at the start of a word of eight bytes, and the integer that these digits form."""
     digits = word ^ _ZERO_DIGITS
     others = ((digits + _ABOVE_NINE) | digits) & _HIGH_BITS
     count = _EIGHT

@@ -47,7 +47,10 @@ class Trajectory(Protocol):
 
 
 class TrajectoryArrays(NamedTuple):
-    """A trajectory as arrays for compiled code."""
+    """A trajectory as arrays for compiled code, one row per tick; the fields are those of `Trajectory`.
+
+    `tick_s` is the duration of a tick.
+    """
 
     positions: Floats
     headings: Floats
@@ -57,7 +60,19 @@ class TrajectoryArrays(NamedTuple):
 
 
 class ControllerConstants(NamedTuple):
-    """Options for compiled code: durations in ticks, and factors that apply once per tick."""
+    """Options for compiled code: durations in ticks, and factors that apply once per tick.
+
+    Parameters
+    ----------
+    follow : whether the desired path is followed by time, by position or in open loop, numbered in `controller_kernels`
+    by_distance : whether poses are compared by the distances of their joints instead of their features
+    period, window : ticks from one search to the next; rows on each side of the displayed one that are not chosen
+    bias, margin : added to, and subtracted from, the cost of continuing before other rows are compared with it
+    blends_root, decay : whether the root's velocity is blended at a switch; (2, 2) decay of the difference per tick
+    holds, pull, clamp_m : whether the root is pulled to the desired path; share of the distance per tick, and largest
+        distance that remains
+    tick_s : duration of a tick
+    """
 
     follow: int
     by_distance: bool
@@ -74,7 +89,15 @@ class ControllerConstants(NamedTuple):
 
 
 class DatabaseArrays(NamedTuple):
-    """Arrays of a database that a controller needs besides the index: steps of the root, pose joints, normaliser."""
+    """Arrays of a database that a controller needs besides the index.
+
+    Parameters
+    ----------
+    successors, steps, starts : as in `RootMotion` and `MatchingDatabase`
+    points : (N, P, 3) positions of the pose joints of each row, in metres
+    offset, scale : (D,) those of the normaliser
+    horizons_s, horizons_ticks : (H,) times ahead at which the trajectory is compared, in seconds and in ticks
+    """
 
     successors: NDArray[np.int64]
     steps: Floats

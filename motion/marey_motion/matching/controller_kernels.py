@@ -36,7 +36,10 @@ PATH_WINDOW_S = 0.5
 
 @compiled
 def _arc(speed, turn_rate, elapsed):  # type: ignore[no-untyped-def]
-    """Compute the steps left and forward, and the turn, after `elapsed` seconds at constant speed and turn rate."""
+    """Compute the movement during `elapsed` seconds at constant speed and turn rate.
+
+    Returns the distances to the left and forward, in the frame at the start, and the turn in radians.
+    """
     half = 0.5 * turn_rate * elapsed
     chord = speed * elapsed * (np.sin(half) / half if half != 0.0 else 1.0)
     return chord * np.sin(half), chord * np.cos(half), 2.0 * half
@@ -51,7 +54,10 @@ def _outward(heading, left, forward):  # type: ignore[no-untyped-def]
 
 @compiled
 def _wished(wish, when):  # type: ignore[no-untyped-def]
-    """Compute position and heading of the desired path at `when` ticks; beyond its end, its last arc continues."""
+    """Compute x, z and heading of the desired path at `when` ticks.
+
+    After its end, the path continues with its last speed and turn rate.
+    """
     last = wish.headings.shape[0] - 1
     if when >= last:
         left, forward, turn = _arc(wish.speeds[last], wish.turn_rates[last], (when - last) * wish.tick_s)
@@ -67,7 +73,10 @@ def _wished(wish, when):  # type: ignore[no-untyped-def]
 
 @compiled
 def _progress(wish, when, x, z):  # type: ignore[no-untyped-def]
-    """Find the moment, in ticks, at which the desired path is nearest to (x, z); search near the last moment `when`."""
+    """Find the moment, in ticks, at which the desired path is nearest to (x, z).
+
+    Only moments near `when`, the result at the previous tick, are searched.
+    """
     window = int(PATH_WINDOW_S / wish.tick_s)
     best, best_square = 0, np.inf
     for tick in range(max(0, int(when) - window), int(when) + window + 1):
@@ -87,13 +96,20 @@ def _progress(wish, when, x, z):  # type: ignore[no-untyped-def]
 
 @compiled
 def _moment(rules, wish, when, tick, x, z):  # type: ignore[no-untyped-def]
-    """Compute the moment of the desired path, in ticks, that corresponds to `tick` or to the position (x, z)."""
+    """Compute the moment of the desired path, in ticks, that corresponds to `tick`.
+
+    If the path is followed by position, it is the moment at which the path is nearest to (x, z), near the moment `when`
+    of the previous tick; otherwise, it is `tick` itself.
+    """
     return _progress(wish, when, x, z) if rules.follow == BY_PATH else float(tick)
 
 
 @compiled
 def moments_along(rules, wish, positions, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (T,) with the moment of the desired path, in ticks, that corresponds to each tick of a trial."""
+    """Fill `out` (T,) with the moment of the desired path, in ticks, that corresponds to each tick of a trial.
+
+    `positions` (T, 2) are the positions of the root at the ticks.
+    """
     when = 0.0
     for tick in range(positions.shape[0]):
         if tick > 0:
@@ -131,9 +147,11 @@ def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):  
 
 @compiled
 def _distance_cost(index, points, row, other, query, first, limit):  # type: ignore[no-untyped-def]
-    """Compute the trajectory cost of `other` plus the summed distance (m) of its pose joints from the joints of `row`.
+    """Compute the cost of row `other` as successor of row `row`.
 
-    If the sum exceeds `limit`, any value above `limit` is returned.
+    It is the squared difference of the trajectory features (from dimension `first` on) from those of the query, plus
+    the distances, in metres, between the pose joints of both rows. If the cost exceeds `limit`, any value above `limit`
+    is returned.
     """
     cost = 0.0
     for d in range(first, query.shape[0]):
@@ -171,9 +189,11 @@ def _search(index, playback, rules, row, query, skip_start, skip_stop):  # type:
 
 @compiled
 def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
-    """Choose the next row; return this row, its cost, and the cost of continuing from `row` (NaN at the end of a clip).
+    """Choose the row whose successor is displayed next; `row` is displayed now.
 
-    The pose of the query is that of `row`, so the cost of continuing is only that of the trajectory.
+    Returns the chosen row (`row` itself, if its clip continues), its cost, and the cost of continuing from `row`, which
+    is NaN at the end of a clip. The pose of the query is that of `row`, so the cost of continuing is only that of the
+    trajectory.
     """
     skip_start = skip_stop = 0
     if rules.window > 0:
@@ -193,7 +213,10 @@ def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
 
 @compiled
 def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-untyped-def]
-    """Find the first row of a trial: the row nearest to the desired trajectory, whatever its pose."""
+    """Find the first row of a trial, and its cost: the row whose trajectory is nearest to the desired one.
+
+    `root` is x, z and heading; `query` (D,) is overwritten.
+    """
     fill_query(index, playback, rules, wish, 0, 0.0, root[0], root[1], root[2], query)
     weights = np.ones(query.shape[0])
     weights[: query.shape[0] - 4 * playback.horizons_s.shape[0]] = 0.0
@@ -202,7 +225,7 @@ def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-un
 
 @compiled
 def _jumped(wish, before, when):  # type: ignore[no-untyped-def]
-    """Return whether the desired velocity or direction jumped between two moments."""
+    """Return whether the desired velocity or direction jumped between the moments `before` and `when`, in ticks."""
     last = wish.speeds.shape[0] - 1
     a, b = min(int(before), last), min(int(when), last)
     x = wish.speeds[b] * np.sin(wish.headings[b]) - wish.speeds[a] * np.sin(wish.headings[a])
@@ -212,9 +235,10 @@ def _jumped(wish, before, when):  # type: ignore[no-untyped-def]
 
 @compiled
 def _advance(playback, rules, row, offsets, root):  # type: ignore[no-untyped-def]
-    """Move `root` (x, z, heading) by the step that follows `row`, and by the remaining blended velocities.
+    """Move `root` (x, z, heading) by the step that follows `row`, plus the remaining offset of the root's velocity.
 
-    offsets (2, 3): the offset of the root's velocity (left, forward, turn), and its change per second.
+    `offsets` (2, 3) are this offset (left, forward, turn per second), which a switch to another row caused, and its
+    change per second; both decay by one tick.
     """
     left = playback.steps[row, 0] + offsets[0, 0] * rules.tick_s
     forward = playback.steps[row, 1] + offsets[0, 1] * rules.tick_s
@@ -230,7 +254,7 @@ def _advance(playback, rules, row, offsets, root):  # type: ignore[no-untyped-de
 
 @compiled
 def _hold(rules, wish, when, root):  # type: ignore[no-untyped-def]
-    """Pull the root towards the desired position and heading, and limit its distance from the desired position."""
+    """Pull `root` (x, z, heading) towards the desired path at `when` ticks, and limit its distance from the path."""
     x, z, heading = _wished(wish, when)
     turn = heading - root[2]
     root[0] += rules.pull * (x - root[0])
@@ -244,7 +268,7 @@ def _hold(rules, wish, when, root):  # type: ignore[no-untyped-def]
 
 @compiled
 def run(index, playback, wish, rules, record):  # type: ignore[no-untyped-def]
-    """Play one trial into the arrays of `record`."""
+    """Simulate one trial, and fill the arrays of `record` with its ticks."""
     query = np.empty(index.rows.shape[1])
     offsets = np.zeros((2, 3))
     root = np.array([wish.positions[0, 0], wish.positions[0, 1], wish.headings[0]])

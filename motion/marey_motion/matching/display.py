@@ -102,7 +102,10 @@ def switched_rows(database: MatchingDatabase, rows: NDArray[np.int32]) -> NDArra
 def _inertialised(
     database: MatchingDatabase, rows: NDArray[np.int32], joints: NDArray[np.int64], half_life_s: float
 ) -> tuple[Floats, Floats]:
-    """Compute displayed poses (T, 3 + 4·K) of K joints in the root's frame, and local translations (T, M, 3)."""
+    """Compute displayed poses (T, 3 + 4·K) of K joints, and the local translations (T, M, 3) of M of them.
+
+    `rows` (T,) are the displayed rows of the database. The poses are in the frame of the simulation root.
+    """
     from marey_motion.matching import display_kernels
 
     rate_hz = database.options.rate_hz

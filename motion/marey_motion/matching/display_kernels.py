@@ -49,7 +49,10 @@ def _turn_to(pose, column, w, x, y, z):  # type: ignore[no-untyped-def]
 
 @compiled
 def _add_velocity(poses, places, successors, joints, moved, row, rate, velocities):  # type: ignore[no-untyped-def]
-    """Add `rate` times the step from a row to the next one to `velocities` (1 + M + K, 3)."""
+    """Add `rate` times the difference between a row and the next row of its clip to `velocities` (1 + M + K, 3).
+
+    The parts of `velocities` are those of the root's position, of M translations and of K rotations.
+    """
     if successors[row] < 0:  # a clip's end goes on as it came
         if row == 0 or successors[row - 1] != row:
             return
@@ -70,7 +73,11 @@ def _add_velocity(poses, places, successors, joints, moved, row, rate, velocitie
 
 @compiled
 def _show(pose, place, joints, moved, offsets, shown, shown_places):  # type: ignore[no-untyped-def]
-    """Fill `shown` (3 + 4·K) and `shown_places` (M, 3) with the pose of a row, plus offsets (1 + M + K, 3)."""
+    """Fill `shown` (3 + 4·K) and `shown_places` (M, 3) with K joints of a row's pose and M of its translations.
+
+    `pose` and `place` are the row's. The `offsets` (1 + M + K, 3) of the root's position, of the translations and of
+    the rotations are added.
+    """
     for c in range(3):
         shown[c] = pose[c] + offsets[0, c]
         for m in range(moved.shape[0]):
@@ -93,7 +100,7 @@ def _show_row(pose, place, joints, moved, shown, shown_places):  # type: ignore[
 
 @compiled
 def _take_offsets(shown, shown_places, pose, place, joints, moved, offsets):  # type: ignore[no-untyped-def]
-    """Fill `offsets` with the difference between a row and the displayed pose."""
+    """Fill `offsets` (1 + M + K, 3) with the displayed pose, `shown` and `shown_places`, minus that of a row."""
     for c in range(3):
         offsets[0, c] = shown[c] - pose[c]
         for m in range(moved.shape[0]):
@@ -106,7 +113,7 @@ def _take_offsets(shown, shown_places, pose, place, joints, moved, offsets):  # 
 
 @compiled
 def _decay(decay, offsets, velocities):  # type: ignore[no-untyped-def]
-    """Advance all offsets and their velocities by one tick; return whether any offset remains."""
+    """Advance all offsets and velocities by one tick, with the matrix `decay`; return whether any offset remains."""
     left = 0.0
     for k in range(offsets.shape[0]):
         for c in range(3):
@@ -121,12 +128,21 @@ def _decay(decay, offsets, velocities):  # type: ignore[no-untyped-def]
 def inertialised(  # type: ignore[no-untyped-def]
     poses, places, successors, joints, moved, rows, cuts, decay, rate_hz, out, out_places
 ):
-    """Fill `out` (T, 3 + 4·K) and `out_places` (T, M, 3) with the poses of K joints, M of them translated.
+    """Fill `out` (T, 3 + 4·K) and `out_places` (T, M, 3) with displayed poses of K joints, M of them translated.
 
-    `poses` (N, 3 + 4·J) and the local translations `places` (N, L, 3) are those of the database. `joints` (K,) and
-    `moved` (M,) are indices of the wanted joints and translations. `rows` (T,) are displayed at each tick. `cuts` (T,)
-    are the rows that replace the displayed rows after each tick, or -1 where a clip continues. `decay` (2, 2) advances
-    offsets and velocities by one tick.
+    When the display switches from one row of the database to another, an offset is added to the next poses, so that the
+    displayed motion continues smoothly; the offset decays.
+
+    Parameters
+    ----------
+    poses, places : (N, 3 + 4·J), (N, L, 3) poses and local translations of the N rows of the database
+    successors : (N,) the row that continues each row's clip, or -1
+    joints, moved : (K,), (M,) indices of the wanted joints, and of their translations among the L of the database
+    rows : (T,) the row that is displayed at each tick, that is, each frame of the display
+    cuts : (T,) the row that a search chose at each tick instead of the displayed one, so that its successor is
+        displayed next; -1 if the displayed clip continues
+    decay : (2, 2) matrix that advances an offset and its velocity by one tick
+    rate_hz : ticks per second
     """
     offsets = np.zeros((1 + moved.shape[0] + joints.shape[0], 3))
     velocities = np.zeros_like(offsets)

@@ -168,7 +168,7 @@ def _chosen(
     record: TrialRecord,
     tick: int,
 ) -> tuple[int, float, Reason]:
-    """Find the row that was chosen, its cost, and the reason."""
+    """Find the row that was chosen at a tick, its cost, and the reason for the choice; `query` is that of the tick."""
     from marey_motion.matching import controller_kernels as kernels
 
     shown = int(record.rows[tick])

@@ -136,7 +136,7 @@ def _wanted_frames(
 
 
 def _moves(clip: Clip, skeleton: Skeleton) -> bool:
-    """Check whether a clip fits a skeleton. End sites may differ, and so may offsets that translations replace."""
+    """Return whether a clip moves the given skeleton; end sites and offsets that translations replace may differ."""
     own = clip.skeleton
     if own is skeleton:
         return True
@@ -149,7 +149,7 @@ def _moves(clip: Clip, skeleton: Skeleton) -> bool:
 
 
 def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], warn: _Warn) -> tuple[int, int]:
-    """Find the range of frames between the rest poses at a clip's ends."""
+    """Find the range [start, stop) of frames between the rest poses at a clip's ends, which `warnings` name."""
     start, stop = 0, clip.frame_count
     for warning in warnings:
         if warning.code == "rest-pose-frame" and warning.frames is not None:

@@ -110,7 +110,11 @@ def _poses(motion: Motion, carrier: Floats, root: SimulationRoot, body: Matching
 
 
 def _hang(poses: Floats, rotations: Floats, facing: Floats, motion: Motion, body: MatchingBody) -> None:
-    """Set the joints above the carrier to their rest pose, so that they follow the root, without moving the carrier."""
+    """Set the joints above the carrier to their rest pose relative to the root, without moving the carrier.
+
+    `poses` and their part `rotations` (F, J, 4) are changed; `facing` (F, 4) are the rotations from the world to the
+    root's frame.
+    """
     skeleton = body.skeleton
     above = skeleton.path_to_root(body.carrier)[1:]
     turned: AnyFloats = quaternions.identity(motion.frame_count)
@@ -128,7 +132,11 @@ def _hang(poses: Floats, rotations: Floats, facing: Floats, motion: Motion, body
 
 
 def _translations(motion: Motion, body: MatchingBody) -> dict[str, Any]:
-    """Collect translations of the joints below the carrier; joint 0 includes the translations on the path to it."""
+    """Collect the local translations of all joints that are not on the path from joint 0 to the carrier.
+
+    The position of joint 0 in the poses already includes the translations on this path. Returns the fields
+    `translations` and `translated_joints` of `ClipRows`.
+    """
     path = body.skeleton.path_to_root(body.carrier)
     joints = [joint for joint in motion.translated_joints if joint not in path]
     kept = [slot for slot, joint in enumerate(motion.translated_joints) if joint in joints]

@@ -69,7 +69,7 @@ def build_index(
 
     Parameters
     ----------
-    normalised : (N, D) float64    features divided by their scales
+    normalised : (N, D) float64    normalised features, from `Normaliser.apply`
     starts : (C + 1,) int64    first row of each clip, and N
     selectable : (N,) bool    rows a search may choose
     method : str    "boxes", "scan" or "auto". "auto" makes a few searches, with mixtures of rows as queries, and
@@ -174,7 +174,7 @@ def _boxes(low: NDArray[np.float32], high: NDArray[np.float32], starts: NDArray[
 
 
 def _boxes_pay(index: SearchIndex) -> bool:
-    """Test on mixed queries, half from one row and half from another, whether boxes save enough comparisons."""
+    """Test whether boxes save enough comparisons, with queries whose halves come from two different rows."""
     from marey_motion.matching import search_kernels as kernels
 
     draws = np.random.default_rng(0).choice(np.flatnonzero(index.selectable), size=(2, _PROBES))

@@ -36,7 +36,16 @@ _SMALLEST = 1e-36
 
 
 class _Query(NamedTuple):
-    """A query during its search: in float64, and in float32 padded to the index's dimensions; arrays for 16 sums."""
+    """A query during its search.
+
+    Parameters
+    ----------
+    exact, exact_weights : (D,) float64 the query, and the weights of the squared differences
+    rounded, weights : the same in float32, padded with zeros to the dimensions of the index
+    skip_start, skip_stop : rows from `skip_start` up to, but not including, `skip_stop` are not found
+    reach, margin, least : terms of the bound that `_limit` computes
+    sums, bounds : (16,) float32 arrays for the float32 costs of the rows of a block, and for those of 16 boxes
+    """
 
     exact: Any
     exact_weights: Any
@@ -128,7 +137,11 @@ def _screened_boxes(boxes, query, number, sums, limit):  # type: ignore[no-untyp
 
 @inlined
 def _choose_row(index, query, block, lanes, row, cost, limit):  # type: ignore[no-untyped-def]
-    """Compare the best row so far (row, cost) with a block's screened rows; return the best, its cost and its limit."""
+    """Compare the best row so far with rows of a block: those whose bits are set in `lanes`.
+
+    `row`, `cost` and `limit` are the best row so far, its exact cost, and the bound that `_limit` computes from the
+    cost. Rows whose float32 cost is above the bound are skipped. Returns the new row, cost and limit.
+    """
     while lanes:
         lane = _lane_of_least(query.sums, lanes)
         if query.sums[lane] > limit:
@@ -145,7 +158,7 @@ def _choose_row(index, query, block, lanes, row, cost, limit):  # type: ignore[n
 
 @inlined
 def _search_group(index, query, group, row, cost, limit):  # type: ignore[no-untyped-def]
-    """Compare the best row so far (row, cost) with the rows of a group; return the best, its cost and its limit."""
+    """Compare the best row so far with the rows of a group of boxes; parameters and results as in `_choose_row`."""
     boxes = _screened_boxes(index.boxes, query, group, query.bounds, limit)
     first = index.group_blocks[group]
     boxes &= (1 << (index.group_blocks[group + 1] - first)) - 1
@@ -162,9 +175,10 @@ def _search_group(index, query, group, row, cost, limit):  # type: ignore[no-unt
 
 @compiled
 def _search_boxes(index, query, row, cost, limit):  # type: ignore[no-untyped-def]
-    """Search the group with the nearest box first, for a tight limit, then the remaining groups in their order.
+    """Search the nearest group of boxes first, for a tight limit, then the remaining groups in their order.
 
     Searching all groups in the order of their distance would visit a few per cent fewer groups, but take longer.
+    Parameters and results are as in `_choose_row`.
     """
     groups = index.boxes.shape[0]
     bounds = np.empty((index.group_boxes.shape[0], LANES), np.float32)
@@ -185,7 +199,7 @@ def _search_boxes(index, query, row, cost, limit):  # type: ignore[no-untyped-de
 
 @compiled
 def _search_blocks(index, query, start, stop, row, cost, limit):  # type: ignore[no-untyped-def]
-    """Compare the best row so far (row, cost) with blocks [start, stop); return the best, its cost and its limit."""
+    """Compare the best row so far with the rows of blocks [start, stop); parameters and results as in `_choose_row`."""
     for block in range(start, stop):
         lanes = _screened_rows(index, query, block, limit)
         if lanes:
@@ -209,7 +223,9 @@ def _nearest(index, query, weights, warm_row, skip_start, skip_stop):  # type: i
 
 @compiled
 def nearest(index, query, warm_row, skip_start, skip_stop):  # type: ignore[no-untyped-def]
-    """Find the selectable row of least cost outside [skip_start, skip_stop) and its cost; (-1, inf) if there is none.
+    """Find the selectable row of least cost outside [skip_start, skip_stop).
+
+    Returns the row and its cost, or (-1, inf) if there is none.
 
     The lowest row wins a tie. `warm_row` is a row likely to be near, or -1: it changes the time taken, not the answer.
     """
@@ -218,20 +234,24 @@ def nearest(index, query, warm_row, skip_start, skip_stop):  # type: ignore[no-u
 
 @compiled
 def nearest_weighted(index, query, weights, skip_start, skip_stop):  # type: ignore[no-untyped-def]
-    """Find the row like `nearest`, but multiply the squared differences by non-negative weights (D,)."""
+    """Find the same as `nearest`, but with squared differences multiplied by non-negative weights (D,)."""
     return _nearest(index, query, weights, -1, skip_start, skip_stop)
 
 
 @compiled
 def nearest_of_each(index, queries, weights, warm_rows, skips, rows, costs):  # type: ignore[no-untyped-def]
-    """Fill `rows` and `costs` (Q,) with the nearest row of each query (Q, D); warm_rows (Q,), skips (Q, 2)."""
+    """Fill `rows` and `costs` (Q,) with the nearest row of each query (Q, D), and its cost.
+
+    `weights` (D,) multiply the squared differences. `warm_rows` (Q,) are rows likely to be near, or -1; `skips` (Q, 2)
+    are the ranges of rows that are not found, all as for `nearest`.
+    """
     for q in range(queries.shape[0]):
         rows[q], costs[q] = _nearest(index, queries[q], weights, warm_rows[q], skips[q, 0], skips[q, 1])
 
 
 @compiled
 def all_costs(index, query, weights, costs):  # type: ignore[no-untyped-def]
-    """Fill `costs` (N,) with the cost of every row, selectable or not."""
+    """Fill `costs` (N,) with the cost of every row, selectable or not; `weights` (D,) are as for `nearest_weighted`."""
     for row in range(costs.shape[0]):
         costs[row] = _cost(index.rows[row], query, weights)
 

@@ -48,7 +48,11 @@ def _from_box(builder: ir.IRBuilder, sides: Values, query: ir.Value) -> ir.Value
 
 
 def _summed(gap: Gap, operands: int) -> Any:
-    """Make an intrinsic that sums weight · gap² over dimensions; its arrays have `operands` vectors per dimension."""
+    """Make a compiled function that sums weight · gap² over dimensions, for sixteen rows or boxes at once.
+
+    `gap` writes the instructions for the gap between a query and a row or box, which is stored as `operands` vectors
+    per dimension.
+    """
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Values) -> ir.Value:
         blocks, query, weights, sums = (

@@ -135,7 +135,10 @@ def dual_coefficients(basis: SplineBasis, coefficients: Floats, inner_product: I
 def _inner_products(
     basis: SplineBasis, deviations: Floats, mean: Floats, weights: Floats, inner_product: InnerProduct
 ) -> tuple[Floats, float]:
-    """Compute the inner products (m, m) of the weighted examples' deviations, and the norm of all weighted examples."""
+    """Compute inner products of m examples whose channels are multiplied by `weights`.
+
+    Returns those of the examples' deviations from their mean (m, m), and the norm of all examples together.
+    """
     weighted, weighted_mean = deviations * weights, mean * weights
     if inner_product == "l2":
         root = np.linalg.cholesky(basis.products).T

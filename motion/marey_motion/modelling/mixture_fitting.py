@@ -136,7 +136,7 @@ class _Fitting:
     seed: int
 
     def choose(self) -> tuple[LatentMixture, list[MixtureCandidate], Floats | None]:
-        """Choose the mixture; also return all candidates and the held-out likelihood of the examples."""
+        """Choose the mixture; return it, all candidates, and the examples' held-out log-likelihoods (n,) or None."""
         examples, dimensions = self.latents.shape
         if examples <= dimensions + 1:
             return _fitted(self.latents, 1, self.options, self.seed)[0], [], self._held_out(1)
@@ -165,7 +165,11 @@ class _Fitting:
         )
 
     def _best(self, candidates: dict[int, MixtureCandidate]) -> tuple[int, Floats | None]:
-        """Choose the number of components with the best criterion and no refusal; record refusals."""
+        """Choose the number of components with the best criterion among the candidates that are not refused.
+
+        `candidates` are by number of components; refusals are recorded in them. Returns the chosen number, and the
+        held-out log-likelihoods (n,) of the examples with this number, or None.
+        """
         single = self._held_out(1)
         falling = sorted(candidates.values(), key=lambda one: getattr(one, self.options.criterion))
         for candidate in falling:
@@ -181,7 +185,10 @@ class _Fitting:
         raise ModelError("the list of possible numbers of components must contain 1")
 
     def _held_out(self, count: int) -> Floats | None:
-        """Compute ln p of each example under a mixture of `count` components fitted without the example's fold."""
+        """Compute ln p of each example under a mixture of `count` components fitted without the example's fold; (n,).
+
+        Returns None if the examples cannot be divided into folds.
+        """
         examples = len(self.latents)
         if self.options.folds < LEAST_FOLDS or examples <= self.options.folds:
             return None

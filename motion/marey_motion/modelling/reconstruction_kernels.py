@@ -9,7 +9,7 @@ from marey_motion.kernels import compiled, inverse, product, put_rotation, rotat
 
 @compiled
 def _load_rotations(pose, rotations, lengths):  # type: ignore[no-untyped-def]
-    """Fill unit local rotations (J, 4) and the lengths (J,) of the pose's quaternions."""
+    """Fill `rotations` (J, 4) with a pose's quaternions, scaled to unit length; `lengths` (J,) with their lengths."""
     for joint in range(len(rotations)):
         column = 3 + 4 * joint
         w, x, y, z = pose[column], pose[column + 1], pose[column + 2], pose[column + 3]
@@ -23,7 +23,7 @@ def _load_rotations(pose, rotations, lengths):  # type: ignore[no-untyped-def]
 
 @compiled
 def _place_joints(pose, local, parents, offsets, world, positions):  # type: ignore[no-untyped-def]
-    """Fill global rotations (J, 4) and positions (J, 3)."""
+    """Fill rotations `world` (J, 4) and positions (J, 3) in the world, from a pose and its local rotations `local`."""
     world[0] = local[0]
     positions[0] = pose[:3]
     for joint in range(1, len(parents)):
@@ -41,7 +41,10 @@ def _place_joints(pose, local, parents, offsets, world, positions):  # type: ign
 
 @compiled
 def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (B,) with the mean distance of joints from targets (T, J, 3), for unnormalised poses (B, T, D)."""
+    """Fill `out` (B,) with the mean distance of joints from targets (T, J, 3), for B motions of T poses (B, T, D).
+
+    The quaternions of the poses need not have unit length. `parents` (J,) and `offsets` (J, 3) are the skeleton's.
+    """
     joints = len(parents)
     local, world = np.empty((joints, 4)), np.empty((joints, 4))
     lengths, positions = np.empty(joints), np.empty((joints, 3))

@@ -110,7 +110,7 @@ class _Problem:
 
     @cached_property
     def grams(self) -> Floats:
-        """Inner products (3 + J, m, m) of the examples in each group of channels."""
+        """Inner products (3 + J, m, m) of the examples' deviations, by group of channels: root axes, then joints."""
         duals = dual_coefficients(self.basis, self.deviations, self.inner_product)
         each = self.deviations.transpose(2, 0, 1) @ duals.transpose(2, 1, 0)
         joints = each[3:].reshape(-1, 4, *each.shape[1:]).sum(axis=1)

@@ -185,7 +185,7 @@ def _examples(
 
 
 def _at(errors: ReconstructionErrors, components: int) -> int:
-    """Find the index in the arrays of `errors` for this number of components; the last one if fewer were measured."""
+    """Find the index of a number of components in the arrays of `errors`; the last index if fewer were measured."""
     return min(components, len(errors.components) - 1)
 
 

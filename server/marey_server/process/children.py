@@ -62,7 +62,11 @@ class ChildLimits:
 
 @dataclass(eq=False)
 class ChildTask(Generic[T]):
-    """Call of a function in a child: `make` returns its argument, and `read` converts its result."""
+    """Call of a function in a child process.
+
+    `make` creates the bytes that the function receives as its argument. `read` converts the bytes that the function
+    returns.
+    """
 
     caller: str
     function: str

@@ -325,11 +325,10 @@ def _held(tx: Transaction, digests: Iterable[str], *, since_us: int) -> set[str]
 
 
 def _within_reach(caller: Principal) -> tuple[ColumnElement[bool], ...]:
-    """Return the condition for rows of `blob_holder` whose bytes may be used with a user's token.
+    """Return the condition for rows of `blob_holder`, the user's uploads, whose bytes the user's token may use.
 
-    With a token that may read in all projects, the condition holds for all uploads of the user. With another token, it
-    holds for uploads to the projects to which the token is limited. If one of the token's scopes is for all projects,
-    it also holds for bytes that were uploaded for every project.
+    A token that may read in all projects may use all uploads of the user. Any other token may use uploads for the
+    projects that its scopes name; and, if one of its other scopes is for all projects, uploads for every project.
     """
     if scopes.allows(caller.scopes, "read"):
         return ()

@@ -49,7 +49,7 @@ def record(
         Path | None,
         typer.Option(
             help="CSV file with one row for each clip: a column `clip` (name, or path below PLACE) or `file` (name of "
-            "the imported file), and columns of fields. Empty cells change nothing."
+            "the imported file), and a column for each field to set. Empty cells change nothing."
         ),
     ] = None,
     column: Annotated[

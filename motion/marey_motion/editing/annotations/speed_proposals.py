@@ -125,7 +125,7 @@ def _distance_from_rest(clip: Clip, body: MatchingBody, side: str) -> Floats:
 
 
 def _downhill(values: Floats, frame: int, step: Literal[-1, 1], last: int) -> int:
-    """Find the first frame, going from `frame` to `last`, after which the values stop falling."""
+    """Find the first frame, from `frame` towards `last` in steps of `step`, after which the values stop falling."""
     way = values[last : frame + 1][::-1] if step == -1 else values[frame : last + 1]
     rising = np.diff(way) >= 0.0
     return frame + step * (int(np.argmax(rising)) if rising.any() else len(way) - 1)

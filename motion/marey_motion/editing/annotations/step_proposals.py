@@ -62,7 +62,11 @@ def propose_steps(clip: Clip, body: MatchingBody, options: StepsProposal | None 
 
 
 class _Step(NamedTuple):
-    """Step in which foot `side` swings and touches the ground at `end`."""
+    """Step in which a foot swings from frame `start` and touches the ground at frame `end`.
+
+    `side` is 0 for the left and 1 for the right foot. `from_standing` and `to_standing` are whether the body stands
+    before and after the step.
+    """
 
     side: int
     start: int

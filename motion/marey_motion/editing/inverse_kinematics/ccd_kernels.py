@@ -42,9 +42,11 @@ STAYING = 1e-9
 
 @compiled
 def _pair_up(targets, frame, k, body, place, tips, turns, matrix):  # type: ignore[no-untyped-def]
-    """Fill the sum Σ w·b·aᵀ (3, 3) over pairs of a vector a that joint k turns and its target direction b.
+    """Collect pairs of a vector a that joint k turns, and the vector b to which a target asks it to turn.
 
-    Returns the number of pairs, and the last pair as unit vectors.
+    `place` is the position of joint k; `tips` and `turns` are positions and rotations of the targets' points. `matrix`
+    (3, 3) is filled with the sum Σ w·b·aᵀ over the pairs, weighted by w. Returns the number of pairs, and a and b of
+    the last pair as unit vectors.
     """
     matrix[:] = 0.0
     pairs = 0
@@ -88,7 +90,10 @@ def _add_pair(matrix, weight, a, b):  # type: ignore[no-untyped-def]
 
 @compiled
 def _davenport(matrix, form):  # type: ignore[no-untyped-def]
-    """Fill Davenport's matrix (4, 4), whose eigenvector of the largest eigenvalue is the best rotation (q-method)."""
+    """Fill `form` with Davenport's matrix (4, 4) of the sum `matrix` from `_pair_up`.
+
+    Its eigenvector of the largest eigenvalue is the best rotation as a quaternion (q-method).
+    """
     trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
     form[0, 0] = trace
     for i in range(3):
@@ -152,7 +157,10 @@ def _annihilate(form, vectors, p, q):  # type: ignore[no-untyped-def]
 
 @compiled
 def _best_turn(pairs, start, end, matrix, form, vectors):  # type: ignore[no-untyped-def]
-    """Compute the smallest world rotation that turns the vectors as close as possible to their target directions."""
+    """Compute the smallest world rotation that turns the vectors of `_pair_up` as close as possible to their targets.
+
+    `pairs`, `start`, `end` and `matrix` are the results of `_pair_up`; `form` and `vectors` (4, 4) are overwritten.
+    """
     if pairs == 1:
         return between(start, end)
     _davenport(matrix, form)
@@ -166,7 +174,11 @@ def _best_turn(pairs, start, end, matrix, form, vectors):  # type: ignore[no-unt
 
 @compiled
 def _hinge_turn(limit, spin, local, flexible, matrix):  # type: ignore[no-untyped-def]
-    """Compute the local rotation of a hinge, moved by a share `flexible` towards its best angle within the limits."""
+    """Compute the local rotation of a hinge, moved by a share `flexible` towards its best angle within the limits.
+
+    `limit` is the joint's row of `JointChains.limits`, `spin` its rotation in the world, `local` its local rotation,
+    and `matrix` the sum from `_pair_up`.
+    """
     reference, axis = (limit[0], limit[1], limit[2], limit[3]), (limit[4], limit[5], limit[6])
     now = twist_angle(product(inverse(reference), local), axis)
     hinge = rotated(product(spin, inverse(local)), rotated(reference, axis))
@@ -192,7 +204,10 @@ def _hinge_turn(limit, spin, local, flexible, matrix):  # type: ignore[no-untype
 
 @compiled
 def _turned_joint(body, k, spin, local, pairs, start, end, work):  # type: ignore[no-untyped-def]
-    """Compute the new local rotation of joint k."""
+    """Compute the new local rotation of joint k, from its rotation in the world `spin` and its local rotation.
+
+    `pairs`, `start` and `end` are the results of `_pair_up`.
+    """
     limit = body.limits[k]
     flexible = 1.0 - body.stiffness[k]
     if body.limited[k] and limit[SWING_RANGE] <= 0.0 and limit[SWING_RANGE + 1] <= 0.0:
@@ -213,7 +228,7 @@ def _turned_joint(body, k, spin, local, pairs, start, end, work):  # type: ignor
 
 @compiled
 def _sweep(body, targets, frame, local, work):  # type: ignore[no-untyped-def]
-    """Turn every movable joint once, from the tips of the chains to their root."""
+    """Turn every movable joint of the pose `local` (K, 4) once, from the tips of the chains to their root."""
     for k in range(body.parents.shape[0] - 1, -1, -1):
         if not body.movable[k]:
             continue
@@ -235,7 +250,7 @@ def _sweep(body, targets, frame, local, work):  # type: ignore[no-untyped-def]
 
 @compiled
 def descend(body, targets, ends, roots, rotations, work, found):  # type: ignore[no-untyped-def]
-    """Solve each frame independently: `rotations` (F, K, 4) are changed in place, `found` is filled.
+    """Solve each frame independently: `rotations` (F, K, 4) are changed in place, `found`, a `SolverResult`, is filled.
 
     `ends` are the maximum number of sweeps, the tolerance in metres and the tolerance in radians.
     """

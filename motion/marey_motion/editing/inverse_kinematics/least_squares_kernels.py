@@ -48,7 +48,10 @@ LIMIT_REACHED_RAD = 1e-9
 
 @compiled
 def _turned_error(kind, error, gaze, wished, turn, drift):  # type: ignore[no-untyped-def]
-    """Compute the change of an angular error if the joint turns by `turn` and the target direction by `drift`."""
+    """Compute the change of an angular error if the joint turns by `turn` and the target direction by `drift`.
+
+    Both are small rotation vectors. `gaze` and `wished` are the unit directions of the look-at axis and of its target.
+    """
     if kind == ORIENTATION:
         # The inverse left Jacobian of the rotation group at `error`.
         angle = length(error)
@@ -61,7 +64,7 @@ def _turned_error(kind, error, gaze, wished, turn, drift):  # type: ignore[no-un
 
 @compiled
 def _look_change(gaze, wished, turn):  # type: ignore[no-untyped-def]
-    """Compute the change of `look_error` if the gaze turns by a small rotation vector."""
+    """Compute the change of `look_error(gaze, wished)` if the gaze turns by the small rotation vector `turn`."""
     across = cross(wished, gaze)
     sine, cosine = length(across), dot(wished, gaze)
     if sine < 1e-9:
@@ -74,9 +77,10 @@ def _look_change(gaze, wished, turn):  # type: ignore[no-untyped-def]
 
 @compiled
 def _fill_column(targets, frame, c, error, tip, turn, move, spin, jacobian, column):  # type: ignore[no-untyped-def]
-    """Fill the derivatives of the error of target `c` with respect to one unknown.
+    """Fill a column of the Jacobian: the derivatives of the error of target `c` with respect to one unknown.
 
-    A unit change of the unknown moves the tip by `move` and turns it by `spin`.
+    `tip` and `turn` are position and rotation of the target's point, `error` is its error. A unit change of the unknown
+    moves the point by `move` and turns it by `spin`.
     """
     if targets.kinds[c] == POSITION:
         axes = targets.axes
@@ -124,7 +128,11 @@ def fill_jacobian(body, targets, frame, work, jacobian):  # type: ignore[no-unty
 
 @compiled
 def _displace(body, local, root, first_local, first_root, work):  # type: ignore[no-untyped-def]
-    """Fill the displacements (3·V + 3,) from the initial pose, and return the sum of their weighted squares."""
+    """Fill `work.displacement` (3·V + 3,), and return the sum of the weighted squares.
+
+    They are the displacements of the V movable joints and the root from the initial pose, `first_local` and
+    `first_root`, to the pose `local` and `root`.
+    """
     columns, cost = 0, 0.0
     for k in range(local.shape[0]):
         if body.movable[k]:
@@ -142,7 +150,7 @@ def _displace(body, local, root, first_local, first_root, work):  # type: ignore
 
 @compiled
 def _fill_softness(body, damping, work):  # type: ignore[no-untyped-def]
-    """Fill the diagonal of D⁻¹, where D contains the damping and the weights of the displacements."""
+    """Fill `work.softness`, the diagonal of D⁻¹; D is the sum of the damping and the weights of the displacements."""
     columns = 0
     for k in range(body.parents.shape[0]):
         if body.movable[k]:
@@ -176,7 +184,10 @@ def _soften(work, vector, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def _solve_positive(matrix, right):  # type: ignore[no-untyped-def]
-    """Solve matrix·x = right in place by Cholesky decomposition, which overwrites the matrix (m, m)."""
+    """Solve matrix·x = right for a positive definite matrix (m, m): replace `right` (m,) by x, and the matrix's values.
+
+    The matrix is replaced by its Cholesky factor.
+    """
     m = right.shape[0]
     for i in range(m):
         for j in range(i + 1):
@@ -196,7 +207,7 @@ def _solve_positive(matrix, right):  # type: ignore[no-untyped-def]
 
 @compiled
 def _fill_step(work):  # type: ignore[no-untyped-def]
-    """Fill the step -(JᵀJ + D)⁻¹·gradient."""
+    """Fill `work.step` with -(JᵀJ + D)⁻¹·gradient; J is the Jacobian, D as in `_fill_softness`."""
     rows, columns = work.jacobian.shape
     _soften(work, work.gradient, work.step)
     for i in range(rows):
@@ -221,7 +232,7 @@ def _fill_step(work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _block(work, v, over):  # type: ignore[no-untyped-def]
-    """Exclude a direction from the steps of movable joint v; return whether it was not excluded before.
+    """Exclude the direction `over` from the steps of movable joint v; return False if all directions were excluded.
 
     `work.outward` is the excluded direction, or, if two are excluded, the direction that remains free.
     """
@@ -236,7 +247,10 @@ def _block(work, v, over):  # type: ignore[no-untyped-def]
 
 @compiled
 def _take_step(body, local, root, work):  # type: ignore[no-untyped-def]
-    """Fill the trial pose; return whether a joint ran into a limit that was not yet known to block it."""
+    """Fill the trial pose: the pose `local` (K, 4) and `root` (3,) moved by `work.step`, within the limits.
+
+    Returns whether a joint ran into a limit that was not yet known to block it.
+    """
     longest = 0.0
     for n in range(3 * work.blocked.shape[0]):
         longest = max(longest, abs(work.step[n]))
@@ -302,7 +316,11 @@ def _try_step(body, damping, local, root, work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _solve_frame(body, targets, frame, offsets, ends, local, root, work, before, after):  # type: ignore[no-untyped-def]
-    """Solve one frame in place; return the number of steps tried and whether all targets are reached."""
+    """Solve one frame: change the pose `local` (K, 4) and `root` (3,) in place.
+
+    `before` and `after` (C,) are filled with the errors of the targets; `ends` is as in `solve_frames`. Returns the
+    number of steps tried, and whether all targets are reached.
+    """
     most_steps, tolerance_m, tolerance_rad = ends
     work.first[:] = local
     work.first_root[:] = root
@@ -350,7 +368,9 @@ def _solve_frame(body, targets, frame, offsets, ends, local, root, work, before,
 
 @compiled
 def solve_frames(body, targets, ends, roots, rotations, work, found):  # type: ignore[no-untyped-def]
-    """Solve each frame independently: `roots` (F, 3), `rotations` (F, K, 4) change in place, `found` is filled.
+    """Solve each frame independently: `roots` (F, 3) and `rotations` (F, K, 4) are changed in place.
+
+    `found`, a `SolverResult`, is filled.
 
     `ends` are the maximum number of steps, the tolerance in metres and the tolerance in radians.
     """

@@ -47,7 +47,10 @@ def place_joints(parents, offsets, root, local, spins, places):  # type: ignore[
 
 @compiled
 def place_tips(targets, spins, places, tips, turns):  # type: ignore[no-untyped-def]
-    """Fill the points (C, 3) and world rotations (C, 4) to which the targets apply."""
+    """Fill `tips` (C, 3) and `turns` (C, 4): positions of the targets' points, and rotations of their joints.
+
+    `spins` (K, 4) and `places` (K, 3) are rotations and positions of all joints; all are in the world.
+    """
     for c in range(targets.kinds.shape[0]):
         k = targets.joints[c]
         spin = rotation_at(spins, k)
@@ -57,7 +60,7 @@ def place_tips(targets, spins, places, tips, turns):  # type: ignore[no-untyped-
 
 @compiled
 def look_error(gaze, wished):  # type: ignore[no-untyped-def]
-    """Compute the rotation vector (radians) from the target's unit direction to the gaze."""
+    """Compute the rotation vector, in radians, from the unit direction `wished` to the unit direction `gaze`."""
     across = cross(wished, gaze)
     sine, cosine = length(across), dot(wished, gaze)
     if sine > TINY:
@@ -85,7 +88,10 @@ def target_error(targets, c, frame, tip, turn):  # type: ignore[no-untyped-def]
 
 @compiled
 def weigh_errors(targets, frame, tips, turns, errors, tolerance_m, tolerance_rad):  # type: ignore[no-untyped-def]
-    """Fill `errors` (C, 3); return the weighted sum of their squares and whether all are within the tolerances."""
+    """Fill `errors` (C, 3) of the targets, whose points have the positions `tips` and the rotations `turns`.
+
+    Returns the weighted sum of the squared errors, and whether all are within the tolerances.
+    """
     cost, reached = 0.0, True
     for c in range(targets.kinds.shape[0]):
         error = target_error(targets, c, frame, vector_at(tips, c), rotation_at(turns, c))
@@ -99,7 +105,11 @@ def weigh_errors(targets, frame, tips, turns, errors, tolerance_m, tolerance_rad
 
 @compiled
 def measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad):  # type: ignore[no-untyped-def]
-    """Place joints and tips and fill the errors; return the cost of the targets and whether all are reached."""
+    """Fill positions, rotations and errors in `work` for the pose `local` (K, 4) and `root` (3,).
+
+    `frame` selects the values of the targets, and `offsets` (K, 3) are those of the joints. Returns the weighted sum
+    of the squared errors, and whether all targets are reached.
+    """
     place_joints(body.parents, offsets, root, local, work.spins, work.places)
     place_tips(targets, work.spins, work.places, work.tips, work.turns)
     return weigh_errors(targets, frame, work.tips, work.turns, work.errors, tolerance_m, tolerance_rad)
@@ -123,7 +133,7 @@ def nearest_in_range(angle, low, high):  # type: ignore[no-untyped-def]
 
 @compiled
 def within_limits(row, q):  # type: ignore[no-untyped-def]
-    """Bring the local rotation `q` into the limits of a row of `Body.limits`."""
+    """Return the local rotation `q` moved into the limits of a joint, its row of `JointChains.limits`."""
     reference = (row[0], row[1], row[2], row[3])
     axis, side = (row[4], row[5], row[6]), (row[7], row[8], row[9])
     turn = product(inverse(reference), q)
@@ -150,7 +160,10 @@ def _within_ellipse(x, y, width, height):  # type: ignore[no-untyped-def]
 
 @compiled
 def measure_frames(body, targets, tolerances, roots, rotations, work, residuals, reached):  # type: ignore[no-untyped-def]
-    """Fill the residuals (F, C) and the flags (F,) of frames in which all targets are reached."""
+    """Fill `residuals` (F, C), the errors of the targets, and `reached` (F,), whether a frame reaches all targets.
+
+    `tolerances` are the tolerance in metres and the tolerance in radians.
+    """
     tolerance_m, tolerance_rad = tolerances
     for f in range(rotations.shape[0]):
         frame = min(f, targets.values.shape[0] - 1)

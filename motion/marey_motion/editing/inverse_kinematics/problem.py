@@ -27,9 +27,15 @@ _KINDS: dict[type, int] = {PositionTarget: 0, OrientationTarget: 1, LookAtTarget
 
 
 class JointChains(NamedTuple):
-    """K joints: parents (K,), offsets (F or 1, K, 3) in metres, freedom and limits.
+    """Arrays about K joints.
 
-    `carries` (K, C) marks the targets that move with each joint.
+    Parameters
+    ----------
+    parents, offsets : (K,), (F or 1, K, 3) index of each joint's parent, and offset from it in metres
+    movable, stiffness : (K,) whether a solver may turn the joint, and how little it turns, from 0 to below 1
+    limited, limits : (K,), (K, 14) whether the joint has limits, and the limits as `JointLimit.row`
+    carries : (K, C) whether each target moves with the joint
+    root_moves : whether a solver may shift the root
     """
 
     parents: Ints
@@ -43,7 +49,16 @@ class JointChains(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """C targets: kinds, joints and error scales (C,), values (F or 1, C, 4), all other arrays (C, 3)."""
+    """Arrays about C targets.
+
+    Parameters
+    ----------
+    kinds, joints : (C,) kind of each target (0 position, 1 orientation, 2 look-at), and index of its joint
+    values : (F or 1, C, 4) position, quaternion or point to look at, in the world
+    axes : (C, 3) 1 for each coordinate of a position that counts, else 0
+    directions, offsets : (C, 3) look-at axis, and place of the target's point, in the frame of the joint
+    scales : (C,) factors of the errors
+    """
 
     kinds: Ints
     joints: Ints
@@ -55,7 +70,11 @@ class Targets(NamedTuple):
 
 
 class SolverResult(NamedTuple):
-    """Results of a solver: residuals (F, C), iterations (F,), and whether all targets are reached (F,)."""
+    """Results of a solver for F frames and C targets.
+
+    `before` and `after` (F, C) are the errors of the targets; `iterations` (F,) are the numbers of iterations, and
+    `reached` (F,) whether all targets are reached.
+    """
 
     before: Floats
     after: Floats

@@ -31,13 +31,16 @@ HINGED, TOLD = math.radians(15.0), math.radians(30.0)
 NEARLY_FOLDED = 0.05
 # What of a hinge's unit direction must be across the upper bone for it to say anything.
 SHORTEST_HINGE = 0.1
-# What becomes of the rotation of the limb's end.
+# The joint at the limb's end turns with the bones, keeps its rotation in the world, or gets a given rotation.
 CARRIED, HELD, GIVEN = 0, 1, 2
 
 
 @compiled
 def bend_at(distance, first, second):  # type: ignore[no-untyped-def]
-    """Compute the inner angle (radians, π if straight) of two joined bones whose outer ends are `distance` apart."""
+    """Compute the angle between two joined bones whose outer ends are `distance` apart, in radians; π if straight.
+
+    `first` and `second` are the lengths of the bones.
+    """
     near = max(distance * distance - (first - second) ** 2, 0.0)
     far = max((first + second) ** 2 - distance * distance, 0.0)
     return 2.0 * math.atan2(math.sqrt(near), math.sqrt(far))
@@ -45,7 +48,9 @@ def bend_at(distance, first, second):  # type: ignore[no-untyped-def]
 
 @compiled
 def damped_bend(angle, wished, zone):  # type: ignore[no-untyped-def]
-    """Damp the change of the inner angle from `angle` to `wished` near a straight limb (Kovar et al. 2002, 5.2).
+    """Damp the change of the angle between the bones, from `angle` to `wished`, near a straight limb.
+
+    Kovar et al. (2002), section 5.2; all angles are in radians.
 
     In the last `zone` radians before the limb is straight, the change is weighted by a cubic that falls from 1 to 0.
     """
@@ -62,7 +67,11 @@ def _weighed(angle, zone):  # type: ignore[no-untyped-def]
 
 @compiled
 def _bent(upper, fore, wished, hinge):  # type: ignore[no-untyped-def]
-    """Compute the vector of the lower bone that forms the inner angle `wished` with the reversed upper bone."""
+    """Compute the vector of the lower bone after the limb is bent so that the angle between its bones is `wished`.
+
+    `upper` and `fore` are the vectors from the middle joint to both ends of the limb; `hinge` is the direction about
+    which a straight limb bends, zero if unknown.
+    """
     back, way = direction(upper), direction(fore)
     axis = cross(back, way)
     hinge = minus(hinge, scaled(back, dot(hinge, back)))
@@ -87,8 +96,9 @@ def _turn_from_hinge(along, across, cosine, wished):  # type: ignore[no-untyped-
 
     Parameters
     ----------
-    along, across : sine of the current bend, about the hinge and about the axis across it
-    cosine : cosine of the current inner angle
+    along, across : components of the current axis of the bend, along the hinge and across it; the length of the axis is
+        the sine of the bend
+    cosine : cosine of the current angle between the bones
     """
     sine = math.hypot(along, across)
     if cosine > 0.0:  # folded, not straight
@@ -102,7 +112,10 @@ def _turn_from_hinge(along, across, cosine, wished):  # type: ignore[no-untyped-
 
 @compiled
 def _reach(limb, body, offsets, root, local, target, rotation, work):  # type: ignore[no-untyped-def]
-    """Turn the joints of the limb in one pose, `local` (K, 4), so that its tip reaches `target`."""
+    """Turn the joints of the limb in one pose, `local` (K, 4), so that its tip reaches `target`.
+
+    The other parameters are those of `reach_frames`, for one frame; `work` has arrays for intermediate results.
+    """
     place_joints(body.parents, offsets, root, local, work.spins, work.places)
     spin = rotation_at(work.spins, limb.end)
     if limb.ending == GIVEN:
@@ -143,9 +156,11 @@ def _turn(body, work, local, k, turn):  # type: ignore[no-untyped-def]
 
 @compiled
 def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):  # type: ignore[no-untyped-def]
-    """Solve each frame independently: `rotations` (F, K, 4) are changed in place.
+    """Turn the joints of a limb in each frame so that its tip reaches a target; change `rotations` (F, K, 4) in place.
 
-    targets (F or 1, 3) are in metres in the world; target_rotations (F or 1, 4) are used if the limb's ending is GIVEN.
+    `targets` (F or 1, 3) are in metres in the world, and `roots` (F, 3) are the positions of the root. If `limb.ending`
+    is GIVEN, the last joint of the limb gets the rotations `target_rotations` (F or 1, 4) in the world; otherwise, they
+    are not used.
     """
     for f in range(rotations.shape[0]):
         target = vector_at(targets, min(f, targets.shape[0] - 1))

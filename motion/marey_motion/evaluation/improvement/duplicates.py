@@ -119,8 +119,9 @@ class _Families:
         return source_of(self._clips[self._first[number]])
 
     def compared(self, number: int, limit_m: float) -> tuple[list[NearDuplicate], int, int]:
-        """Find near-duplicates of a source among later sources; also count the aligned clips, and all later clips.
+        """Find the near-duplicates of source `number` among later sources, up to the distance `limit_m` per frame.
 
+        Returns them, the number of clips that were aligned with the source, and the number of all later clips.
         The source is compared with the later sources and with their mirrored copies. Its own mirrored copy is left out:
         mirroring both clips of a pair does not change their distance.
         """

@@ -192,7 +192,10 @@ def source_seconds(
 
 
 def _less(missing: Floats, seconds: Floats, options: EvaluationOptions) -> Floats:
-    """Compute the deficit of each cell after adding `seconds` of data; a deficit below half a frame is set to 0."""
+    """Compute the seconds that each cell lacks after adding `seconds` (V, O) of data to the `missing` (V, O) cells.
+
+    A value below half a frame is set to 0.
+    """
     left = np.maximum(missing - seconds, 0.0)
     left[left < 0.5 / options.database.rate_hz] = 0.0
     return left

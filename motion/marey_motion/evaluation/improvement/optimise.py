@@ -154,7 +154,10 @@ class _Search:
         self.spent = False
 
     def best_step(self, last: OptimisationStep, progress: ProgressCallback | None) -> OptimisationStep | None:
-        """Choose the candidate that lowers the objective most; None if none lowers it enough or the budget is spent."""
+        """Choose the step, after the step `last`, that lowers the objective most.
+
+        Returns None if no step lowers it enough, or if the budget is spent.
+        """
         candidates = self._candidates(frozenset(last.absent))
         best: tuple[float, Action, tuple[str, ...], Sources] | None = None
         for done, (action, sources, absent) in enumerate(candidates):

@@ -102,8 +102,8 @@ def write_predecessor_alignment(time_function: Floats, sections: Sequence[tuple[
 def as_increasing(frames: NDArray[np.int64], source_frames: int) -> Floats:
     """Make a time function of whole frames strictly increasing.
 
-    A frame of the source that belongs to several canonical frames is assigned to the middle of them; times between are
-    interpolated linearly.
+    If several canonical frames have the same source frame, only the middle one keeps it; the others get source frames
+    that are interpolated linearly.
 
     Parameters
     ----------

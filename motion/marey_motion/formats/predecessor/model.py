@@ -154,7 +154,10 @@ def _constant_speed(frames: int) -> PredecessorTime:
 
 
 def _functions(part: Document, what: str, file: str) -> tuple[SplineBasis, Floats, Floats]:
-    """Read basis, mean (n, D) and components (k, n, D) of the spatial or temporal functions."""
+    """Read the spatial or temporal functions, as coefficients of n splines for D channels.
+
+    `what` names the part for messages. Returns the splines, the mean (n, D) and the k components (k, n, D).
+    """
     basis = _basis(part, what, file)
     start, stop = basis.span
     if start != 0.0 or abs(stop - round(stop)) > 1e-6 or stop < 2.0:
@@ -193,7 +196,10 @@ def _functions(part: Document, what: str, file: str) -> tuple[SplineBasis, Float
 
 
 def _basis(part: Document, what: str, file: str) -> SplineBasis:
-    """Make the basis over the knots; the oldest models have the numbers of coefficients and frames instead of knots."""
+    """Make the splines of a part from its knots.
+
+    The oldest models contain the numbers of coefficients and frames instead of knots.
+    """
     if "knots" not in part and "n_frames" in part:
         frames, count = (field_of(part, name, int, file) for name in ("n_frames", "n_coeffs"))
         if not 2 <= count <= frames <= MOST_FRAMES:
@@ -247,7 +253,11 @@ def _animated(parts: ModelParts, basis: SplineBasis, mean: Floats, skeleton: Ske
 def _on_skeleton(
     mean: Floats, vectors: Floats, maxima: Floats, animated: list[str], skeleton: Skeleton
 ) -> tuple[Floats, Floats]:
-    """Extend mean (n, 3 + 4·J) and components (k, n, 3 + 4·J) to all joints, in metres; others keep rest rotations."""
+    """Extend the functions of the `animated` joints to all J joints of the skeleton, and convert them to metres.
+
+    `maxima` (3,) are factors of the root's translation. Returns the mean (n, 3 + 4·J) and the components
+    (k, n, 3 + 4·J), in which all other joints keep their rest rotations.
+    """
     rest = np.concatenate((np.zeros(3), skeleton.rest_rotations.ravel()))
     columns = columns_of(animated, skeleton)
     whole = np.tile(rest, (len(mean), 1))
@@ -287,7 +297,10 @@ def _time(parts: ModelParts, frames: int, file: str) -> PredecessorTime:
 
 
 def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> tuple[LatentMixture, int]:
-    """Read the mixture and its number of temporal components, which is 0 for mixtures of space alone."""
+    """Read the mixture, and the number of temporal scores in its vectors; 0 if they have spatial scores only.
+
+    `spatial` and `temporal` are the numbers of spatial and temporal components of the model.
+    """
     if part is None:
         dimensions = spatial + temporal
         return LatentMixture(np.ones(1), np.zeros((1, dimensions)), np.eye(dimensions)[None]), temporal

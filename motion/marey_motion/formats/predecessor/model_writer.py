@@ -87,7 +87,7 @@ def model_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...])
 
 
 def _flat_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...]) -> dict[str, Any]:
-    """Write the primitive in layout 2, with the form `increments` of its first training program."""
+    """Convert a primitive to layout 2, with the time function in the form `increments` (see `time_functions`)."""
     mean, vectors = _space(primitive, animated_joints)
     time = as_increments(primitive)
     mixture = {f"gmm_{name}": values for name, values in _mixture(primitive).items()}
@@ -113,7 +113,11 @@ def _flat_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...])
 
 
 def _space(primitive: MotionPrimitive, animated_joints: tuple[str, ...]) -> tuple[Floats, Floats]:
-    """Compute mean (n, D) and components (k, n, D) of the animated joints; the root in cm, relative to its offset."""
+    """Compute spline coefficients of the animated joints: their mean (n, D), and k components (k, n, D).
+
+    n is the number of coefficients of each of the D channels. The root's position is in centimetres, relative to its
+    offset in the skeleton.
+    """
     columns = columns_of(animated_joints, primitive.skeleton)
     mean = primitive.spatial.mean[:, columns].copy()
     vectors = primitive.spatial.directions[..., columns].copy()

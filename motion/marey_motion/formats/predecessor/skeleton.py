@@ -80,7 +80,7 @@ def skeleton_document(skeleton: Skeleton, *, form: SkeletonForm = "database") ->
 
 
 def _listed_nodes(document: Document, file: str) -> list[tuple[str, str | None, Document]]:
-    """List (name, parent, node) depth first, from the list of joints."""
+    """List name, name of the parent, and content of each node, depth first, from the list `jointDescs`."""
     listed: dict[str, Document] = {}
     parents: dict[str, str] = {}
     for node in document["jointDescs"]:
@@ -109,7 +109,7 @@ def _listed_nodes(document: Document, file: str) -> list[tuple[str, str | None, 
 
 
 def _nested_nodes(root: Document, file: str) -> list[tuple[str, str | None, Document]]:
-    """List (name, parent, node) depth first, from nested nodes."""
+    """List name, name of the parent, and content of each node, depth first, from nested nodes."""
     nodes: list[tuple[str, str | None, Document]] = []
     waiting: list[tuple[Any, str | None]] = [(root, None)]
     while waiting:
@@ -240,7 +240,7 @@ def _nested_document(skeleton: Skeleton, tips: list[tuple[str, int, NDArray[np.f
 def _nested_node(
     name: str, index: int, above: Document | None, offset: NDArray[np.float64], rotation: NDArray[np.float64]
 ) -> Document:
-    """Make a node and add it below its parent."""
+    """Make the node of a joint or tip, and add it to the children of the node `above`, if there is one."""
     node: Document = {
         "name": name,
         "parent": above["name"] if above else None,

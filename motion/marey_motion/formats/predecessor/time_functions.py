@@ -172,7 +172,7 @@ def as_increments(primitive: MotionPrimitive) -> PredecessorTime:
 
 
 def _drawn(primitive: MotionPrimitive) -> tuple[Floats, Floats]:
-    """Draw temporal parts (m, k) of latent vectors from the model, and compute their time functions (m, N).
+    """Draw the temporal scores (m, k) of m latent vectors from the model, and compute their time functions (m, N).
 
     The limits that keep a model's motions within its examples' range are not applied: they would bend the linear
     function that is fitted.
@@ -183,7 +183,7 @@ def _drawn(primitive: MotionPrimitive) -> tuple[Floats, Floats]:
 
 
 def _linear_fit(scores: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Fit mean (n,) and directions (k, n) of the best linear function of scores (m, k) with values (m, n)."""
+    """Fit a linear function of scores (m, k) to values (m, n); return its mean (n,) and its slopes (k, n)."""
     columns = np.concatenate((np.ones((len(scores), 1)), scores), axis=1)
     solution = np.linalg.lstsq(columns, values, rcond=None)[0]
     return np.asarray(solution[0]), np.asarray(solution[1:])

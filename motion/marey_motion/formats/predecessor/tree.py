@@ -132,7 +132,10 @@ def write_predecessor_tree(tree: SampleTree, spatial: int, branching: int, *, en
 
 
 def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]]:
-    """Find samples and number of children of each node, level by level; a parent has all samples of its children."""
+    """List the samples of each node and its number of children, level by level from the root.
+
+    `count` is the number of samples in the document. The samples of a node include those of its children.
+    """
     indices: list[Ints] = []
     children: list[int] = []
     waiting: deque[tuple[Node, str, int]] = deque([(root, "root", 0)])
@@ -163,7 +166,10 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]
 
 
 def _in_tree_order(indices: list[Ints], children: list[int]) -> Ints:
-    """Sort samples by leaf, from the first leaf to the last, so that the samples of each node are consecutive."""
+    """Return the samples in the order of the leaves, so that the samples of each node are consecutive.
+
+    `indices` are the samples and `children` the numbers of children of each node, level by level.
+    """
     first = np.concatenate(([1], 1 + np.cumsum(children)[:-1]))
     order: list[Ints] = []
     path = [0]

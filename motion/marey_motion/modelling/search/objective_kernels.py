@@ -25,7 +25,11 @@ _SMALL = 1e-4
 
 @compiled
 def _pose(chains, latent, channels, local, positions, rotations):  # type: ignore[no-untyped-def]
-    """Compute channels of the constrained frames, poses of joints on their chains, and lengths of raw quaternions."""
+    """Compute the poses of the V joints of `chains` for one latent vector, in canonical coordinates.
+
+    Fills `channels` (X,), the mean channels plus those of the scores; `local` (V, 5), each joint's local rotation of
+    unit length and the length of its quaternion before; `positions` (V, 3) and `rotations` (V, 4).
+    """
     channels[:] = chains.mean
     for component in range(chains.directions.shape[0]):
         score = latent[component]
@@ -51,7 +55,11 @@ def _pose(chains, latent, channels, local, positions, rotations):  # type: ignor
 
 @compiled
 def _items(chains, placement, positions, rotations, points, turns):  # type: ignore[no-untyped-def]
-    """Compute the tracked points in the world: sums of joint positions, and the rotation of one joint of each."""
+    """Convert the poses of joints to the n tracked points of `chains`, in the world.
+
+    Fills `points` (n, 3), sums and differences of joint positions, and `turns` (n, 4), the rotation of one joint of
+    each point.
+    """
     cos, sin = math.cos(placement[0]), math.sin(placement[0])
     yaw = (math.cos(0.5 * placement[0]), 0.0, math.sin(0.5 * placement[0]), 0.0)
     for item in range(points.shape[0]):
@@ -67,10 +75,11 @@ def _items(chains, placement, positions, rotations, points, turns):  # type: ign
 
 @compiled
 def _times(clocks, latent, first, log_steps, times):  # type: ignore[no-untyped-def]
-    """Fill `times` with the seconds from the start of the motion to each clock, and `log_steps` with the step lengths.
+    """Fill `times` (n,) with the time, in seconds from the start of the motion, of each canonical frame of `clocks`.
 
-    Returns the factor by which all times are multiplied so that the duration is within its range, and the duration in
-    seconds before this multiplication. On return, `log_steps` contains the lengths in frames, not their logarithms.
+    `log_steps` (N - 1,) is filled with the lengths of the steps between canonical frames, in frames (not with their
+    logarithms). The temporal scores begin at index `first` of the latent vector. Returns the factor by which all times
+    are multiplied so that the duration is within its range, and the duration in seconds before this multiplication.
     """
     log_steps[:] = clocks.mean
     for component in range(clocks.directions.shape[0]):
@@ -114,7 +123,11 @@ def _rotation_error(turn, target, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def _aims(kind, row, rows, points, turns, pointing, wanted):  # type: ignore[no-untyped-def]
-    """Compute the unit directions of a joint's axis and of its target; return the distance of the point to look at."""
+    """Compute where a joint's axis points, and where the constraint with index `row` wants it to point.
+
+    Fills `pointing` and `wanted` with unit directions (3,). Returns the distance from the joint to the point to look
+    at, or 1 if the constraint is a direction.
+    """
     item = rows.items[row]
     axis, target = rows.axes[row], rows.targets[row]
     pointing[0], pointing[1], pointing[2] = rotate_vector(turns[item], axis[0], axis[1], axis[2])
@@ -140,7 +153,10 @@ def _crossed(a, b, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def _residual(row, rows, points, turns, times, room, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (3,) with a constraint's error: metres, radians or seconds."""
+    """Fill `out` (3,) with the error of the constraint with index `row`, in metres, radians or seconds.
+
+    `points` and `turns` are the tracked points and rotations, `times` those of `_times`; `room` (2, 3) is overwritten.
+    """
     kind, item, target = rows.kinds[row], rows.items[row], rows.targets[row]
     out[:] = 0.0
     if kind == POSITION:
@@ -171,7 +187,7 @@ def _residual(row, rows, points, turns, times, room, out):  # type: ignore[no-un
 
 @compiled
 def errors(chains, clocks, rows, placement, latents, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (n, rows) with the errors of latent vectors (n, L) in each constraint: metres, radians or seconds."""
+    """Fill `out` (n, m) with the errors of n latent vectors (n, L) in m constraints, in metres, radians or seconds."""
     nodes, items = chains.parents.shape[0], chains.turned.shape[0]
     channels, local = np.empty(chains.mean.shape[0]), np.empty((nodes, 5))
     positions, rotations = np.empty((nodes, 3)), np.empty((nodes, 4))
@@ -193,7 +209,7 @@ def errors(chains, clocks, rows, placement, latents, out):  # type: ignore[no-un
 
 @compiled
 def costs(prices, errors, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (n,) with sums of errors (n, rows) times `prices` (rows,), which are weights divided by tolerances."""
+    """Fill `out` (n,) with sums of errors (n, m) times `prices` (m,), weights of constraints divided by tolerances."""
     for n in range(out.shape[0]):
         total = 0.0
         for row in range(prices.shape[0]):

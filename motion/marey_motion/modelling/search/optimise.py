@@ -124,7 +124,10 @@ def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAUL
 
 
 def _step(curvature: Floats, gradient: Floats) -> Floats | None:
-    """Compute the step to the minimum of a quadratic; None if it is numerically singular and needs more damping."""
+    """Compute the step (W,) to the minimum of a quadratic function with given curvature (W, W) and gradient (W,).
+
+    Returns None if the curvature is numerically singular, so that more damping is needed.
+    """
     try:
         step = np.asarray(np.linalg.solve(curvature, -gradient))
     except np.linalg.LinAlgError:
@@ -153,7 +156,10 @@ class _Prior:
         return -self._weight * sum(float(mixture.log_density(stacked[None, part])[0]) for mixture, part in pairs)
 
     def quadratic(self, stacked: Floats) -> _Quadratic:
-        """Compute JᵀJ and Jᵀr of the residuals of the most likely components."""
+        """Approximate the cost near `stacked` by the most likely component of each mixture.
+
+        Returns JᵀJ (curvature) and Jᵀr (gradient) of the residuals r with the derivatives J.
+        """
         curvature, gradient = np.zeros((len(stacked), len(stacked))), np.zeros(len(stacked))
         for mixture, part in zip(self._mixtures, self._parts, strict=True):
             likeliest = int(np.argmax(mixture.component_log_densities(stacked[None, part])[0]))
@@ -165,7 +171,7 @@ class _Prior:
 
 
 def _precisions(mixture: LatentMixture) -> Floats:
-    """Compute the inverse variance (L,) of each number, to which the damping is proportional."""
+    """Compute the inverse variance (L,) of each dimension of a mixture, to which the damping is proportional."""
     centre = mixture.weights @ mixture.means
     spread = np.diagonal(mixture.covariances, axis1=1, axis2=2) + (mixture.means - centre) ** 2
     return np.asarray(1.0 / (mixture.weights @ spread))

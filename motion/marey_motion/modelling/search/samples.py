@@ -95,7 +95,7 @@ def _descend(
 ) -> FoundSamples:
     """Return the `top` samples of a tree that have the lowest costs, following `candidates` nodes of each level.
 
-    The costs are those of the latent vectors after `transform`; the result contains these transformed vectors.
+    The costs are those of the latent vectors after `transform`; the result contains the transformed vectors.
     """
     frontier = np.zeros(1, dtype=np.intp)
     seen, costs, evaluations = [], [], 0
@@ -134,13 +134,16 @@ def _best(tree: SampleTree, samples: Indices, costs: Floats, top: int, evaluatio
 
 
 def _smallest(costs: Floats, places: Indices, count: int) -> Indices:
-    """Find the entries of `places` with the smallest costs, in order; of equal costs, the first ones."""
+    """Return the `count` entries of `places`, indices into `costs`, with the smallest costs, in order of their costs.
+
+    Of equal costs, the first ones are returned.
+    """
     order: Indices = np.lexsort((places, costs))[:count]
     return order
 
 
 def _ranges(starts: NDArray[np.int32], counts: NDArray[np.int32]) -> Indices:
-    """Concatenate ranges of integers, given their starts and counts."""
+    """Concatenate ranges of consecutive integers; each begins at one of `starts` and has one of `counts` numbers."""
     ends = np.cumsum(counts)
     firsts: Indices = np.repeat(starts - (ends - counts), counts)
     return firsts + np.arange(len(firsts), dtype=np.intp)

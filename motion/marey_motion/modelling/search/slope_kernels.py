@@ -35,7 +35,11 @@ _SMALL_ANGLE = 1e-3
 
 @compiled
 def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-untyped-def]
-    """Fill derivatives (V, 3, k) of joint positions and rotations with respect to scores, in canonical coordinates."""
+    """Fill `shifts` and `spins` (V, 3, k) with the derivatives of V joints' positions and rotations.
+
+    They are derivatives with respect to the k spatial scores, in canonical coordinates. `local` and `rotations` are
+    those that `objective_kernels._pose` computes.
+    """
     for node in range(chains.parents.shape[0]):
         first, parent = chains.columns[node], chains.parents[node]
         w, x, y, z, length = local[node]
@@ -66,7 +70,11 @@ def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-u
 
 @compiled
 def track(chains, placement, moved, latent, first, points, turns, point_slopes, turn_slopes):  # type: ignore[no-untyped-def]
-    """Fill the tracked points (n, 3) and rotations (n, 4), and their derivatives (n, 3, W), in the world."""
+    """Fill `points` (n, 3) and `turns` (n, 4) with the tracked points and rotations, in the world.
+
+    `point_slopes` and `turn_slopes` (n, 3, W) are filled with their derivatives with respect to the stacked latent
+    vectors `latent` (W,).
+    """
     nodes, scores = chains.parents.shape[0], chains.directions.shape[0]
     channels, local = np.empty(chains.mean.shape[0]), np.empty((nodes, 5))
     positions, rotations = np.empty((nodes, 3)), np.empty((nodes, 4))
@@ -93,7 +101,11 @@ def track(chains, placement, moved, latent, first, points, turns, point_slopes, 
 
 @compiled
 def _add_turned(cos, sin, sign, slopes, first, out):  # type: ignore[no-untyped-def]
-    """Convert derivatives (3, k) from canonical to world coordinates, and add them to the derivatives in the world."""
+    """Convert derivatives `slopes` (3, k) from canonical to world coordinates, and add them to `out` (3, W).
+
+    `cos` and `sin` are those of the placement's heading; `sign` is a factor, 1 or -1. The columns of the k scores begin
+    at `first`.
+    """
     for score in range(slopes.shape[1]):
         x, z = slopes[0, score], slopes[2, score]
         out[0, first + score] += sign * (cos * x + sin * z)
@@ -103,7 +115,10 @@ def _add_turned(cos, sin, sign, slopes, first, out):  # type: ignore[no-untyped-
 
 @compiled
 def keep_time(clocks, latent, first, times, slopes):  # type: ignore[no-untyped-def]
-    """Fill the seconds (n,) at the clocks and their derivatives (n, W); temporal scores are at `first` and after it."""
+    """Fill `times` (n,) with the times of canonical frames, in seconds, and `slopes` (n, W) with their derivatives.
+
+    The temporal scores of the step begin at index `first` of the stacked latent vectors `latent` (W,).
+    """
     steps = np.empty(clocks.mean.shape[0])
     factor, lasting = _times(clocks, latent, first, steps, times)
     least, most = math.exp(clocks.log_slope_bounds[0]), math.exp(clocks.log_slope_bounds[1])
@@ -145,7 +160,10 @@ def _multiply(a, b):  # type: ignore[no-untyped-def]
 
 @compiled
 def _orientation_slope(residual, by_turn):  # type: ignore[no-untyped-def]
-    """Compute the inverse left Jacobian of a rotation vector; it is finite up to half a turn."""
+    """Fill `by_turn` (3, 3) with the inverse left Jacobian of the rotation vector `residual`.
+
+    This is the derivative of the vector with respect to the rotation; it is finite up to half a turn.
+    """
     angle = math.sqrt(residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2)
     factor = 1.0 / 12.0
     if angle > _SMALL_ANGLE:
@@ -160,9 +178,11 @@ def _orientation_slope(residual, by_turn):  # type: ignore[no-untyped-def]
 
 @compiled
 def _aim_slopes(pointing, wanted, distance, by_point, by_turn):  # type: ignore[no-untyped-def]
-    """Fill the derivatives of the rotation vector angle / sin(angle) · (pointing × wanted).
+    """Fill the derivatives of the error of an axis, the rotation vector angle / sin(angle) · (pointing × wanted).
 
-    `distance` is the distance of the point to look at, or 0 for a constraint without such a point.
+    `pointing` and `wanted` are the unit directions of the axis and of the target. `by_turn` and `by_point` (3, 3) are
+    the derivatives with respect to the joint's rotation and position. `distance` is the distance of the point to look
+    at, or 0 for a constraint without such a point.
     """
     across = np.empty(3)
     sine = _crossed(pointing, wanted, across)
@@ -186,7 +206,10 @@ def _aim_slopes(pointing, wanted, distance, by_point, by_turn):  # type: ignore[
 
 @compiled
 def _slopes_of(row, rows, points, turns, residual, by_point, by_turn):  # type: ignore[no-untyped-def]
-    """Fill the derivatives (3, 3) of a constraint's error with respect to its tracked point and tracked rotation."""
+    """Fill `by_point` and `by_turn` (3, 3) with derivatives of the error `residual` of the constraint with index `row`.
+
+    They are derivatives with respect to its tracked point and its tracked rotation.
+    """
     kind, item = rows.kinds[row], rows.items[row]
     by_point[:], by_turn[:] = 0.0, 0.0
     if kind == POSITION:

@@ -1,8 +1,8 @@
 """Sequences of several motions, with constraints on each of them.
 
-Each step is placed in the world so that its root begins where the root of the previous step ended, with the same
-heading. Therefore, the root's ground position and heading are continuous whatever the latent vectors are. Continuity of
-hands, feet and the height of the root is a constraint.
+Each step is placed in the world so that its pelvis begins above the point of the ground where the pelvis of the
+previous step ended, with the same heading. So ground position and heading are continuous for any latent vectors.
+Continuity of the *transition joints* (hands and feet) and of the height of the pelvis is a constraint.
 """
 
 from __future__ import annotations
@@ -78,11 +78,11 @@ class _Link(NamedTuple):
 
     Parameters
     ----------
-    objective : the step's constraints; if there are several steps, the first tracked points are pelvis, facing and
-        transition joints at the start of the step, followed by those at its end
-    beginning : pelvis and facing at the start of the step, from which its placement at the end of the previous step is
-        computed
-    first : index in the stacked latent vectors at which the step's own begins
+    objective : the step's constraints. If the sequence has several steps, the objective also computes the points that
+        `_ends` lists, before those of the constraints
+    beginning : pelvis, and axis of the body from right to left, at the start of the step; they determine how the step
+        is placed at the end of the previous one
+    first : index of the step's first number in the stacked latent vectors of all steps
     """
 
     objective: Objective
@@ -236,7 +236,7 @@ class SeveralSteps:
         return float(np.sqrt(self.transitions.weight) / self.transitions.tolerance_m)
 
     def _walk(self, stacked: Floats, count: int) -> Iterator[_Walked]:
-        """Place the first `count` steps, each at the end of the one before."""
+        """Place the first `count` steps, each at the end of the one before; `stacked` (W,) are all latent vectors."""
         ends = 2 + len(self.joints)
         jumping = [0, *range(2, ends)]
         placement, moved = as_row(self.start), np.zeros((3, len(stacked)))
@@ -255,7 +255,11 @@ class SeveralSteps:
 
 
 def _ends(step: Step, joints: Sequence[str]) -> tuple[Tracked, ...]:
-    """List the points tracked at the start of a step, then those at its end. Raises `MappingError`."""
+    """List points of a step whose positions are compared with those of its neighbours. Raises `MappingError`.
+
+    First those at the start of the step: the pelvis, the axis of the body from right to left, and the transition
+    joints `joints`; then the same at its end.
+    """
     return tuple(
         one
         for frame in (0.0, float(step.primitive.frame_count - 1))
@@ -273,7 +277,12 @@ def _link(step: Step, ends: Sequence[Tracked], first: int) -> _Link:
 
 
 def _carry_on(points: Floats, slopes: Floats, link: _Link, stacked: Floats) -> tuple[Floats, Floats]:
-    """Compute the placement (3,) of a step that continues pelvis and facing `points`, and its derivatives (3, W)."""
+    """Place a step so that it begins where the previous step ended.
+
+    The first two of `points` (2 or more, 3) are the pelvis of the previous step at its end, and the axis of its body
+    from right to left; `slopes` (2 or more, 3, W) are their derivatives with respect to the latent vectors `stacked`
+    (W,) of all steps. Returns the placement (3,) of the step, as heading, x and z, and its derivatives (3, W).
+    """
     width = len(stacked)
     begun, begun_slopes = np.empty((2, 3)), np.empty((2, 3, width))
     still = np.zeros((3, width))

@@ -62,14 +62,16 @@ class Chains(NamedTuple):
 
 
 class Clocks(NamedTuple):
-    """Seconds that have passed at n moments.
+    """Arrays from which the time of n canonical frames, in seconds, is computed for a latent vector.
+
+    A step is the time between two consecutive ones of the N canonical frames, in frames of the motion.
 
     Parameters
     ----------
-    mean, directions : (N - 1,), (k, N - 1) mean logarithms of steps, and their change per unit of each temporal number
-        of a latent vector
-    weights : (n, N - 1) factors that convert the length of each step, in frames, to the seconds of it that have passed
-        at each moment
+    mean, directions : (N - 1,), (k, N - 1) mean logarithms of the steps, and their change per unit of each temporal
+        number of a latent vector
+    weights : (n, N - 1) factors by which the steps are multiplied; their sum is the time, in seconds, at each of the n
+        canonical frames
     frame_s : seconds of one frame
     range_s : (2,) shortest and longest duration of a motion; a longer or shorter one is played faster or slower as a
         whole
@@ -168,7 +170,7 @@ def track_points(primitive: MotionPrimitive, tracked: Sequence[Tracked]) -> Chai
 
 
 def track_times(primitive: MotionPrimitive, moments: Sequence[float]) -> Clocks:
-    """Prepare the steps of canonical time, and the share of each step that has passed at each moment.
+    """Prepare arrays from which the times of canonical frames are computed for a latent vector.
 
     Parameters
     ----------
@@ -194,7 +196,7 @@ def track_times(primitive: MotionPrimitive, moments: Sequence[float]) -> Clocks:
 
 
 def _nodes(primitive: MotionPrimitive, tracked: Sequence[Tracked]) -> list[tuple[float, int]]:
-    """List every joint at every frame that is needed, in the skeleton's order within a frame."""
+    """List the pairs of frame and joint that are needed: tracked joints and their ancestors, sorted."""
     found = {
         (one.frame, carrier)
         for one in tracked

@@ -24,7 +24,11 @@ def _square_distance(a, b):  # type: ignore[no-untyped-def]
 
 @compiled
 def _place_centres(features, members, randoms, nearest, centres):  # type: ignore[no-untyped-def]
-    """Choose centres among members by k-means++ (Arthur and Vassilvitskii 2007); return their number."""
+    """Choose centres of clusters among members by k-means++ (Arthur and Vassilvitskii 2007); return their number.
+
+    `members` are row numbers of `features`; `randoms` are uniform random numbers, one per centre. `centres` is filled;
+    `nearest` has space for one distance per member.
+    """
     count = members.shape[0]
     centres[0] = features[members[min(int(randoms[0] * count), count - 1)]]
     for m in range(count):
@@ -49,7 +53,10 @@ def _place_centres(features, members, randoms, nearest, centres):  # type: ignor
 
 @compiled
 def _assign(features, members, centres, labels):  # type: ignore[no-untyped-def]
-    """Assign each member to its nearest centre, or to the first of equally near ones; return the number of changes."""
+    """Fill `labels` with the index of each member's nearest centre, the first of equally near ones.
+
+    Returns the number of members whose label has changed.
+    """
     changed = 0
     for m in range(members.shape[0]):
         best, label = np.inf, 0
@@ -64,7 +71,10 @@ def _assign(features, members, centres, labels):  # type: ignore[no-untyped-def]
 
 @compiled
 def _average(features, members, labels, centres, sizes):  # type: ignore[no-untyped-def]
-    """Move each centre to the mean of its members; a centre without members does not move."""
+    """Move each of `centres` to the mean of its members, and fill `sizes` with their numbers.
+
+    A centre without members does not move.
+    """
     sums = np.zeros(centres.shape)
     sizes[:] = 0
     for m in range(members.shape[0]):
@@ -78,7 +88,11 @@ def _average(features, members, labels, centres, sizes):  # type: ignore[no-unty
 
 @compiled
 def _split(features, members, randoms, sizes, room):  # type: ignore[no-untyped-def]
-    """Sort members by cluster in place, and fill the sizes of the clusters; return their number."""
+    """Divide members into clusters by k-means: sort `members` by cluster in place, and fill `sizes` of the clusters.
+
+    `randoms` are uniform random numbers, one per cluster; `room` has arrays for intermediate results. Returns the
+    number of clusters.
+    """
     nearest, labels, ordered = room
     count = members.shape[0]
     centres = np.empty((sizes.shape[0], features.shape[1]))
@@ -112,7 +126,9 @@ def grow(features, randoms, branching, leaf_size, depth, order, starts, sizes, c
 
     `order` (n,) is permuted so that each node's members are contiguous; `starts`, `sizes` and `children` (nodes,) are
     filled per node: first member, number of members, number of child nodes. The children of a node have consecutive
-    numbers, and the nodes of a level are in the order of their parents.
+    numbers, and the nodes of a level are in the order of their parents. A node has up to `branching` children; a node
+    with at most `leaf_size` samples, or at level `depth`, has none. `randoms` (nodes, branching) are uniform random
+    numbers.
     """
     count = features.shape[0]
     room = (np.empty(count), np.empty(count, np.int64), np.empty(count, np.int64))
@@ -139,7 +155,7 @@ def grow(features, randoms, branching, leaf_size, depth, order, starts, sizes, c
 
 @compiled
 def locate(sizes, children, starts):  # type: ignore[no-untyped-def]
-    """Fill each node's first sample: the parent's first sample plus the sizes of the siblings before the node."""
+    """Fill `starts` with the first sample of each node: the parent's, plus the sizes of the siblings before it."""
     starts[0] = 0
     following = 1
     for node in range(sizes.shape[0]):
@@ -152,7 +168,7 @@ def locate(sizes, children, starts):  # type: ignore[no-untyped-def]
 
 @compiled
 def average(samples, starts, sizes, means):  # type: ignore[no-untyped-def]
-    """Fill the mean of each node's samples."""
+    """Fill `means` (nodes, L) with the mean of each node's samples, which begin at `starts` and number `sizes`."""
     means[:] = 0.0
     for node in range(sizes.shape[0]):
         for sample in range(starts[node], starts[node] + sizes[node]):

@@ -1,6 +1,7 @@
-"""Revisions that entries need and no item has, because another server sent them or a merge combined them.
+"""Creation of revisions for entries of a dataset whose content no item of the project has.
 
-Each gets a new hidden item, so that no folder changes; a checkout restores the item at the path of its entry.
+Such content was sent by another server, or combined by a merge. For each such entry, a new hidden item is created, so
+that no folder changes; a checkout later shows the item at the path of the entry.
 """
 
 from __future__ import annotations

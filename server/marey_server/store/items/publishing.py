@@ -395,8 +395,8 @@ class _Publication:
 def _names(draft: Draft) -> Iterator[str]:
     """Yield the names to try for a new item.
 
-    The first is the name of the draft. If items with equal content are reused, this name may belong to an item with
-    other content; then numbered names follow.
+    The first is the name that the draft asks for. If the draft reuses items with equal content, an item with other
+    content may have this name; therefore, numbered names follow without end: `walk-2`, `walk-3` and so on.
     """
     yield draft.item_name
     if draft.reuse == "by_content":

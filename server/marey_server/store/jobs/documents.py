@@ -17,7 +17,7 @@ from marey_server.store.transaction import IN_LIST, Transaction
 
 
 def select_jobs() -> Select[Any]:
-    """Select jobs with the names of their project and author."""
+    """Return a SELECT of all jobs, each with the columns `project_name` and `author_name`."""
     return (
         select(job, project.c.name.label("project_name"), user.c.name.label("author_name"))
         .join(project, project.c.id == job.c.project_id)

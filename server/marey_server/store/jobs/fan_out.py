@@ -20,12 +20,11 @@ MOST_GATHERED = 1000
 
 
 def gather(tx: Transaction, parent_id: str) -> list[Ended]:
-    """End a parent job whose tasks have all ended, and return it.
+    """End a parent job whose tasks have all ended; return the jobs that ended.
 
-    If its kind combines the results of the tasks in a worker, the job is queued instead, and nothing is returned.
-
-    If all tasks succeeded, the parent job succeeds or is queued. Otherwise it is cancelled if cancellation was
-    requested, and failed if a task failed.
+    If all tasks succeeded, the parent job succeeds. If a worker must combine the results of the tasks, the parent job
+    is queued instead, and nothing is returned. If a task failed, the parent job fails; if cancellation was requested
+    before, it is cancelled.
     """
     columns = (*commits.JOB_COLUMNS, job.c.gathers, job.c.cancel_requested_us)
     head = tx.execute(select(*columns).where(job.c.id == parent_id)).one()
