@@ -21,7 +21,10 @@ VECTOR = 3 * ROW
 
 @contracted
 def _turn(parent, joint):  # type: ignore[no-untyped-def]
-    """Make a joint's local rotations global: joint = parent · joint."""
+    """Replace local rotations of a joint by rotations in the world: joint = parent · joint.
+
+    `parent` and `joint` (4, frames) are rotations of the parent, in the world, and of the joint.
+    """
     for f in range(BLOCK):
         aw, ax, ay, az = parent[f], parent[ROW + f], parent[2 * ROW + f], parent[3 * ROW + f]
         bw, bx, by, bz = joint[f], joint[ROW + f], joint[2 * ROW + f], joint[3 * ROW + f]
@@ -31,7 +34,10 @@ def _turn(parent, joint):  # type: ignore[no-untyped-def]
 
 @contracted
 def _place(rotation, origin, point):  # type: ignore[no-untyped-def]
-    """Make a point's local offsets global: point = origin + rotation · point."""
+    """Replace offsets of a point by positions in the world: point = origin + rotation · point.
+
+    `rotation` (4, frames) and `origin` (3, frames) are those of the point's parent; `point` (3, frames) is changed.
+    """
     for f in range(BLOCK):
         w, x, y, z = rotation[f], rotation[ROW + f], rotation[2 * ROW + f], rotation[3 * ROW + f]
         px, py, pz = point[f], point[ROW + f], point[2 * ROW + f]

@@ -139,7 +139,10 @@ def _frame(skeleton: Skeleton, sources: NDArray[np.int64], carried: NDArray[np.b
 
 
 def _frame_of_bones(by_rest: Floats, bones: Floats, partners: Floats) -> Floats:
-    """Find the improper matrix nearest to `by_rest` that takes the partner's bones (n, 3) to the joint's own."""
+    """Find the improper matrix (3, 3) nearest to `by_rest` that maps the partner's bones to the joint's own.
+
+    `bones` and `partners` (n, 3) are the offsets of the children of the joint and of its partner.
+    """
     seen = partners @ by_rest.T
     lengths = np.linalg.norm(bones, axis=1) * np.linalg.norm(seen, axis=1)
     if np.all(np.sum(bones * seen, axis=1) >= np.cos(SAME_DIRECTION_RAD) * lengths):

@@ -324,7 +324,7 @@ def _hip_height_ratio(
     heights = [float(np.sum(part[known])) for part in parts]
     if min(heights) <= 0.0:
         raise MappingError(
-            "the scale cannot be computed from legs of length zero; set the scale with --scale (scale)",
+            "the scale cannot be computed from legs of length zero; set the parameter scale (--scale)",
             where="left_hip",
         )
     return heights[1] / heights[0]
@@ -341,7 +341,7 @@ def _heights(
     if missing:
         raise MappingError(
             "the scale is computed from both legs, but these joints are not mapped in both skeletons: "
-            f"{', '.join(missing)}; map them, or set the scale with --scale (scale)",
+            f"{', '.join(missing)}; map them, or set the parameter scale (--scale)",
             where=missing[0],
         )
     positions, pelvis = skeleton.rest_global_positions, joints["pelvis"]
@@ -373,7 +373,7 @@ def _position_in_world(clip: Clip, joint: int) -> AnyFloats:
 
 
 def _offsets_by_joint(translations: NDArray[np.float32] | None, joints: tuple[int, ...]) -> dict[int, AnyFloats]:
-    """Return the offsets (F, 3) of the joints with translations, by joint index."""
+    """Return the translations (F, 3) of each of `joints`, by joint index; none if `translations` is None."""
     return {} if translations is None else {joint: translations[:, slot] for slot, joint in enumerate(joints)}
 
 

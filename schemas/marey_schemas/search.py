@@ -37,7 +37,7 @@ class StartPlacement(Request):
 
 
 class SearchStep(Request):
-    """Motion in a sequence, with its constraints."""
+    """One of several motions that follow each other, with its constraints."""
 
     model: ItemId | None = Field(
         None, description="Id of a model of the project; absent: the model in the request's path."

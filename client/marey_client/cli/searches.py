@@ -87,7 +87,10 @@ def search(
     format: Annotated[str, typer.Option(help=f"{one_of(MOTION_FORMATS)}.")] = DEFAULT_FORMAT,  # noqa: A002
     as_json: AsJson = False,
 ) -> None:
-    """Find the motion of a model that best meets constraints. WHEN: keyframe label, start, end, or canonical frame."""
+    """Find the motion of a model that best meets constraints.
+
+    WHEN in an option is the label of a keyframe, `start`, `end`, or the number of a canonical frame.
+    """
     from marey_schemas.search import SearchRequest
 
     if format not in MOTION_FORMATS:

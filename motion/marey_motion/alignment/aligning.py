@@ -335,7 +335,7 @@ def joint_weights(body: MatchingBody, given: Mapping[str, float]) -> Floats:
 
 
 def _with_signs_of(motion: Motion, reference: Motion) -> Motion:
-    """Change the signs of a joint's quaternions in all frames if they are mostly opposite to the reference's."""
+    """Change the signs of a joint's quaternions, in all frames, if they are on average opposite to the reference's."""
     return motion._replace(rotations=consistent_signs(motion.rotations[None], reference.rotations)[0])
 
 

@@ -12,9 +12,10 @@ from marey_motion.kernels import compiled
 
 @compiled
 def _products(points, others, real, imaginary, heights):  # type: ignore[no-untyped-def]
-    """Sum horizontal products h·h̄' and squared height differences over P points, for each frame of `others` (P, 3, m).
+    """Compare the points of one frame (P, 3) with each of m frames, `others` (P, 3, m).
 
-    h = x + i·z are horizontal positions as complex numbers.
+    `real` and `imaginary` (m,) are filled with the sums, over the points, of the products h·h̄' of horizontal positions
+    h = x + i·z; `heights` (m,) with the sums of squared differences of height.
     """
     real[:] = 0.0
     imaginary[:] = 0.0
@@ -33,7 +34,8 @@ def _products(points, others, real, imaginary, heights):  # type: ignore[no-unty
 def turned(rows, columns, energies, other_energies, costs):  # type: ignore[no-untyped-def]
     """Fill `costs` (n, m) with the cost of each pair of frames after the best rotation about the vertical.
 
-    rows (n, P, 3) and columns (P, 3, m) are the points of the two motions, centred in each frame.
+    rows (n, P, 3) and columns (P, 3, m) are the points of the two motions, centred in each frame; `energies` (n,) and
+    `other_energies` (m,) are the sums of their squared horizontal distances from the centre.
     """
     n, m = costs.shape
     real, imaginary, heights = np.empty(m), np.empty(m), np.empty(m)
@@ -46,7 +48,10 @@ def turned(rows, columns, energies, other_energies, costs):  # type: ignore[no-u
 
 @compiled
 def turned_windows(a, b, window, costs):  # type: ignore[no-untyped-def]
-    """Fill `costs` (n, m) like `turned`, but with one rotation and shift for all frames of a window."""
+    """Fill `costs` (n, m) like `turned`, but with one rotation and shift for all `window` frames of a window.
+
+    `a` and `b` are the motions, as `cost.CostPoints`.
+    """
     n, m = costs.shape
     width = m + window - 1
     sums = np.zeros((3, m))
@@ -69,7 +74,10 @@ def turned_windows(a, b, window, costs):  # type: ignore[no-untyped-def]
 
 @compiled
 def _slide(history, row, window, sums):  # type: ignore[no-untyped-def]
-    """Fill `sums` (c, m) with sums along diagonals of the pair matrix, over `window` rows up to and including `row`."""
+    """Fill `sums` (c, m) with sums along diagonals of c matrices, over `window` rows up to and including `row`.
+
+    `history` (window, c, m + window - 1) is a ring buffer with the newest rows of the matrices.
+    """
     sums[:] = 0.0
     for step in range(window):
         past = history[(row - window + 1 + step) % window]
@@ -92,14 +100,17 @@ def _squares(points, others, row):  # type: ignore[no-untyped-def]
 
 @compiled
 def plain(rows, columns, costs):  # type: ignore[no-untyped-def]
-    """Fill `costs` (n, m) with weighted squared distances, without rotation or shift."""
+    """Fill `costs` (n, m) with sums of squared distances of the points `rows` (n, P, 3) from `columns` (P, 3, m).
+
+    The points contain the square roots of their weights as factors, see `cost.CostPoints`.
+    """
     for i in range(costs.shape[0]):
         _squares(rows[i], columns, costs[i])
 
 
 @compiled
 def plain_windows(rows, columns, window, costs):  # type: ignore[no-untyped-def]
-    """Fill `costs` (n, m) like `plain`, averaged over the frames of a window."""
+    """Fill `costs` (n, m) like `plain`, averaged over the `window` frames of each window."""
     n, m = costs.shape
     sums = np.zeros((1, m))
     history = np.empty((window, 1, m + window - 1))

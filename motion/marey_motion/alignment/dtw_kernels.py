@@ -13,7 +13,10 @@ LANES = 4
 
 @compiled
 def align(costs, path):  # type: ignore[no-untyped-def]
-    """Fill `path` with the cheapest path, last cell first; return its total cost and its number of cells."""
+    """Fill `path` (n + m, 2) with the cheapest path through `costs` (n, m), last cell first.
+
+    Returns the total cost of the path and its number of cells.
+    """
     n, m = costs.shape
     steps = np.empty((n, m), np.uint8)
     # The row before a block and those of the block, with a border from which no path comes, except into the first cell.
@@ -31,7 +34,10 @@ def align(costs, path):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
-    """Find the least of three totals and its step. No branches are used, since they are unpredictable."""
+    """Find the least of three totals, and the number of its step: 0 in both motions, 1 in the first, 2 in the second.
+
+    No branches are used, since they are unpredictable.
+    """
     least = min(both, first, second)
     alone = least < both
     return least, np.uint8(alone) + np.uint8(alone & (least < first))
@@ -39,7 +45,10 @@ def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cells(costs, before, totals, steps, start, stop):  # type: ignore[no-untyped-def]
-    """Fill columns [start, stop) of one row of totals and steps; column j of costs is column j + 1 of totals."""
+    """Fill columns [start, stop) of one row of `totals` and `steps`, from the row `before` of totals.
+
+    Column j of `costs` is column j + 1 of the totals.
+    """
     for j in range(start, stop):
         least, steps[j] = _cheapest(before[j], before[j + 1], totals[j])
         totals[j + 1] = least + costs[j]
@@ -68,7 +77,7 @@ def _four_rows(costs, totals, steps):  # type: ignore[no-untyped-def]
 
 @compiled
 def _walk_back(steps, path):  # type: ignore[no-untyped-def]
-    """Fill `path` from the stored steps, last cell first; return the number of cells."""
+    """Fill `path` from the step to each cell, `steps` (n, m), last cell first; return the number of cells."""
     i, j, length = steps.shape[0] - 1, steps.shape[1] - 1, 0
     while True:
         path[length, 0], path[length, 1] = i, j
@@ -84,7 +93,7 @@ def _walk_back(steps, path):  # type: ignore[no-untyped-def]
 
 @compiled
 def total(costs):  # type: ignore[no-untyped-def]
-    """Compute the total cost of the cheapest path in O(m) memory."""
+    """Compute the total cost of the cheapest path through `costs` (n, m) in O(m) memory."""
     n, m = costs.shape
     totals = np.empty(m)
     for i in range(n):
@@ -125,10 +134,13 @@ def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
 
 @compiled
 def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first, not_second):  # type: ignore[no-untyped-def]
-    """Fill a row of totals from the row before; row r of `runs` is for r + 1 steps in the first motion alone.
+    """Fill row `i` of the totals, `not_first` and `not_second` (m,), from the row before.
 
-    `runs` has the shape (max_run, m). A run of steps in the second motion alone starts from totals that depend only on
-    the row before. No cell therefore waits for its left neighbour, and every loop runs over whole vectors.
+    They are the least totals of paths to each cell whose last step is not in the first motion alone, and not in the
+    second alone; `first_before` and `second_before` are the same in the row before. Row r of `runs` (max_run, m) has
+    the totals of paths that end with r + 1 steps in the first motion alone. A run of steps in the second motion alone
+    starts from totals that depend only on the row before. No cell therefore waits for its left neighbour, and every
+    loop runs over whole vectors.
     """
     m, max_run = costs.shape[0], runs.shape[0]
     if i == 0:
@@ -161,6 +173,8 @@ def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first
 @compiled
 def _walk_back_limited(costs, max_run, not_first, not_second, path):  # type: ignore[no-untyped-def]
     """Fill `path`, last cell first, one run of equal steps at a time; return the number of cells.
+
+    `not_first` and `not_second` (n, m) are the totals of `_limited_row` for all rows.
 
     Among equally cheap steps, a step in both motions is preferred to a step in the first alone, and that to a step in
     the second alone.

@@ -48,7 +48,11 @@ def time_function(path: NDArray[np.integer]) -> Floats:
 
 
 def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
-    """Find the mean cell of each run of cells that share a frame; the ends of the path are the first and last knot."""
+    """Find the points between which a time function is interpolated: canonical frames (k,) and source frames (k,).
+
+    Each is the mean of a run of cells of the path that share a frame of one motion; the first and the last are the ends
+    of the path.
+    """
     steps = np.diff(path, axis=0)
     side = steps[:, 0] - steps[:, 1]  # 0 for a step in both, else which motion steps alone
     before = np.concatenate(([0], side[:-1]))
@@ -60,7 +64,10 @@ def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
 
 
 def _with_least_slope(times: Floats) -> Floats:
-    """Find times with the same ends and no step below the least slope, whose steps are nearest in least squares."""
+    """Return the times (N,) nearest to the given ones that have no step from frame to frame below `LEAST_SLOPE`.
+
+    The first and the last time stay; the steps are nearest in least squares. Raises `MotionError`.
+    """
     steps, least = np.diff(times), LEAST_SLOPE + _SLACK
     if steps.min() >= LEAST_SLOPE:
         return times

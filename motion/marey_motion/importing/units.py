@@ -175,7 +175,11 @@ def _choose_up_axis(source: SourceMotion, body: _Measurements, options: ImportOp
 
 
 def _settle_up_axis(body: _Measurements, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
-    """Choose the upward axis if the body is not upright along y: it may lie or climb, or another axis may point up."""
+    """Choose the upward axis if the body is not upright along y: it may lie or climb, or another axis may point up.
+
+    `axis` is the axis nearest to the direction from feet to head, and `cosine` that of the angle between them. `flat`
+    is the axis along which the lowest of feet and hands hardly moves, with the evidence in words, or None.
+    """
     rest_axis, rest_cosine = _body_axis(body.rest[:, None], body.landmarks)
     standing, resting = f"mean direction from feet to head is {axis} with cosine {cosine:.2f}", _FOLDED
     if rest_cosine > 0.0:

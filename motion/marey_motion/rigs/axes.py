@@ -330,7 +330,10 @@ def _tip(skeleton: Skeleton, joint: int) -> Floats | None:
 
 
 def _swing(standard: str, body: _PosedBody) -> Floats:
-    """Compute global directions (K, 3) whose mean in the joint's frame is its swing axis."""
+    """Compute the swing axis of a joint in each of K frames, as directions (K, 3) in the world.
+
+    Their mean in the frame of the joint is its swing axis.
+    """
     side, _, joint = standard.partition("_")
     if side not in SIDES:
         if standard in ("spine_2", "neck", "head"):
@@ -383,7 +386,10 @@ def _arm_hinge(side: str, joint: str, body: _PosedBody) -> Floats:
 
 
 def _across(swing: Floats, twist: Floats) -> Floats:
-    """Compute the unit part of a swing axis perpendicular to the twist axis; any perpendicular if that part is zero."""
+    """Compute the part of a swing axis (3,) perpendicular to the twist axis (3,), scaled to unit length.
+
+    If that part is zero, any perpendicular direction is returned.
+    """
     across = swing - (swing @ twist) * twist
     if np.linalg.norm(across) < 1e-6:
         across = np.cross(twist, np.eye(3)[int(np.argmin(np.abs(twist)))])

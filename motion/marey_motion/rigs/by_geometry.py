@@ -159,7 +159,10 @@ def _branches(tree: BoneTree, joint: int) -> list[int]:
 
 
 def _left_direction(skeleton: Skeleton, legs: LimbReading, joints: dict[str, int]) -> Floats | None:
-    """Compute the cross product of up and the direction of the feet in the rest pose; None if that is degenerate."""
+    """Compute the direction (3,) to the body's left in the rest pose: up, crossed with the direction of the feet.
+
+    Returns None if these do not determine it.
+    """
     positions = skeleton.rest_global_positions
     up = positions[joints.get("head", joints["pelvis"])] - positions[joints["pelvis"]]
     forward = sum((_foot(skeleton, legs.joint(side, 2), legs.joint(side, 3)) for side in range(2)), start=np.zeros(3))

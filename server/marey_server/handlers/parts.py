@@ -72,9 +72,10 @@ class PartResource(Resource):
 
     @reads(access=Access.READER, query=PartQuery, answer=Document, etag=True)
     async def get(self, project: str, kind: str, item: str, part: str, query: PartQuery) -> Rendered:
-        """Return a document, whole or some frames and joints of it.
+        """Return a document, or only some frames and joints of it.
 
-        As MessagePack or BSON with `arrays=blocks` in the media type, arrays are sent compressed, as they are stored.
+        If the header `Accept` asks for MessagePack or BSON with the parameter `arrays=blocks`, arrays are sent
+        compressed, as they are stored.
         """
         encoded = self.media.arrays == "blocks"
         return await self.answer_with(

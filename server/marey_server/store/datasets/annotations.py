@@ -47,7 +47,11 @@ class AnnotationMerger:
         """Merged documents by content digest."""
 
     def merge(self, changed: Sequence[ChangedPart]) -> list[str | AnnotationClash | None]:
-        """Merge the documents of parts, as `merge_entries` needs it; only annotations are merged."""
+        """Merge the documents of those parts that are annotations.
+
+        Returns, for each part, the content digest of the merged annotation, or the reason why it cannot be merged, or
+        None if the part is no annotation.
+        """
         outcomes: list[str | AnnotationClash | None] = [None] * len(changed)
         places = [at for at, one in enumerate(changed) if one.ours.kind == Kind.ANNOTATION.value and one.part == PART]
         for start in range(0, len(places), AT_ONCE):
@@ -75,7 +79,10 @@ class AnnotationMerger:
         ]
 
     def _find_documents(self, wanted: Iterable[str]) -> dict[str, str]:
-        """Return the digest of the annotation in each revision with a wanted content digest, if the project has it."""
+        """Return the digests of annotations, by the content digests of the revisions that contain them.
+
+        `wanted` are content digests of revisions; those that the project does not have are left out.
+        """
         held = revisions_with(self._tx, self._project_id, wanted)
         parts = read_part_digests(self._tx, set(held.values()))
         return {content: parts[key][PART] for content, key in held.items()}

@@ -57,7 +57,7 @@ class ItemFilters:
 
     @property
     def looks_up_name(self) -> bool:
-        """Whether `name` selects one name, or the names that begin with a text that itself ends in `*`."""
+        """Whether `name` is one name, or ends in `**`: `walk**` selects the names that begin with `walk*`."""
         return bool(self.name) and (not str(self.name).endswith("*") or str(self.name).endswith("**"))
 
 

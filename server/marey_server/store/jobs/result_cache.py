@@ -237,9 +237,9 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
 
 
 def _publish_anew(tx: Transaction, job_id: str) -> list[Ended]:
-    """Publish the shared result as the result of a waiting job; return None if it is no longer stored.
+    """Publish the shared result as the result of a waiting job; return the jobs that have ended by this.
 
-    Raises the errors of `publish`.
+    No job ends if the result is no longer stored. Raises the errors of `publish`.
     """
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")
