@@ -215,7 +215,10 @@ class RangeBounds:
 
 
 def _box_costs(a: Floats, b: NDArray[np.floating], frames_per_box: int) -> Floats:
-    """Compute the mean distance (n,) of the points of each frame of `a` from the nearest bounding box of `b`."""
+    """Compute the distance (n,) of each frame of `a` from the nearest bounding box of `frames_per_box` frames of `b`.
+
+    `a` (n, P, 3) and `b` (m, P, 3) are points; the distance is the mean over the points.
+    """
     from marey_motion.alignment import dtw_kernels as kernels
 
     starts = np.arange(0, len(b), frames_per_box)
@@ -229,6 +232,6 @@ def _box_costs(a: Floats, b: NDArray[np.floating], frames_per_box: int) -> Float
 
 
 def _points(a: NDArray[np.floating], b: NDArray[np.floating]) -> tuple[Floats, Floats]:
-    """Arrange the points of two motions for kernels: frames are the first axis of one array, the last of the other."""
+    """Arrange the points of two motions (n, P, 3) and (m, P, 3) for kernels, as (n, P, 3) and (P, 3, m)."""
     require_same_points(a, b)
     return np.ascontiguousarray(a, dtype=np.float64), np.ascontiguousarray(b.transpose(1, 2, 0), dtype=np.float64)

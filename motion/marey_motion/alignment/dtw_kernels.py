@@ -56,7 +56,10 @@ def _cells(costs, before, totals, steps, start, stop):  # type: ignore[no-untype
 
 @compiled
 def _four_rows(costs, totals, steps):  # type: ignore[no-untyped-def]
-    """Fill four rows at once, each a column behind the one above it, so that their cells are computed in parallel."""
+    """Fill four rows of `totals` and `steps` at once, as `_cells` does.
+
+    Each row is a column behind the one above it, so that their cells are computed in parallel.
+    """
     m = costs.shape[1]
     for row in range(LANES - 1):
         _cells(costs[row], totals[row], totals[row + 1], steps[row], 0, LANES - 1 - row)
@@ -108,7 +111,10 @@ def total(costs):  # type: ignore[no-untyped-def]
 
 @compiled
 def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
-    """Fill `path` like `align`, with at most `max_run` consecutive steps in one motion alone."""
+    """Fill `path` like `align`, with at most `max_run` consecutive steps in one motion alone.
+
+    Returns the total cost, infinite if there is no such path, and the number of cells.
+    """
     n, m = costs.shape
     # Least totals of the paths to each cell whose last step is not in the first alone, and not in the second alone.
     not_first, not_second = np.empty((n, m)), np.empty((n, m))

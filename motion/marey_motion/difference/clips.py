@@ -105,7 +105,7 @@ def _carrier(before: Clip, after: Clip, pairing: JointPairs) -> int:
 
 
 def _poses(clip: Clip, joints: tuple[int, ...], carrier: int) -> Poses:
-    """Return the rotations of `joints`, in this order, and the positions of the joint `carrier` in the world."""
+    """Return the poses of a clip: rotations of `joints`, in this order, and positions of `carrier` in the world."""
     whole = joints == tuple(range(clip.skeleton.joint_count))
     positions = clip.root_translations if carrier == 0 else np.ascontiguousarray(global_positions(clip)[:, carrier])
     return Poses(positions, clip.rotations if whole else clip.rotations[:, list(joints)])
@@ -129,7 +129,7 @@ def _compare_moved(before: Poses, after: Poses, rate_ratio: float) -> tuple[Timi
 
 
 def _paths(timing: Timing, after: Poses, move: Move | None) -> tuple[Floats, Floats]:
-    """Return the positions (n, 3) of the body in matched frames of the old and of the new clip.
+    """Return the positions of the body in n matched frames: of the old clip (n, 3), and of the new clip (n, 3).
 
     If `move` was applied to the old clip, the positions before this movement are returned.
     """

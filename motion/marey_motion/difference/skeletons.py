@@ -67,7 +67,11 @@ def pair_joints(before: Skeleton, after: Skeleton) -> JointPairs:
 def _renamed_from(
     before: Skeleton, after: Skeleton, joint: int, found: Mapping[int, int], kept: set[str]
 ) -> int | None:
-    """Return the only joint of `before` that may have been renamed to joint `joint` of `after`, or None."""
+    """Return the only joint of `before` that may have been renamed to joint `joint` of `after`, or None.
+
+    `found` maps joints of `after` to the joints of `before` that are paired already; `kept` are the names that both
+    skeletons have.
+    """
     parent = int(after.parents[joint])
     if parent >= 0 and parent not in found:
         return None

@@ -121,7 +121,10 @@ def _better(best: Timing, before: Poses, after: Poses, pace: float, *, search: b
 
 
 def _at_pace(before: Poses, after: Poses, pace: Pace, *, search: bool) -> Timing:
-    """Sample the old clip at a pace, and match the samples with the frames of the new clip."""
+    """Sample the old clip at a pace, and match the samples with the frames of the new clip.
+
+    `search` is whether to search for similar frames, see `match_frames`.
+    """
     sampled = before
     if pace != Pace(1.0):
         count = int((before.frame_count - 1 - pace.phase) * pace.samples_per_frame + ROUNDED_FRAMES) + 1
@@ -172,9 +175,10 @@ def _rounded(start: float, step: float, count: int) -> Pace:
 
 
 def _robust_line(places: Floats, values: Floats, weights: Floats, apart: int) -> tuple[float, float]:
-    """Fit a straight line to values that jump where frames were removed; return its value at place 0 and its slope.
+    """Fit a straight line to values (n,) at places (n,); return its value at place 0, and its slope.
 
-    The first estimate of the slope is the median over pairs of places that are `apart` places apart.
+    The values may jump where frames were removed; `weights` (n,) are their reliability. The first estimate of the slope
+    is the median over pairs of values whose indices differ by `apart`.
     """
     apart = max(1, min(apart, len(places) - 1))
     slope = float(np.median((values[apart:] - values[:-apart]) / (places[apart:] - places[:-apart])))
@@ -187,7 +191,7 @@ def _robust_line(places: Floats, values: Floats, weights: Floats, apart: int) ->
 
 
 def _line(places: Floats, values: Floats, weights: Floats) -> tuple[float, float]:
-    """Return start and slope of a straight line by weighted least squares."""
+    """Fit a straight line by weighted least squares; return its value at place 0, and its slope."""
     total = float(weights.sum())
     if total <= 0.0:
         return 0.0, 0.0

@@ -217,7 +217,10 @@ def _limit(rig: _Rig, asked: AnyLimit) -> JointLimit:
 
 
 def _finding(asked: AnyConstraint, constraint: Constraint, before: Any, after: Any) -> dict[str, Any]:
-    """Describe the largest errors of a constraint, in metres or radians, and count the frames that satisfy it."""
+    """Describe the largest errors of a constraint, and count the frames that satisfy it.
+
+    `before` and `after` are its errors in its frames, in metres or radians, before and after solving.
+    """
     is_position = isinstance(constraint.target, PositionTarget)
     unit = "m" if is_position else "rad"
     tolerance = _OPTIONS.tolerance_m if is_position else _OPTIONS.tolerance_rad
@@ -244,7 +247,10 @@ def _foot(rig: _Rig, side: str) -> Foot:
 
 
 def _given_contacts(take: Take, feet: Sequence[Foot], command: PlantFeet) -> tuple[FootContacts, ...]:
-    """Return the contacts of the command: toes are planted in all of its frames, heels only while they are slow."""
+    """Return the contacts of each foot that the command lists.
+
+    In the frames of a contact, the toe is always planted, and the heel only while it is slow.
+    """
     positions = take.motion.positions(take.skeleton)
     contacts = []
     for side, foot in zip(("left", "right"), feet, strict=True):

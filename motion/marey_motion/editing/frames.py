@@ -140,14 +140,21 @@ def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
 
 
 def _joined(first: Motion, second: Motion, overlap: int, count: int, frame_rate_hz: float) -> Motion:
-    """Join two motions, blended over `count` frames, with or without overlap; a `count` of 0 makes a hard cut."""
+    """Join two motions.
+
+    If `overlap` is not 0, this many frames of both are blended into each other. Otherwise, the difference in pose and
+    velocity decays over the first `count` frames of the second motion; a `count` of 0 makes a hard cut.
+    """
     if overlap:
         return _faded_over(first, second, overlap)
     return _in_a_row(first, _inertialised(first, second, count, frame_rate_hz) if count else second)
 
 
 def _inertialised(first: Motion, second: Motion, count: int, frame_rate_hz: float) -> Motion:
-    """Make the second motion start with the pose and velocity in which the first one ends."""
+    """Make the second motion start with the pose and velocity in which the first one ends.
+
+    The change decays over the first `count` frames.
+    """
     difference, velocity = seam_offset(first, second)
     ages = np.arange(min(count, second.frame_count), dtype=np.float64)
     velocity_life = min(float(count), max(1.0, VELOCITY_S * frame_rate_hz))
@@ -164,7 +171,7 @@ def _in_a_row(first: Motion, second: Motion) -> Motion:
 
 
 def _faded_over(first: Motion, second: Motion, overlap: int) -> Motion:
-    """Join two motions; the last frames of the first fade into the first frames of the second."""
+    """Join two motions; the last `overlap` frames of the first fade into the first frames of the second."""
     share = smooth_step(np.arange(1, overlap + 1) / (overlap + 1))
     end, start = slice(first.frame_count - overlap, None), slice(None, overlap)
     middle = first._replace(

@@ -78,7 +78,7 @@ def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> l
 
 
 def _stretched(take: Take, clip: Clip, frames: tuple[int, int | None] | None, count: int) -> Motion:
-    """Resample a range of a clip to `count` frames. Raises `EditError` if the clip lacks the frames."""
+    """Resample the range `frames` of a clip to `count` frames. Raises `EditError` if the clip lacks the frames."""
     try:
         start, stop = take.moved(motion_of(clip)).frames(frames)
     except EditError as error:

@@ -96,7 +96,10 @@ def _smooth_positions(values: Floats, weights: Floats) -> Floats:
 
 
 def _smooth_rotations(take: Take, rotations: Floats, weights: Floats, joints: Sequence[int]) -> Floats:
-    """Compute the weighted means over time of rotations (F, J, 4), normalised."""
+    """Compute the weighted means over time of rotations (F, J, 4) of `joints`, normalised.
+
+    Raises `EditError` if a joint turns so fast that its rotations have no mean.
+    """
     reach = len(weights) // 2
     before = _reflected(rotations[0], rotations[reach:0:-1])
     after = _reflected(rotations[-1], rotations[-2 : -reach - 2 : -1])

@@ -74,9 +74,10 @@ def read_amc(
 
 
 def _read_amc_header(lines: TextLines, degrees: bool) -> tuple[bool, float | None]:
-    """Read the header, up to the first frame; return whether angles are in degrees, and the frame rate if given.
+    """Read the header, up to the first frame.
 
-    If the AMC gives no unit of angles, `degrees` is returned, which says whether the ASF uses degrees.
+    Returns whether angles are in degrees, and the frame rate or None. If the AMC gives no unit of angles, `degrees` is
+    returned, which says whether the ASF uses degrees.
     """
     rate_hz = None
     while True:

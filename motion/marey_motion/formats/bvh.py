@@ -116,7 +116,7 @@ def channel_columns(channels: tuple[tuple[str, ...], ...]) -> ChannelColumns:
 def _read_frames(
     header: BvhHeader, columns: ChannelColumns, lines: TextLines, warnings: list[CheckWarning]
 ) -> NDArray[np.float64]:
-    """Read the channel values (F, C)."""
+    """Read the values (F, C) of all channels in all frames; an unusual layout is added to `warnings`."""
     width = len(columns.labels)
     text = np.frombuffer(lines.data, np.uint8, offset=min(header.data_start, len(lines.data)))
     try:
@@ -179,7 +179,10 @@ def _fill_motion(source: SourceMotion, values: NDArray[np.float64], columns: Cha
 def _positions_of(
     joints: list[int], values: NDArray[np.float64], columns: ChannelColumns, offsets: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Read local positions (F, k, 3) of k joints: position channels, or OFFSET on axes without a position channel."""
+    """Return the local positions (F, k, 3) of k joints, from the values (F, C) of the channels.
+
+    On axes without a position channel, it is the OFFSET, `offsets` (J, 3).
+    """
     wanted = columns.positions[joints]
     positions = values[:, wanted]
     absent = wanted == NO_COLUMN

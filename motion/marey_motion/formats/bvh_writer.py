@@ -117,7 +117,10 @@ def _written_offset(offset: NDArray[np.float64], scale: float) -> str:
 
 
 def _channel_values(clip: Clip, order: list[int], axes: NDArray[np.int64], scale: float) -> NDArray[np.float64]:
-    """Compute the numbers (F, C) of the file, frame by frame."""
+    """Compute the numbers (F, C) of the file: the values of all channels, with the joints in the order `order`.
+
+    `axes` are the axes of the rotations of each joint; lengths are multiplied by `scale`.
+    """
     angles_deg = np.empty((clip.frame_count, len(order), 3))
     euler_from_rotations(np.ascontiguousarray(clip.rotations[:, order]), axes, angles_deg)
     columns: list[NDArray[np.floating]] = []

@@ -158,7 +158,7 @@ def _pelvis(style: GaitStyle, moments: GaitMoments) -> AnyFloats:
 
 
 def _ankle(skeleton: Skeleton, side: str, foot: FootMotion, rotations: dict[str, AnyFloats]) -> AnyFloats:
-    """Compute the position (n, 3) of the ankle, and store the rotations of foot and toes."""
+    """Compute the position (n, 3) of the ankle, and add the rotations of foot and toes to `rotations`."""
     name, toes = side + "Foot", side + "ToeBase"
     rotations[name] = quaternions.from_euler("yx", np.stack((foot.yaws, -foot.pitches), axis=-1))
     rotations[toes] = quaternions.from_euler("yx", np.stack((foot.yaws, -foot.toe_pitches), axis=-1))
@@ -173,7 +173,11 @@ def _pelvis_heights(
     ankles: Mapping[str, AnyFloats],
     loaded: Mapping[str, NDArray[np.bool_]],
 ) -> AnyFloats:
-    """Compute heights (n,) of the root: the gait's rise and fall, limited by the reach of the stance legs."""
+    """Compute heights (n,) of the root: the gait's rise and fall, limited by the reach of the legs on the ground.
+
+    `pelvis` (n, 4) are rotations, and `ankles` positions (n, 3) by side; `loaded` are flags (n,) by side that mark the
+    moments at which the foot is on the ground.
+    """
     speeds = moments.settled(moments.root.speeds)
     leg = _thigh_m(skeleton) + _shank_m(skeleton)
     moving = eased(speeds / 1.2)

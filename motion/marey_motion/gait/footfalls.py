@@ -321,7 +321,7 @@ class Footfalls:
 
 
 def _seen_from(root: RootState, points: Complexes, velocities: Complexes) -> tuple[Complexes, Complexes]:
-    """Transform points on the floor, and their velocities, from the world into the root's moving frame.
+    """Transform points (n,) on the floor, and their velocities (n,), from the world into the root's moving frame.
 
     The velocities are relative to that frame: the root's own travel and turning are subtracted.
     """
@@ -331,7 +331,10 @@ def _seen_from(root: RootState, points: Complexes, velocities: Complexes) -> tup
 
 
 def _cubic(share: AnyFloats, start: Any, start_rate: Any, end: Any, end_rate: Any) -> Any:
-    """Compute Hermite's cubic over `share` in 0 to 1; rates are per unit of `share`."""
+    """Compute the cubic with the values `start` and `end`, and the rates of change `start_rate` and `end_rate`.
+
+    `share` is the place from 0 (start) to 1 (end); rates are per unit of `share`.
+    """
     s, r = share, 1.0 - share
     return (
         r * r * (1.0 + 2.0 * s) * start + r * r * s * start_rate + s * s * (3.0 - 2.0 * s) * end - s * s * r * end_rate

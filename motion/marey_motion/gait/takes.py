@@ -215,7 +215,10 @@ def _programme() -> list[tuple[str, RootPath, tuple[str, ...]]]:
 
 
 def _slalom(speed_m_s: float, turn_rate_rad_s: float, bend_s: float, bends: int) -> RootPath:
-    """Make alternating bends; the first and last have half the length, so that the initial heading is restored."""
+    """Make a path of `bends` bends to alternating sides, each of `bend_s` seconds.
+
+    Half a bend is added before and after them, so that the initial heading is restored.
+    """
     durations: Sequence[float] = [0.5 * bend_s, *[bend_s] * bends, 0.5 * bend_s]
     return RootPath(
         tuple(

@@ -181,7 +181,10 @@ def _rest_poses(clip: Clip, tracks: Tracks) -> list[CheckWarning]:
 
 
 def _rest_pose_frames(clip: Clip, tracks: Tracks) -> tuple[int, int]:
-    """Count the frames of a rest pose at the start and at the end: every joint at rest, or arms held out in a T."""
+    """Count the frames of a rest pose at the start of a clip, and those at its end.
+
+    In a rest pose, nearly every joint is at rest, or the arms are held out in a T.
+    """
 
     def resting(frames: slice) -> NDArray[np.bool_]:
         return _at_rest(clip, frames) | _in_t_pose(tracks, frames)

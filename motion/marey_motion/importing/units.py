@@ -262,7 +262,10 @@ def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _flat_axis(body: _Measurements) -> tuple[UpAxis, str] | None:
-    """Find the axis along which the lowest of feet and hands hardly moves, while it moves along the others."""
+    """Find the axis along which the lowest of feet and hands hardly moves, while it moves along the others.
+
+    Returns the axis with the evidence in words, or None.
+    """
     limbs = [*body.landmarks.ground_joints, *(body.landmarks.hands or ())]
     assert body.leg is not None
     below = body.positions.take(limbs, axis=0)

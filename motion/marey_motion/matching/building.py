@@ -254,7 +254,11 @@ def _normaliser_notes(normaliser: Normaliser) -> tuple[DatabaseNote, ...]:
 def _joined_translations(
     built: Sequence[_Built], body: MatchingBody
 ) -> tuple[NDArray[np.float32] | None, tuple[int, ...]]:
-    """Collect translations of all joints that any clip translates; in other clips, they equal the joint's offset."""
+    """Collect the translations (N, k, 3) of the k joints that any clip translates, and the indices of these joints.
+
+    In a clip that does not translate a joint, they equal the joint's offset. Returns None and no joints if no clip
+    translates any.
+    """
     joints = np.array(sorted({joint for row in built for joint in row[1].translated_joints}), dtype=np.int64)
     if not len(joints):
         return None, ()

@@ -32,7 +32,10 @@ def _exponential(x, y, z):  # type: ignore[no-untyped-def]
 
 @compiled
 def _turn_to(pose, column, w, x, y, z):  # type: ignore[no-untyped-def]
-    """Compute the rotation vector, of at most half a turn, from a rotation of `pose` to (w, x, y, z)."""
+    """Compute the rotation vector, of at most half a turn, from a rotation of a pose to the rotation (w, x, y, z).
+
+    The rotation of the pose begins at index `column` of `pose`.
+    """
     bw, bx, by, bz = (
         np.float64(pose[column]),
         np.float64(pose[column + 1]),

@@ -71,7 +71,10 @@ def _cost(values, query, weights):  # type: ignore[no-untyped-def]
 
 @compiled
 def cost_of(index, row, query):  # type: ignore[no-untyped-def]
-    """Compute the squared distance of a row, selectable or not, to the query (D,), in the order of dimensions."""
+    """Compute the squared distance of a row, selectable or not, from the query (D,).
+
+    The terms are added in the order of the dimensions.
+    """
     values = index.rows[row]
     cost = 0.0
     for d in range(query.shape[0]):

@@ -149,7 +149,10 @@ def _inner_products(
 
 
 def _decompose(products: Floats, size: float) -> tuple[Floats, Floats]:
-    """Compute singular values (r,), descending, and left singular vectors (m, r) from inner products (m, m)."""
+    """Compute singular values (r,), descending, and left singular vectors (m, r) from inner products (m, m).
+
+    Values that are small compared with the largest one, or with the norm `size` of all examples, are left out.
+    """
     squares, vectors = np.linalg.eigh(products)
     lengths = np.sqrt(np.maximum(squares[::-1], 0.0))
     floor = max(SMALLEST_RELATIVE_DEVIATION * float(lengths[0]), SMALLEST_RELATIVE_SPREAD * size)

@@ -202,7 +202,7 @@ class _Fitting:
 
 
 def _fitted(latents: Floats, count: int, options: MixtureOptions, seed: int) -> tuple[LatentMixture, bool]:
-    """Fit a mixture with a given number of components; also return whether the fit converged."""
+    """Fit a mixture with `count` components to latent vectors (n, d); return it, and whether the fit converged."""
     examples, dimensions = latents.shape
     if count == 1:
         return _normal(latents, options.regularisation, shrink=examples <= dimensions + 1), True
@@ -230,7 +230,10 @@ def _fitted(latents: Floats, count: int, options: MixtureOptions, seed: int) -> 
 
 
 def _normal(latents: Floats, regularisation: float, *, shrink: bool) -> LatentMixture:
-    """Fit one component by maximum likelihood, with its covariance shrunk towards a sphere if `shrink` is set."""
+    """Fit one component to latent vectors (n, d) by maximum likelihood.
+
+    With `shrink`, its covariance is shrunk towards a sphere. `regularisation` is added to the diagonal.
+    """
     if shrink:
         from sklearn.covariance import ledoit_wolf
 

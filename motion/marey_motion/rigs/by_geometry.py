@@ -95,7 +95,10 @@ def find_body(skeleton: Skeleton) -> GeometryMatch | None:
 
 
 def _doubts(skeleton: Skeleton, plan: BodyPlan, rivals: list[BodyPlan]) -> tuple[str, ...]:
-    """Describe other chains that may be the legs or arms, because their proportions are nearly as common."""
+    """Describe other chains that may be the legs or arms, one sentence each.
+
+    `rivals` are interpretations of the body whose proportions are nearly as common as those of `plan`.
+    """
     doubts = []
     for limb, joints, reading, others in (
         ("legs", "hip, knee and ankle", plan.legs, [one.legs for one in rivals]),
@@ -109,7 +112,10 @@ def _doubts(skeleton: Skeleton, plan: BodyPlan, rivals: list[BodyPlan]) -> tuple
 
 
 def _neck(tree: BoneTree, plan: BodyPlan) -> tuple[float, list[int]]:
-    """Find the chain from neck to head that starts where the arms branch off, and a score of how common it is."""
+    """Find the chain of joints from neck to head, which starts where the arms branch off.
+
+    Returns a score of how common its proportions are, and the chain; the chain is empty if there is none.
+    """
     skeleton, arms, legs = tree.skeleton, plan.arms.pair, plan.legs.pair
     limbs = {limb.chain[0] for limb in arms.limbs} | set(skeleton.path_to_root(legs.parent))
     chains = [_neck_chain(tree, joint) for joint in skeleton.children[arms.parent] if joint not in limbs]
@@ -147,7 +153,7 @@ def _looks_like_neck(tree: BoneTree, plan: BodyPlan, chain: list[int]) -> float:
 
 
 def _turn(skeleton: Skeleton, a: int, b: int, c: int) -> float:
-    """Compute the cosine of the angle between two bones in the rest pose."""
+    """Compute the cosine of the angle, in the rest pose, between the bones from `a` to `b` and from `b` to `c`."""
     positions = skeleton.rest_global_positions
     return float(unit(positions[b] - positions[a]) @ unit(positions[c] - positions[b]))
 
@@ -172,7 +178,10 @@ def _left_direction(skeleton: Skeleton, legs: LimbReading, joints: dict[str, int
 
 
 def _foot(skeleton: Skeleton, ankle: int | None, toe: int | None) -> Floats:
-    """Compute the vector from an ankle to its toe, or else to the tip of the foot; zero if there is neither."""
+    """Compute the vector (3,), in the rest pose, from an ankle to its toe, or else to the tip of the foot.
+
+    It is zero if there is neither.
+    """
     if ankle is not None and toe is not None:
         way: Floats = skeleton.rest_global_positions[toe] - skeleton.rest_global_positions[ankle]
         return way

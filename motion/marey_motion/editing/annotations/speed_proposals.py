@@ -106,7 +106,7 @@ def propose_reaches(clip: Clip, body: MatchingBody, options: WristContactProposa
 
 
 def _distance_from_rest(clip: Clip, body: MatchingBody, side: str) -> Floats:
-    """Compute the distance (F,) of a wrist from its position at the start of the clip, in metres."""
+    """Compute the distance (F,), in metres, of the wrist on a `side` from its rest position (see `propose_reaches`)."""
     wrist = body.standard_joints.get(f"{side}_wrist")
     if wrist is None:
         raise MappingError(

@@ -76,7 +76,10 @@ class _Step(NamedTuple):
 
 
 def _standing(stances: tuple[list[Stance], ...], clip: Clip, standing_s: float) -> list[Stance]:
-    """Find the periods in which both feet are on the ground for long enough to count as standing."""
+    """Find the periods of at least `standing_s` seconds in which both feet are on the ground.
+
+    `stances` are those of the left and of the right foot.
+    """
     both = [Stance(max(a.start, b.start), min(a.end, b.end)) for a in stances[0] for b in stances[1]]
     return sorted(one for one in both if one.end - one.start >= max(1.0, standing_s * clip.frame_rate_hz))
 

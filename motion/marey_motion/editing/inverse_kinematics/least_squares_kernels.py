@@ -100,7 +100,10 @@ def _fill_column(targets, frame, c, error, tip, turn, move, spin, jacobian, colu
 
 @compiled
 def fill_jacobian(body, targets, frame, work, jacobian):  # type: ignore[no-untyped-def]
-    """Fill the Jacobian (3·C, 3·V + 3) of the scaled errors by displacements of the V movable joints and the root."""
+    """Fill `jacobian` (3·C, 3·V + 3): the derivatives of the scaled errors of C targets.
+
+    They are derivatives with respect to displacements of the V movable joints and of the root.
+    """
     jacobian[:] = 0.0
     columns = 0
     for k in range(body.parents.shape[0]):
@@ -165,7 +168,7 @@ def _fill_softness(body, damping, work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _soften(work, vector, out):  # type: ignore[no-untyped-def]
-    """Fill `out` with D⁻¹·vector, without the excluded directions of the joints."""
+    """Fill `out` with D⁻¹·vector, D as in `_fill_softness`, without the directions that `_block` has excluded."""
     for v in range(work.blocked.shape[0]):
         known, along = work.blocked[v], 0.0
         for i in range(3):
@@ -290,7 +293,10 @@ def _fill_gradient(work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _prepare(body, targets, frame, work):  # type: ignore[no-untyped-def]
-    """Fill Jacobian and gradient of the measured pose; return the mean squared length of the Jacobian's rows."""
+    """Fill `work.jacobian` and `work.gradient` for the pose that was measured last.
+
+    Returns the mean squared length of the rows of the Jacobian.
+    """
     fill_jacobian(body, targets, frame, work, work.jacobian)
     for c in range(targets.kinds.shape[0]):
         for i in range(3):
@@ -305,7 +311,10 @@ def _prepare(body, targets, frame, work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _try_step(body, damping, local, root, work):  # type: ignore[no-untyped-def]
-    """Compute the trial pose, which a damped step leads to; joints at their limits slide along them."""
+    """Compute the pose to which a damped step leads from `local` and `root`: `work.trial` and `work.trial_root`.
+
+    Joints at their limits slide along them.
+    """
     _fill_softness(body, damping, work)
     work.blocked[:] = 0
     for _ in range(LIMIT_PASSES):
@@ -386,7 +395,7 @@ def solve_frames(body, targets, ends, roots, rotations, work, found):  # type: i
 
 @compiled
 def residuals_and_jacobian(body, targets, roots, rotations, work):  # type: ignore[no-untyped-def]
-    """Fill `work.scaled_errors` and `work.jacobian` of the first frame."""
+    """Fill `work.scaled_errors` and `work.jacobian` for the first frame of the poses `roots` and `rotations`."""
     measure(body, targets, 0, body.offsets[0], roots[0], rotations[0], work, 0.0, 0.0)
     work.displacement[:] = 0.0
     _prepare(body, targets, 0, work)

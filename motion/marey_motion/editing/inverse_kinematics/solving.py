@@ -348,8 +348,8 @@ def _kernel_limb(
 def _keep_better(problem: IkProblem, before: Floats, found: SolverResult) -> None:
     """Restore the given pose and its errors in each frame in which the closed form increased the error.
 
-    The error can increase if the wrist turns a tool away from its target. In all other frames, set the number of
-    iterations to 1.
+    `before` (F, K, 4) are the given local rotations. The error can increase if the wrist turns a tool away from its
+    target. In all other frames, the number of iterations is set to 1.
     """
     squares = problem.targets.scales**2
     worse = (found.after**2) @ squares > (found.before**2) @ squares + 1e-18

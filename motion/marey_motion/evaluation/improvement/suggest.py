@@ -131,7 +131,10 @@ def suggest(
 def _redundancy(
     simulation: Resimulation, how: SuggestionOptions, gone: frozenset[str], stages: _Stages
 ) -> tuple[tuple[Removal, ...], tuple[PlannedRemoval, ...]]:
-    """Rank clips and plan removals, both for the set without its unused clips."""
+    """Rank the clips by the harm of their removal, and plan several removals, both for the set without `gone`.
+
+    `gone` are the sources of its unused clips.
+    """
     found = leave_one_out(
         simulation, how.objective, removed=gone, consider=how.consider, progress=stages.within("leaving out")
     )

@@ -155,7 +155,10 @@ def _needed(
 
 
 def _gaps(needed: NDArray[np.bool_], before: int, after: int, least: int) -> list[tuple[int, int]]:
-    """Find half-open ranges of at least `least` frames that are outside the margins of every needed frame."""
+    """Find the ranges [start, stop) of at least `least` frames that are far from every needed frame.
+
+    A frame is far if it is more than `before` frames before the needed frame, or more than `after` frames after it.
+    """
     count = len(needed)
     edges = np.zeros(count + 1, dtype=np.int64)
     frames = np.flatnonzero(needed)

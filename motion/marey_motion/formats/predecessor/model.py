@@ -235,7 +235,11 @@ def _check_size(frames: int, coefficients: int, what: str, file: str) -> None:
 
 
 def _animated(parts: ModelParts, basis: SplineBasis, mean: Floats, skeleton: Skeleton, file: str) -> list[str]:
-    """List the joints that the model rotates. Raises `FormatError` if the skeleton lacks them."""
+    """List the joints that the model rotates.
+
+    `mean` (n, D) are the coefficients of its mean motion. Raises `FormatError` if the skeleton lacks a joint, or if
+    rotations are zero.
+    """
     animated = parts.animated_joints or list(skeleton.joint_names)
     if mean.shape[1] != 3 + 4 * len(animated):
         message = f"the mean has {mean.shape[1]} channels, but {len(animated)} joints need {3 + 4 * len(animated)}"

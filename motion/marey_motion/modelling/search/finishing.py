@@ -88,7 +88,7 @@ def _constrained(
     mapping: JointMapping,
     axes: Mapping[str, JointAxes] | None,
 ) -> Constrained | None:
-    """Convert a constraint for inverse kinematics; None for a kind that inverse kinematics cannot meet."""
+    """Convert a constraint of step `number` for inverse kinematics; None if inverse kinematics cannot meet it."""
     if not isinstance(constraint, JointPositionConstraint | JointOrientationConstraint | LookDirectionConstraint):
         return None
     joint = joint_index(step.primitive, constraint.joint, step.standard_joints)

@@ -237,7 +237,10 @@ def _row(
     tracked: dict[Tracked, int],
     moments: dict[float, int],
 ) -> _ResidualRow:
-    """Convert a constraint to numbers, and add the points that it needs to the tracked points, each once."""
+    """Convert a constraint to numbers, and add the points and times that it needs to `tracked` and `moments`.
+
+    Both contain each point or canonical frame once, with its index.
+    """
     frame = frame_at(primitive, constraint.at)
 
     def place(one: Tracked) -> int:

@@ -112,7 +112,10 @@ def _angle_factors(sine, cosine):  # type: ignore[no-untyped-def]
 
 @compiled
 def _rotation_error(turn, target, out):  # type: ignore[no-untyped-def]
-    """Fill `out` with the rotation vector from the target to the rotation; its length is the geodesic distance."""
+    """Fill `out` (3,) with the rotation vector from the rotation `target` to the rotation `turn`.
+
+    Its length is the angle between them.
+    """
     w, x, y, z = product(turn, inverse(target))
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
@@ -219,7 +222,7 @@ def costs(prices, errors, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def track(chains, placement, latents, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (n, items, 3) with the tracked points of the motions of latent vectors (n, L), in the world."""
+    """Fill `out` (n, p, 3) with the p tracked points of `chains`, in the world, for latent vectors (n, L)."""
     nodes, items = chains.parents.shape[0], chains.turned.shape[0]
     channels, local = np.empty(chains.mean.shape[0]), np.empty((nodes, 5))
     positions, rotations, turns = np.empty((nodes, 3)), np.empty((nodes, 4)), np.empty((items, 4))

@@ -93,7 +93,7 @@ def search_closely(
 def _descend(
     objective: Objective, tree: SampleTree, candidates: int, top: int, transform: Callable[[Floats], Floats]
 ) -> FoundSamples:
-    """Return the `top` samples of a tree that have the lowest costs, following `candidates` nodes of each level.
+    """Return the best `top` samples that a search finds by following `candidates` nodes of each level of a tree.
 
     The costs are those of the latent vectors after `transform`; the result contains the transformed vectors.
     """

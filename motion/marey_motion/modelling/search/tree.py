@@ -162,7 +162,7 @@ def feature_frames(primitive: MotionPrimitive) -> list[float]:
 def _features(
     primitive: MotionPrimitive, samples: Floats, options: TreeOptions, end_effectors: Sequence[int]
 ) -> Floats:
-    """Compute the features (n, D) by which the samples are clustered."""
+    """Compute the features (n, D) by which n samples are clustered: spatial scores, or positions of end effectors."""
     if options.features == "latent":
         return np.ascontiguousarray(samples[:, : primitive.spatial.count])
     if not end_effectors:
