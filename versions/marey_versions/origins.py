@@ -104,7 +104,11 @@ def find_origins(
 
 
 def _pass_to_parents(search: _OriginSearch, commit: str, key: str, names: set[str]) -> set[str]:
-    """Continue the search in the parents for those of `names` whose values a parent already had; return these names."""
+    """Continue the search for the entry with `key` in the parents of `commit`, and return the names that continue.
+
+    `names` are parts, the path or the tags of the entry. The search of a name continues in the first parent whose entry
+    has the same value for it; for all other names, the commit is the origin.
+    """
     present = search.entry(commit, key)
     assert present is not None
     values = _named(present)

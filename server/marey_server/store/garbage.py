@@ -87,7 +87,7 @@ def _collect(
 
 
 def _candidates(tx: Transaction, table: Table, grace_us: int, behind: str) -> list[str]:
-    """Return the next unreferenced digests, at most `BATCH`.
+    """Return the next digests after `behind` that have had no references for `grace_us`, at most `BATCH`.
 
     Their rows have at most `BATCH_BYTES` together; a single row may have more.
     """

@@ -83,7 +83,14 @@ class SolverResult(NamedTuple):
 
 
 class Placing(NamedTuple):
-    """Scratch arrays for one pose of K joints and C targets; the last three are for the best rotation of a joint."""
+    """Scratch arrays of cyclic coordinate descent, for one pose of K joints and C targets.
+
+    Parameters
+    ----------
+    spins, places : (K, 4), (K, 3) rotations and positions of the joints in the world
+    tips, turns, errors : (C, 3), (C, 4), (C, 3) positions of the targets' points, rotations of their joints, errors
+    matrix, form, vectors : (3, 3), (4, 4), (4, 4) for the best rotation of a joint
+    """
 
     spins: Floats
     places: Floats
@@ -96,7 +103,11 @@ class Placing(NamedTuple):
 
 
 class Stepping(NamedTuple):
-    """Scratch arrays for one pose and for a step of least squares with n unknowns and m errors."""
+    """Scratch arrays of least squares: for one pose, as in `Placing`, and for a step with n unknowns and m errors.
+
+    The unknowns are displacements of the pose from the pose at the start, `first` and `first_root`. `trial` and
+    `trial_root` are the pose after a step; the other arrays are terms of the equations of the step.
+    """
 
     spins: Floats
     places: Floats

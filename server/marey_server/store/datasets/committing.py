@@ -260,7 +260,10 @@ def _require_checked_out(found: Row[Any], parent: str | None) -> None:
 def _from_folder(
     tx: Transaction, project_row: ProjectRow, found: Row[Any], store: StoredChunks, before: str | None
 ) -> tuple[str, Contents]:
-    """Store the tree of the items in the dataset's folder; return the digest of its root, and the items' contents."""
+    """Store the tree of the items in the dataset's folder, as changes of the tree `before`, if there is one.
+
+    Returns the digest of the root of the tree, and the content digests of the items.
+    """
     state = read_folder(tx, project_row, found)
     if before is None:
         return build(store, sorted(state.entries.items())), state.contents
@@ -273,7 +276,10 @@ def _from_folder(
 def _from_changes(
     tx: Transaction, project_row: ProjectRow, store: StoredChunks, before: str | None, changes: Sequence[EntryChange]
 ) -> tuple[str, Contents]:
-    """Apply changes in their order; return the resulting tree, and the contents of the revisions in it."""
+    """Apply changes, in their order, to the tree `before`, or to an empty tree if it is None.
+
+    Returns the digest of the root of the resulting tree, and the content digests of the revisions in the changes.
+    """
     before = before or build(store, [])
     put = [one for one in changes if isinstance(one, PutEntry)]
     rows = _items_named(tx, project_row, put)

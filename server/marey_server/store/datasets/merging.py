@@ -119,7 +119,10 @@ def _parent_of(picked: Commit, parent: int | None) -> str | None:
 def _start(
     tx: Transaction, found: Row[Any], request: CombineRequest, theirs: str | None, message: str
 ) -> PreparedMerge:
-    """Return a merge that is not computed yet; `commit.recorded` is set if an earlier request has recorded it."""
+    """Return a merge of the commit `theirs` into the branch that `request` names, which is not computed yet.
+
+    `commit.recorded` is set if an earlier request has recorded the merge; `message` is used if the request has none.
+    """
     recorded = recorded_as(tx, found.id, request.write_id)
     ours = head_of(tx, found.id, request.into, None if recorded else request.expected)
     if ours is None:
@@ -134,7 +137,11 @@ def _start(
 def _combine(
     tx: Transaction, project_id: str, request: CombineRequest, started: PreparedMerge, most: int | None = None
 ) -> PreparedMerge:
-    """Merge three ways: apply the changes between `base` and `theirs` to the tree of `ours`; list conflicts."""
+    """Compute a merge that `_start` has returned: the resulting tree and the conflicts.
+
+    The changes from the commit `base` to the commit `theirs`, both named in `started.answer`, are applied to the tree
+    of the commit `ours`.
+    """
     store = StoredChunks(tx)
     answer, commit = started.answer, started.commit
     base, ours, theirs = (

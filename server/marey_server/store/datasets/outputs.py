@@ -128,7 +128,11 @@ def commit_outputs(tx: Transaction, wanted: OutputEntries, mover: Mover) -> Comm
 
 
 def _with_removals(base: Tree, wanted: OutputEntries) -> dict[str, DatasetEntry | None]:
-    """Return the outputs, and None for each entry that the job replaces; at most one more than a commit may have."""
+    """Return the outputs of a job as entries by key, and None for each entry that the job removes.
+
+    A job that replaces the content of a folder removes the other entries of its kinds in this folder of `base`. The
+    result has at most one entry more than a commit may have.
+    """
     entries: dict[str, DatasetEntry | None] = dict(wanted.entries)
     if wanted.replaced is not None and entries:
         inside = (key for key, _ in base.entries(prefix=f"{wanted.replaced}/"))
@@ -168,9 +172,9 @@ def _merged(
     entries: Mapping[str, DatasetEntry | None],
     annotations: AnnotationMerger,
 ) -> MergedEntries:
-    """Return the result of merging the entries of a job with changes of others since `base`, part by part.
+    """Merge the entries of a job, part by part, with changes of others.
 
-    Only changes at the paths of these entries, up to the commit's tree `head`, are merged.
+    The changes of others are those from the tree `base` to the tree `head`, at the paths of these entries only.
     """
     before = {key: entry_of(key, value) for key, value in Tree(reader, base).get_several(entries).items()}
     if base == head:
@@ -192,7 +196,7 @@ def _compared(before: DatasetEntry | None, after: DatasetEntry | None) -> Compar
 def _store_combined(
     tx: Transaction, wanted: OutputEntries, merged: MergedEntries, annotations: AnnotationMerger
 ) -> None:
-    """Store the revisions of the entries that have changes of the job and of somebody else."""
+    """Store the revisions of those entries in `merged` that have changes of the job and of somebody else."""
     if merged.combined:
         folder = tx.execute(_FOLDER.where(dataset.c.id == wanted.dataset_id)).scalar()
         store_combined(
@@ -226,7 +230,10 @@ def _record(
 def _on_own_branch(
     tx: Transaction, wanted: OutputEntries, mover: Mover, store: StoredChunks, tree: str, merged: MergedEntries
 ) -> CommittedOutputs:
-    """Commit the outputs to a new branch that starts where the job started, and return the conflict."""
+    """Commit the outputs, the tree `tree`, to a new branch that starts where the job started.
+
+    Returns the commit, and the conflicts in `merged` as the reason why it is not on the intended branch.
+    """
     paths = sorted({path_and_kind(one.key)[0] for one in merged.conflicts})
     changed = f"{counted(len(paths), 'path')} of the outputs changed on {wanted.branch!r} while the job ran"
     conflict = CommitConflict(
@@ -261,10 +268,11 @@ def _create_branch(tx: Transaction, wanted: OutputEntries, digest: str) -> str:
 def _follow_in_folder(
     tx: Transaction, wanted: OutputEntries, before: str | None, digest: str, changes: Mapping[str, Value | None]
 ) -> None:
-    """Let the next commit of the dataset's folder follow this commit, if the folder has all that the commit changed.
+    """Record the commit `digest` as checked out in the dataset's folder, if the folder has everything that it changed.
 
-    This is so if the folder followed the commit before, and each changed entry is the newest revision of an item at
-    its path in the folder. Otherwise the folder is checked out first.
+    This is so if the commit `before` was checked out in the folder, and each entry in `changes` is the newest revision
+    of an item at its path in the folder. Otherwise, nothing is recorded, and a user must check out the commit before
+    the next commit of the folder.
     """
     followed = (dataset.c.id == wanted.dataset_id, dataset.c.folder_commit.is_not_distinct_from(before))
     folder = tx.execute(_FOLDER.where(*followed)).scalar()

@@ -267,7 +267,7 @@ class _Publication:
         return found
 
     def _find_contents(self, waiting: Sequence[_Ready], kind: Kind) -> dict[str, Row[Any]]:
-        """Return, by id of the draft, the row of the first item of the project that has the same required parts."""
+        """Return, by name of the draft, the row of the first item of the project that has the same required parts."""
         self.tx.lock(f"content:{self.project.id}:{kind}")
         statement = select(item.c.id, item.c.head, item.c.creator_id).where(
             item.c.project_id == self.project.id, item.c.kind == kind.value, item.c.deleted_us.is_(None)

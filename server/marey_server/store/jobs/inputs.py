@@ -194,7 +194,11 @@ def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: st
 def _entries_of(
     tx: Transaction, project: ProjectRow, spec: InputSpec, choice: DatasetInput, place: str, errors: list[FieldError]
 ) -> Iterator[Pin]:
-    """Pin the entries of a version of a dataset; each pin has the name and the folder of the entry in this version."""
+    """Yield pins for the entries of the version of a dataset that `choice` names; faults are added to `errors`.
+
+    Each pin has the name and the folder of the entry in this version. `place` is the pointer to the choice in the
+    request.
+    """
     try:
         version = datasets.entries_of_kind(
             tx, project, choice.dataset, choice.version, spec.kind, path=choice.path, most=MOST_INPUTS + 1

@@ -100,9 +100,10 @@ def _waiting(tx: Transaction, ids: Sequence[str]) -> Sequence[Row[Any]]:
 
 
 def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[Ended]]) -> list[Ended]:
-    """Count the dependencies of waiting jobs that have ended; make jobs ready whose dependencies have all ended.
+    """Update waiting jobs after ends of jobs on which they depend.
 
-    Jobs that can no longer run are ended. Returns the jobs that have ended.
+    `upstream` lists these ends by the id of the waiting job. Jobs whose dependencies have all succeeded are made ready;
+    jobs that can no longer run are ended. Returns the jobs that have ended.
     """
     following: list[Ended] = []
     left: dict[str, int] = {}

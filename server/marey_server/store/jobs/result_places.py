@@ -38,7 +38,7 @@ def find_clash(kind: KindDeclaration, params: Any, pins: PinnedInputs, into: str
 
 
 def _too_long(kind: KindDeclaration, pins: PinnedInputs, into: str) -> tuple[str, str] | None:
-    """Return the conflict if the path of a result of many inputs, below `into`, would be too long."""
+    """Return code and detail of the conflict if the path of a result, below `into`, would be too long."""
     kept = [pin for name, spec in kind.inputs.items() if spec.many for pin in pins.get(name, ()) if "job" not in pin]
     for folder in sorted({"", *map(_folder, kept)}) if into else ():
         try:
@@ -60,7 +60,7 @@ def _same_name(named: list[Pin]) -> tuple[str, str] | None:
 def _over_another_input(
     kind: KindDeclaration, params: Any, pins: Mapping[str, list[Pin]], into: str
 ) -> tuple[str, str] | None:
-    """Return the conflict if the result of one input would replace another input of the same job."""
+    """Return code and detail of the conflict if the result of one input would replace another input of the same job."""
     named = pins.get(kind.named_after or "", [])
     if kind.in_place is not None and getattr(params, kind.in_place):
         return None

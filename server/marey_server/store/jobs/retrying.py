@@ -136,7 +136,10 @@ class _Family:
 
 
 def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_ins: Mapping[str, str]) -> Submission:
-    """Return the submission that retries a job under the id `new`, with its dependencies replaced by their retries."""
+    """Return the submission that retries a job under the id `new`.
+
+    `stand_ins` maps its dependencies to their retries, on which the new job depends instead.
+    """
     try:
         kind = find_kind(row.kind)
     except UnknownKindError as error:
@@ -173,7 +176,7 @@ def _late_pins(row: Row[Any], stand_ins: Mapping[str, str]) -> PinnedInputs:
 
 
 def _pins_of(tx: Transaction, row: Row[Any], fanned: str | None) -> PinnedInputs:
-    """Return the inputs of a job; for a parent job, those of its tasks."""
+    """Return the inputs of a job; for a parent job, the input `fanned`, which is split, is joined from its tasks."""
     if row.size is None or fanned is None:
         return dict(row.inputs)
     statement = select(job.c.inputs).where(job.c.parent_id == row.id).order_by(job.c.position)
