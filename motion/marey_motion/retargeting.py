@@ -324,7 +324,7 @@ def _hip_height_ratio(
     heights = [float(np.sum(part[known])) for part in parts]
     if min(heights) <= 0.0:
         raise MappingError(
-            "the scale cannot be computed from legs of length zero; set the parameter scale (--scale)",
+            "the scale cannot be computed from legs of length zero; set it with --scale or the parameter scale",
             where="left_hip",
         )
     return heights[1] / heights[0]
@@ -341,7 +341,7 @@ def _heights(
     if missing:
         raise MappingError(
             "the scale is computed from both legs, but these joints are not mapped in both skeletons: "
-            f"{', '.join(missing)}; map them, or set the parameter scale (--scale)",
+            f"{', '.join(missing)}; map them, or set the scale with --scale or the parameter scale",
             where=missing[0],
         )
     positions, pelvis = skeleton.rest_global_positions, joints["pelvis"]

@@ -84,7 +84,7 @@ def _split(compared: Iterable[ComparedEntry]) -> Iterator[ComparedEntry]:
 
 
 def _rejoined(compared: Sequence[ComparedEntry]) -> list[ComparedEntry]:
-    """Join a removed and an added entry of the same path and kind to a changed one."""
+    """Replace each pair of a removed and an added entry with the same path and kind by one changed entry."""
     added = {one.after.key: one.after for one in compared if one.before is None and one.after is not None}
     removed = {one.before.key for one in compared if one.after is None and one.before is not None}
     joined: list[ComparedEntry] = []

@@ -13,7 +13,7 @@ LANES = 4
 
 @compiled
 def align(costs, path):  # type: ignore[no-untyped-def]
-    """Fill `path` (n + m, 2) with the cheapest path through `costs` (n, m), last cell first.
+    """Fill the first rows of `path` with the cheapest path through `costs` (n, m), last cell first.
 
     Returns the total cost of the path and its number of cells.
     """

@@ -249,7 +249,10 @@ def _response_s(series: TrialSeries, first: int, stop: int) -> float | None:
 
 
 def _switch_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]:
-    """Count the transitions that searches chose, and apart from them the ends of clips and restarts of loops."""
+    """Count the transitions that searches chose, and separately the ends of clips and restarts of loops.
+
+    `window` marks the steps that count.
+    """
     status = record.status[1:][window]
     transitions = float(np.count_nonzero(status == Status.REPLACING))
     return {

@@ -76,7 +76,8 @@ def _draw_bars(
     """Draw the labelled bars of the subject with index `number`.
 
     There is one bar for each listed clip, one for all remaining clips if `others` is true, and a hatched one for
-    transitions.
+    transitions. `values` are the lengths of the bars without the last one, `places` the positions of all bars, and
+    `thick` is their thickness.
     """
     total = sum(use.ticks.values())
     colours = [COLOURS[number]] * (len(values) - others) + [REFERENCE] * others
