@@ -13,9 +13,8 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.provenance import require_comparable
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.matching.record import TrialRecord
+from marey_schemas.documents.evaluations import CONFIDENCE, RESAMPLES
 
-CONFIDENCE = 0.95
-RESAMPLES = 9_999
 BOOTSTRAP_SEED = 0
 SAME_CHANGE = 1e-12
 """Relative difference up to which two changes count as equal, since rounding can cause it."""

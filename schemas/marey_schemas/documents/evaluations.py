@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Literal, NamedTuple
 
 from pydantic import ConfigDict, Field
 
@@ -10,6 +12,40 @@ from marey_schemas.base import Request
 
 COSTS = ("match_cost", "continuing_cost", "pose_cost")
 """Costs that the part `records` contains for each tick."""
+
+CONFIDENCE = 0.95
+"""Confidence of intervals of changes between two evaluations."""
+
+RESAMPLES = 9_999
+"""Number of samples of trials from which these intervals are computed."""
+
+
+class HeadlineMetric(NamedTuple):
+    """Number that lists and summaries show for an evaluation."""
+
+    meaning: str
+    of_trials: str | None = None
+    """The metric of trials of which it is the mean over all trials that define it; None if it is no mean."""
+
+
+HEADLINE_METRICS: Mapping[str, HeadlineMetric] = MappingProxyType(
+    {
+        "clips": HeadlineMetric("number of clips; a clip and its mirrored copy count as one"),
+        "unused_clips": HeadlineMetric("number of clips that no trial displayed"),
+        "data_s": HeadlineMetric("duration of all clips, in seconds"),
+        "trials": HeadlineMetric("number of trials"),
+        "followed_trials": HeadlineMetric("number of trials whose trajectory the character followed"),
+        "offset_mean_m": HeadlineMetric("distance from the desired position, in metres", "offset_mean"),
+        "baseline_offset_mean_m": HeadlineMetric("offset_mean_m with generated clips that cover every cell"),
+        "abs_se_v_m_s": HeadlineMetric("error of the speed, in metres per second", "abs_se_v"),
+        "abs_se_omega_deg_s": HeadlineMetric("error of the turn rate, in degrees per second", "abs_se_omega_deg"),
+        "transitions_per_s": HeadlineMetric("number of jumps between frames per second", "transitions_per_s"),
+        "pose_cost_mean_m": HeadlineMetric("distance between successive poses, in metres", "pose_cost_mean"),
+        "coverage_index": HeadlineMetric("share of the cells of speed and turn rate that have enough data"),
+        "symmetry": HeadlineMetric("similarity of the coverage of left and right turns, from 0 to 1"),
+    }
+)
+"""Numbers of the headline of an evaluation, by name; names end in their unit."""
 
 
 class EvaluationDocument(Request):

@@ -12,6 +12,7 @@ from tests.support.project_in_memory import PARAMS, ProjectInMemory, add_clip
 from marey_motion.gait import generate_gait
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import MatchingDatabase
+from marey_schemas.documents.evaluations import HEADLINE_METRICS
 from marey_schemas.lru import LruCache
 from marey_worker.context import JobRefused, Task
 from marey_worker.job_io import matching_clips
@@ -96,6 +97,7 @@ def test_what_the_mathematics_refuses_is_not_tried_again(project: ProjectInMemor
 def test_the_headline_counts_the_clips_and_those_that_no_trial_plays() -> None:
     headline = evaluate.headline_of(synthetic_result(clips=6, unused=2))
     assert (headline["clips"], headline["unused_clips"]) == (6, 2)
+    assert list(headline) == list(HEADLINE_METRICS)
 
 
 @pytest.mark.slow

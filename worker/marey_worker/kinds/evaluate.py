@@ -15,6 +15,7 @@ from marey_motion.evaluation.suite import assemble, evaluate_baseline, run_suite
 from marey_motion.matching.record import TrialRecord
 from marey_reports.evaluation.figures import FIGURES, DrawnFigure, draw_figure, draw_figures
 from marey_reports.evaluation.page import render_report, verdict
+from marey_schemas.documents.evaluations import HEADLINE_METRICS
 from marey_schemas.documents.reports import EvaluationReport
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.kinds import Kind
@@ -104,27 +105,23 @@ def _read_records(context: Context, results: Sequence[Mapping[str, Any]]) -> dic
 
 
 def headline_of(result: EvaluationResult) -> Headline:
-    """Return the numbers shown in lists; names end with the unit, shares are from 0 to 1.
-
-    A clip and its mirrored copy count as one.
-    """
+    """Return the numbers of `HEADLINE_METRICS`."""
     sources = sum_by_source(result.clips, result.usage)
     rows = recorded_rows(result.clips, result.usage)
-    return {
+    found: Headline = {
         "clips": len(sources),
         "unused_clips": sum(source.ticks == 0 for source in sources),
         "data_s": rows / result.options.database.rate_hz,
         "trials": len(result.trials),
         "followed_trials": judge(result).followed,
-        "offset_mean_m": result.suite["offset_mean"],
         "baseline_offset_mean_m": None if result.baseline is None else result.baseline.suite["offset_mean"],
-        "abs_se_v_m_s": result.suite["abs_se_v"],
-        "abs_se_omega_deg_s": result.suite["abs_se_omega_deg"],
-        "transitions_per_s": result.suite["transitions_per_s"],
-        "pose_cost_mean_m": result.suite["pose_cost_mean"],
         "coverage_index": result.coverage.index,
         "symmetry": result.coverage.symmetry,
     }
+    for name, metric in HEADLINE_METRICS.items():
+        if metric.of_trials is not None:
+            found[name] = result.suite[metric.of_trials]
+    return {name: found[name] for name in HEADLINE_METRICS}
 
 
 def write_report(context: Context, result: EvaluationResult, params: EvaluateParams) -> dict[str, Any]:
