@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TypeAlias, TypeVar
 
+from marey_client.errors import NotFound
 from marey_client.handles.datasets import Datasets
 from marey_client.items import ItemHandle, Items
 from marey_schemas.datasets.commits import Entry
@@ -25,7 +26,10 @@ def as_inputs(places: Places[Handle]) -> tuple[ExistingInput, ...]:
 
 
 def items_at(items: Items[Handle], places: Places[Handle], *, sort: str | None = None) -> Iterator[Item]:
-    """Yield the items in one or several inputs, each at the revision that its input names, or else at its newest."""
+    """Yield the items in one or several inputs, each at the revision that its input names, or else at its newest.
+
+    Items in a version of a dataset have the tags that they have in this version.
+    """
     for place in _as_list(places):
         if isinstance(place, ItemHandle):
             yield place.item
@@ -34,7 +38,7 @@ def items_at(items: Items[Handle], places: Places[Handle], *, sort: str | None =
             yield item if place.revision is None else item.model_copy(update={"revision": place.revision})
         elif isinstance(place, DatasetInput):
             for entry, item in entries_at(items, place):
-                yield item.model_copy(update={"revision": entry.revision})
+                yield item.model_copy(update={"revision": entry.revision, "tags": entry.tags})
         else:
             folder = place.strip("/") if isinstance(place, str) else place.collection
             yield from (one.item for one in items.list(collection=folder, sort=sort))
@@ -45,13 +49,24 @@ def _as_list(places: Places[Handle]) -> list[Place[Handle]]:
 
 
 def entries_at(items: Items[Handle], place: DatasetInput) -> Iterator[tuple[Entry, Item]]:
-    """Yield the entries of a dataset version, each with its item; entries without an item are left out."""
+    """Yield the entries of a dataset version, each with its item, which may have been deleted since.
+
+    Entries without an item are left out.
+    """
     dataset = Datasets(items.transport, items.project).at(place.dataset)
     folder = dataset.read().collection
     present = {} if folder is None else {one.id: one.item for one in items.list(collection=folder)}
+    deleted: dict[str, Item] = {}
     for entry in dataset.entries(place.version, path=place.path):
-        if entry.kind is items.kind and entry.item is not None:
-            yield entry, present.get(entry.item) or items.get(entry.item).item
+        if entry.kind is not items.kind or entry.item is None:
+            continue
+        if entry.item not in present:
+            try:
+                present[entry.item] = items.get(entry.item).item
+            except NotFound:
+                deleted = deleted or {one.id: one.item for one in items.list(deleted=True)}
+                present[entry.item] = deleted[entry.item]
+        yield entry, present[entry.item]
 
 
 def _as_input(place: Place[Handle]) -> ExistingInput:

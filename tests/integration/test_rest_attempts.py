@@ -128,6 +128,17 @@ def test_an_attempt_reads_its_inputs_and_what_they_name_and_nothing_else(desk: D
     assert desk.attempt.get("/projects").json()["items"] == []
 
 
+def test_an_attempt_reads_an_input_that_was_deleted_and_no_other_deleted_item(desk: Desk) -> None:
+    for kind, item in (("clips", desk.clip), ("skeletons", desk.skeleton), ("clips", desk.other_clip)):
+        assert desk.author.delete(f"/projects/lab/{kind}/{item}", headers={"If-Match": "*"}).is_success
+    assert desk.part("clip", desk.clip, "motion")["joints"] == ["hips"]
+    assert desk.attempt.get(f"/blobs/{digest(ORIGINAL)}").content == ORIGINAL
+    assert desk.part("skeleton", desk.skeleton, "hierarchy") is None
+    assert desk.part("clip", desk.other_clip, "motion") is None
+    place = {"kind": "clip", "item": desk.clip, "revision": 1, "part": "motion"}
+    assert desk.author.post("/projects/lab/parts", json={"parts": [place]}).json() == {"documents": [None]}
+
+
 def test_an_attempt_neither_reads_nor_publishes_blobs_of_its_author_in_another_project(desk: Desk) -> None:
     assert desk.attempt.get(f"/blobs/{digest(SECRET)}").status_code == 404
     assert desk.stage(SECRET).json()["code"] == "missing-blobs"

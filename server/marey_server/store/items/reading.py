@@ -81,14 +81,13 @@ _PART = (
 )
 _PARTS_OF_PROJECT = Prepared(
     select(
-        item.c.kind, revision_part.c.item_id, revision_part.c.number, revision_part.c.part, document.c.digest,
-        document.c.size_bytes,
+        item.c.kind, item.c.deleted_us, revision_part.c.item_id, revision_part.c.number, revision_part.c.part,
+        document.c.digest, document.c.size_bytes,
     )
     .join(item, item.c.id == revision_part.c.item_id)
     .join(document, document.c.digest == revision_part.c.document_digest)
     .where(
         item.c.project_id == bindparam("project_id"),
-        item.c.deleted_us.is_(None),
         revision_part.c.item_id.in_(bindparam("items", expanding=True)),
         revision_part.c.number.in_(bindparam("numbers", expanding=True)),
     )
@@ -225,7 +224,9 @@ MOST_BYTES_AT_ONCE = 32 << 20
 def load_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace]) -> list[dict[str, Any] | None]:
     """Load the documents of parts with encoded arrays, in the order of the request; None for a missing part.
 
-    If the documents together are too large, those at the end are left out; the first one is always loaded.
+    A deleted item has no parts, except for an attempt whose job has this revision as an input: it may come from a
+    version of a dataset that still has the item. If the documents together are too large, those at the end are left
+    out; the first one is always loaded.
     """
     project_row = projects.require(tx, project)
     keys = {
@@ -234,6 +235,7 @@ def load_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace]) -> li
     }
     rows = tx.run(_PARTS_OF_PROJECT, {"project_id": project_row.id, **keys})
     refused = reach.unreachable_places(tx, {(row.item_id, row.number) for row in rows})
+    refused |= {(row.item_id, row.number) for row in rows if row.deleted_us is not None} - reach.pinned_places(tx)
     found = {
         (row.kind, row.item_id, row.number, row.part): row for row in rows if (row.item_id, row.number) not in refused
     }

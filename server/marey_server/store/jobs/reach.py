@@ -1,7 +1,8 @@
 """Items that an attempt may read: the inputs of its job, and the items to which these inputs and the parameters refer.
 
 A clip names its skeleton, an annotation its clip, an evaluation its clips. Jobs follow such references while they run,
-so an attempt may read the items that the references lead to, in its project, and no others.
+so an attempt may read the items that the references lead to, in its project, and no others. Of deleted items, it may
+read only the revisions that are inputs of its job, since these may come from an earlier version of a dataset.
 """
 
 from __future__ import annotations
@@ -51,6 +52,11 @@ def unreachable_items(tx: Transaction, wanted: Iterable[str]) -> set[str]:
     return beyond.difference(_named_items(tx, pins)) if beyond else beyond
 
 
+def pinned_places(tx: Transaction) -> frozenset[PinnedPlace]:
+    """Return the revisions that are inputs of the attempt's job; none if the caller is not an attempt."""
+    return _pins_of(tx).places if tx.principal.kind == "attempt" else frozenset()
+
+
 def unreachable_places(tx: Transaction, wanted: Iterable[PinnedPlace]) -> set[PinnedPlace]:
     """Return those of the wanted revisions that the caller may not read; none if the caller is not an attempt."""
     if tx.principal.kind != "attempt":
@@ -72,16 +78,17 @@ def reachable_blobs(tx: Transaction, digests: Collection[str]) -> set[str]:
         .where(or_(job.c.id == principal.job_id, job.c.parent_id == principal.job_id))
     )
     of_document = (
-        select(document_blob.c.blob_digest, revision_part.c.item_id, revision_part.c.number)
+        select(document_blob.c.blob_digest, item.c.deleted_us, revision_part.c.item_id, revision_part.c.number)
         .join(revision_part, revision_part.c.document_digest == document_blob.c.document_digest)
         .join(item, item.c.id == revision_part.c.item_id)
-        .where(item.c.project_id == principal.project_id, item.c.deleted_us.is_(None))
+        .where(item.c.project_id == principal.project_id)
     )
     found: set[str] = set()
     for some in _batched(digests):
         found.update(tx.execute(of_job.where(job_blob.c.blob_digest.in_(some))).scalars())
         rows = tx.execute(of_document.where(document_blob.c.blob_digest.in_(some))).all()
         refused = unreachable_places(tx, {(row.item_id, row.number) for row in rows}) if rows else set()
+        refused |= {(row.item_id, row.number) for row in rows if row.deleted_us is not None} - pinned_places(tx)
         found.update(row.blob_digest for row in rows if (row.item_id, row.number) not in refused)
     return found
 
