@@ -15,6 +15,7 @@ from pydantic_core import PydanticUndefined
 import marey_server.app  # noqa: F401 - loads every module, and so every class of errors
 from marey_client.cli.app import app
 from marey_motion.importing import checks
+from marey_schemas.documents.evaluations import HEADLINE_METRICS
 from marey_schemas.queries.fields import FIELDS, OPERATORS
 from marey_schemas.queries.grammar import MOST_CHARACTERS, MOST_COMPARED_VALUES, MOST_CONDITIONS
 from marey_schemas.queue.job_kinds import job_kinds
@@ -124,6 +125,10 @@ def job_kinds_page() -> str:
         text += _table(("input", "takes", "meaning"), inputs) if inputs else ""
         schema = kind.params.model_json_schema()
         text += _table(("parameter", "type", "meaning"), list(_properties(schema, schema.get("$defs", {}))))
+        if kind.name == "evaluate":
+            metrics = [(f"`{name}`", metric.meaning) for name, metric in HEADLINE_METRICS.items()]
+            text += "Metrics of the result, as `marey dataset bisect --metric` names them:\n\n"
+            text += _table(("metric", "meaning"), metrics)
     return NOTE + text.rstrip() + "\n"
 
 

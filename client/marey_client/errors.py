@@ -57,6 +57,10 @@ class NothingToArchive(MareyError):
     """All commits of the version to archive are among those to leave out."""
 
 
+class CannotBisect(MareyError):
+    """No first bad version can be searched for between two versions of a dataset; the text gives the reason."""
+
+
 class FileChanged(MareyError):
     """A file changed while it was being sent."""
 

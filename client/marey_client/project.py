@@ -7,7 +7,9 @@ from functools import cached_property
 from typing import Any
 
 from marey_client.access import Members, change_quotas
+from marey_client.handles.bisections import read_range
 from marey_client.handles.coverage_streams import CoverageStreams
+from marey_client.handles.crossings import Crossing, Limit, OnMeasured, VersionEvaluations, find_crossing
 from marey_client.handles.datasets import Datasets
 from marey_client.handles.edits import Commands
 from marey_client.handles.evaluations import EvaluationHandle
@@ -31,6 +33,7 @@ from marey_client.requests import (
 )
 from marey_client.transport import Params, as_json, read_model
 from marey_schemas.access import Project, ProjectChange, QuotaChange, QuotasInUse
+from marey_schemas.datasets.naming import MAIN
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.job_params import (
     AlignParams,
@@ -258,6 +261,44 @@ class ProjectHandle(ProjectItems):
     def evaluation(self, job: Job, *, on_progress: OnProgress | None = None) -> EvaluationHandle:
         """Return the evaluation created by a job, after waiting for its end. Raises `JobUnsuccessful`."""
         return self.evaluations.get(self._made_by(job, on_progress))
+
+    def bisect(
+        self,
+        dataset: str,
+        good: str,
+        bad: str = MAIN,
+        *,
+        metric: str,
+        limit: Limit | None = None,
+        first_parent: bool = False,
+        path: str = "",
+        into: str | None = None,
+        normaliser: EvaluationHandle | str | None = None,
+        priority: int = 0,
+        cache: CacheMode = "use",
+        on_progress: OnProgress | None = None,
+        on_measured: OnMeasured | None = None,
+        **options: Any,
+    ) -> Crossing:
+        """Find the first version of a dataset, between `good` and `bad`, at which a metric has crossed a value.
+
+        Evaluates the clips below `path` at both ends, then at few versions between them. A version is bad if `metric`,
+        one of `HEADLINE_METRICS`, exceeds `limit`, for example `Limit(0.3)` or `Limit(0.5, above=False)`; by default,
+        the limit is half-way between the values at the ends. A version that cannot be evaluated is skipped. The
+        evaluations are stored in the folder `into`, by default the dataset's name with `-bisect` at its end. If the
+        search is interrupted, the same call continues it, because existing evaluations are reused.
+
+        `options` are those of `EvaluateParams`. Raises `CannotBisect` if there is no such metric, if `good` is not
+        among the versions before `bad`, or if an end is not what it is given as.
+        """
+        handle = self.datasets.at(dataset)
+        evaluations = VersionEvaluations(
+            self, handle, metric, EvaluateParams.model_validate(options),
+            path=path, into=into, normaliser=normaliser, priority=priority, cache=cache, on_progress=on_progress,
+        )  # fmt: skip
+        return find_crossing(
+            read_range(handle, good, bad, first_parent=first_parent), evaluations, limit, on_measured
+        )  # fmt: skip
 
     def train_model(
         self,

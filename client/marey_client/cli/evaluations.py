@@ -17,6 +17,8 @@ from marey_client.cli.terminal.typed_values import is_frame
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from marey_client.handles.evaluations import EvaluationHandle
     from marey_client.marey import Marey
 
@@ -33,6 +35,20 @@ EVALUATE = OptionsOf(
     without=("loops", "trims"),
 )
 
+Loops = Annotated[
+    list[str] | None, typer.Option("--loop", help="A clip that is a loop, or a folder of such clips; may be repeated.")
+]
+Trims = Annotated[
+    list[str] | None,
+    typer.Option("--trim", help="Frames of a clip to use, as project/folder/clip=first:stop; may be repeated."),
+]
+Normaliser = Annotated[
+    str | None,
+    typer.Option(
+        help="Scale features as in this evaluation, so that the results can be compared: project/folder/name."
+    ),
+]
+
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
@@ -46,19 +62,9 @@ def evaluate(
     params: Chosen,
     job: Chosen,
     into: Annotated[str | None, typer.Option(help="Folder of the result; default: the folder of the clips.")] = None,
-    loop: Annotated[
-        list[str] | None, typer.Option(help="A clip that is a loop, or a folder of such clips; may be repeated.")
-    ] = None,
-    trim: Annotated[
-        list[str] | None,
-        typer.Option(help="Frames of a clip to use, as project/folder/clip=first:stop; may be repeated."),
-    ] = None,
-    normaliser: Annotated[
-        str | None,
-        typer.Option(
-            help="Scale features as in this evaluation, so that the results can be compared: project/folder/name."
-        ),
-    ] = None,
+    loop: Loops = None,
+    trim: Trims = None,
+    normaliser: Normaliser = None,
     out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
     wait: Wait = True,
     as_json: AsJson = False,
@@ -72,15 +78,10 @@ def evaluate(
             "--out writes the result of the job, but --no-wait does not wait for it; leave out one of them"
         )
     folder, last = _place_beside(addresses[0].path)
-    if loop:
-        params.setdefault("database", {}).setdefault("end_policy", "loop")
     params.setdefault("name", f"{last}-eval" if last else "evaluation")
     with connect(context) as marey:
         project = marey.project(addresses[0].project)
-        if loop:
-            params["loops"] = [one.id for place in loop for one in _clips_in(marey, Address.parse(place))]
-        if trim:
-            params["trims"] = dict(_trim(marey, text) for text in trim)
+        add_clip_options(marey, params, loop, trim)
         submitted = project.evaluate(
             [clips_at(marey, address) for address in addresses],
             into=folder if into is None else into.strip("/"),
@@ -99,6 +100,18 @@ def evaluate(
     if out is not None:
         print_message(f"report: {out}")
     print_commit(ended)
+
+
+def add_clip_options(marey: Marey, params: Chosen, loop: Sequence[str] | None, trim: Sequence[str] | None) -> None:
+    """Add the options that name clips to those of an evaluation, with the ids of the clips.
+
+    With loops, clips continue at their end unless the options choose another behaviour.
+    """
+    if loop:
+        params.setdefault("database", {}).setdefault("end_policy", "loop")
+        params["loops"] = [one.id for place in loop for one in _clips_in(marey, Address.parse(place))]
+    if trim:
+        params["trims"] = dict(_trim(marey, text) for text in trim)
 
 
 def _place_beside(path: str) -> tuple[str, str]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypedDict, Unpack
 
 from marey_client.access import ANY_STATE
 from marey_client.errors import NotFound, RequestFailed
+from marey_client.handles.bisections import Bisection, IsBad, OnStep, bisect, read_range
 from marey_client.handles.proposals import Proposals
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
@@ -300,6 +301,25 @@ class DatasetHandle:
         """Return the commits that last changed the parts, the path and the tags of an entry."""
         query: Params = {"version": version, "entry": path, "kind": kind}
         return self.transport.get(EntryOrigins, f"{self.url}/blame", query)
+
+    def bisect(
+        self,
+        good: str,
+        bad: str,
+        is_bad: IsBad,
+        *,
+        first_parent: bool = False,
+        on_step: OnStep | None = None,
+    ) -> Bisection:
+        """Find the first bad version among those after `good` that led to `bad`, by halving them again and again.
+
+        `is_bad` is called with the commits of versions to test, first with the two ends. It returns whether the version
+        is bad, or None if it cannot be tested. With `first_parent`, only the first parents of merges are followed.
+        `ProjectHandle.bisect` tests a metric of the evaluation of each version.
+
+        Raises `CannotBisect` if `good` is not among the versions before `bad`, or if an end is not what it is given as.
+        """
+        return bisect(read_range(self, good, bad, first_parent=first_parent), is_bad, on_step)
 
     def check_out(self, version: str = MAIN, *, discard: bool = False) -> CheckoutAnswer:
         """Bring the folder of the dataset to the state of a version.

@@ -1,0 +1,280 @@
+"""Search for the first version of a dataset at which a metric of its evaluation has crossed a value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from marey_client.errors import CannotBisect, Invalid, JobUnsuccessful
+from marey_client.handles.bisections import Bisection, VersionRange, VersionTest, bisect
+from marey_client.handles.datasets import DatasetHandle
+from marey_client.handles.evaluations import EvaluationHandle, trial_rows
+from marey_client.jobs import Jobs, OnProgress
+from marey_client.project_items import ProjectItems
+from marey_client.requests import evaluate_request
+from marey_schemas.datasets.commits import Commit
+from marey_schemas.documents.evaluations import CONFIDENCE, HEADLINE_METRICS, RESAMPLES
+from marey_schemas.queue.job_params import EvaluateParams
+from marey_schemas.queue.jobs import CacheMode, DatasetInput, Job, JobOutput, JobState
+
+NAME_DIGITS = 12
+"""Number of digits of a commit's digest in the name of its evaluation."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Value of a metric; versions with a value above it, or below it if `above` is false, are bad."""
+
+    value: float
+    above: bool = True
+
+    def exceeded_by(self, value: float) -> bool:
+        """Return whether a value is bad."""
+        return value > self.value if self.above else value < self.value
+
+    def __str__(self) -> str:
+        return f"{'above' if self.above else 'below'} {self.value:.6g}"
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Value of the metric at a version; None if the version cannot be evaluated, for the given `reason`.
+
+    `output` is the revision of the evaluation, and `reused` is true if it existed before or another version has the
+    same entries.
+    """
+
+    commit: Commit
+    value: float | None
+    output: JobOutput | None = None
+    reused: bool = False
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class ParentChange:
+    """Change of the metric from a parent of the first bad version to this version.
+
+    `interval` has the bounds of the mean change of a trial at 95 % confidence, by bootstrap over the trials. It is None
+    if the metric is no mean over trials, or if fewer than two trials define it.
+    """
+
+    parent: Measurement
+    interval: tuple[float, float] | None
+
+    @property
+    def may_be_noise(self) -> bool:
+        """Whether the interval contains 0."""
+        return self.interval is not None and self.interval[0] <= 0.0 <= self.interval[1]
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """Result of a search for the first version at which a metric has crossed a value.
+
+    Parameters
+    ----------
+    search : the tests of versions, and the version or the versions that they leave
+    metric, limit : what was tested
+    measurements : values at the tested versions and at the parents of the first bad one, in the order of measuring
+    changes : if a single version is left, the change from each of its parents
+    """
+
+    search: Bisection
+    metric: str
+    limit: Limit
+    measurements: tuple[Measurement, ...]
+    changes: tuple[ParentChange, ...]
+
+    @property
+    def first_bad(self) -> Commit | None:
+        """The first bad version, or None if several versions can be the first bad one."""
+        return self.search.first_bad
+
+    def value(self, commit: Commit) -> float | None:
+        """Return the value of the metric at a version; None if it was not measured or cannot be."""
+        return next((one.value for one in self.measurements if one.commit.digest == commit.digest), None)
+
+
+OnMeasured = Callable[[VersionTest, Measurement, int], None]
+"""Function called after each test with its result, the value, and the number of tests that are still expected."""
+
+
+@dataclass
+class VersionEvaluations:
+    """Evaluations of versions of a dataset; versions with the same entries are evaluated once.
+
+    Parameters
+    ----------
+    project, dataset : the dataset and its project
+    metric : name of a metric of the headline
+    params : options of the evaluations; each gets a name of its own
+    path : folder of the dataset whose clips are evaluated; empty: all clips
+    into : folder that receives the evaluations; None: the name of the dataset with `-bisect` at its end
+
+    Raises `CannotBisect` if there is no such metric.
+    """
+
+    project: ProjectItems
+    dataset: DatasetHandle
+    metric: str
+    params: EvaluateParams
+    path: str = ""
+    into: str | None = None
+    normaliser: EvaluationHandle | str | None = None
+    priority: int = 0
+    cache: CacheMode = "use"
+    on_progress: OnProgress | None = None
+    measured: dict[str, Measurement] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        if self.metric not in HEADLINE_METRICS:
+            names = ", ".join(HEADLINE_METRICS)
+            raise CannotBisect(f"evaluations have no metric {self.metric!r}; their metrics are {names}")
+
+    def measure(self, commit: Commit) -> Measurement:
+        """Return the value of the metric at a version, from its evaluation or that of a version with the same entries.
+
+        An evaluation that is interrupted by Ctrl-C is cancelled.
+        """
+        if commit.digest not in self.measured:
+            same = next((one for one in self.measured.values() if one.commit.tree == commit.tree), None)
+            self.measured[commit.digest] = (
+                self._evaluated(commit)
+                if same is None
+                else Measurement(commit, same.value, same.output, True, same.reason)
+            )
+        return self.measured[commit.digest]
+
+    def _evaluated(self, commit: Commit) -> Measurement:
+        jobs = Jobs(self.project.transport)
+        try:
+            submitted = self._submit(jobs, commit)
+        except Invalid as error:  # the version has no clips, or clips without content
+            return Measurement(commit, None, reason=error.detail)
+        try:
+            ended = jobs.wait(submitted.id, on_progress=self.on_progress, require_success=False)
+        except KeyboardInterrupt:
+            jobs.cancel(submitted.id)
+            raise
+        if ended.state is JobState.CANCELLED:
+            raise JobUnsuccessful(f"job {ended.id} was cancelled", ended)
+        if ended.state is not JobState.SUCCEEDED:
+            return Measurement(commit, None, reason=f"job {ended.id} failed" + _detail(ended))
+        (output,) = jobs.outputs(ended.id)
+        value, reused = (ended.result or {}).get(self.metric), ended.cached_from is not None
+        reason = f"{self.metric} is not defined" if value is None else ""
+        return Measurement(commit, None if value is None else float(value), output, reused, reason)
+
+    def _submit(self, jobs: Jobs, commit: Commit) -> Job:
+        clips = DatasetInput(dataset=self.dataset.name, version=commit.digest, path=self.path)
+        name = commit.digest.partition(":")[2][:NAME_DIGITS]
+        params = self.params.model_copy(update={"name": name, "report": False})
+        request = evaluate_request(self.project, clips, params, self.normaliser)
+        chosen = {
+            "into": f"{self.dataset.name}-bisect" if self.into is None else self.into,
+            "priority": self.priority,
+            "cache": self.cache,
+        }
+        return jobs.submit(self.project.name, request.model_copy(update=chosen))
+
+    def interval(self, before: Measurement, after: Measurement) -> tuple[float, float] | None:
+        """Return the bounds of the mean change of the metric from one version to another, as in `ParentChange`."""
+        metric = HEADLINE_METRICS[self.metric].of_trials
+        if metric is None or before.output is None or after.output is None:
+            return None
+        return change_interval(self._trials(before.output), self._trials(after.output), metric)
+
+    def _trials(self, output: JobOutput) -> list[dict[str, Any]]:
+        return list(trial_rows(self.project.evaluations.get(output.item).document(revision=output.revision)))
+
+
+def find_crossing(
+    among: VersionRange, evaluations: VersionEvaluations, limit: Limit | None, on_measured: OnMeasured | None = None
+) -> Crossing:
+    """Evaluate the ends, then versions between them until the first bad one is found.
+
+    Without `limit`, it is half-way between the values at the ends. Raises `CannotBisect` if the ends cannot be
+    evaluated, or if the good end is not good or the bad end not bad.
+    """
+    limit = _checked_limit(among, evaluations, limit)
+
+    def is_bad(commit: Commit) -> bool | None:
+        value = evaluations.measure(commit).value
+        return None if value is None else limit.exceeded_by(value)
+
+    def on_step(step: VersionTest, left: int) -> None:
+        if on_measured is not None:
+            on_measured(step, evaluations.measure(step.commit), left)
+
+    found = bisect(among, is_bad, on_step)
+    changes = _changes(among, evaluations, found.first_bad) if found.first_bad is not None else ()
+    return Crossing(found, evaluations.metric, limit, tuple(evaluations.measured.values()), changes)
+
+
+def _checked_limit(among: VersionRange, evaluations: VersionEvaluations, limit: Limit | None) -> Limit:
+    good, bad = _end(evaluations, among.good, "good"), _end(evaluations, among.bad, "bad")
+    values = f"{evaluations.metric} is {good:.6g} at the good version and {bad:.6g} at the bad one"
+    if limit is None:
+        if good == bad:
+            raise CannotBisect(f"{values}, so no value is half-way between them")
+        limit = Limit((good + bad) / 2, above=bad > good)
+    if limit.exceeded_by(good):
+        raise CannotBisect(f"{values}; the good one is {limit}, too, so it is not good")
+    if not limit.exceeded_by(bad):
+        raise CannotBisect(f"{values}; the bad one is not {limit}, so it is not bad")
+    return limit
+
+
+def _end(evaluations: VersionEvaluations, commit: Commit, which: str) -> float:
+    found = evaluations.measure(commit)
+    if found.value is None:
+        raise CannotBisect(f"the {which} version, {commit.digest}, cannot be evaluated: {found.reason}")
+    return found.value
+
+
+def _changes(among: VersionRange, evaluations: VersionEvaluations, first_bad: Commit) -> tuple[ParentChange, ...]:
+    """Measure the parents of the first bad version; some of them may have been taken as good without a test."""
+    after = evaluations.measure(first_bad)
+    changes = []
+    for digest in among.parents[first_bad.digest]:
+        commit = among.commits.get(digest) or evaluations.dataset.at(digest)
+        before = evaluations.measure(commit)
+        changes.append(ParentChange(before, evaluations.interval(before, after)))
+    return tuple(changes)
+
+
+def change_interval(
+    before: Iterable[Mapping[str, Any]], after: Iterable[Mapping[str, Any]], metric: str
+) -> tuple[float, float] | None:
+    """Compute the bounds of the mean change of a metric over the trials that both evaluations define.
+
+    Parameters
+    ----------
+    before, after : one row for each trial, as `trial_rows` yields
+    metric : name of the metric
+
+    Returns
+    -------
+    (2,) float    bounds at 95 % confidence, in the unit of the metric, by bootstrap over trials; None if fewer than two
+        trials define the metric in both
+    """
+    earlier = {row["trial"]: row.get(metric) for row in before}
+    pairs = [
+        (first, second)
+        for row in after
+        if (second := row.get(metric)) is not None and (first := earlier.get(row["trial"])) is not None
+    ]
+    if len(pairs) < 2:
+        return None
+    changes = np.array([second - first for first, second in pairs])
+    drawn = np.random.default_rng(0).integers(len(changes), size=(RESAMPLES, len(changes)))
+    low, high = np.quantile(changes[drawn].mean(axis=1), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)
+
+
+def _detail(job: Job) -> str:
+    return "" if job.failure is None else f" ({job.failure.code}): {job.failure.detail}"
