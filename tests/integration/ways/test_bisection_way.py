@@ -238,6 +238,15 @@ def test_wrong_options_are_refused_before_anything_is_evaluated(
     assert list(lab.jobs()) == []
 
 
+def test_a_change_within_its_interval_is_called_possible_noise(gaits: DatasetHandle, run: CommandLine) -> None:
+    spoiled = spoil(gaits)
+    others = {"v1": spoiled.digest, "offset_mean_m": "transitions_per_s"}
+    done = run(*(others.get(word, word) for word in BISECT))
+    assert "Drop the fast walk" in done.stdout
+    assert re.search(r"95 % interval -\S+ to [+-]\S+", done.stdout)
+    assert re.search(r"the interval of the change from [0-9a-f]{12} contains 0: the crossing may be noise", done.stderr)
+
+
 def test_any_test_of_versions_can_be_searched_with(gaits: DatasetHandle) -> None:
     spoiled = spoil(gaits)
     found = gaits.bisect("v1", "main", lambda commit: commit.entries < 9)
