@@ -65,6 +65,8 @@ def entries_at(items: Items[Handle], place: DatasetInput) -> Iterator[tuple[Entr
                 present[entry.item] = items.get(entry.item).item
             except NotFound:
                 deleted = deleted or {one.id: one.item for one in items.list(deleted=True)}
+                if entry.item not in deleted:
+                    raise
                 present[entry.item] = deleted[entry.item]
         yield entry, present[entry.item]
 

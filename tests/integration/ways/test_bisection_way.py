@@ -36,6 +36,8 @@ WORDS = ("--speeds", "1", "--turns=-50,50", "--duration", "3", "--no-baseline")
 """The options of `GRID` on the command line."""
 BISECT_WITHOUT_LIMIT = ("dataset", "bisect", "lab/gaits", "--good", "v1", "--metric", "offset_mean_m", *WORDS)
 BISECT = (*BISECT_WITHOUT_LIMIT, "--half-way")
+LONG = ("--speeds", "1:3:0.5", "--duration", "100")
+"""Options that make an evaluation take so long that it can be interrupted."""
 LEFT_TURNS = [f"raw/walk {speed} 60" for speed in ("1", "1.5", "2")]
 
 
@@ -183,7 +185,7 @@ def test_an_interrupted_search_is_continued_by_the_same_command(
     lab: ProjectHandle, gaits: DatasetHandle, run: CommandLine, marey: Marey
 ) -> None:
     spoiled = spoil(gaits)
-    process = run.start(*BISECT)
+    process = run.start(*BISECT, *LONG)
     assert process.stderr is not None
     for line in process.stderr:
         if " is bad: " in line:
@@ -195,7 +197,7 @@ def test_an_interrupted_search_is_continued_by_the_same_command(
     assert "the same command continues the search and reuses the 2 evaluations made so far" in told
     assert marey.jobs.wait(running, require_success=False).state is JobState.CANCELLED
 
-    done = run(*BISECT)
+    done = run(*BISECT, *LONG)
     assert short(spoiled) in done.stdout
     assert done.stderr.count("(reused)") == 2
 
