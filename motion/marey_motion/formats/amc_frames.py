@@ -244,7 +244,7 @@ def _fail(
             f"the skeleton has no bone {excerpt(word[0])!r}; use the ASF that belongs to this AMC", code="unknown-bone"
         )
     if stopped == _REPEATED_BONE:
-        raise lines.error(f"frame {state[_NUMBER]} has two lines for the bone", joint=bone.name)
+        raise lines.error(f"the bone has a second line in frame {state[_NUMBER]}; remove one", joint=bone.name)
     if stopped == _WRONG_WIDTH:
         cut = state[_FOUND] < len(bone.channels) and not lines.data[state[_POSITION] :].strip(b"\r\n\t ").count(b"\n")
         raise lines.error(

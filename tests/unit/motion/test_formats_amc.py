@@ -147,7 +147,7 @@ def test_gaps_in_the_numbers_of_frames_are_told() -> None:
         (AMC.replace("shin 70", "shin 1e999"), 7, "shin", "too large"),
         (AMC.replace("shin 70", "shin 7,0"), 7, "shin", "decimal comma"),
         (AMC.replace("shin 70", "knee 70"), 7, None, "no bone 'knee'"),
-        (AMC.replace("shin 70", "thigh 1 2 3"), 7, "thigh", "twice"),
+        (AMC.replace("shin 70", "thigh 1 2 3"), 7, "thigh", "second line"),
         (AMC.replace("shin 70\n", ""), 7, "shin", "no line for this bone"),
         (AMC[: AMC.index("thigh 40 50 61")], 11, "thigh", "cut off"),
         (AMC[: AMC.index(" 61")] + "\n", 11, "thigh", "cut off"),
