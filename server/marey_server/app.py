@@ -61,6 +61,7 @@ from marey_server.store.database.opening import opening
 from marey_server.store.database.schema import upgrade_schema
 from marey_server.store.transaction import Transaction
 from marey_server.store.wakeups import wakeups
+from marey_server.webhooks.delivering import delivering
 
 log = logging.getLogger(__name__)
 
@@ -159,7 +160,7 @@ async def listening(app: Application) -> AsyncIterator[Running]:
     host, port = sockets[0].getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host
     try:
-        async with keeping_house(app.services), following_feed(app.services):
+        async with keeping_house(app.services), following_feed(app.services), delivering(app.services):
             yield Running(app, f"http://{shown}:{port}", server)
     finally:
         await _drain(app.services, server, connections)

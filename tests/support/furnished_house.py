@@ -103,6 +103,9 @@ BODIES = {
     "UploadCreate": {"length": 5},
     "CoverageStreamCreate": {"frame_rate_hz": 60},
     "CoverageFrames": {"offset": 0, "ends_take": True},
+    "WebhookCreate": {"url": "https://hooks.example.org/marey"},
+    "WebhookChange": {"description": CANARY},
+    "WebhookRotation": {"grace_s": 60},
     "AnnotationChange": {"commands": [{"command": "clear"}]},
     "AnnotationImport": {"document": {"sections": [{"start_idx": 0, "end_idx": 0}]}},
     "EditPreviewRequest": {"commands": [{"command": "trim", "start": 0, "stop": 1}]},
@@ -246,7 +249,12 @@ def _furnish(owner: Any) -> dict[str, str]:
     proposal = f"{datasets}/{CANARY}/proposals"
     assert owner.post(proposal, json=BODIES["ProposalCreate"]).status_code == 201
     assert owner.post(f"{proposal}/1/comments", json=BODIES["CommentCreate"]).status_code == 201
+    webhooks = "/projects/lab/webhooks"
+    hook = owner.post(webhooks, json={"url": f"https://hooks.invalid/{CANARY}", "description": CANARY}).json()["id"]
+    delivery = owner.post(f"{webhooks}/{hook}/test").json()["id"]
+    assert owner.patch(f"{webhooks}/{hook}", json={"paused": True}).is_success
     return {
+        "webhook": hook, "delivery": delivery,
         "collection": collection, "item": made.json()["id"], "annotation": annotation.json()["id"], "dataset": CANARY,
         "ref": "spare", "version": "spare", "proposal": "1",
     }  # fmt: skip

@@ -19,6 +19,7 @@ from marey_server.handlers import (
     samples,
     searches,
     uploads,
+    webhooks,
 )
 from marey_server.handlers.queue import jobs, leases, pipelines
 from marey_server.handlers.versions import contents, datasets, differences, proposals
@@ -48,6 +49,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     *blobs.RESOURCES,
     *uploads.RESOURCES,
     *events.RESOURCES,
+    *webhooks.RESOURCES,
     *documentation.RESOURCES,
     *health.RESOURCES,
 )

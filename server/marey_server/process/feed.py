@@ -20,7 +20,7 @@ from marey_server.process.services import Services
 from marey_server.store import events
 from marey_server.store.database.lanes import SERVER
 from marey_server.store.transaction import Transaction
-from marey_server.store.wakeups import COMMITTED_EVENTS, wakeups, work_topic
+from marey_server.store.wakeups import COMMITTED_EVENTS, NUMBERED_EVENTS, wakeups, work_topic
 
 T = TypeVar("T")
 
@@ -84,7 +84,7 @@ class _FeedPosition:
         complete = False
         while not complete:
             news = await self._read(events.read_news, self._last)
-            wakeups.announce(news.topics)
+            wakeups.announce({*news.topics, NUMBERED_EVENTS} if news.last > self._last else news.topics)
             self._last, complete = news.last, news.complete
         await self._announce_due()
 

@@ -29,6 +29,7 @@ from marey_schemas.queue.log_lines import LogForm, log_to_standard_error
 
 _SANE_ID = re.compile(r"[A-Za-z0-9._:-]{8,128}")
 _BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30)
+_DELAYS_S = (0.01, 0.05, 0.1, 0.5, 1, 5, 30, 120, 600, 3600, 86400)
 _MALFORMED = (
     "Invalid Host header",
     "Invalid header name",
@@ -133,9 +134,20 @@ class Metrics:
         )  # fmt: skip
         self.imports = Counter("marey_imported_files", "Files imported.", ("status",), registry=self.registry)
         self.draining = Gauge("marey_draining", "1 while the server is stopping.", registry=self.registry)
+        self._add_webhooks()
         self._rendering = asyncio.Lock()
         self._renderings = 0
         self._rendered = b""
+
+    def _add_webhooks(self) -> None:
+        self.webhook_deliveries = Counter(
+            "marey_webhook_deliveries", "Attempts to deliver to webhooks, by outcome: delivered, retry (will be "
+            "repeated) or dead (given up).", ("outcome",), registry=self.registry,
+        )  # fmt: skip
+        self.webhook_delay = Histogram(
+            "marey_webhook_delay_seconds", "Time from an event to its delivery.", buckets=_DELAYS_S,
+            registry=self.registry,
+        )  # fmt: skip
 
     async def exposition(self) -> tuple[bytes, str]:
         """Return all metrics in the text format of Prometheus, and its media type.

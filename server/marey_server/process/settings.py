@@ -6,6 +6,7 @@ import difflib
 import os
 from collections.abc import Mapping
 from dataclasses import fields
+from ipaddress import IPv4Network, IPv6Network
 from pathlib import Path
 from typing import Literal
 
@@ -209,6 +210,16 @@ class Settings(BaseSettings):
         Quotas.project_stored_bytes,
         ge=0,
         description="Greatest number of bytes that the revisions of a project's items take.",
+    )
+    project_webhooks: int = Field(
+        Quotas.project_webhooks, ge=0, description="Greatest number of webhooks of a project; 0: no webhooks."
+    )
+    webhook_networks: tuple[IPv4Network | IPv6Network, ...] = Field(
+        (),
+        description='Networks to which webhooks may be sent although they are not public, such as ["10.1.0.0/16"].',
+    )
+    webhook_failing_days: int = Field(
+        5, ge=0, description="Days after which a webhook is paused if all attempts have failed; 0: never."
     )
     events_days: int = Field(Retention.events_days, ge=0, description="Days for which events are kept; 0: for ever.")
     logs_days: int = Field(

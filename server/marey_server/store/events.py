@@ -48,7 +48,7 @@ def list_events(
     `GoneProblem` if events after `after` were deleted, unless `after` is 0, which means the oldest stored event.
     """
     require_kept(tx, after)
-    number = _number(tx)
+    number = number_of(tx)
     statement = select(*_COLUMNS, number.label("number"), project.c.name.label("project")).select_from(
         event.outerjoin(project, project.c.id == event.c.project_id)
     )
@@ -58,7 +58,7 @@ def list_events(
         statement = statement.where(event.c.project_id == projects.require(tx, project_name).id)
     if subject is not None:
         statement = statement.where(event.c.subject == subject)
-    rows = tx.execute(statement.where(_follows(tx, after)).order_by(number).limit(min(limit, MAX_EVENTS)))
+    rows = tx.execute(statement.where(follows(tx, after)).order_by(number).limit(min(limit, MAX_EVENTS)))
     return [_shown(row) for row in rows]
 
 
@@ -77,30 +77,40 @@ def require_kept(tx: Transaction, after: int) -> None:
         )
 
 
-def delete_oldest(tx: Transaction, age_us: int) -> int:
-    """Delete some of the oldest events if they are older than `age_us`, and return how many; the newest one is kept."""
-    number = _number(tx)
-    newest = newest_number(tx)
-    oldest = select(number.label("number"), event.c.at_us).where(_follows(tx, 0), number < newest)
+class OldEvents(NamedTuple):
+    """Oldest events: how many there are, and the number of the last one."""
+
+    found: int
+    last: int
+
+
+def find_oldest(tx: Transaction, age_us: int) -> OldEvents | None:
+    """Return some of the oldest events if they are older than `age_us`; the newest event is not among them."""
+    number = number_of(tx)
+    oldest = select(number.label("number"), event.c.at_us).where(follows(tx, 0), number < newest_number(tx))
     rows = tx.execute(oldest.order_by(number).limit(DELETED_AT_ONCE)).all()
     old = list(takewhile(lambda row: row.at_us < tx.now_us - age_us, rows))
-    if not old:
-        return 0
-    tx.execute(delete(event).where(_follows(tx, 0), number <= old[-1].number))
+    return OldEvents(len(old), old[-1].number) if old else None
+
+
+def delete_until(tx: Transaction, last: int) -> None:
+    """Delete the events up to the one numbered `last`, and store that they were deleted."""
+    tx.execute(delete(event).where(follows(tx, 0), number_of(tx) <= last))
     is_mark = server_state.c.key == _LAST_DELETED
-    if tx.execute(update(server_state).where(is_mark).values(value=old[-1].number)).rowcount == 0:
-        tx.execute(insert(server_state).values(key=_LAST_DELETED, value=old[-1].number))
-    return len(old)
+    if tx.execute(update(server_state).where(is_mark).values(value=last)).rowcount == 0:
+        tx.execute(insert(server_state).values(key=_LAST_DELETED, value=last))
 
 
 _COLUMNS = (event.c.at_us, event.c.kind, event.c.subject, event.c.actor, event.c.body)
 
 
-def _number(tx: Transaction) -> ColumnElement[int]:
+def number_of(tx: Transaction) -> ColumnElement[int]:
+    """Return the column of the numbers of events."""
     return event.c.number if tx.is_postgres else event.c.seq
 
 
-def _follows(tx: Transaction, after: int) -> ColumnElement[bool]:
+def follows(tx: Transaction, after: int) -> ColumnElement[bool]:
+    """Return the condition for events after the one numbered `after`."""
     if tx.is_postgres:
         return event.c.number > after
     return and_(_UNNUMBERED, event.c.seq > after)  # the first condition makes the index of the feed usable
@@ -154,17 +164,17 @@ class News(NamedTuple):
 
 def newest_number(tx: Transaction) -> int:
     """Return the number of the newest event in the feed, 0 if there is none."""
-    return int(tx.execute(select(func.max(_number(tx)))).scalar() or 0)
+    return int(tx.execute(select(func.max(number_of(tx)))).scalar() or 0)
 
 
 def read_news(tx: Transaction, after: int) -> News:
     """Read the events after the one numbered `after`; return the topics of the waiting requests that they wake up."""
-    number = _number(tx)
+    number = number_of(tx)
     rows = tx.execute(
         select(number.label("number"), event.c.project_id, event.c.subject)
         .add_columns(job.c.kind, job.c.state, job.c.run_at_us, job.c.finished_us, job.c.concurrency_key)
         .select_from(event.outerjoin(job, job.c.id == event.c.subject))
-        .where(_follows(tx, after))
+        .where(follows(tx, after))
         .order_by(number)
         .limit(MAX_EVENTS)
     ).all()

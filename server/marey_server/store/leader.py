@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
-from sqlalchemy import case, or_, update
+from dataclasses import dataclass
+
+from sqlalchemy import case, or_, select, update
 
 from marey_server.store.tables import leader
 from marey_server.store.transaction import Transaction
+
+
+@dataclass(frozen=True)
+class Lead:
+    """Leadership of a process for one task."""
+
+    name: str
+    holder: str
+    fence: int
 
 
 def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | None:
@@ -29,6 +40,12 @@ def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | Non
     first = {"name": name, "holder": holder, "fence": 1, "expires_us": tx.now_us + ttl_us}
     made = tx.execute(tx.insert_or_ignore(leader, first).returning(leader.c.fence)).scalar_one_or_none()
     return None if made is None else int(made)
+
+
+def holds_lead(tx: Transaction, lead: Lead) -> bool:
+    """Return whether the leadership has not passed to another process; it cannot pass before the transaction ends."""
+    which = (leader.c.name == lead.name, leader.c.holder == lead.holder, leader.c.fence == lead.fence)
+    return tx.execute(select(leader.c.fence).where(*which).with_for_update(read=True)).first() is not None
 
 
 def give_up_lead(tx: Transaction, name: str, holder: str) -> None:

@@ -200,7 +200,10 @@ def change_limits(tx: Transaction, of: Literal["project", "user"], owner_id: str
     changed = _add(tx, owner_id, Held()).limits | change.model_dump(exclude_unset=True)
     limits = {name: limit for name, limit in changed.items() if limit is not None}
     tx.execute(update(holding).where(holding.c.owner_id == owner_id).values(limits=limits))
-    tx.emit(f"{of}.limited", owner_id, project_id=owner_id if of == "project" else None, limits=limits)
+    if of == "project":
+        tx.emit("project.limited", owner_id, project_id=owner_id, limits=limits)
+    else:
+        tx.emit("user.limited", owner_id, limits=limits)
     return show_quotas(tx, of, owner_id)
 
 

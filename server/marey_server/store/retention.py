@@ -1,4 +1,4 @@
-"""Retention: deletes events, logs and jobs that are older than the settings allow.
+"""Retention: deletes events, deliveries of webhooks, logs and jobs that are older than the settings allow.
 
 Work is done in batches, each in a transaction of its own, so that no other write waits long. If a process dies between
 two batches, the next round continues. A job that created a revision or a commit is never deleted.
@@ -28,6 +28,8 @@ from marey_server.store.tables import (
     staged_output,
 )
 from marey_server.store.transaction import Transaction
+from marey_server.store.webhooks import outbox
+from marey_server.store.webhooks.managing import forget_old_secrets
 
 DELETED_LOG = b"[This log was deleted because it was old.]\n"
 """Text that replaces a deleted log. Logs that are not longer than this text are kept."""
@@ -53,6 +55,7 @@ class Retired:
 
 def retire(database: Database, retention: Retention) -> Retired:
     """Delete events, logs and jobs that are too old, and return how many; may run in several processes at once."""
+    database.write(SYSTEM, forget_old_secrets)
     return Retired(
         events=_retire_events(database, retention.events_days) if retention.events_days else 0,
         logs=_retire_logs(database, retention.logs_days) if retention.logs_days else 0,
@@ -61,10 +64,23 @@ def retire(database: Database, retention: Retention) -> Retired:
 
 
 def _retire_events(database: Database, days: int) -> int:
+    """Delete old events, and deliveries of webhooks that ended long ago; return the number of events."""
     deleted = 0
-    while count := database.write(SYSTEM, events.delete_oldest, days * DAY_US):
+    while count := database.write(SYSTEM, _delete_oldest, days * DAY_US):
         deleted += count
+    while database.write(SYSTEM, outbox.delete_old_deliveries, days * DAY_US, BATCH) == BATCH:
+        pass
     return deleted
+
+
+def _delete_oldest(tx: Transaction, age_us: int) -> int:
+    """Delete some old events; count those that a webhook has not delivered, so that it reports them."""
+    old = events.find_oldest(tx, age_us)
+    if old is None:
+        return 0
+    outbox.count_missed(tx, old.last)
+    events.delete_until(tx, old.last)
+    return old.found
 
 
 # -- logs --------------------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import sqlalchemy
 from sqlalchemy import Connection, CursorResult, Executable, Table
 from sqlalchemy.dialects import postgresql, sqlite
 
+from marey_schemas.event_kinds import EventKind
 from marey_server.access.principal import Principal
 from marey_server.access.roles import STRICTEST
 from marey_server.store import tables
@@ -21,7 +22,7 @@ from marey_server.store.wakeups import COMMITTED_EVENTS, wakeups
 IN_LIST = 1000
 """Maximum number of list values in one statement; longer lists are split, because databases limit the parameters."""
 
-Event = tuple[str, str | None, str, dict[str, Any]]
+Event = tuple[EventKind, str | None, str, dict[str, Any]]
 """Kind of an event, project id, id of its subject, and body."""
 
 _INSERT_EVENT = Prepared(sqlalchemy.insert(tables.event))
@@ -40,6 +41,7 @@ class Quotas:
     user_stored_bytes: int = 128 * 2**30
     project_items: int = 1_000_000
     project_stored_bytes: int = 64 * 2**30
+    project_webhooks: int = 20
 
 
 class Transaction:
@@ -121,7 +123,7 @@ class Transaction:
                 sqlalchemy.select(sqlalchemy.func.pg_advisory_xact_lock(sqlalchemy.func.hashtextextended(name, 0)))
             )
 
-    def emit(self, kind: str, subject: str, *, project_id: str | None = None, **body: Any) -> None:
+    def emit(self, kind: EventKind, subject: str, *, project_id: str | None = None, **body: Any) -> None:
         """Record an event, which becomes visible when the transaction commits."""
         self.emit_each([(kind, project_id, subject, body)])
 

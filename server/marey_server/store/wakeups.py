@@ -13,6 +13,9 @@ from contextlib import contextmanager
 COMMITTED_EVENTS = "committed events"
 """Topic that is announced whenever a transaction with events was committed, in this process or in another."""
 
+NUMBERED_EVENTS = "numbered events"
+"""Topic that is announced when events can be read that have not been announced before."""
+
 
 def events_topic(project_id: str) -> str:
     """Return the topic of new events of a project."""

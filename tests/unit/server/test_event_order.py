@@ -55,7 +55,7 @@ class Overlap:
                 for _ in range(2):
                     subject = f"{name}-{len(self.written)}"
                     self.written.add(subject)
-                    tx.emit("overlap", subject, project_id=self.project_id)
+                    tx.emit("item.changed", subject, project_id=self.project_id)
             if not self.lab.database.is_sqlite:
                 self.open[name] = stack.pop_all()
 
@@ -97,8 +97,8 @@ LATE = ("ann", "ben", "ben", "numbers", "numbers", "follow", "ann")
 @pytest.mark.parametrize("by_insertion", [False, True])
 def test_an_order_by_insertion_would_lose_events(lab: Lab, monkeypatch: pytest.MonkeyPatch, by_insertion: bool) -> None:
     if by_insertion and not lab.database.is_sqlite:
-        monkeypatch.setattr(events, "_number", lambda _tx: event.c.seq)
-        monkeypatch.setattr(events, "_follows", lambda _tx, after: event.c.seq > after)
+        monkeypatch.setattr(events, "number_of", lambda _tx: event.c.seq)
+        monkeypatch.setattr(events, "follows", lambda _tx, after: event.c.seq > after)
     overlap = Overlap(lab)
     for name in LATE:
         overlap.follow() if name == "follow" else overlap.turn(name)
@@ -114,12 +114,12 @@ def test_events_do_not_wait_for_transactions_that_are_open(lab: Lab) -> None:
     elsewhere = sqlalchemy.create_engine(lab.database.url.set(database="postgres"))
     with elsewhere.connect() as other, other.begin(), open_transaction(lab.database) as slow:
         other.exec_driver_sql("SELECT pg_current_xact_id()")
-        slow.emit("slow", "s", project_id=lab.read(projects.read_project, "lab").id)
+        slow.emit("tag.created", "s", project_id=lab.read(projects.read_project, "lab").id)
         last = lab.events()[-1].seq
         lab.add_skeleton()
         assert [one.kind for one in lab.events(last)] == ["collection.created", "item.created"]
     elsewhere.dispose()
-    assert [one.kind for one in lab.events(last)] == ["collection.created", "item.created", "slow"]
+    assert [one.kind for one in lab.events(last)] == ["collection.created", "item.created", "tag.created"]
 
 
 def test_numbers_continue_although_all_events_were_deleted(lab: Lab) -> None:

@@ -9,6 +9,7 @@ from sqlalchemy import CTE, Row, delete, func, insert, literal_column, null, sel
 
 from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind, RefMove
 from marey_schemas.datasets.protection import ProtectionRule
+from marey_schemas.event_kinds import EventKind
 from marey_schemas.items import Page
 from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import collections, listing, projects
@@ -178,7 +179,8 @@ def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> 
     _require_room(held, MOST_REFS, "branches and tags in a dataset", "too-many-refs")
     with taken(ConflictProblem(f"There is a branch or tag {request.name!r} already.", code="name-taken")):
         tx.execute(insert(dataset_ref).values(**new_ref(tx, row.id, request.name, request.kind, digest)))
-    tx.emit(f"{request.kind.value}.created", row.id, project_id=project_row.id, name=request.name, commit=digest)
+    created: EventKind = "branch.created" if request.kind is RefKind.BRANCH else "tag.created"
+    tx.emit(created, row.id, project_id=project_row.id, name=request.name, commit=digest)
     made = find_ref(tx, row.id, request.name)
     assert made is not None
     return _shown_ref(made)
@@ -226,7 +228,8 @@ def delete_ref(tx: Transaction, project: str, name: str, ref: str, *, expected_r
     )
     require_deletable(tx, changed)
     tx.execute(delete(dataset_ref).where(*which))
-    tx.emit(f"{changed.kind}.deleted", row.id, project_id=project_row.id, name=ref, commit=changed.digest)
+    gone: EventKind = "branch.deleted" if changed.kind == RefKind.BRANCH else "tag.deleted"
+    tx.emit(gone, row.id, project_id=project_row.id, name=ref, commit=changed.digest)
 
 
 def protect_branch(
@@ -247,7 +250,7 @@ def protect_branch(
         raise is_tag(branch)
     if changed.digest is None:
         raise InvalidProblem(f"The branch {branch!r} has no commits yet; commit to it first.", code="no-commits")
-    kind = "branch.protected" if rule is not None else "branch.unprotected"
+    kind: EventKind = "branch.protected" if rule is not None else "branch.unprotected"
     tx.emit(kind, row.id, project_id=project_row.id, branch=branch)
     return _shown_ref(changed)
 

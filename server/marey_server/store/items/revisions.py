@@ -8,6 +8,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, insert, select, update
 
+from marey_schemas.event_kinds import EventKind
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_server.store.documents import load_body
@@ -87,7 +88,7 @@ def write_revisions(
     )
 
 
-def emit_item(tx: Transaction, event: str, project_row: ProjectRow, subject: Item, **body: Any) -> None:
+def emit_item(tx: Transaction, event: EventKind, project_row: ProjectRow, subject: Item, **body: Any) -> None:
     """Record an event about an item."""
     tx.emit(
         event, subject.id, project_id=project_row.id, item_kind=subject.kind.value, name=subject.name,

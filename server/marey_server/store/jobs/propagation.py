@@ -13,6 +13,8 @@ from typing import Any
 
 from sqlalchemy import Row, and_, bindparam, delete, false, select, tuple_, update
 
+from marey_schemas.event_kinds import EventKind
+from marey_schemas.queue.jobs import JobState
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs import late_inputs, result_cache
 from marey_server.store.jobs.endings import Ended, dependency_failure, end_jobs
@@ -54,12 +56,19 @@ def make_ready(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
 
 READY_COLUMNS = (job.c.id, job.c.project_id, job.c.kind, job.c.size, job.c.unbound, job.c.cache_key, job.c.cache_mode)
 
+_ENDINGS: dict[str, EventKind] = {
+    JobState.SUCCEEDED: "job.succeeded",
+    JobState.FAILED: "job.failed",
+    JobState.CANCELLED: "job.cancelled",
+}
+"""Kinds of events by the state in which jobs ended."""
+
 
 def _announce(tx: Transaction, ended: Sequence[Ended]) -> None:
     for state in sorted({end.state for end in ended}):
         emit_job_events(
             tx,
-            f"job.{state}",
+            _ENDINGS[state],
             [(end.project_id, end.id, _facts_of(end)) for end in ended if end.state == state],
         )
     wake_watchers(tx, [end.id for end in ended])

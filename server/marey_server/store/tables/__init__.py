@@ -35,7 +35,15 @@ from marey_server.store.tables.queue import (
     job_log,
     staged_output,
 )
-from marey_server.store.tables.serving import coverage_stream, event, idempotency_key, leader, server_state
+from marey_server.store.tables.serving import (
+    coverage_stream,
+    event,
+    idempotency_key,
+    leader,
+    server_state,
+    webhook,
+    webhook_delivery,
+)
 
 __all__ = [
     "ONE_RUNS_PER_KEY",
@@ -82,4 +90,6 @@ __all__ = [
     "upload",
     "upload_chunk",
     "user",
+    "webhook",
+    "webhook_delivery",
 ]

@@ -1,6 +1,6 @@
-"""Tables of what the server keeps for itself: events, repeated requests, streams, and its own state."""
+"""Tables of what the server keeps for itself: events, webhooks, repeated requests, streams, and its own state."""
 
-from sqlalchemy import BigInteger, Column, ForeignKey, Index, Integer, LargeBinary, String, Table
+from sqlalchemy import BigInteger, Boolean, Column, ForeignKey, Index, Integer, LargeBinary, String, Table, Text
 
 from marey_server.store.tables.columns import DIGEST, ID, Document, Micros, Sequence64, metadata
 
@@ -18,6 +18,50 @@ event = Table(
     Index("uq_event_number", "number", unique=True),
     Index("ix_event_feed", "project_id", "number", "seq"),
     sqlite_autoincrement=True,
+)
+
+webhook = Table(
+    "webhook",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("project_id", ID, ForeignKey("project.id"), nullable=False, index=True),
+    Column("creator_id", ID, ForeignKey("user.id")),
+    Column("url", String(2048), nullable=False),
+    Column("kinds", Document, nullable=False),
+    Column("description", Text, nullable=False),
+    Column("secret", String(128), nullable=False),
+    Column("old_secret", String(128)),
+    Column("old_secret_until_us", Micros),
+    Column("position", BigInteger, nullable=False),  # number of the last event that was delivered or given up
+    Column("missed", BigInteger, nullable=False, default=0),  # events deleted before delivery, not yet reported
+    Column("attempts", Integer, nullable=False, default=0),  # failed ones to send what follows `position`
+    Column("failures", Integer, nullable=False, default=0),  # since the last success
+    Column("next_us", Micros, nullable=False, default=0, index=True),  # time of the next attempt after a failure
+    Column("failing_since_us", Micros),
+    Column("delivered_us", Micros),
+    Column("last_status", Integer),
+    Column("last_error", String(255)),
+    Column("paused", Boolean, nullable=False, default=False),
+    Column("paused_reason", String(512)),
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False),
+)
+
+webhook_delivery = Table(  # those that failed or were requested; others leave no row
+    "webhook_delivery",
+    metadata,
+    Column("id", String(80), primary_key=True),
+    Column("webhook_id", ID, ForeignKey("webhook.id"), nullable=False),
+    Column("kind", String(64), nullable=False),
+    Column("number", BigInteger),  # of the event; null for a test
+    Column("body", Text, nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("attempts", Integer, nullable=False),
+    Column("last_status", Integer),
+    Column("last_error", String(255)),
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False, index=True),
+    Index("ix_webhook_delivery_state", "webhook_id", "state", "created_us"),
 )
 
 idempotency_key = Table(

@@ -1,0 +1,80 @@
+"""Network addresses that the server may connect to for a user: public ones, and those that the operator allows.
+
+Users give URLs to the server, so the server could be used to reach machines behind a firewall. Therefore addresses of
+private networks are refused, also if they are written in another form or embedded in an IPv6 address.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterable
+from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
+
+Address = IPv4Address | IPv6Address
+Network = IPv4Network | IPv6Network
+
+_LOOPBACK = IPv4Address("127.0.0.1")
+_REFUSED: tuple[Network, ...] = tuple(
+    map(
+        ip_network,
+        (
+            "0.0.0.0/8",
+            "10.0.0.0/8",
+            "100.64.0.0/10",  # between providers and their customers
+            "127.0.0.0/8",
+            "169.254.0.0/16",
+            "172.16.0.0/12",
+            "192.0.0.0/24",
+            "192.88.99.0/24",  # relays of 6to4
+            "192.168.0.0/16",
+            "198.18.0.0/15",
+            "224.0.0.0/4",
+            "240.0.0.0/4",
+            "::/96",  # contains an IPv4 address
+            "64:ff9b::/96",  # NAT64: contains an IPv4 address
+            "64:ff9b:1::/48",
+            "100::/64",
+            "2001::/23",  # contains Teredo, which contains an IPv4 address
+            "2002::/16",  # 6to4: contains an IPv4 address
+            "fc00::/7",
+            "fe80::/10",
+            "fec0::/10",
+            "ff00::/8",
+        ),
+    )
+)
+"""Networks that are not public, or whose addresses contain one of another network."""
+
+
+def may_connect(address: str, allowed: Iterable[Network]) -> bool:
+    """Return whether the server may connect to a numeric address: a public one, or one in a network of `allowed`."""
+    found = _parsed(address)
+    if any(found.version == network.version and found in network for network in allowed):
+        return True
+    return found.is_global and not any(found.version == one.version and found in one for one in _REFUSED)
+
+
+def _parsed(address: str) -> Address:
+    """Return an address, without its zone; an IPv4 address that is written as `::ffff:1.2.3.4` becomes that address."""
+    found = ip_address(address.partition("%")[0])
+    return found.ipv4_mapped or found if isinstance(found, IPv6Address) else found
+
+
+def literal_address(host: str) -> str | None:
+    """Return the numeric address that a host of a URL is, or None for a name that must be resolved.
+
+    Old forms of IPv4 addresses, such as `127.1` or `0x7f000001`, are addresses, too, and so is `localhost`.
+    """
+    name = host.rstrip(".").lower()
+    if name == "localhost" or name.endswith(".localhost"):
+        return str(_LOOPBACK)
+    try:
+        return str(ip_address(name.partition("%")[0]))
+    except ValueError:
+        pass
+    if not name or name[-1] not in "0123456789abcdef" or not name[0].isdigit():
+        return None
+    try:
+        return socket.inet_ntoa(socket.inet_aton(name))
+    except OSError:
+        return None

@@ -1,0 +1,286 @@
+"""Work of the process that sends deliveries: what to send next, and the outcomes.
+
+The position of a webhook is the number of the last event that was delivered or given up, so events are sent in their
+order. An outcome moves the position in the transaction that records it. So a process that dies loses no delivery, and
+repeats at most those whose outcome was not recorded. Outcomes are recorded only under the lead for which the delivery
+was sent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+from sqlalchemy import Row, and_, delete, func, or_, select, update
+
+from marey_schemas.address import API
+from marey_schemas.backoff import Backoff
+from marey_schemas.kinds import Kind
+from marey_schemas.webhooks import WebhookMessage
+from marey_server.store import events, leader
+from marey_server.store.database.clock import DAY_US, datetime_of
+from marey_server.store.leader import Lead
+from marey_server.store.tables import event, project, webhook, webhook_delivery
+from marey_server.store.transaction import Transaction
+from marey_server.store.webhooks.managing import give_up_retries
+
+MOST_ATTEMPTS = 8
+"""Number of attempts after which a delivery is given up."""
+RETRY = Backoff(first_s=5.0, longest_s=1800.0)
+"""Wait after failed attempts of a webhook; the first eight attempts take five to eleven minutes."""
+BATCH = 100
+"""Greatest number of deliveries that are read at once."""
+SKIPPED_MOST = 10_000
+"""Number of events of other kinds or projects after which the position of a webhook without deliveries moves on."""
+MISSED_KIND = "webhook.events_missed"
+
+Outcome = Literal["delivered", "retry", "dead"]
+
+
+class Work(NamedTuple):
+    """Webhooks that may have something to send, the newest event, and the time of the next retry if there is one."""
+
+    any: bool
+    """Whether any webhook is not paused."""
+    webhook_ids: frozenset[str]
+    newest: int
+    next_us: int | None
+    now_us: int
+
+
+def find_work(tx: Transaction, after: int | None) -> Work:
+    """Return the webhooks with events after the one numbered `after`, or with a retry that is due; None: all."""
+    newest = events.newest_number(tx)
+    active = webhook.c.paused.is_(False)
+    due = and_(webhook.c.next_us > 0, webhook.c.next_us <= tx.now_us)
+    if tx.execute(select(webhook.c.id).where(active).limit(1)).first() is None:
+        return Work(False, frozenset(), newest, None, tx.now_us)
+    statement = select(webhook.c.id).where(active)
+    if after is not None:
+        changed = select(event.c.project_id).where(events.follows(tx, after), event.c.project_id.is_not(None))
+        statement = statement.where(or_(due, webhook.c.project_id.in_(changed.distinct())))
+    found = frozenset(tx.execute(statement).scalars())
+    next_us = tx.execute(select(func.min(webhook.c.next_us)).where(active, webhook.c.next_us > tx.now_us)).scalar()
+    return Work(True, found, newest, next_us, tx.now_us)
+
+
+# -- what to send -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """Delivery that can be sent. `requested` ones are sent once; others follow the position of the webhook."""
+
+    id: str
+    webhook_id: str
+    kind: str
+    number: int | None
+    body: str = field(repr=False)
+    at_us: int
+    requested: bool = False
+    missed: int = 0
+    """Number of missed events that the delivery reports."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Next deliveries of a webhook in their order, and what sending them needs."""
+
+    url: str = field(repr=False)
+    secrets: tuple[str, ...] = field(repr=False)
+    position: int
+    attempts: int
+    deliveries: tuple[Delivery, ...]
+    complete: bool
+    """Whether there is nothing more to send at present."""
+    waits: bool
+    """Whether events wait for the time of the next result."""
+
+
+def next_batch(tx: Transaction, webhook_id: str, scanned: int) -> Batch | None:
+    """Return the next deliveries of a webhook; None if it is paused or deleted, or if its project is.
+
+    Events up to the one numbered `scanned` are known not to concern the webhook if its position is lower.
+    """
+    statement = select(webhook, project.c.name.label("project")).join(project, project.c.id == webhook.c.project_id)
+    alive = webhook.c.paused.is_(False), project.c.deleted_us.is_(None)
+    row = tx.execute(statement.where(webhook.c.id == webhook_id, *alive)).first()
+    if row is None:
+        return None
+    found = _requested(tx, webhook_id)
+    if row.next_us > tx.now_us:
+        return _batch(tx, row, found, complete=True, waits=True)
+    if row.missed:
+        found.append(_missed(row, tx.now_us))
+    following = [] if len(found) >= BATCH else _events(tx, row, max(row.position, scanned))
+    complete = len(found) < BATCH and len(following) < BATCH
+    return _batch(tx, row, [*found, *following], complete=complete, waits=False)
+
+
+def _batch(tx: Transaction, row: Row[Any], found: list[Delivery], *, complete: bool, waits: bool) -> Batch:
+    return Batch(row.url, _secrets(row, tx.now_us), row.position, row.attempts, tuple(found), complete, waits)
+
+
+def _secrets(row: Row[Any], now_us: int) -> tuple[str, ...]:
+    if row.old_secret is None or row.old_secret_until_us <= now_us:
+        return (row.secret,)
+    return row.secret, row.old_secret
+
+
+def _requested(tx: Transaction, webhook_id: str) -> list[Delivery]:
+    which = (webhook_delivery.c.webhook_id == webhook_id, webhook_delivery.c.state == "waiting")
+    rows = tx.execute(select(webhook_delivery).where(*which).order_by(webhook_delivery.c.created_us).limit(BATCH))
+    return [
+        Delivery(row.id, webhook_id, row.kind, row.number, row.body, row.updated_us, requested=True) for row in rows
+    ]
+
+
+def _missed(row: Row[Any], now_us: int) -> Delivery:
+    """Return the delivery that reports how many events were deleted before they were delivered."""
+    delivery_id = f"{row.id}-missed-{row.position}"
+    message = WebhookMessage(
+        id=delivery_id, kind=MISSED_KIND, seq=row.position, project=row.project, at=datetime_of(now_us),
+        subject=row.id, missed=row.missed,
+        links={"events": f"{API}/projects/{row.project}/events?after={row.position}"},
+    )  # fmt: skip
+    return Delivery(delivery_id, row.id, MISSED_KIND, row.position, message.encoded(), now_us, missed=row.missed)
+
+
+def _events(tx: Transaction, row: Row[Any], after: int) -> list[Delivery]:
+    number = events.number_of(tx)
+    concerned = (event.c.project_id == row.project_id, event.c.kind.in_(row.kinds), events.follows(tx, after))
+    statement = select(event, number.label("place")).where(*concerned).order_by(number).limit(BATCH)
+    return [_of_event(row, found) for found in tx.execute(statement)]
+
+
+def _of_event(row: Row[Any], found: Row[Any]) -> Delivery:
+    delivery_id = f"{row.id}-{found.place}"
+    links = {"event": f"{API}/projects/{row.project}/events?after={found.place - 1}&limit=1"}
+    message = WebhookMessage(
+        id=delivery_id, kind=found.kind, seq=found.place, project=row.project, at=datetime_of(found.at_us),
+        subject=found.subject, links=links | _subject_link(row.project, found),
+    )  # fmt: skip
+    return Delivery(delivery_id, row.id, found.kind, found.place, message.encoded(), found.at_us)
+
+
+def _subject_link(project_name: str, found: Row[Any]) -> dict[str, str]:
+    """Return the link to the object of an event, if the id of the object is part of its address."""
+    about = found.kind.partition(".")[0]
+    if about == "job":
+        return {"subject": f"{API}/jobs/{found.subject}"}
+    if about == "item" and found.body.get("item_kind") in set(Kind):
+        kind = Kind(found.body["item_kind"])
+        return {"subject": f"{API}/projects/{project_name}/{kind.plural}/{found.subject}"}
+    return {}
+
+
+def move_on(tx: Transaction, webhook_id: str, position: int, to: int) -> None:
+    """Move the position of a webhook past events that do not concern it."""
+    tx.execute(update(webhook).where(webhook.c.id == webhook_id, webhook.c.position == position).values(position=to))
+
+
+# -- outcomes ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class DeliveryResult:
+    """Result of one attempt: the HTTP status, if there was an answer, and the reason of a failure."""
+
+    status: int | None
+    error: str | None = None
+
+
+def record(
+    tx: Transaction, lead: Lead, delivery: Delivery, result: DeliveryResult, before: tuple[int, int], failing_days: int
+) -> Outcome | None:
+    """Record the result of an attempt, and return the outcome.
+
+    `before` is the position of the webhook and its number of attempts when the delivery was sent. Returns None and
+    records nothing if another process leads now, or if the webhook was changed in the meantime. After failures only for
+    `failing_days`, the webhook is paused; 0 means never.
+    """
+    if not leader.holds_lead(tx, lead):
+        return None
+    row = tx.execute(select(webhook).where(webhook.c.id == delivery.webhook_id).with_for_update()).first()
+    if row is None:
+        return None
+    if delivery.requested:
+        outcome: Outcome = "delivered" if result.error is None else "dead"
+        _note(tx, delivery, result, outcome)
+        return outcome
+    if (row.position, row.attempts) != before:
+        return None
+    if result.error is None:
+        _succeed(tx, row, delivery, result)
+        return "delivered"
+    return _fail(tx, row, delivery, result, failing_days)
+
+
+def _succeed(tx: Transaction, row: Row[Any], delivery: Delivery, result: DeliveryResult) -> None:
+    retried = (webhook_delivery.c.id == delivery.id, webhook_delivery.c.state == "retrying")
+    noted = {"state": "delivered", "last_status": result.status, "last_error": None, "updated_us": tx.now_us}
+    tx.execute(update(webhook_delivery).where(*retried).values(**noted, attempts=webhook_delivery.c.attempts + 1))
+    values: dict[str, Any] = {
+        "position": delivery.number, "attempts": 0, "failures": 0, "next_us": 0, "failing_since_us": None,
+        "delivered_us": tx.now_us, "last_status": result.status, "last_error": None,
+        "missed": webhook.c.missed - delivery.missed,
+    }  # fmt: skip
+    tx.execute(update(webhook).where(webhook.c.id == row.id).values(**values))
+
+
+def _fail(tx: Transaction, row: Row[Any], delivery: Delivery, result: DeliveryResult, failing_days: int) -> Outcome:
+    dead = row.attempts + 1 >= MOST_ATTEMPTS
+    _note(tx, delivery, result, "dead" if dead else "retry")
+    since_us = row.failing_since_us or tx.now_us
+    values: dict[str, Any] = {
+        "attempts": 0 if dead else row.attempts + 1, "failures": row.failures + 1, "failing_since_us": since_us,
+        "next_us": tx.now_us + round(RETRY.delay_s(row.failures + 1) * 1_000_000),
+        "last_status": result.status, "last_error": result.error,
+    }  # fmt: skip
+    if dead:
+        values |= {"position": delivery.number, "missed": webhook.c.missed - delivery.missed}
+    if failing_days and since_us < tx.now_us - failing_days * DAY_US:
+        reason = f"every attempt has failed for {failing_days} days; the last error: {result.error}"
+        values |= {"paused": True, "paused_reason": reason, "updated_us": tx.now_us}
+        tx.emit("webhook.changed", row.id, project_id=row.project_id, fields=["paused"])
+    tx.execute(update(webhook).where(webhook.c.id == row.id).values(**values))
+    return "dead" if dead else "retry"
+
+
+def _note(tx: Transaction, delivery: Delivery, result: DeliveryResult, outcome: Outcome) -> None:
+    """Create or change the row of a delivery."""
+    state = "retrying" if outcome == "retry" else outcome
+    noted = {
+        "state": state, "last_status": result.status, "last_error": result.error, "updated_us": tx.now_us
+    }  # fmt: skip
+    row = {
+        "id": delivery.id, "webhook_id": delivery.webhook_id, "kind": delivery.kind, "number": delivery.number,
+        "body": delivery.body, "attempts": 1, "created_us": tx.now_us, **noted,
+    }  # fmt: skip
+    added = tx.insert_into(webhook_delivery, row)
+    again = {**noted, "attempts": webhook_delivery.c.attempts + 1}
+    tx.execute(added.on_conflict_do_update(index_elements=[webhook_delivery.c.id], set_=again))
+
+
+# -- retention --------------------------------------------------------------------------------------------------------
+
+
+def count_missed(tx: Transaction, last: int) -> None:
+    """Count the events up to the one numbered `last`, which are about to be deleted, for webhooks that miss them."""
+    for row in tx.execute(select(webhook).where(webhook.c.position < last).with_for_update()).all():
+        number = events.number_of(tx)
+        concerned = (event.c.project_id == row.project_id, event.c.kind.in_(row.kinds), number <= last)
+        missed = select(func.count()).where(*concerned, events.follows(tx, row.position))
+        count = tx.execute(missed).scalar_one()
+        if count:
+            moved = {"position": last, "missed": webhook.c.missed + count, "attempts": 0}
+            tx.execute(update(webhook).where(webhook.c.id == row.id).values(**moved))
+            give_up_retries(tx, row.id)
+
+
+def delete_old_deliveries(tx: Transaction, age_us: int, most: int) -> int:
+    """Delete at most `most` deliveries that ended more than `age_us` ago, and return how many."""
+    old = (webhook_delivery.c.updated_us < tx.now_us - age_us, webhook_delivery.c.state.in_(("delivered", "dead")))
+    some = list(tx.execute(select(webhook_delivery.c.id).where(*old).limit(most)).scalars())
+    tx.execute(delete(webhook_delivery).where(webhook_delivery.c.id.in_(some), *old))
+    return len(some)
