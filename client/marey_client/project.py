@@ -15,6 +15,7 @@ from marey_client.handles.edits import Commands
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.handles.models import ModelHandle
 from marey_client.handles.pipelines import PipelineRun, submit_pipeline
+from marey_client.handles.webhooks import Webhooks
 from marey_client.jobs import Jobs, OnProgress
 from marey_client.project_items import ProjectItems
 from marey_client.requests import (
@@ -107,6 +108,11 @@ class ProjectHandle(ProjectItems):
     def members(self) -> Members:
         """The members of the project and their roles."""
         return Members(self.transport, self.name)
+
+    @cached_property
+    def webhooks(self) -> Webhooks:
+        """The webhooks of the project: addresses to which the server sends events."""
+        return Webhooks(self.transport, f"{self.url}/webhooks")
 
     # -- jobs ----------------------------------------------------------------------------------------------------------
 

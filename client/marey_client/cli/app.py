@@ -24,6 +24,7 @@ from marey_client.cli import (
     searches,
     skeletons,
     tokens,
+    webhooks,
 )
 from marey_client.cli.datasets import archives, proposals, versions
 from marey_client.cli.difference import diff
@@ -92,5 +93,6 @@ for register in (
     searches,
     jobs,
     pipelines,
+    webhooks,
 ):
     register.add_to(app)

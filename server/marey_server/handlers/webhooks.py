@@ -29,7 +29,7 @@ class DeliveriesQuery(PageQuery):
     state: DeliveryState | None = Field(None, description="State of the deliveries; absent: any.")
 
 
-class Webhooks(Resource):
+class ProjectWebhooks(Resource):
     """Webhooks of a project."""
 
     path = "/projects/{project}/webhooks"
@@ -145,7 +145,7 @@ class WebhookRedelivery(Resource):
 
 
 RESOURCES: tuple[type[Resource], ...] = (
-    Webhooks,
+    ProjectWebhooks,
     WebhookResource,
     WebhookSecret,
     WebhookTest,

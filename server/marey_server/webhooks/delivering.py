@@ -31,7 +31,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 LEAD = "webhooks"
-LEAD_TTL_S = 30.0
+LEAD_TTL_S = 15.0
 RENEW_EVERY_S = 5.0
 PAUSE_S = 0.02
 """Least time between two searches for work; under load, one search serves many events."""
@@ -203,18 +203,19 @@ class Deliverer:
             result = await self._sender.send(batch, delivery)
         faults.point("webhook.before_record")
         days = self._services.settings.webhook_failing_days
-        outcome: Outcome | None = await self._write(outbox.record, lead, delivery, result, before, days)
+        recorded = await self._write(outbox.record, lead, delivery, result, before, days)
         faults.point("webhook.after_record")
-        if outcome is not None:
-            self._count(delivery, result, outcome)
-        return outcome
+        if recorded is None:
+            return None
+        self._count(delivery, result, *recorded)
+        return recorded.outcome
 
-    def _count(self, delivery: Delivery, result: DeliveryResult, outcome: Outcome) -> None:
+    def _count(self, delivery: Delivery, result: DeliveryResult, outcome: Outcome, now_us: int) -> None:
         metrics = self._services.metrics
         metrics.webhook_deliveries.labels(outcome).inc()
         if outcome == "delivered":
             if not delivery.requested:
-                metrics.webhook_delay.observe(max(0.0, time.time() - delivery.at_us / 1_000_000))
+                metrics.webhook_delay.observe((now_us - delivery.at_us) / 1_000_000)
             log.debug("delivered %s", delivery.id)
         else:
             level = logging.WARNING if outcome == "dead" else logging.INFO

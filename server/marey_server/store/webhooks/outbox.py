@@ -190,9 +190,16 @@ class DeliveryResult:
     error: str | None = None
 
 
+class Recorded(NamedTuple):
+    """Outcome of an attempt, and the time at which it was recorded, on the clock of the database."""
+
+    outcome: Outcome
+    now_us: int
+
+
 def record(
     tx: Transaction, lead: Lead, delivery: Delivery, result: DeliveryResult, before: tuple[int, int], failing_days: int
-) -> Outcome | None:
+) -> Recorded | None:
     """Record the result of an attempt, and return the outcome.
 
     `before` is the position of the webhook and its number of attempts when the delivery was sent. Returns None and
@@ -207,13 +214,13 @@ def record(
     if delivery.requested:
         outcome: Outcome = "delivered" if result.error is None else "dead"
         _note(tx, delivery, result, outcome)
-        return outcome
+        return Recorded(outcome, tx.now_us)
     if (row.position, row.attempts) != before:
         return None
     if result.error is None:
         _succeed(tx, row, delivery, result)
-        return "delivered"
-    return _fail(tx, row, delivery, result, failing_days)
+        return Recorded("delivered", tx.now_us)
+    return Recorded(_fail(tx, row, delivery, result, failing_days), tx.now_us)
 
 
 def _succeed(tx: Transaction, row: Row[Any], delivery: Delivery, result: DeliveryResult) -> None:

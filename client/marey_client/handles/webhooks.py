@@ -1,0 +1,104 @@
+"""Webhooks of a project, and their deliveries."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+
+from marey_client.paging import pages
+from marey_client.transport import Params, Transport, as_json, read_model
+from marey_schemas.event_kinds import DEFAULT_WEBHOOK_KINDS, ProjectEventKind
+from marey_schemas.webhooks import (
+    DeliveryState,
+    NewWebhook,
+    Webhook,
+    WebhookChange,
+    WebhookCreate,
+    WebhookDelivery,
+    WebhookRotation,
+)
+
+LOOK_EVERY_S = 0.2
+
+
+@dataclass(frozen=True)
+class Webhooks:
+    """Webhooks of a project; only its owners may use them."""
+
+    transport: Transport
+    url: str
+
+    def create(
+        self, url: str, kinds: Sequence[ProjectEventKind] = DEFAULT_WEBHOOK_KINDS, *, description: str = ""
+    ) -> NewWebhook:
+        """Create a webhook that sends events of these kinds to `url`.
+
+        The secret is in the answer and never shown again. Raises `Invalid` if the URL is one that the server does not
+        send to, and `Conflict` if the project has too many webhooks.
+        """
+        request = WebhookCreate(url=url, kinds=tuple(kinds), description=description)
+        return self.transport.post(NewWebhook, self.url, request, repeatable=False)
+
+    def list(self) -> Iterator[Webhook]:
+        """List the webhooks, oldest first, without their secrets."""
+        return pages(self.transport, Webhook, self.url)
+
+    def at(self, webhook_id: str) -> WebhookHandle:
+        """Return a handle of the webhook with this id; no request is sent."""
+        return WebhookHandle(self.transport, f"{self.url}/{webhook_id}")
+
+
+@dataclass(frozen=True)
+class WebhookHandle:
+    """Handle of a webhook; requests are sent only by its methods."""
+
+    transport: Transport
+    url: str
+
+    def read(self) -> Webhook:
+        """Return the webhook and the result of its last attempt."""
+        return self.transport.get(Webhook, self.url)
+
+    def change(self, change: WebhookChange) -> Webhook:
+        """Change, pause or resume the webhook; fields that are None stay as they are."""
+        return read_model(Webhook, self.transport.send("PATCH", self.url, content=as_json(change)))
+
+    def rotate(self, *, grace: timedelta = timedelta(days=1)) -> NewWebhook:
+        """Replace the secret; the new one is in the answer and never shown again.
+
+        For the duration `grace`, deliveries are also signed with the old secret.
+        """
+        request = WebhookRotation(grace_s=int(grace.total_seconds()))
+        return self.transport.post(NewWebhook, f"{self.url}/rotate", request, repeatable=False)
+
+    def delete(self) -> None:
+        """Delete the webhook and its deliveries."""
+        self.transport.send("DELETE", self.url)
+
+    def deliveries(self, state: DeliveryState | None = None) -> Iterator[WebhookDelivery]:
+        """List the deliveries that failed or were requested, newest first; with `state`, only those in this state."""
+        query: Params = {} if state is None else {"state": state}
+        return pages(self.transport, WebhookDelivery, f"{self.url}/deliveries", query)
+
+    def delivery(self, delivery_id: str) -> WebhookDelivery:
+        """Return a delivery with the result of its last attempt."""
+        return self.transport.get(WebhookDelivery, f"{self.url}/deliveries/{delivery_id}")
+
+    def redeliver(self, delivery_id: str) -> WebhookDelivery:
+        """Request that a delivery is sent once more; `wait` waits for the result."""
+        return self.transport.post(WebhookDelivery, f"{self.url}/deliveries/{delivery_id}/redeliver", repeatable=False)
+
+    def test(self) -> WebhookDelivery:
+        """Request a delivery of the kind `webhook.test`; `wait` waits for the result."""
+        return self.transport.post(WebhookDelivery, f"{self.url}/test", repeatable=False)
+
+    def wait(self, delivery_id: str, *, timeout_s: float = 30.0) -> WebhookDelivery:
+        """Return a requested delivery after its attempt, or after `timeout_s` although it still waits."""
+        deadline = time.monotonic() + timeout_s
+        found = self.delivery(delivery_id)
+        while found.state == "waiting" and time.monotonic() < deadline:
+            time.sleep(LOOK_EVERY_S)
+            found = self.delivery(delivery_id)
+        return found
