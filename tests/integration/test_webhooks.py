@@ -19,6 +19,7 @@ from marey_schemas.backoff import Backoff
 from marey_server.store.database.connections import Database
 from marey_server.store.transaction import Quotas
 from marey_server.store.webhooks import outbox
+from marey_server.webhooks import delivering
 
 
 @pytest.fixture
@@ -300,3 +301,20 @@ def test_a_deleted_webhook_sends_nothing_more(owner: httpx.Client, open_receiver
     assert owner.delete(f"/projects/lab/webhooks/{hook['id']}").status_code == 204
     assert owner.get(f"/projects/lab/webhooks/{hook['id']}").json()["code"] == "no-webhook"
     assert owner.get("/projects/lab/webhooks").json()["items"] == []
+
+
+def test_deliveries_continue_after_the_server_could_not_renew_its_lead(
+    owner: httpx.Client, open_receiver: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(delivering, "RENEW_EVERY_S", 0.2)
+    receiver = open_receiver()
+    make_webhook(owner, receiver.url)
+    send_one = delivering.Deliverer._send
+    doubts = iter(range(3))
+
+    async def send_if_leading(self: Any, *args: Any) -> Any:
+        return await send_one(self, *args) if next(doubts, None) is None else None
+
+    monkeypatch.setattr(delivering.Deliverer, "_send", send_if_leading)
+    add_folders(owner, "first")
+    receiver.wait_for(lambda found: len(found) == 2)

@@ -25,6 +25,15 @@ def issue_secret() -> str:
     return KEY_PREFIX + base64.b64encode(secrets.token_bytes(_SIGNING_KEY_BYTES)).decode("ascii")
 
 
+def is_secret(text: str) -> bool:
+    """Return whether a text is a complete secret."""
+    try:
+        key = base64.b64decode(text.removeprefix(KEY_PREFIX), validate=True)
+    except ValueError:
+        return False
+    return text.startswith(KEY_PREFIX) and len(key) == _SIGNING_KEY_BYTES
+
+
 def sign(secret: str, delivery_id: str, timestamp: int, body: bytes) -> str:
     """Return the signature of a delivery: `v1,` and Base64.
 

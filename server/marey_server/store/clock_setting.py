@@ -16,13 +16,13 @@ from marey_server.store.tables import job, metadata, token
 
 PAST = frozenset(
     {
-        "at_us", "cancel_requested_us", "created_us", "deleted_us", "ended_us", "finished_us", "last_used_us",
-        "since_us", "started_us", "updated_us",
+        "at_us", "cancel_requested_us", "created_us", "deleted_us", "delivered_us", "ended_us", "failing_since_us",
+        "finished_us", "last_used_us", "since_us", "started_us", "updated_us",
     }
 )  # fmt: skip
 """Columns of moments that have passed; none may lie in the future."""
-WAITING = frozenset({"expires_us", "lease_expires_us", "run_at_us", "until_us"})
-"""Columns of times to wait for. If they are set to now, leases are renewed, and waiting jobs and sign-ins go on."""
+WAITING = frozenset({"expires_us", "lease_expires_us", "next_us", "old_secret_until_us", "run_at_us", "until_us"})
+"""Columns of times to wait for. If they are set to now, leases are renewed; jobs, sign-ins and webhooks go on."""
 MOVED = {token.c.expires_us: token.c.created_us, job.c.deadline_us: job.c.started_us}
 """Columns of ends, each with the column of the start: if the start lies in the future, both move by the same time."""
 

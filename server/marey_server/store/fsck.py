@@ -21,12 +21,14 @@ from marey_schemas.encoding.arrays import ArrayError, EncodedArray
 from marey_schemas.encoding.canonical import array_digest, canonical_json
 from marey_schemas.kinds import PARTS, Kind
 from marey_server.access.principal import SYSTEM
+from marey_server.access.webhook_signatures import is_secret
 from marey_server.store import quotas
 from marey_server.store.blobs import digest_of, read_blob
 from marey_server.store.database.connections import Database
 from marey_server.store.database.schema import schema_at_head
 from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.history import revisions_with
+from marey_server.store.events import newest_number
 from marey_server.store.items.summaries import summarise
 from marey_server.store.tables import (
     blob,
@@ -46,6 +48,8 @@ from marey_server.store.tables import (
     upload,
     upload_chunk,
     user,
+    webhook,
+    webhook_delivery,
 )
 from marey_server.store.transaction import Transaction
 from marey_versions.records import CommitRecord, entry_of
@@ -81,6 +85,7 @@ def check_store(
         ("uploads", upload, _check_upload),
         ("tree chunks", tree_chunk, _check_chunk),
         ("datasets", dataset, _check_dataset),
+        ("webhooks", webhook, _check_webhook),
         ("projects", project, partial(_check_holding, owner=item.c.project_id)),
         ("users", user, partial(_check_holding, owner=item.c.creator_id)),
     )
@@ -329,6 +334,18 @@ def _is_consistent(one: Row[Any], branches: set[str]) -> bool:
         followed = {one.target} if one.head is not None else {one.target, one.source}
         return followed <= branches and one.ended_us is None and one.merged is None
     return None not in (one.head, one.ended_us) and (one.merged is not None) == (one.state == ProposalState.MERGED)
+
+
+def _check_webhook(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
+    """Return the faults of a webhook because of which it would skip events or could not sign."""
+    retried = (webhook_delivery.c.webhook_id == row.id, webhook_delivery.c.state == "retrying")
+    faults = {
+        "its position is after the newest event": row.position > newest_number(tx),
+        "its secret is damaged": not is_secret(row.secret),
+        "the delivery that it repeats is missing": bool(row.attempts)
+        and tx.execute(select(webhook_delivery.c.id).where(*retried).limit(1)).first() is None,
+    }
+    return [StoreDefect("webhook-corrupt", row.id, text) for text, is_so in faults.items() if is_so]
 
 
 def find_faults(tx: Transaction) -> list[str]:

@@ -153,19 +153,27 @@ class Deliverer:
             self._again.discard(webhook_id)
             if self._leads():
                 self._start(webhook_id)
+            else:
+                self._after = None
 
     async def _serve(self, webhook_id: str) -> None:
-        """Send everything that a webhook has to send, until an attempt fails."""
+        """Send everything that a webhook has to send, until an attempt fails.
+
+        If it is interrupted for another reason, the next search for work considers all webhooks again.
+        """
+        interrupted = True
         try:
             going_on = True
             while going_on and self._leads():
                 going_on = await self._send_batch(webhook_id)
+            interrupted = going_on
         except ApiProblem as error:
             log.warning("deliveries to the webhook %s were interrupted: %s", webhook_id, error.detail)
-            self._after = None  # so that the next search finds this webhook again
         except Exception:
             log.exception("deliveries to the webhook %s failed", webhook_id)
-            self._after = None
+        finally:
+            if interrupted:
+                self._after = None
 
     async def _send_batch(self, webhook_id: str) -> bool:
         """Send the next deliveries of a webhook; return whether there may be more."""
@@ -178,6 +186,7 @@ class Deliverer:
         for delivery in batch.deliveries:
             outcome = await self._send(batch, delivery, before)
             if outcome is None:
+                self._after = None
                 return False
             if not delivery.requested:
                 if outcome != "delivered":

@@ -6,6 +6,7 @@ import json
 from typing import Any
 
 import pytest
+from sqlalchemy import delete, update
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.store_fixtures import Lab, declared
 
@@ -13,8 +14,10 @@ from marey_schemas.items import CollectionCreate, Page
 from marey_schemas.webhooks import NewWebhook, WebhookChange, WebhookCreate
 from marey_server.access.principal import SYSTEM
 from marey_server.store import collections, events, leader, projects, retention
+from marey_server.store.fsck import check_store
 from marey_server.store.leader import Lead
 from marey_server.store.retention import Retention
+from marey_server.store.tables import webhook, webhook_delivery
 from marey_server.store.transaction import Transaction
 from marey_server.store.webhooks import deliveries, managing, outbox
 from marey_server.store.webhooks.outbox import Batch, DeliveryResult, Outcome, Recorded
@@ -237,6 +240,25 @@ def test_the_search_for_work_finds_webhooks_with_news_or_a_due_retry(desk: Desk,
     assert find(work.newest).webhook_ids == {desk.hook.id}
     desk.lab.write(managing.change_webhook, "lab", desk.hook.id, WebhookChange(paused=True), (), required=OWNER)
     assert not find(None).any
+
+
+def test_the_check_of_the_store_finds_damaged_webhooks(desk: Desk) -> None:
+    def change(**values: Any) -> None:
+        desk.lab.database.write(SYSTEM, lambda tx: tx.execute(update(webhook).values(**values)))
+
+    desk.add_folders("one")
+    desk.record(FAILED)
+    assert list(check_store(desk.lab.database)) == []
+    change(position=10**9, secret="whsec_AAAA")
+    found = {(one.code, one.subject, one.detail) for one in check_store(desk.lab.database)}
+    assert found == {
+        ("webhook-corrupt", desk.hook.id, "its position is after the newest event"),
+        ("webhook-corrupt", desk.hook.id, "its secret is damaged"),
+    }
+    change(position=0, secret=desk.hook.secret)
+    desk.lab.database.write(SYSTEM, lambda tx: tx.execute(delete(webhook_delivery)))
+    [defect] = check_store(desk.lab.database)
+    assert defect.detail == "the delivery that it repeats is missing"
 
 
 def test_a_position_moves_past_events_that_do_not_concern_the_webhook(desk: Desk) -> None:
