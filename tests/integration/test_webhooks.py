@@ -13,7 +13,7 @@ import httpx
 import pytest
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.rest_server import Server, running
-from tests.support.webhook_receiver import PATIENCE_S, Open
+from tests.support.webhook_receiver import PATIENCE_S, SELF_SIGNED, Open
 
 from marey_schemas.backoff import Backoff
 from marey_server.store.database.connections import Database
@@ -154,6 +154,19 @@ def test_a_redirect_is_a_failure_and_is_not_followed(owner: httpx.Client, open_r
     wait_until(lambda: read(owner, hook)["failures"] == 1)
     assert read(owner, hook)["last_error"] == "the answer has the status 307; redirects are not followed"
     assert target.received == []
+
+
+def test_a_receiver_whose_certificate_nobody_vouches_for_gets_nothing(
+    owner: httpx.Client, open_receiver: Open, tmp_path: Path
+) -> None:
+    certificate = tmp_path / "self-signed.pem"
+    certificate.write_text(SELF_SIGNED)
+    receiver = open_receiver(certificate=certificate)
+    hook = make_webhook(owner, receiver.url)
+    add_folders(owner, "one")
+    wait_until(lambda: read(owner, hook)["failures"] == 1)
+    assert read(owner, hook)["last_error"].startswith("the certificate is not valid: self")
+    assert receiver.received == []
 
 
 def test_a_long_answer_is_not_read_to_its_end(owner: httpx.Client, open_receiver: Open) -> None:

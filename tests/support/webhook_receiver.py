@@ -5,16 +5,38 @@ from __future__ import annotations
 import base64
 import hmac
 import json
+import ssl
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 PATIENCE_S = 60.0
+
+SELF_SIGNED = """\
+-----BEGIN PRIVATE KEY-----
+MIGHAgEAMBMGByqGSM49AgEGCCqGSM49AwEHBG0wawIBAQQghyQlcVgLq5JbtYST
+rjT7sulir6UUVdGqk72Oejb1ah2hRANCAATRlc73OXqdi3JdSvBP6iDFNw4giWlM
+vjYTRi5e7lGIQHBdZrBT0eLzUs9rFEPt8ZZgJxFbZAlEHPlZERvIEctU
+-----END PRIVATE KEY-----
+-----BEGIN CERTIFICATE-----
+MIIBkDCCATagAwIBAgIUWfJSjSFJuFoRy8OuWMrwKRo9v/YwCgYIKoZIzj0EAwIw
+FDESMBAGA1UEAwwJMTI3LjAuMC4xMCAXDTI2MTEyNDIzNDA0M1oYDzIxMjYxMDMx
+MjM0MDQzWjAUMRIwEAYDVQQDDAkxMjcuMC4wLjEwWTATBgcqhkjOPQIBBggqhkjO
+PQMBBwNCAATRlc73OXqdi3JdSvBP6iDFNw4giWlMvjYTRi5e7lGIQHBdZrBT0eLz
+Us9rFEPt8ZZgJxFbZAlEHPlZERvIEctUo2QwYjAdBgNVHQ4EFgQUtjwRSrD5JOHj
+zBj4lEwwTLIvJOowHwYDVR0jBBgwFoAUtjwRSrD5JOHjzBj4lEwwTLIvJOowDwYD
+VR0TAQH/BAUwAwEB/zAPBgNVHREECDAGhwR/AAABMAoGCCqGSM49BAMCA0gAMEUC
+IQCXA6VAHlmloaSzEU1Z26+aNoj8t5YTwokj2CZuq88mRQIgO0bgCMX9rHuaRWFT
+KJr2O8GJlqONEqbhOT46ZXvv/OM=
+-----END CERTIFICATE-----
+"""
+"""Certificate of 127.0.0.1 that no authority has signed, and its key, which nothing else uses."""
 
 
 @dataclass
@@ -44,6 +66,8 @@ class Receiver:
     delay_s: float = 0.0
     answer: bytes = b""
     headers: dict[str, str] = field(default_factory=dict)
+    certificate: Path | None = None
+    """File with a certificate and its key, for https."""
     received: list[Received] = field(default_factory=list)
     url: str = ""
     changed: threading.Condition = field(default_factory=threading.Condition)
@@ -90,9 +114,14 @@ def open_receiver() -> Iterator[Open]:
                 pass
 
         server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        if receiver.certificate is not None:
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            context.load_cert_chain(receiver.certificate)
+            server.socket = context.wrap_socket(server.socket, server_side=True)
         servers.append(server)
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        receiver.url = f"http://127.0.0.1:{server.server_address[1]}/hook"
+        scheme = "http" if receiver.certificate is None else "https"
+        receiver.url = f"{scheme}://127.0.0.1:{server.server_address[1]}/hook"
         return receiver
 
     yield start
