@@ -270,7 +270,10 @@ def command_text(command: dict[str, Any]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return a text that `shlex.split` reads as one word, without the single quotes that people put around commands."""
+    """Quote a text so that `shlex.split` reads it as one word.
+
+    Only double quotes are added, because people put single quotes around whole commands.
+    """
     if shlex.quote(text) == text:
         return text
     name, _, value = text.partition("=")

@@ -259,7 +259,10 @@ def _rows(chosen: NDArray[Any], columns: int, lead: int) -> tuple[NDArray[np.int
 
 
 def _prediction(others: Integers, lead: int, count: int, negative: NDArray[np.bool_]) -> Integers:
-    """Return the integers of ±sqrt(1 - a² - b² - c²), computed in double precision.
+    """Predict one component of each quaternion from the other three: ±sqrt(1 - a² - b² - c²), as float32 bits.
+
+    a, b and c are the three rows of `others` for this quaternion; the rows start after the first `lead` rows. Returns
+    integers (`count`, frames). The root is computed in double precision.
 
     Products of two float32 are exact in double precision, so a fused multiply-add changes nothing: every machine with
     IEEE 754 arithmetic computes the same bits.

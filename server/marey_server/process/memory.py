@@ -48,7 +48,7 @@ class RequestMemory:
             self._by_owner[owner] += more
 
     def give_back(self, owner: str, held: int) -> None:
-        """Subtract `held` bytes from the memory of the owner of a request, which no longer holds them."""
+        """Subtract `held` bytes, which a request no longer holds, from the memory counted for its owner."""
         with self._lock:
             self.held_bytes -= held
             self._by_owner[owner] -= held

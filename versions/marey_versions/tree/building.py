@@ -4,7 +4,7 @@ The rule depends on keys alone, so that a changed value never moves an end. The 
 ends its chunk if the first 4 bytes of SHA-256 of the text "l k", read as a big-endian number, are below 2^32 / n. In
 leaves n is `MEAN_ENTRIES`, above them `MEAN_CHILDREN`. There are two exceptions. The first member of a chunk never ends
 it, so that each level has at most about half as many chunks as the level below. A chunk with `LONGEST` times n members
-ends in any case, so that keys which somebody has chosen on purpose cannot make chunks of any size.
+ends in any case, so that keys which somebody has chosen on purpose cannot make a chunk arbitrarily large.
 """
 
 from __future__ import annotations

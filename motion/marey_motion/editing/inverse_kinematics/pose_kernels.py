@@ -88,7 +88,9 @@ def target_error(targets, c, frame, tip, turn):  # type: ignore[no-untyped-def]
 
 @compiled
 def weigh_errors(targets, frame, tips, turns, errors, tolerance_m, tolerance_rad):  # type: ignore[no-untyped-def]
-    """Fill `errors` (C, 3) of the targets, whose points have the positions `tips` and the rotations `turns`.
+    """Fill `errors` (C, 3): how far the pose is from each target.
+
+    In this pose, the points that should reach the targets have the positions `tips` and the rotations `turns`.
 
     Returns the weighted sum of the squared errors, and whether all are within the tolerances.
     """

@@ -199,7 +199,11 @@ class _Search:
         return candidates
 
     def _additions(self, absent: Sources) -> list[str]:
-        """List absent sources that fit into the budget of data, sorted by the share of the deficit that they fill."""
+        """List the absent sources to try, at most `consider`; those that supply most of the missing seconds come first.
+
+        Seconds are missing where the present sources have less than `_least`. Sources that would exceed `max_data_s`
+        are left out.
+        """
         limit = self._options.max_data_s
         room = np.inf if limit is None else limit - self._simulation.seconds(absent)
         fitting = [source for source in sorted(absent) if self._simulation.seconds_of(source) <= room]

@@ -116,7 +116,7 @@ def _similarity_to_tree(similarity: PoseSimilarity) -> Tree:
 
 
 def optimisation_to_tree(optimisation: Optimisation) -> Tree:
-    """Convert the log of an optimisation, which can be stored and continued.
+    """Convert the log of an optimisation, so that it can be stored and the optimisation continued later.
 
     Parameters
     ----------

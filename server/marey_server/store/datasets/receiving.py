@@ -115,8 +115,8 @@ class PreparedReceipt:
 def prepare_receipt(tx: Transaction, project: str, name: str, request: ReceivedCommit) -> PreparedReceipt:
     """Compute the tree of a commit from an archive or another server.
 
-    Raises `ConflictProblem` if the dataset lacks a parent or the project a revision, and `InvalidProblem` if the
-    changes do not give the tree that the commit names.
+    Raises `ConflictProblem` if a parent is missing from the dataset or a revision is missing from the project.
+    Raises `InvalidProblem` if the changes do not give the tree that the commit names.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)

@@ -70,7 +70,10 @@ def unreachable_places(tx: Transaction, wanted: Iterable[PinnedPlace]) -> set[Pi
 
 
 def reachable_blobs(tx: Transaction, digests: Collection[str]) -> set[str]:
-    """Return the blobs to which the attempt's job, the tasks of the job, and the documents that it may read refer."""
+    """Return those of the given blobs that the attempt may read.
+
+    It may read blobs of its job, of the tasks of this job, and of the documents that it may read.
+    """
     principal = tx.principal
     of_job = (
         select(job_blob.c.blob_digest)

@@ -25,7 +25,10 @@ class Clash(NamedTuple):
 
 
 def find_clash(kind: KindDeclaration, params: Any, pins: PinnedInputs, into: str) -> Clash | None:
-    """Return a conflict among the places of a job's results, or None; late inputs are not checked."""
+    """Return a conflict among the places of a job's results, or None.
+
+    Names are not compared if an input is the result of another job, because this result may not exist yet.
+    """
     unclear = kind.unclear_place(params, into) if kind.unclear_place is not None else None
     if unclear is not None:
         return Clash("/into", "ambiguous-place", f"It is not clear where results should go: {unclear}.")
