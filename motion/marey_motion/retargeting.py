@@ -295,8 +295,8 @@ def _axes_of(axes: Mapping[str, JointAxes], joint: str, which: str) -> NDArray[n
     cross = np.cross(twist, swing)
     if not np.linalg.norm(cross) > 1e-6 * np.linalg.norm(twist) * np.linalg.norm(swing):
         raise MappingError(
-            f"the twist axis {axes[joint].twist} and the swing axis {axes[joint].swing} of the {which} "
-            "skeleton's joint must be longer than zero and not parallel",
+            f"the twist axis {axes[joint].twist} and the swing axis {axes[joint].swing} of this joint of the {which} "
+            "skeleton must not be zero and must not be parallel",
             where=joint,
         )
     columns = (twist, np.cross(cross, twist), cross)

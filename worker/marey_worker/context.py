@@ -98,9 +98,9 @@ class Context:
     def documents(
         self, pins: Iterable[PinnedInput], part: str, *, required: bool = True
     ) -> Iterator[tuple[PinnedInput, Any]]:
-        """Yield each input with one of its parts, or with None if an optional part does not exist.
+        """Yield each input with its part named `part`, or with None if the part is not required and does not exist.
 
-        Further parts are read before the caller needs them.
+        While the caller uses one input, the parts of the next inputs are read.
         """
         for pin, (document,) in self.documents_of_each(pins, part):
             if document is None and required:
@@ -113,7 +113,7 @@ class Context:
     ) -> Iterator[tuple[PinnedInput, tuple[Any, ...]]]:
         """Yield each input with several of its parts, and None for each part that does not exist.
 
-        Further parts are read before the caller needs them.
+        While the caller uses one input, the parts of the next inputs are read.
         """
         wanted = (
             (pin, PartPlace(kind=pin.kind, item=pin.item, revision=pin.revision, part=part))

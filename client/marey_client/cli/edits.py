@@ -34,7 +34,7 @@ Do = Annotated[
     list[str] | None,
     typer.Option(
         "--do",
-        help="A command, such as 'trim start=10 stop=200'; may be repeated. marey edit commands lists all commands.",
+        help="A command, such as 'trim start=10 stop=200'; may be repeated. `marey edit commands` lists all commands.",
     ),
 ]
 From = Annotated[

@@ -61,12 +61,27 @@ def search(
     place: Annotated[str, typer.Argument(help="A model: project/folder/name, or project/id.")],
     params: Chosen,
     at: Annotated[
-        Many, typer.Option(help="Put a joint at a position: WHEN:JOINT=x,y,z in metres; _ leaves a coordinate free.")
+        Many,
+        typer.Option(
+            help="Put a joint at a position in metres: WHEN:JOINT=x,y,z, such as end:left_wrist=0.2,_,1; _ is free."
+        ),
     ] = None,
-    turned: Annotated[Many, typer.Option(help="Give a joint a rotation in the world: WHEN:JOINT=w,x,y,z.")] = None,
-    look: Annotated[Many, typer.Option(help="Point a joint's z axis in a direction: WHEN:JOINT=x,y,z.")] = None,
-    look_at: Annotated[Many, typer.Option(help="Point a joint's z axis at a position: WHEN:JOINT=x,y,z.")] = None,
-    stand: Annotated[Many, typer.Option(help="Put the body at a position on the ground: WHEN=x,z in metres.")] = None,
+    turned: Annotated[
+        Many, typer.Option(help="Give a joint a rotation in the world: WHEN:JOINT=w,x,y,z, such as end:head=1,0,0,0.")
+    ] = None,
+    look: Annotated[
+        Many,
+        typer.Option(
+            help="Point a joint's z axis in a direction of the world: WHEN:JOINT=x,y,z, such as start:head=0,0,1."
+        ),
+    ] = None,
+    look_at: Annotated[
+        Many,
+        typer.Option(help="Point a joint's z axis at a position in metres: WHEN:JOINT=x,y,z, such as end:head=0,1,3."),
+    ] = None,
+    stand: Annotated[
+        Many, typer.Option(help="Put the body at a position on the ground: WHEN=x,z in metres, such as end=0,1.5.")
+    ] = None,
     face: Annotated[
         Many, typer.Option(help="Turn the body to a heading: WHEN=degrees from +z, positive to the left.")
     ] = None,

@@ -82,7 +82,7 @@ def _match(before: Sequence[Segment], after: Sequence[Segment]) -> list[tuple[in
     old, new = before[head : len(before) - tail], after[head : len(after) - tail]
     if len(old) * len(new) > MOST_PAIRS:
         raise AnnotationError(
-            f"the annotations differ in {len(old):,} and {len(new):,} entries, which are too many to compare",
+            f"too many entries differ to be compared: {len(old):,} of the old and {len(new):,} of the new annotation",
             code="too-many-entries",
         )
     labels = {one.label: number for number, one in enumerate((*old, *new))}

@@ -47,7 +47,10 @@ def readings(names: Sequence[str]) -> tuple[Names, ...]:
 
 
 def _marked(names: Names) -> Names:
-    """List the names that must all contain a mark: those of all joints except the root, which exporters often add."""
+    """List the names that must share a prefix or suffix for it to be removed: those of all joints except the root.
+
+    Exporters often add a root with a name of its own.
+    """
     return names[1:]
 
 

@@ -1,9 +1,9 @@
 """Limits on wrong passwords, shared by all servers; a stranger cannot use them to lock out the owner of an account.
 
-Every try counts in three limits until its password turns out to be right: a limit for the account from this address, a
-limit for the address, and a limit for the account from all unknown addresses. An address is unknown if nobody has
-signed in to the account from it. Because the last limit does not apply to known addresses, guesses from other addresses
-never lock out the owner (docs/decisions/0020-sign-in-limits.md).
+Every try with a wrong password counts in a limit for the account from this address, in a limit for the address, and, if
+the address is unknown, in a limit for the account from all unknown addresses together. An address is unknown if nobody
+has signed in to the account from it. The last limit does not apply to known addresses, so guesses from elsewhere never
+lock out an owner who signs in from a known address (docs/decisions/0020-sign-in-limits.md).
 """
 
 from __future__ import annotations
