@@ -302,9 +302,7 @@ class ProjectHandle(ProjectItems):
             self, handle, metric, EvaluateParams.model_validate(options),
             path=path, into=into, normaliser=normaliser, priority=priority, cache=cache, on_progress=on_progress,
         )  # fmt: skip
-        return find_crossing(
-            read_range(handle, good, bad, first_parent=first_parent), evaluations, limit, on_measured
-        )  # fmt: skip
+        return find_crossing(read_range(handle, good, bad, first_parent=first_parent), evaluations, limit, on_measured)
 
     def train_model(
         self,

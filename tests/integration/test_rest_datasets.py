@@ -14,6 +14,7 @@ from tests.support.rest_server import Server
 from marey_schemas.access import Role
 from marey_schemas.encoding.canonical import document_digest
 from marey_server.access.principal import SYSTEM
+from marey_server.store import fsck
 from marey_server.store.database.connections import Database
 from marey_server.store.fsck import check_store
 from marey_server.store.tables import dataset_commit, revision, tree_chunk
@@ -327,8 +328,9 @@ def number_of_revisions(tx: Transaction) -> int:
 
 
 def test_an_entry_whose_content_nobody_has_is_named(
-    owner: httpx.Client, gaits: Callable[..., Any], database: Database
+    owner: httpx.Client, gaits: Callable[..., Any], database: Database, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(fsck, "PAGE", 1)  # the trees of the versions are read in several batches
     put(owner, "gaits/a", "Pelvis")
     gaits("second")
     database.write(SYSTEM, lose_contents)

@@ -26,7 +26,7 @@ class VersionReader(Protocol):
 
 @dataclass(frozen=True)
 class VersionRange:
-    """VersionReader among which the first bad one is searched for.
+    """Versions among which the first bad one is searched for.
 
     Parameters
     ----------

@@ -2,6 +2,7 @@
 
 from sqlalchemy import BigInteger, Boolean, Column, ForeignKey, Index, Integer, LargeBinary, String, Table, Text
 
+from marey_schemas.webhooks import MAX_URL_LENGTH
 from marey_server.store.tables.columns import DIGEST, ID, Document, Micros, Sequence64, metadata
 
 event = Table(
@@ -26,7 +27,7 @@ webhook = Table(
     Column("id", ID, primary_key=True),
     Column("project_id", ID, ForeignKey("project.id"), nullable=False, index=True),
     Column("creator_id", ID, ForeignKey("user.id")),
-    Column("url", String(2048), nullable=False),
+    Column("url", String(MAX_URL_LENGTH), nullable=False),
     Column("kinds", Document, nullable=False),
     Column("description", Text, nullable=False),
     Column("secret", String(128), nullable=False),
@@ -34,7 +35,7 @@ webhook = Table(
     Column("old_secret_until_us", Micros),
     Column("position", BigInteger, nullable=False),  # number of the last event that was delivered or given up
     Column("missed", BigInteger, nullable=False, default=0),  # events deleted before delivery, not yet reported
-    Column("attempts", Integer, nullable=False, default=0),  # failed ones to send what follows `position`
+    Column("attempts", Integer, nullable=False, default=0),  # number of failed attempts to send the next delivery
     Column("failures", Integer, nullable=False, default=0),  # since the last success
     Column("next_us", Micros, nullable=False, default=0, index=True),  # time of the next attempt after a failure
     Column("failing_since_us", Micros),
