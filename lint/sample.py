@@ -33,18 +33,18 @@ def _docstrings(module: Module) -> Iterator[tuple[str, str]]:
     """Yield every docstring after what surrounds it in the code: module, enclosing classes, signature."""
     if text := ast.get_docstring(module.tree):
         yield module.name, text
-    introduction = f"In {module.name}: {_first_line(module.tree)}"
+    introduction = f"In {module.name}: {_first_paragraph(module.tree)}"
     definitions = dict(module.definitions)
     for name, node in module.definitions:
         if text := ast.get_docstring(node):
             parts = name.split(".")
             outside = [definitions[".".join(parts[:depth])] for depth in range(1, len(parts))]
-            around = [f"{_head(outer)} {_first_line(outer)}" for outer in outside]
+            around = [f"{_head(outer)} {_first_paragraph(outer)}" for outer in outside]
             yield f"{module.name}:{node.lineno}", "\n".join([introduction, *around, _head(node), text])
 
 
-def _first_line(node: ast.Module | Definition) -> str:
-    return (ast.get_docstring(node) or "").partition("\n")[0]
+def _first_paragraph(node: ast.Module | Definition) -> str:
+    return " ".join((ast.get_docstring(node) or "").partition("\n\n")[0].split())
 
 
 def _head(definition: Definition) -> str:
