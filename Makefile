@@ -11,8 +11,8 @@ ARGS   ?=
 # Tests start hundreds of processes, each of which would compile the sources again.
 unexport PYTHONDONTWRITEBYTECODE
 EFFORT ?= 4
-# One process more than two processors: tests of faults mostly wait, for leases to end or processes to start.
-PYTEST := $(BIN)/python -m pytest -q -n 3 --dist loadgroup $(ARGS)
+# Twice as many processes as two processors: tests of faults mostly wait, for leases to end or processes to start.
+PYTEST := $(BIN)/python -m pytest -q -n 4 --dist loadgroup $(ARGS)
 
 .DEFAULT_GOAL := help
 .PHONY: help installed demo check test soak lint format dev bench docs pins audit bom clean
