@@ -113,7 +113,7 @@ class ItemHandle:
         return self.transport.get(Lineage, f"{self.url}/lineage")
 
     def lineage_graph(self, revision: int | None = None, **options: Any) -> LineageGraph:
-        """Return what a revision, by default the newest, was made from, and what was made from it, through all jobs.
+        """Return the inputs and results of a revision, by default the newest, traced through all jobs.
 
         `options` are those of `LineageOptions`, such as `direction="inputs"` and `depth=1`. Raises `NotFound` if there
         is no such revision.

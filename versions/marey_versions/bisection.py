@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 
 class BadCommitSearch:
-    """Commits that can be the first bad one, which each tested commit makes fewer.
+    """Set of commits of which one is the first bad commit; each test of a commit reduces the set.
 
     The search assumes that the commits after a bad commit are bad, and that the ancestors of a good commit are good. It
     always tests the commit for which the larger of the two possible remainders is smallest. In a history without
@@ -94,7 +94,7 @@ def _parents_first(parents: Mapping[str, Sequence[str]], start: str) -> Iterator
 
 
 def _places_in(commits: int) -> Iterator[int]:
-    """Yield the places of the bits that are set, the lowest first."""
+    """Yield the positions of the bits that are set in `commits`, lowest first."""
     while commits:
         lowest = commits & -commits
         yield lowest.bit_length() - 1

@@ -58,7 +58,7 @@ def _cells(costs, before, totals, steps, start, stop):  # type: ignore[no-untype
 def _four_rows(costs, totals, steps):  # type: ignore[no-untyped-def]
     """Fill four rows of `totals` and `steps` at once, as `_cells` does.
 
-    Each row is a column behind the one above it, so that their cells are computed in parallel.
+    Each row is computed one column behind the row above it, so that one cell of each row is computed in parallel.
     """
     m = costs.shape[1]
     for row in range(LANES - 1):
@@ -140,13 +140,14 @@ def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
 
 @compiled
 def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first, not_second):  # type: ignore[no-untyped-def]
-    """Fill row `i` of the totals, `not_first` and `not_second` (m,), from the row before.
+    """Fill row `i` of the least totals, `not_first` and `not_second` (m,), from the row before.
 
-    They are the least totals of paths to each cell whose last step is not in the first motion alone, and not in the
-    second alone; `first_before` and `second_before` are the same in the row before. Row r of `runs` (max_run, m) has
-    the totals of paths that end with r + 1 steps in the first motion alone. A run of steps in the second motion alone
-    starts from totals that depend only on the row before. No cell therefore waits for its left neighbour, and every
-    loop runs over whole vectors.
+    `not_first[j]` is the least total of the paths to cell j whose last step does not advance the first motion alone;
+    `not_second[j]` is that of the paths whose last step does not advance the second motion alone. `first_before` and
+    `second_before` are the values of `not_first` and `not_second` in the row before. Row r of `runs` (max_run, m)
+    contains the totals of paths that end with r + 1 steps in the first motion alone; it is updated in place.
+    `scratch` (2, m) is working memory for runs in the second motion alone. Such runs start from `not_second`, which
+    depends only on the row before, so every loop runs over whole vectors.
     """
     m, max_run = costs.shape[0], runs.shape[0]
     if i == 0:

@@ -40,7 +40,7 @@ def bisect(
     metric: Annotated[
         str,
         typer.Option(
-            help="Number of the headline of the evaluation, such as offset_mean_m; an unknown name lists all."
+            help="Headline metric of the evaluation, such as offset_mean_m; an unknown name lists all metrics."
         ),
     ],
     params: Chosen,
@@ -54,7 +54,7 @@ def bisect(
     ] = False,
     path: Annotated[str, typer.Option(help="Folder of the dataset whose clips are evaluated; default: all.")] = "",
     first_parent: Annotated[
-        bool, typer.Option("--first-parent", help="Of a merge, follow only the branch that it changed.")
+        bool, typer.Option("--first-parent", help="At a merge, follow only the first parent, which is the branch that was merged into.")
     ] = False,
     into: Annotated[
         str | None,
@@ -101,7 +101,10 @@ def bisect(
 
 
 def _limit(above: float | None, below: float | None, half_way: bool) -> Limit | None:
-    """Return the limit that the options give, or None for the one half-way. Raises `WrongUsage` without one limit."""
+    """Return the limit given by --above or --below, or None for --half-way.
+
+    Raises `WrongUsage` unless exactly one of these options is given.
+    """
     from marey_client.handles.crossings import Limit
 
     if (above is not None) + (below is not None) + half_way != 1:

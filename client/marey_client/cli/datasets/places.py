@@ -53,7 +53,11 @@ def parse(text: str, *, version: bool = False) -> NamedVersion:
 
 
 def imported(at: NamedVersion, made: ImportedVersion) -> str:
-    """Return a sentence about an imported version: the branch that is at the version now, or how to merge the two."""
+    """Return a sentence for the user after an import, with the next command.
+
+    If the branch moved to the imported version, the command checks out the branch; otherwise, it merges the version
+    into the branch.
+    """
     name, digits = f"{at.project}/{at.dataset}", short(made.commit.digest)
     if not made.moved:
         return (

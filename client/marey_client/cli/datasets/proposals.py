@@ -58,7 +58,7 @@ def open_proposal(
     context: typer.Context,
     place: VersionPlace,
     title: Annotated[str, typer.Option("--title", "-t", help="What the proposal changes.")],
-    description: Annotated[str, typer.Option(help="Why, and what reviewers should look at.")] = "",
+    description: Annotated[str, typer.Option(help="Reasons for the changes, and what reviewers should look at.")] = "",
     into: Into = "main",
     as_json: AsJson = False,
 ) -> None:
@@ -104,7 +104,10 @@ def show(context: typer.Context, place: DatasetPlace, number: Number, as_json: A
 
 
 def _verdicts(found: ProposalDetail) -> list[tuple[str, str, str]]:
-    """Return one table row for each review and check: who made it, of what, and its state or verdict with its text."""
+    """Return one table row for each review and check: its author, its subject, and its result with its text.
+
+    The subject is the reviewed commit or the name of the check; the result is the verdict or the state.
+    """
     reviews = [
         (one.author, f"{short(one.commit)}{', an earlier commit' if one.stale else ''}", f"{one.verdict} {one.text}")
         for one in found.reviews
@@ -213,7 +216,7 @@ def check(
     job: Annotated[
         str | None,
         typer.Option(
-            help="Id of the job that made the check; the state succeeded is refused unless this job has succeeded."
+            help="Id of the job that ran the check; the state succeeded is accepted only if this job has succeeded."
         ),
     ] = None,
     link: Annotated[str | None, typer.Option(help="Address of a page about the check.")] = None,

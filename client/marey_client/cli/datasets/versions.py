@@ -222,7 +222,7 @@ def blame(
     kind: Annotated[str, typer.Option(help="Kind of the entry.")] = "clip",
     as_json: AsJson = False,
 ) -> None:
-    """Show which commit changed each part of an entry last, its tags last, and its path last, with author and time."""
+    """Show the last commit that changed each part of an entry, its tags and its path, with author and time."""
     at = parse(place, version=True)
     with connect(context) as marey:
         found = at.on(marey).blame(path.strip("/"), kind_named(kind), at.version)

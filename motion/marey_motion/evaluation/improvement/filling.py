@@ -130,7 +130,9 @@ def plan_fillings(
     collections: Mapping[str, MatchingDatabase],
     options: EvaluationOptions,
 ) -> tuple[Addition, ...]:
-    """Order candidates: each step adds the one that is best for the data still missing, until none provides any.
+    """Order candidates by adding, step by step, the one that best provides the data that is still missing.
+
+    The order ends when no candidate provides missing data.
 
     Candidates of another skeleton come after all others.
 

@@ -201,7 +201,7 @@ class _Search:
     def _additions(self, absent: Sources) -> list[str]:
         """List the absent sources to try, at most `consider`; those that supply most of the missing seconds come first.
 
-        Seconds are missing where the present sources have less than `_least`. Sources that would exceed `max_data_s`
+        A cell misses seconds if the present sources have less than `_least` in it. Sources that would exceed `max_data_s`
         are left out.
         """
         limit = self._options.max_data_s
