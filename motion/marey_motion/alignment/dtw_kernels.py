@@ -80,7 +80,10 @@ def _four_rows(costs, totals, steps):  # type: ignore[no-untyped-def]
 
 @compiled
 def _walk_back(steps, path):  # type: ignore[no-untyped-def]
-    """Fill `path` from the step to each cell, `steps` (n, m), last cell first; return the number of cells."""
+    """Trace the path back from the last cell; fill `path`, last cell first, and return the number of its cells.
+
+    `steps` (n, m) contains, for each cell, the number of the step that leads to it, as in `_cheapest`.
+    """
     i, j, length = steps.shape[0] - 1, steps.shape[1] - 1, 0
     while True:
         path[length, 0], path[length, 1] = i, j

@@ -75,7 +75,7 @@ def cuts_of(layer: Layer) -> tuple[Cut, ...]:
     repeated = [label for label, count in Counter(label for cut in cuts for label in cut.labels).items() if count > 1]
     if repeated:
         raise AnnotationError(
-            "this is a label, and also a repeated label with its number; rename one of the two labels",
+            "two cuts get this label, one of them as the number of a repeated label; rename one of the two labels",
             code="label-repeats",
             where=repeated[0],
         )

@@ -284,9 +284,9 @@ def _cost_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]
 
 
 def _literal_metrics(series: TrialSeries, window: Flags, grid: Grid) -> Metrics:
-    """Compute equations 1 to 4 of the paper as printed.
+    """Compute equations 1 to 4 of Abichequer Sangalli et al. (2022) as printed.
 
-    There, a sum of m + 1 terms is divided by m, and the square of a sum is divided by a count.
+    In these equations, a sum of m + 1 terms is divided by m, and the square of a sum is divided by a count.
     """
     metrics: dict[str, float | None] = {}
     for name, recorded, wanted, settings in (

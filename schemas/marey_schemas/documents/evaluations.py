@@ -21,7 +21,7 @@ RESAMPLES = 9_999
 
 
 class HeadlineMetric(NamedTuple):
-    """Number that lists and summaries show for an evaluation."""
+    """Metric of an evaluation that is shown in lists and summaries."""
 
     meaning: str
     of_trials: str | None = None
@@ -52,7 +52,7 @@ class EvaluationDocument(Request):
     """Part `evaluation`: options, provenance, metrics of every trial, usage, coverage, baseline.
 
     Its members are those of `marey_motion.evaluation.result.EvaluationResult`, with arrays as leaves. This class
-    declares only the members that lists and summaries show.
+    declares only the members that are shown in lists and summaries.
     """
 
     model_config = ConfigDict(extra="allow")

@@ -177,7 +177,9 @@ def _inside(project_row: ProjectRow, path: str) -> tuple[ColumnElement[bool], ..
 
 
 def _lock_inside(tx: Transaction, project_row: ProjectRow, path: str) -> Sequence[str]:
-    """Lock all folders below a locked one and return their paths; none is changed or added before this write ends.
+    """Lock all folders below the locked folder at `path`, and return their paths.
+
+    No folder below `path` is changed or added before this write ends.
 
     `ensure` locks the parent while it adds a folder. A folder that this function waited for may have got new subfolders
     in the meantime, so the search is repeated.

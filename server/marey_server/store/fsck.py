@@ -337,7 +337,7 @@ def _is_consistent(one: Row[Any], branches: set[str]) -> bool:
 
 
 def _check_webhook(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return the faults of a webhook because of which it would skip events or could not sign."""
+    """Return the faults of a webhook that would make it skip events or prevent it from signing messages."""
     retried = (webhook_delivery.c.webhook_id == row.id, webhook_delivery.c.state == "retrying")
     faults = {
         "its position is after the newest event": row.position > newest_number(tx),

@@ -48,7 +48,9 @@ def test_labels_that_repeat_are_numbered_in_the_order_of_time() -> None:
     layer = Layer(60, (Segment("left", 0, 20), Segment("right", 20, 40), Segment("left", 40, 60)))
     assert [cut.labels for cut in cuts_of(layer)] == [("left",), ("right",), ("left 2",)]
     clash = Layer(60, (Segment("left", 0, 20), Segment("left", 20, 40), Segment("left 2", 40, 60)))
-    with pytest.raises(AnnotationError, match="left 2: this is a label, and also a repeated label with its number"):
+    with pytest.raises(
+        AnnotationError, match="left 2: two cuts get this label, one of them as the number of a repeated label"
+    ):
         cuts_of(clash)
 
 

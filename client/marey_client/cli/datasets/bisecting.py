@@ -54,7 +54,7 @@ def bisect(
     ] = False,
     path: Annotated[str, typer.Option(help="Folder of the dataset whose clips are evaluated; default: all.")] = "",
     first_parent: Annotated[
-        bool, typer.Option("--first-parent", help="At a merge, follow only the first parent, which is the branch that was merged into.")
+        bool, typer.Option("--first-parent", help="At a merge, follow only the branch into which it merged.")
     ] = False,
     into: Annotated[
         str | None,
@@ -70,9 +70,9 @@ def bisect(
 ) -> None:
     """Find the first version, after a good one, at which a metric of the evaluation has crossed a value.
 
-    Evaluates the good and the bad version, then versions between them, each time the one that halves those that can be
-    the first bad one. Versions that cannot be evaluated are skipped; if they hide the first bad version, all versions
-    that can be it are listed, and the exit status is 1. The same command continues an interrupted search.
+    Evaluates the good and the bad version, then versions between them. Each evaluation halves the number of candidates
+    for the first bad version. Versions that cannot be evaluated are skipped; if this leaves several candidates, all of
+    them are listed, and the exit status is 1. The same command continues an interrupted search.
     """
     from marey_client.handles.bisections import read_range
     from marey_client.handles.crossings import VersionEvaluations, find_crossing

@@ -103,8 +103,8 @@ def log(
 ) -> None:
     """List a version and the versions before it, newest first.
 
-    Of a merge, only the first parent is followed: the branch that the merge changed. So the list of this branch has the
-    merge itself, but not the versions that it merged.
+    At a merge, the list continues only with the first parent, which is the branch into which the version was merged.
+    The list therefore contains the merge itself, but not the merged versions.
     """
     at = parse(place, version=True)
     with connect(context) as marey:

@@ -132,9 +132,7 @@ def plan_fillings(
 ) -> tuple[Addition, ...]:
     """Order candidates by adding, step by step, the one that best provides the data that is still missing.
 
-    The order ends when no candidate provides missing data.
-
-    Candidates of another skeleton come after all others.
+    The order ends when no candidate provides missing data. Candidates of another skeleton come after all others.
 
     Parameters
     ----------

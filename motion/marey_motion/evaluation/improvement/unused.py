@@ -93,7 +93,7 @@ def find_unused(
 ) -> Unused:
     """Find the sources and ranges of frames that no trial needs, the longest first.
 
-    A loop is removed only as a whole if playback wraps from its end to its start.
+    A loop whose playback wraps from its end to its start is removed either as a whole or not at all.
 
     Parameters
     ----------

@@ -262,7 +262,7 @@ class VersionEntries(NamedTuple):
     """Path of the dataset's folder, empty if it has none."""
     found: tuple[EntryRevision, ...]
     missing: tuple[DatasetEntry, ...]
-    """Entries whose content no revision of the project has."""
+    """Entries whose content is not in any revision of the project."""
 
 
 def entries_of_kind(
