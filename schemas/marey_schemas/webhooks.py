@@ -113,7 +113,8 @@ DeliveryState = Literal["waiting", "retrying", "delivered", "dead"]
 class WebhookDelivery(Answer):
     """Delivery that was requested, or of which an attempt has failed.
 
-    `waiting` deliveries are sent once and soon, `retrying` ones are repeated, and `dead` ones were given up.
+    A `waiting` delivery will be sent once, soon. A `retrying` delivery is sent again until it succeeds or is given up;
+    it is then `delivered` or `dead`.
     """
 
     id: str

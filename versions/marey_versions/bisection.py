@@ -50,7 +50,7 @@ class BadCommitSearch:
     def next(self) -> str | None:
         """Return the commit to test next, or None if the search has ended.
 
-        The search has ended if only the bad commit is left, or if none of the others that are left can be tested.
+        The search has ended if the known bad commit is the only suspect, or if no other suspect can be tested.
         """
         total = self._left.bit_count()
 

@@ -75,7 +75,7 @@ def cuts_of(layer: Layer) -> tuple[Cut, ...]:
     repeated = [label for label, count in Counter(label for cut in cuts for label in cut.labels).items() if count > 1]
     if repeated:
         raise AnnotationError(
-            "two cuts get this label, one of them as the number of a repeated label; rename one of the two labels",
+            "this is both the label of one cut and the numbered name of a repeated label; rename one of the two labels",
             code="label-repeats",
             where=repeated[0],
         )

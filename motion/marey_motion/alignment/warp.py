@@ -64,9 +64,10 @@ def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
 
 
 def _with_least_slope(times: Floats) -> Floats:
-    """Return the times (N,) nearest to the given ones that have no step from frame to frame below `LEAST_SLOPE`.
+    """Change times (N,) as little as possible so that every step from frame to frame is at least `LEAST_SLOPE`.
 
-    The first and the last time stay; the steps are nearest in least squares. Raises `MotionError`.
+    The first and the last time stay, and the sum of the squared changes of the steps is minimal. Raises `MotionError`
+    if the mean slope is below `LEAST_SLOPE`.
     """
     steps, least = np.diff(times), LEAST_SLOPE + _SLACK
     if steps.min() >= LEAST_SLOPE:

@@ -137,7 +137,7 @@ def measure_trial(trial: Trial, reference: Reference, record: TrialRecord, optio
 
 
 def _pieces(trial: Trial, times_s: Floats) -> NDArray[np.int64]:
-    """Find the number of the period of constant speed at each time; -1 before the circle."""
+    """Return, for each time, the index of its period of constant speed; -1 during the approach."""
     on_circle = times_s + TIME_TOLERANCE_S - trial.approach_s
     if trial.family == "switching":
         return np.maximum(np.floor(on_circle / trial.switch_every_s), -1.0).astype(np.int64)

@@ -87,7 +87,7 @@ def draw_difference(difference: Difference, file_type: FileType) -> bytes:
     elif difference.annotations is not None:
         figure = _draw_annotations(difference, *difference.annotations)
     else:
-        raise ValueError("only differences between motions and between annotations have a picture")
+        raise ValueError("only differences between two motions or between two annotations can be drawn")
     return to_png(figure) if file_type == "png" else to_svg(figure, _title(difference)).encode()
 
 

@@ -60,7 +60,7 @@ class EvaluationDocument(Request):
     schema_: Literal["marey/evaluation@1"] = Field("marey/evaluation@1", alias="schema")
     verdict: str = Field(max_length=2000, description="Assessment of the clips in one or two sentences.")
     headline: dict[str, float | int | None] = Field(
-        max_length=64, description="Numbers that lists of items show, by name."
+        max_length=64, description="Numbers by name, shown in lists of items."
     )
 
 

@@ -138,7 +138,7 @@ class MotionPrimitiveDocument(Request):
     name: ItemName = Field(description="Name of the action that the model generates.")
     verdict: str = Field("", max_length=2000, description="Assessment of the model in one or two sentences.")
     headline: dict[str, float | int | str | None] = Field(
-        default_factory=dict, max_length=64, description="Numbers that lists of items show, by name."
+        default_factory=dict, max_length=64, description="Numbers by name, shown in lists of items."
     )
     skeleton: RevisionRef | OutputRef
     joints: tuple[JointName, ...] = Field(

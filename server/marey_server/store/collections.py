@@ -179,10 +179,9 @@ def _inside(project_row: ProjectRow, path: str) -> tuple[ColumnElement[bool], ..
 def _lock_inside(tx: Transaction, project_row: ProjectRow, path: str) -> Sequence[str]:
     """Lock all folders below the locked folder at `path`, and return their paths.
 
-    No folder below `path` is changed or added before this write ends.
-
-    `ensure` locks the parent while it adds a folder. A folder that this function waited for may have got new subfolders
-    in the meantime, so the search is repeated.
+    No folder below `path` is changed or added before this write ends, because `ensure` locks the parent while it adds a
+    folder. While this function waits for the lock of a folder, subfolders may be added to it, so the search is repeated
+    until it finds no more folders.
     """
     statement = select(collection.c.path).where(*_inside(project_row, path)).order_by(collection.c.path)
     paths: Sequence[str] = []

@@ -294,7 +294,7 @@ def _check_dataset(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return a fault for each entry of a version if no revision in the project has the content of that entry."""
+    """Return a fault for each entry of a version whose content is not in any revision of the project."""
     trees = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id == row.id)
     waiting = set(tx.execute(trees).scalars())
     seen: set[str] = set()

@@ -24,14 +24,14 @@ FORGOTTEN_AT_ONCE = 10_000
 
 @dataclass(frozen=True, slots=True)
 class RateLimit:
-    """Limit of the events with a key: at most `burst` at once, and then one each `interval_us`."""
+    """Limit on events with the same key: at most `burst` at once, then one per `interval_us` (microseconds)."""
 
     key: str
     burst: int
     interval_us: int
 
     def latest_us(self, now_us: int) -> int:
-        """Return the latest time that the row may contain if another event is to be allowed now."""
+        """Return the latest time in the row of the limit at which another event is still allowed now."""
         return now_us + (self.burst - 1) * self.interval_us
 
 

@@ -70,8 +70,8 @@ def create_archive(
 def verify(file: ArchivePath, as_json: AsJson = False) -> None:
     """Check that an archive is complete, and that nothing in it was changed. No server is needed.
 
-    The commit is printed last: compare it with the one that you expect, because somebody could have made a new archive
-    of other content.
+    The commit is printed last. Compare it with the commit that you expect: a new archive with other content also
+    passes this check.
     """
     from marey_versions.archive.checking import check_archive
 

@@ -70,7 +70,7 @@ def bisect(
 ) -> None:
     """Find the first version, after a good one, at which a metric of the evaluation has crossed a value.
 
-    Evaluates the good and the bad version, then versions between them. Each evaluation halves the number of candidates
+    Evaluates the good and the bad version, then versions between them. Each evaluation roughly halves the candidates
     for the first bad version. Versions that cannot be evaluated are skipped; if this leaves several candidates, all of
     them are listed, and the exit status is 1. The same command continues an interrupted search.
     """

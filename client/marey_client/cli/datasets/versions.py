@@ -94,8 +94,8 @@ def log(
     path: Annotated[
         str,
         typer.Option(
-            help="Entry or folder: list only versions that changed it or anything below it, and how many entries each "
-            "of them added, removed, moved or changed there, compared with its first parent."
+            help="Entry or folder. Only versions that changed it or anything below it are listed, each with the numbers "
+            "of entries that were added, removed, moved or changed there since its first parent."
         ),
     ] = "",
     most: Annotated[int, typer.Option("--limit", "-n", min=1, help="Greatest number of versions to list.")] = 20,
@@ -120,7 +120,7 @@ def log(
 
 
 def _at_path(one: ListedCommit) -> str:
-    """Return what a commit did at the path of the list, such as `1 moved to raw/stroll`."""
+    """Return the changes of a commit at the path given to `log`, such as `1 moved to raw/stroll`."""
     where = [f" {way} {path}" for way, path in (("from", one.moved_from), ("to", one.moved_to)) if path]
     return "".join([comparing.counts_in_words(one.changes or {}), *where])
 
@@ -249,7 +249,7 @@ def checkout(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Bring the folder of a dataset to the state of a version. Removed items can be restored."""
+    """Bring the folder of a dataset to the state of a version. Items that this removes can be restored."""
     at = parse(place, version=True)
     with connect(context) as marey:
         found = at.on(marey).check_out(at.version, discard=discard)

@@ -68,7 +68,9 @@ def record(
     with connect(context) as marey:
         clips = _clips_at(marey.project(address.project).clips, address.path, query)
         if not clips:
-            raise WrongUsage(f"there are no such clips at {place}; `marey ls {address.project}` lists the project")
+            raise WrongUsage(
+                f"{place} has no clips, or none that --query selects; `marey ls {address.project}` lists the project"
+            )
         if table is not None:
             changes = list(_from_table(table, clips, address.path, _pairs(column or ())))
         else:

@@ -45,7 +45,7 @@ class Suggestions:
     unused : data whose removal changes no trial
     redundant : all clips that were tried, ranked by the harm of their removal per second saved
     plan : a sequence of removals, starting from the set without its unused clips
-    spared : near-duplicates to remove, each with its pair, whose other clip stays
+    spared : near-duplicates to remove, each with the pair to which it belongs; the other clip of the pair stays
     fillings, additions : clips of other collections that fill holes: each measured alone, and a sequence in which each
         is measured after all earlier ones
     tried : number of needed clips that were left out one at a time, and number of all needed clips
