@@ -111,7 +111,7 @@ DeliveryState = Literal["waiting", "retrying", "delivered", "dead"]
 
 
 class WebhookDelivery(Answer):
-    """Delivery that was requested, or of which an attempt has failed.
+    """Delivery that a user requested, or that has failed at least once.
 
     A `waiting` delivery will be sent once, soon. A `retrying` delivery is sent again until it succeeds or is given up;
     it is then `delivered` or `dead`.

@@ -94,8 +94,8 @@ def log(
     path: Annotated[
         str,
         typer.Option(
-            help="Entry or folder. Only versions that changed it or anything below it are listed, each with the numbers "
-            "of entries that were added, removed, moved or changed there since its first parent."
+            help="Entry or folder. Only versions that changed it or anything below it are listed, each with the "
+            "numbers of entries that were added, removed, moved or changed there since its first parent."
         ),
     ] = "",
     most: Annotated[int, typer.Option("--limit", "-n", min=1, help="Greatest number of versions to list.")] = 20,
