@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 
 class BadCommitSearch:
-    """Set of commits of which one is the first bad commit; each test of a commit reduces the set.
+    """State of a search. The suspects are the commits that can be the first bad one; each test reduces them.
 
     The search assumes that the commits after a bad commit are bad, and that the ancestors of a good commit are good. It
     always tests the commit for which the larger of the two possible remainders is smallest. In a history without

@@ -182,7 +182,7 @@ def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first
 
 @compiled
 def _walk_back_limited(costs, max_run, not_first, not_second, path):  # type: ignore[no-untyped-def]
-    """Fill `path`, last cell first, one run of equal steps at a time; return the number of cells.
+    """Trace the path back, one run of equal steps at a time; fill `path`, last cell first; return the number of cells.
 
     `not_first` and `not_second` (n, m) are the totals of `_limited_row` for all rows.
 

@@ -31,7 +31,7 @@ class RateLimit:
     interval_us: int
 
     def latest_us(self, now_us: int) -> int:
-        """Return the latest time in the row of the limit at which another event is still allowed now."""
+        """Return the greatest value that the time in the row may have for another event to be allowed now."""
         return now_us + (self.burst - 1) * self.interval_us
 
 

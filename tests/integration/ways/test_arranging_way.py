@@ -304,7 +304,7 @@ def test_a_wrong_table_changes_no_record(
         (["record", "lab/raw"], "give either values with --set"),
         (["record", "lab/raw", "--set", "selcet=best"], "there is no field 'selcet'"),
         (["record", "lab/raw", "--set", "best"], "'best' has no name and value"),
-        (["record", "lab/nothing", "--set", "select=best"], "has no clips, or none that --query selects"),
+        (["record", "lab/nothing", "--set", "select=best"], "lab/nothing has no clips"),
     ],
 )
 def test_wrong_queries_and_records_are_refused(run: Command, arguments: list[str], told: str) -> None:

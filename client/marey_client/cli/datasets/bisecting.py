@@ -45,12 +45,12 @@ def bisect(
     ],
     params: Chosen,
     job: Chosen,
-    bad: Annotated[str, typer.Option(help="Bad version, after the good one.")] = "main",
+    bad: Annotated[str, typer.Option(help="Bad version, after the good one: a branch, a tag or a commit.")] = "main",
     above: Annotated[float | None, typer.Option(help="Versions with a value above this one are bad.")] = None,
     below: Annotated[float | None, typer.Option(help="Versions with a value below this one are bad.")] = None,
     half_way: Annotated[
         bool,
-        typer.Option("--half-way", help="The limit is half-way between the values at the good and the bad version."),
+        typer.Option("--half-way", help="Set the limit half-way between the values of the good and the bad version."),
     ] = False,
     path: Annotated[str, typer.Option(help="Folder of the dataset whose clips are evaluated; default: all.")] = "",
     first_parent: Annotated[
@@ -58,7 +58,9 @@ def bisect(
     ] = False,
     into: Annotated[
         str | None,
-        typer.Option(help="Folder of the evaluations; default: the name of the dataset with -bisect at its end."),
+        typer.Option(
+            help="Folder that receives the evaluations; default: the name of the dataset, followed by -bisect."
+        ),
     ] = None,
     loop: Loops = None,
     trim: Trims = None,

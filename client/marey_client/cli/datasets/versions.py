@@ -249,7 +249,7 @@ def checkout(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Bring the folder of a dataset to the state of a version. Items that this removes can be restored."""
+    """Bring the folder of a dataset to the state of a version. Items removed by the command can be restored."""
     at = parse(place, version=True)
     with connect(context) as marey:
         found = at.on(marey).check_out(at.version, discard=discard)

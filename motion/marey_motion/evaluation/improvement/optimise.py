@@ -201,8 +201,8 @@ class _Search:
     def _additions(self, absent: Sources) -> list[str]:
         """List the absent sources to try, at most `consider`; those that supply most of the missing seconds come first.
 
-        A cell misses seconds if the present sources have less than `_least` in it. Sources whose addition would exceed
-        `max_data_s` are left out.
+        A cell lacks data if the present sources have less than `_least` seconds in it. Sources whose addition would
+        exceed `max_data_s` are left out.
         """
         limit = self._options.max_data_s
         room = np.inf if limit is None else limit - self._simulation.seconds(absent)
