@@ -150,7 +150,7 @@ class Context:
         """Stage results. All of them become visible together when the job completes.
 
         Raises `RequestRefused` if earlier results could not be stored. The method does not wait until results are
-        stored: the supervisor waits for the last ones, while this process runs the next job.
+        stored. The supervisor waits for the last results of a job while this process runs the next job.
         """
         body = encode_outputs(outputs)
         while len(self._staging) >= STAGED_AT_ONCE:

@@ -55,8 +55,7 @@ class SourceExample:
     Parameters
     ----------
     uid : str    stable name of the example
-    name : str    name shown to people; of equally good references, the one that is first by name, then by uid, is
-        chosen
+    name : str    name shown to people; among equally good references, the first by name, then by uid, is chosen
     clip : Clip    the motion
     cuts : tuple of Cut    labelled frames of this clip, in the order of time (`segments.cuts_of`); all examples must
         have cuts with the same labels

@@ -19,7 +19,7 @@ class CostPoints(NamedTuple):
 
     Parameters
     ----------
-    rows : (F, P, 3) float64    positions, times the square root of each point's share of the total weight
+    rows : (F, P, 3) float64    positions, multiplied by the square root of each point's share of the total weight
     columns : (P, 3, F) float64    the same, transposed
     energies : (n,) float64    weighted sum of squared horizontal distances from the centre, over each frame's window
     centres : (n, 2) float64    horizontal weighted centre of each frame's window; zero if each frame is centred alone

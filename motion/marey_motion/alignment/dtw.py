@@ -37,8 +37,8 @@ class Alignment:
 def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
     """Find the cheapest path through a matrix of costs.
 
-    A step is named after the frames by which it advances in both motions. Among equally cheap paths, a step 1-1 is
-    preferred to 1-0, and 1-0 to 0-1.
+    A step 1-0, for example, advances by one frame in the first motion and by none in the second. Among equally cheap
+    paths, a step 1-1 is preferred to 1-0, and 1-0 to 0-1.
 
     Parameters
     ----------

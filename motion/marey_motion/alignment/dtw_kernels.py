@@ -244,8 +244,8 @@ def distances(a, b, out):  # type: ignore[no-untyped-def]
 def total_within(a, b, rest, limit):  # type: ignore[no-untyped-def]
     """Compute the least total of a path through the distances of a (n, P, 3) and b (P, 3, m); infinite above `limit`.
 
-    rest (n,) is a lower bound of the cost of all rows after each row. Every path crosses every row, and its total never
-    falls: once the least total of a row plus `rest` exceeds the limit, the final total does, too.
+    rest[i] is a lower bound of the cost that a path adds after row i. Every path crosses every row, so the computation
+    stops as soon as the least total in a row plus its `rest` exceeds the limit.
     """
     n, m = a.shape[0], b.shape[2]
     costs = np.empty(m)

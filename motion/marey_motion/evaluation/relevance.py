@@ -42,7 +42,7 @@ def clip_starts(clips: Sequence[DatabaseClip]) -> NDArray[np.int64]:
 
     Returns
     -------
-    (C + 1,) int64    first rows, and the number of all rows
+    (C + 1,) int64    first row of each clip, then the total number of rows
     """
     return np.array([clip.start for clip in clips] + [clips[-1].stop if clips else 0], dtype=np.int64)
 

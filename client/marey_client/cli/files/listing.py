@@ -135,7 +135,7 @@ def _explain(
 
 
 def _columns(text: str, *, also: Sequence[str] = ()) -> list[str]:
-    """Return the names of columns in a text with commas. Raises `WrongUsage`."""
+    """Return the column names in a comma-separated text. Raises `WrongUsage` for an unknown column."""
     names = [name.strip() for name in text.split(",")]
     for name in names:
         if name not in COLUMNS and name not in also:

@@ -86,7 +86,7 @@ def _clips_at(clips: Any, path: str, query: str | None) -> list[ClipHandle]:
 
 
 def _pairs(texts: Sequence[str]) -> dict[str, str]:
-    """Return names and values of texts such as `action=walk`."""
+    """Parse texts such as `action=walk`, and return the values by name."""
     pairs = {}
     for text in texts:
         name, sign, value = text.partition("=")
@@ -160,7 +160,7 @@ def _from_table(
 
 
 def _keyed(clips: Sequence[ClipHandle], path: str, key: str) -> dict[str, list[ClipHandle]]:
-    """Return clips by the texts that identify them in a table."""
+    """Group clips by the text that identifies them in the column `key` of a table."""
     known: dict[str, list[ClipHandle]] = {}
     for clip in clips:
         if key == "clip":
