@@ -103,9 +103,9 @@ def evaluate(
 
 
 def add_clip_options(marey: Marey, params: Chosen, loop: Sequence[str] | None, trim: Sequence[str] | None) -> None:
-    """Add the options that name clips to those of an evaluation, with the ids of the clips.
+    """Add the clips of --loop and --trim, by their ids, to the parameters of an evaluation.
 
-    With loops, clips continue at their end unless the options choose another behaviour.
+    With --loop, the end policy of the database is `loop`, unless the parameters set another one.
     """
     if loop:
         params.setdefault("database", {}).setdefault("end_policy", "loop")

@@ -160,7 +160,7 @@ def _from_table(
 
 
 def _keyed(clips: Sequence[ClipHandle], path: str, key: str) -> dict[str, list[ClipHandle]]:
-    """Group clips by the text that identifies them in the column `key` of a table."""
+    """Group clips by the texts that can identify them in the column `key` of a table."""
     known: dict[str, list[ClipHandle]] = {}
     for clip in clips:
         if key == "clip":
