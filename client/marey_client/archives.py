@@ -179,7 +179,7 @@ class _Making:
         self.writer.add(ArchiveMember(MemberKind.COMMIT, commit.digest), canonical_json(record.document))
 
     def _note(self, entry: Entry, earlier: Entry | None) -> None:
-        """Note the revision of an entry, and where to fetch its documents, except those that `earlier` has, too."""
+        """Record the revision of an entry, and where to fetch its documents; skip documents that `earlier` also has."""
         content = _content(entry)
         self.known.add(content)
         for part, digest in entry.parts.items():
@@ -313,7 +313,11 @@ def _place(entry: Entry) -> tuple[str, str]:
 
 
 def _line(place: tuple[str, str], entry: Entry | None, unchanged: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Return the JSON object that describes a changed entry in the archive's list of changes."""
+    """Return the JSON object that describes a changed entry in the archive's list of changes.
+
+    `entry` is the entry after the change; None if it was removed. `unchanged` maps the parts that did not change to the
+    content digest of the earlier revision.
+    """
     path, kind = place
     if entry is None:
         return {"path": path, "kind": kind, "removed": True}

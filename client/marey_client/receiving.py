@@ -73,7 +73,7 @@ def require_base(archive: Archive, has: Callable[[str], bool]) -> None:
 
 
 class _Revision(NamedTuple):
-    """Revision in an archive, with the path of an entry that has this revision; None if no entry has it."""
+    """Revision in an archive. `path` is the path of an entry that has this revision; None if no entry has it."""
 
     kind: str
     parts: Mapping[str, str]
@@ -201,7 +201,10 @@ class _Import:
         self._note(contents)
 
     def _part(self, digest: str) -> Any:
-        """Return a document as it is sent to the server, or, if the project has it, a revision that contains it."""
+        """Return a part of a revision for a request: the document, or a reference to a revision that contains it.
+
+        The reference is used if the project has the document already.
+        """
         if digest in self.homes:
             return {"content": self.homes[digest]}
         tree = self._document(digest)

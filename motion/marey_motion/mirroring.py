@@ -30,7 +30,7 @@ class _Mirror:
     Parameters
     ----------
     sources : (J,) index of the joint from which each joint gets its motion
-    frames : (J, 3, 3) improper matrices that map the partner's local axes to the joint's own
+    frames : (J, 3, 3) improper matrices that map the local axes of the source to those of the joint
     outer, inner : (J, 4) rotations to multiply the source's local rotation with, from the left and from the right
     carried : (J,) joints that have no counterpart and keep their local motion
     """
@@ -125,7 +125,10 @@ def _mirror_of(skeleton: Skeleton, pairing: tuple[int, ...]) -> _Mirror:
 
 
 def _frame(skeleton: Skeleton, sources: NDArray[np.int64], carried: NDArray[np.bool_], joint: int) -> Floats:
-    """Make the improper matrix (3, 3) that maps the local axes of the partner to the axes of the joint."""
+    """Return the improper matrix (3, 3) that maps the local axes of a joint's source to those of the joint.
+
+    `sources` and `carried` are those of `_Mirror`.
+    """
     source = sources[joint]
     rest = quaternions.as_matrix(skeleton.rest_global_rotations[[joint, source]])
     by_rest = rest[0].T @ REFLECTION @ rest[1]
@@ -139,9 +142,9 @@ def _frame(skeleton: Skeleton, sources: NDArray[np.int64], carried: NDArray[np.b
 
 
 def _frame_of_bones(by_rest: Floats, bones: Floats, partners: Floats) -> Floats:
-    """Find the improper matrix (3, 3) nearest to `by_rest` that maps the partner's bones to the joint's own.
+    """Find the improper matrix (3, 3) nearest to `by_rest` that maps the bones of a joint's source to its own bones.
 
-    `bones` and `partners` (n, 3) are the offsets of the children of the joint and of its partner.
+    `bones` and `partners` (n, 3) are the offsets of the children of the joint and of its source.
     """
     seen = partners @ by_rest.T
     lengths = np.linalg.norm(bones, axis=1) * np.linalg.norm(seen, axis=1)

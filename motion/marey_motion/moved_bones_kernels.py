@@ -1,6 +1,7 @@
-"""Compiled turns of moved bones, kept apart so that importing the rest of the package does not load numba.
+"""Compiled functions that compute the rotations of bones whose joints were moved.
 
-Operations and their order are the same as in `quaternions`, so that results are bit-identical.
+They have a module of their own, so that importing the rest of the package does not load numba. Operations and their
+order are the same as in `quaternions`, so that results are bit-identical.
 """
 
 from __future__ import annotations
@@ -48,10 +49,10 @@ def shortest_turns(rigid, moved, starts, ends, shortest_bone, nearly_opposite, t
 
 @compiled
 def turn_joints(world, parents, joints, turns, out):  # type: ignore[no-untyped-def]
-    """Turn B joints in the world, and fill `out` (F, 4·J) with the resulting local rotations of all joints.
+    """Apply rotations in world axes to B joints, and fill `out` (F, 4·J) with the new local rotations of all J joints.
 
-    `world` (F, J, 4) are the global rotations before. Rotation b of `turns` (B, F, 4) turns joint b of `joints` (B,).
-    `parents` (J,) are the indices of the parents.
+    `world` (F, J, 4) are the global rotations of all joints before. Rotation b of `turns` (B, F, 4) is applied to joint
+    b of `joints` (B,). `parents` (J,) are the indices of the joints' parents.
     """
     turned = np.empty((parents.shape[0], 4))
     for f in range(world.shape[0]):

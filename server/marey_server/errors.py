@@ -40,10 +40,11 @@ class ApiProblem(Exception):
 
 
 def forget_origin(error: BaseException) -> None:
-    """Remove the traceback and the causes of a refusal, which nobody logs.
+    """Remove the traceback and the causes from an `ApiProblem`, which is sent to the client and never logged.
 
-    A function that stores its error in a future refers to both, and the traceback refers to the function. Such circles
-    would keep the whole body of a refused request until the garbage collector finds them, which stops all threads.
+    If a function stores an error in a future, the function refers to the error, and the traceback of the error refers
+    to the function. Such reference cycles would keep the whole body of a refused request in memory until the next
+    garbage collection, which stops all threads.
     """
     if isinstance(error, ApiProblem):
         error.__traceback__ = error.__context__ = error.__cause__ = None

@@ -46,7 +46,7 @@ def claim(transport: Transport, request: ClaimRequest) -> tuple[Lease, ...]:
 
 
 class AttemptApi:
-    """Client of one attempt's endpoints, with its own token. Every method may raise `LeaseLost`."""
+    """Client of the endpoints of one attempt at a job, with the attempt's token. Every method may raise `LeaseLost`."""
 
     def __init__(self, transport: Transport, lease: Lease) -> None:
         self._transport = transport.with_token(lease.attempt_token)
@@ -83,7 +83,7 @@ class AttemptApi:
         self._post("fail", as_json(request))
 
     def read_parts(self, places: Sequence[PartPlace]) -> list[bytes | None]:
-        """Read documents as undecoded MessagePack with arrays in blocks; None replaces a document that does not exist.
+        """Read documents as undecoded MessagePack with block-encoded arrays; None if a document does not exist.
 
         Documents at the end of a long list may be omitted, but not the first one.
         """

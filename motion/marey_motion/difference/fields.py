@@ -36,8 +36,8 @@ def changed_values(before: Any, after: Any, pointer: str = "") -> Iterator[Chang
     """Compare two documents.
 
     Objects are compared by field, lists of equal length by position. If lists have different lengths, entries of only
-    one of them count as removed or added. Arrays are compared as a whole. Null, an empty list and an empty object equal
-    an absent value.
+    one of them count as removed or added. Arrays are compared as a whole. Null, an empty list and an empty object count
+    as absent values.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def _changed_members(before: Mapping[str, Any], after: Mapping[str, Any], pointe
 
 
 def _is_nothing(value: Any) -> bool:
-    """Return whether a value is null, an empty list or an empty object, which equal an absent value."""
+    """Return whether a value is null, an empty list or an empty object, all of which count as absent values."""
     return value is None or (isinstance(value, Mapping | list | tuple) and not value)
 
 
@@ -109,7 +109,7 @@ def _key(value: Any) -> str:
 
 
 def _shown(value: Any) -> Any:
-    """Return a value for the difference; arrays and long values are replaced by a description in words."""
+    """Return a value as it appears in a difference: arrays and long values become short descriptions in words."""
     if isinstance(value, np.ndarray):
         return f"array of {' x '.join(str(size) for size in value.shape)} numbers"
     text = json.dumps(value, default=_shown)

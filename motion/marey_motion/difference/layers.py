@@ -106,7 +106,11 @@ def _pair_costs(before: Ints, after: Ints) -> Floats:
 
 
 def _range_costs(before: Ints, after: Ints) -> Floats:
-    """Compute (n, m) values: 1 minus the share of frames that the ranges of two entries have in common."""
+    """Compute the costs (n, m) of pairing ranges: 0 for equal ranges, 1 for ranges that do not overlap.
+
+    The cost is 1 minus the number of common frames, divided by the number of frames from the first start to the last
+    end.
+    """
     common = np.minimum(before[:, None, 2], after[None, :, 2]) - np.maximum(before[:, None, 1], after[None, :, 1])
     whole = np.maximum(before[:, None, 2], after[None, :, 2]) - np.minimum(before[:, None, 1], after[None, :, 1])
     return np.asarray(1.0 - np.maximum(common, 0) / whole, dtype=np.float64)

@@ -109,7 +109,7 @@ def _paces(count_before: int, count_after: int, rate_ratio: float) -> list[float
 def _better(best: Timing, before: Poses, after: Poses, pace: float, *, search: bool = False) -> Timing:
     """Match the frames at another pace, and refine that pace; return `best` unless the new timing is much better.
 
-    `search` is whether to search for similar frames while refining, see `match_frames`.
+    `search` enables a search for similar frames (see `match_frames`) while the pace is refined.
     """
     if pace == 1.0:
         tried = _at_pace(before, after, Pace(1.0), search=True)
@@ -123,7 +123,7 @@ def _better(best: Timing, before: Poses, after: Poses, pace: float, *, search: b
 def _at_pace(before: Poses, after: Poses, pace: Pace, *, search: bool) -> Timing:
     """Sample the old clip at a pace, and match the samples with the frames of the new clip.
 
-    `search` is whether to search for similar frames, see `match_frames`.
+    `search` enables a search for similar frames (see `match_frames`).
     """
     sampled = before
     if pace != Pace(1.0):

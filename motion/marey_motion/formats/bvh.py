@@ -140,7 +140,7 @@ def _read_frames(
     if frames == 0 and header.declared_frames:
         lines.number = header.data_line
         declared = counted(header.declared_frames, "frame")
-        raise lines.error(f"the header declares {declared}, but the file contains none", code="file-truncated")
+        raise lines.error(f"the header declares {declared}, but the file contains no frames", code="file-truncated")
     _warn_of_layout(header, frames, wrapped, warnings)
     return table.values.reshape(frames, width) if frames else np.empty((0, width))
 
@@ -181,7 +181,7 @@ def _positions_of(
 ) -> NDArray[np.float64]:
     """Return the local positions (F, k, 3) of k joints, from the values (F, C) of the channels.
 
-    On axes without a position channel, it is the OFFSET, `offsets` (J, 3).
+    On axes without a position channel, the position is the joint's OFFSET, from `offsets` (J, 3).
     """
     wanted = columns.positions[joints]
     positions = values[:, wanted]

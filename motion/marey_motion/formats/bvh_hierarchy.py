@@ -49,7 +49,10 @@ class BvhHeader:
 
 @dataclass(frozen=True)
 class _KeptHierarchy:
-    """A parsed HIERARCHY, which files share, so its lists must not be changed; and the position and line after it."""
+    """Parsed HIERARCHY in the cache. Files with equal text share it, so its lists must not be changed.
+
+    `position` is the offset of the first byte after its text, `number` the number of the last line of its text.
+    """
 
     header: BvhHeader
     position: int

@@ -70,7 +70,7 @@ def _axes_of(skeleton: Skeleton, joint: int, rotation_order: str, source: Source
 
 
 def _depth_first(skeleton: Skeleton) -> list[int]:
-    """List the joints in depth-first order, which is the order of the skeleton if that is depth-first."""
+    """List the indices of the joints in depth-first order. An order that is depth-first already does not change."""
     order, waiting = [], [0]
     while waiting:
         joint = waiting.pop()
@@ -135,7 +135,7 @@ def _channel_values(clip: Clip, order: list[int], axes: NDArray[np.int64], scale
 
 
 def format_table(values: NDArray[np.float64]) -> bytes:
-    """Format lines of numbers with six decimals, separated by blanks.
+    """Format lines of numbers with six decimals, separated by spaces.
 
     Parameters
     ----------

@@ -160,7 +160,7 @@ def _turned(rotations: NDArray[Real], axes: NDArray[np.float64]) -> NDArray[Real
 
 
 def _notices(source: SourceMotion, up_axis: UpAxis) -> list[CheckWarning]:
-    """List changes made by the reader and the conversion, for the user."""
+    """List the changes that the reader and the conversion made to the data, as warnings for the user."""
     notices = []
     if up_axis != "y":
         message = f"the file has {up_axis} up; it was turned to y up"

@@ -1,4 +1,4 @@
-"""Lines of a text file with their numbers, and the errors that all text readers share."""
+"""Lines of a text file with line numbers, and the errors that all text readers share."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class TextLines:
     Attributes
     ----------
     number : number of the line last returned, from 1; 0 before the first
-    position : byte after that line's end
+    position : offset of the first byte after that line and its line end
     """
 
     def __init__(self, data: bytes, file: str) -> None:
@@ -34,7 +34,7 @@ class TextLines:
         self.position = len(_BYTE_ORDER_MARK) if data.startswith(_BYTE_ORDER_MARK) else 0
 
     def __iter__(self) -> Iterator[bytes]:
-        """Yield every further line that is not blank, without surrounding whitespace."""
+        """Yield each remaining line that is not blank, without surrounding white space."""
         while (line := self.next()) is not None:
             if line:
                 yield line
@@ -156,7 +156,7 @@ def number_problem(word: str) -> str:
 
 
 def decode_name(name: bytes) -> str:
-    """Decode a joint name as UTF-8, or else as Latin-1; unprintable characters become blanks.
+    """Decode a joint name as UTF-8, or else as Latin-1; unprintable characters become spaces.
 
     Parameters
     ----------

@@ -78,7 +78,7 @@ def normalise(q: ArrayLike) -> AnyFloats:
 
     Raises
     ------
-    RotationError    if one has no length
+    RotationError    if a quaternion has zero length
     """
     (q,), dtype = widened((q, 4))
     return unit(q, "quaternion").astype(dtype, copy=False)
@@ -158,7 +158,7 @@ def between_vectors(start: ArrayLike, end: ArrayLike, *, half_turn_axis: ArrayLi
 
     Raises
     ------
-    RotationError    if a direction has no length
+    RotationError    if a direction has zero length
     """
     (start, end), dtype = widened((start, 3), (end, 3))
     start, end = np.broadcast_arrays(unit(start, "start direction"), unit(end, "end direction"))
@@ -290,7 +290,8 @@ def _rotated(q: Floats, v: Floats) -> Floats:
 def _between_opposite(start: Floats, end: Floats, wished: NDArray[Any] | None) -> Floats:
     """Find rotations (n, 4) from `start` (n, 3) to nearly opposite unit vectors `end` (n, 3).
 
-    Each is half a turn about an axis perpendicular to `start`, then the small rotation from there to `end`.
+    Each is half a turn about an axis perpendicular to `start`, then the small rotation from there to `end`. `wished`
+    (..., 3) gives the axis of the half turn where `start` and `end` are exactly opposite; it may be None.
     """
     candidates = [cross(start, end), np.eye(3)[np.argmin(np.abs(start), axis=-1)]]
     if wished is not None:

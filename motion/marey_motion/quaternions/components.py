@@ -135,7 +135,7 @@ def unit(v: Floats, what: str) -> Floats:
     Parameters
     ----------
     v : (..., n) float64    vectors or quaternions
-    what : str    word for one of them in an error
+    what : str    noun for a single vector or quaternion, for the error message
 
     Returns
     -------
@@ -143,7 +143,7 @@ def unit(v: Floats, what: str) -> Floats:
 
     Raises
     ------
-    RotationError    if one has no length
+    RotationError    if a vector or quaternion has zero length
     """
     length: Floats = np.linalg.norm(v, axis=-1, keepdims=True)
     if not np.all(length > TINY):

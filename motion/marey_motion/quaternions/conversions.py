@@ -93,7 +93,7 @@ def from_axis_angle(axis: ArrayLike, angle_rad: ArrayLike) -> AnyFloats:
 
     Raises
     ------
-    RotationError    if an axis has no length
+    RotationError    if an axis has zero length
     """
     (axis,), dtype = widened((axis, 3))
     half = 0.5 * np.asarray(angle_rad, dtype=np.float64)[..., None]

@@ -202,7 +202,7 @@ class MoveToOrigin(NamedCommand):
 
 
 class Scale(NamedCommand):
-    """Scale the path of the body, including its heights. The skeleton is another item and does not change."""
+    """Scale the path of the body, including its heights. The skeleton is a separate item and does not change."""
 
     examples: ClassVar[Examples] = ({"factor": 1.2, "translations": True},)
     command: Literal["scale"] = "scale"

@@ -223,9 +223,9 @@ def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
 
 
 def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
-    """Prevent the deletion of blobs that a job's parameters or result name; readers of its project may then read them.
+    """Prevent the deletion of blobs that a job's parameters or result name, and let readers of its project read them.
 
-    Raises `ConflictProblem` (`missing-blobs`) if one is not stored or the caller may not refer to it.
+    Raises `ConflictProblem` (`missing-blobs`) if a blob is not stored or the caller may not refer to it.
     """
     wanted = set(digests)
     if lacking := wanted - hold(tx, wanted):
@@ -325,10 +325,11 @@ def _held(tx: Transaction, digests: Iterable[str], *, since_us: int) -> set[str]
 
 
 def _within_reach(caller: Principal) -> tuple[ColumnElement[bool], ...]:
-    """Return the condition for rows of `blob_holder`, the user's uploads, whose bytes the user's token may use.
+    """Return SQL conditions that select, among the uploads of a user, those whose bytes the user's token may use.
 
-    A token that may read in all projects may use all uploads of the user. Any other token may use uploads for the
-    projects that its scopes name; and, if one of its other scopes is for all projects, uploads for every project.
+    The uploads are rows of `blob_holder`, each for one project or for every project. A token that may read in all
+    projects may use all uploads of its user. Any other token may use the uploads for the projects that its scopes name.
+    If one of its scopes is for all projects, it may also use the uploads for every project.
     """
     if scopes.allows(caller.scopes, "read"):
         return ()
@@ -338,7 +339,7 @@ def _within_reach(caller: Principal) -> tuple[ColumnElement[bool], ...]:
 
 
 def reaches(tx: Transaction, places: Collection[str]) -> bool:
-    """Return whether the token of a user is valid for all the projects for which bytes were uploaded."""
+    """Return whether the caller's token is valid for all projects with the ids `places`."""
     caller = tx.principal
     names = scopes.projects_of(caller.scopes, *_USES)
     return EVERY_PROJECT in names or set(places) <= set(tx.execute(_ids_of(names)).scalars())

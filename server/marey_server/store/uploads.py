@@ -117,8 +117,9 @@ def read_pieces(tx: Transaction, upload_id: str, start: int, size_bytes: int) ->
 def finish(tx: Transaction, upload_id: str, digest: str, copy: Path | None) -> StoredUpload:
     """Store a complete upload, whose bytes have the given digest, as a blob; a repeated call changes nothing.
 
-    The bytes are not read: the blob uses either the stored pieces, or `copy`, a file that the backing made. If another
-    digest was announced, no blob is made and the actual digest is recorded, see `require_intact`.
+    The bytes are not read. The blob uses either the stored pieces, or `copy`, a file to which the storage of blobs has
+    copied them. If another digest was announced, no blob is made, and `digest` is recorded as the actual digest (see
+    `require_intact`).
 
     Raises `ConflictProblem` if bytes are missing.
     """
@@ -153,7 +154,7 @@ def require_intact(found: StoredUpload) -> None:
 
 
 def abandon(tx: Transaction, upload_id: str) -> None:
-    """Delete an upload; a blob made from it is kept."""
+    """Mark an upload as dropped, so that it is deleted later; a blob made from it is kept."""
     found = _find(tx, upload_id)
     tx.execute(update(upload).where(upload.c.id == found.id).values(dropped=True))
 
@@ -162,7 +163,7 @@ def abandon(tx: Transaction, upload_id: str) -> None:
 
 
 def drop_old(tx: Transaction, limit: int) -> int:
-    """Delete uploads that received no piece for `LIFETIME_US`; return their number."""
+    """Mark uploads that received no piece for `LIFETIME_US` as dropped; return their number."""
     old = select(upload.c.id).where(upload.c.updated_us < tx.now_us - LIFETIME_US, upload.c.dropped.is_(False))
     found = list(tx.execute(old.limit(limit).with_for_update(skip_locked=True)).scalars())
     tx.execute(update(upload).where(upload.c.id.in_(found)).values(dropped=True))
@@ -182,14 +183,14 @@ def delete_pieces(tx: Transaction) -> int:
 
 
 def delete_dropped(tx: Transaction, limit: int) -> int:
-    """Delete the rows of dropped uploads that have no pieces; return their number."""
+    """Delete the rows of dropped uploads whose pieces were deleted; return the number of rows."""
     has_pieces = exists().where(upload_chunk.c.upload_id == upload.c.id)
     empty = select(upload.c.id).where(upload.c.dropped, ~_HAS_BLOB, ~has_pieces).limit(limit)
     return tx.execute(delete(upload).where(upload.c.id.in_(list(tx.execute(empty).scalars())))).rowcount
 
 
 def _sender(tx: Transaction) -> dict[str, Any]:
-    """Return the columns that say who sends an upload and for which projects."""
+    """Return the columns of a new upload that record who sends it and for which projects."""
     caller = tx.principal
     blobs.require_sender(caller)
     if caller.kind == "attempt":

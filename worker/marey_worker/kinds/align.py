@@ -200,7 +200,10 @@ class _Job:
         return found
 
     def _cuts(self, clip: _Clip, annotations: Mapping[str, Sequence[_ClipAnnotation]]) -> tuple[Cut, ...]:
-        """Return the frames at which a clip's annotation cuts it. An annotation of the clip's revision is preferred."""
+        """Return the frames at which a clip's annotation cuts it.
+
+        An annotation of the clip's own revision has precedence over annotations of other revisions of the clip.
+        """
         known = annotations.get(clip.pin.item, ())
         known = [one for one in known if one.clip.revision == clip.pin.revision] or known
         if len(known) != 1:

@@ -86,7 +86,7 @@ def _proposal(params: AnnotateParams) -> Propose:
 
 
 def _joints(rigged: Rigged, names: Sequence[str]) -> tuple[int, ...]:
-    """Return joints by their own name, or else by their standard name. Raises `UnknownJoint`."""
+    """Return the indices of joints, found by their own names or else by standard names. Raises `UnknownJoint`."""
     found = []
     for name in names:
         own = name if name in rigged.skeleton else rigged.mapping.joints.get(name)

@@ -136,7 +136,7 @@ class _Editing:
         )
 
     def _body(self, motion: MotionDocument) -> EditedBody:
-        """Return the skeleton of a motion; its mapping is read only if a command needs it. Raises `MotionError`."""
+        """Return the skeleton of a motion, with a function that reads its joint mapping. Raises `MotionError`."""
         used = _skeleton_of(motion)
         if used not in self._bodies:
             tree = self._context.document(Kind.SKELETON, used.item, used.revision, "hierarchy")

@@ -67,7 +67,9 @@ class _Exporting:
         self._skeletons: dict[RevisionRef, tuple[Skeleton, dict[str, Any]]] = {}
 
     def file_of(self, pin: PinnedInput, info: dict[str, Any], tree: Any = None) -> _File:
-        """Return the file of a clip; the original file needs no motion.
+        """Return a clip as a file in the requested format.
+
+        `info` and `tree` are the parts `info` and `motion` of the clip; the format "original" does not need `tree`.
 
         Raises `MotionError` or `NoSuchThing` if the clip has no file in this format.
         """

@@ -126,7 +126,9 @@ def _provenance(
 def write_model_report(
     context: Context, trained: TrainedPrimitive, aligned: AlignedSet, origin: Mapping[str, Any], params: ModelParams
 ) -> dict[str, Any]:
-    """Draw the figures of a model and of its alignment, write the page, and return the document that refers to them.
+    """Draw the figures of a model and of its alignment, and write the report page with them.
+
+    Returns the document that refers to the stored page and figures.
 
     Parameters
     ----------

@@ -69,7 +69,10 @@ def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> Matc
 
 
 def _simulation(context: Context, evaluated: EvaluatedSet, database: MatchingDatabase) -> Resimulation:
-    """Return a simulation of the set, which reuses the evaluation's records if the database has no further clips."""
+    """Return a simulation with the clips of `database`.
+
+    If these are only the clips of the evaluated set, the simulation reuses the records of the evaluation.
+    """
     alone = database is evaluated.clips.database
     return Resimulation(
         database,

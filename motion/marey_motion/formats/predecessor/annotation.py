@@ -145,7 +145,7 @@ def write_predecessor_annotation(
 
 
 def _parsed(text: str, file: str) -> Any:
-    """Parse sections that are stored as text in the document."""
+    """Parse sections that the document contains as a string of JSON."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:

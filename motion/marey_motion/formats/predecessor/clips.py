@@ -41,7 +41,7 @@ def motion_of_document(
     skeleton_file: str = "the skeleton document",
     frame_rate_hz: float | None = None,
 ) -> SourceMotion:
-    """Read a document of a clip, for which `skeleton` contains its skeleton, or a document of a skeleton.
+    """Read a clip document together with its skeleton document, or a skeleton document alone.
 
     Parameters
     ----------
@@ -138,7 +138,10 @@ def write_predecessor_skeleton(
 
 
 def _clip_fields(document: dict[str, Any], file: str) -> tuple[list[str], NDArray[np.float64], float]:
-    """Read joint names, poses (F, 3 + 4·J) with quaternions w, x, y, z, and frame time, from either form of clip."""
+    """Read the joint names, the poses and the frame time of a clip document of either form ("poses" or "frames").
+
+    The rows of the poses (F, 3 + 4·J) contain the root's translation and quaternions w, x, y, z.
+    """
     if "poses" in document:
         names = text_list(document, "joint_sequence", file)
         poses = number_array(document["poses"], file, "poses")
@@ -174,7 +177,10 @@ def _engine_rows(frames: list[Any], file: str) -> NDArray[np.float64]:
 
 
 def _fill_motion(source: SourceMotion, names: list[str], poses: NDArray[np.float64], file: str) -> None:
-    """Assign the rows to the skeleton's joints; joints that the clip does not contain get their rest rotation."""
+    """Set the rotations and root positions of `source`, which already has its skeleton, from the poses of a clip.
+
+    Joints that the clip does not contain get their rest rotation.
+    """
     indices = {name: joint for joint, name in enumerate(source.joint_names)}
     unknown = next((name for name in names if name not in indices), None)
     if unknown is not None:

@@ -1,9 +1,9 @@
-"""The predecessor's graphs of models: nodes by action and by the id of the model in the predecessor's data base, and
-the node where sequences start.
+"""The predecessor's graphs of models: nodes with transitions, and the node where sequences start.
 
+A document contains the nodes by action and by the id of the model in the predecessor's data base. It has the form
 `{"nodes": {action: {model id: {"name", "type", "transitions": {"action:model": {"action_name", "model_name",
-"model_id"}}}}}, "start_node": [action, model]}`; some programs write `startNode`. A transition and the start name a
-model by its id or by its name.
+"model_id"}}}}}, "start_node": [action, model]}`; some programs write `startNode`. Transitions and the start node refer
+to a model by its id or by its name.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The predecessor's motion primitives, in the four layouts that were published (see `model_layouts`).
 
-Right-handed, centimetres, quaternions w, x, y, z; the root's translation is added to the root's offset. Arrays of
-coefficients have the shape (coefficient, channel).
+The documents are right-handed, with lengths in centimetres and quaternions w, x, y, z. The root's translation is added
+to the root's offset. Arrays of coefficients have the shape (coefficient, channel).
 """
 
 from __future__ import annotations
@@ -238,7 +238,7 @@ def _animated(parts: ModelParts, basis: SplineBasis, mean: Floats, skeleton: Ske
     """List the joints that the model rotates.
 
     `mean` (n, D) are the coefficients of its mean motion. Raises `FormatError` if the skeleton lacks a joint, or if
-    rotations are zero.
+    all rotations of a frame are zero.
     """
     animated = parts.animated_joints or list(skeleton.joint_names)
     if mean.shape[1] != 3 + 4 * len(animated):

@@ -150,7 +150,9 @@ def _renamed(document: Document, names: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _time_part(time: Document | None, layout: Layout, file: str) -> tuple[Document | None, TimeForm]:
-    """Return the time part of a model, with one component per row, or None if there is none; and the form of its time.
+    """Return the time part of a model, and the form of its time function.
+
+    The returned part has one component per row; it is None if the model has no time part.
 
     Layout 2 was written by two training programs. The first stores components as columns and uses the form
     `increments`; the later one stores them as rows and uses the form `coefficients`, as layout 3 does.

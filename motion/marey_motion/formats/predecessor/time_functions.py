@@ -5,7 +5,7 @@ scores. Marey's model contains ln(t(x + 1) - t(x)), which is linear in g. The pr
 
 * `coefficients` (layouts 1 and 3, and layout 2 by its later training program): t(x) is a spline whose coefficients are
   cumsum(exp(mean + g · eigen)) - 1. The logarithm of its slope is not linear in g. It is approximated by the linear
-  function that fits best for scores drawn from the model; the largest error is returned, too.
+  function that fits best for scores drawn from the model; `as_log_slopes` also returns the largest error.
 * `increments` (layout 2 by its first training program): t(x + 1) - t(x) = exp(spline(x + 1)), where the spline is
   linear in g. This is also the form of Marey's model.
 """
@@ -76,14 +76,14 @@ def as_log_slopes(
     Parameters
     ----------
     time : PredecessorTime    the time function
-    scores : (m, k) float64    scores that the model draws
+    scores : (m, k) float64    scores drawn from the model, at which the conversion is fitted
     variances : (k,) float64    variances of the scores
     file : str    name of the file, for messages
 
     Returns
     -------
     components : FunctionalComponents    Marey's form
-    error_frames : float    largest difference over the scores
+    error_frames : float    largest difference between the two forms at these scores, in frames
     """
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
         wanted = time.time_functions(scores)
@@ -174,8 +174,8 @@ def as_increments(primitive: MotionPrimitive) -> PredecessorTime:
 def _drawn(primitive: MotionPrimitive) -> tuple[Floats, Floats]:
     """Draw the temporal scores (m, k) of m latent vectors from the model, and compute their time functions (m, N).
 
-    The limits that keep a model's motions within its examples' range are not applied: they would bend the linear
-    function that is fitted.
+    The limits that keep a model's motions within its examples' range are not applied, because with them the time
+    functions would not be close to a function that is linear in the scores.
     """
     free = replace(primitive, duration_range_s=None, log_slope_range=None)
     latents = free.sample(DRAWN, SEED)
@@ -190,10 +190,12 @@ def _linear_fit(scores: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def _basis_over(steps: int) -> SplineBasis:
-    """Make a basis with as many coefficients as steps, so that any function is represented exactly.
+    """Make a spline basis for functions with values at `steps` steps.
 
-    Knots are at all steps but the second and the last but one. Evenly spaced knots would drift away from the steps to
-    places between them, where interpolation amplifies rounding. Long functions have fewer knots.
+    If `steps` is at most `KNOTS_AT_MOST`, there are at least as many coefficients as steps, so that any function is
+    represented exactly. Its knots are at all steps but the second and the last but one. Evenly spaced knots would drift
+    away from the steps to places between them, where interpolation amplifies rounding. Longer functions have fewer
+    knots, and are approximated.
     """
     if steps <= DEGREE:
         return SplineBasis.clamped(steps, DEGREE + 1)
@@ -202,7 +204,7 @@ def _basis_over(steps: int) -> SplineBasis:
 
 
 def _spline_fit(basis: SplineBasis, values: Floats) -> Floats:
-    """Fit the coefficients (m, n) of functions with values (m, N) at each canonical frame, by banded systems."""
+    """Fit the coefficients (m, n) of splines to values (m, N) at N frames, by solving banded linear systems."""
     from scipy.interpolate import make_interp_spline, make_lsq_spline
 
     frames = np.arange(values.shape[1], dtype=np.float64)

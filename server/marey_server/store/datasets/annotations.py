@@ -33,7 +33,7 @@ class AnnotationMerger:
     """Merges annotations of one project, and keeps the resulting documents until a commit stores them."""
 
     def __init__(self, tx: Transaction, project_id: str, most: int | None = None) -> None:
-        """Merge at most `most` annotations, by default `MOST_MERGED`; further ones are in conflict."""
+        """Create a merger of at most `most` annotations, by default `MOST_MERGED`; further ones are in conflict."""
         self._tx = tx
         self._project_id = project_id
         self._most = MOST_MERGED if most is None else most
@@ -90,7 +90,11 @@ class AnnotationMerger:
     def _refusal(
         self, three: Sequence[str], digests: Mapping[str, str], sizes: Mapping[str, int]
     ) -> AnnotationClash | None:
-        """Return the reason for which versions of an annotation are not loaded, None if they are."""
+        """Return the reason why an annotation is not merged, or None if its three versions can be loaded.
+
+        `three` are the content digests of the base, our version and their version; `digests` maps these to the digests
+        of the documents, and `sizes` maps the latter to sizes in bytes.
+        """
         if not three:
             return ADDED_TWICE
         if any(content not in digests for content in three):
@@ -113,7 +117,10 @@ class AnnotationMerger:
 
 
 def _contents_of(one: ChangedPart) -> tuple[str, ...]:
-    """Return the content digests of the three revisions with versions of a part; none if there is no base."""
+    """Return the content digests of the revisions that contain the base, our version and their version of a part.
+
+    If there is no base, the result is empty.
+    """
     return () if one.base is None else (one.base.content, one.ours.content, one.theirs.content)
 
 

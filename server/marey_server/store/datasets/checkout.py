@@ -115,8 +115,8 @@ class _Checkout:
         held = revisions_with(self.tx, self.project.id, wanted)
         if lacking := sorted(wanted[content].path for content in wanted.keys() - held.keys()):
             raise InvalidProblem(
-                f"The project has no item with the content of {counted(len(lacking), 'entry')} of the version, the "
-                f"first at {lacking[0]!r}. Commit another content to this path, or check out another version.",
+                f"The project has no item with the content of {counted(len(lacking), 'entry')} of the version; the "
+                f"first is at {lacking[0]!r}. Commit an existing item to this path, or check out another version.",
                 code="no-content",
             )
         parts = read_part_digests(self.tx, set(held.values()))

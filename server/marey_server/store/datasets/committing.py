@@ -1,7 +1,7 @@
 """Commits: a read prepares the new version, and a short write records it.
 
-The write checks that the newest commit of the branch is still the one that the read has found. So no version is
-computed from one commit and recorded after another.
+The write checks that the newest commit of the branch is still the one that the read has found. So a version that was
+computed from an older commit is never recorded.
 """
 
 from __future__ import annotations
@@ -313,7 +313,7 @@ def _items_named(tx: Transaction, project_row: ProjectRow, put: Sequence[PutEntr
         rows.update((row.id, row) for row in tx.execute(statement))
     if missing := [one for one in wanted if one not in rows]:
         raise NotFoundProblem(
-            f"{counted(len(missing), 'item')} of the changes are not in this project, the first {missing[0]!r}.",
+            f"{counted(len(missing), 'item')} of the changes are not in this project; the first is {missing[0]!r}.",
             code="no-item",
         )
     return rows

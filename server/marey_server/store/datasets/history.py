@@ -52,7 +52,7 @@ def _commit(tx: Transaction, dataset_id: str, digest: str) -> Commit:
 
 
 def tree_of(tx: Transaction, dataset_id: str, digest: str) -> str:
-    """Return the root of the tree of a commit."""
+    """Return the digest of the root of a commit's tree."""
     of_dataset = (dataset_commit.c.dataset_id == dataset_id, dataset_commit.c.digest == digest)
     return str(tx.execute(select(dataset_commit.c.tree).where(*of_dataset)).scalar_one())
 
@@ -81,8 +81,8 @@ def list_commits(
 ) -> Page:
     """List a commit and the commits before it, newest first; of the parents of a merge, only the first is followed.
 
-    With `path`, list only the commits that changed the entries at this path or below it, compared with their first
-    parent, and say what each of them did there. A page ends after `MOST_EXAMINED` commits or `MOST_DIFFERENCES`
+    With `path`, list only the commits that changed entries at this path or below it, compared with their first parent,
+    and report what each commit changed there. A page ends after `MOST_EXAMINED` commits or `MOST_DIFFERENCES`
     compared entries, so it may have fewer than `limit` commits although more follow.
     """
     row = find_dataset(tx, projects.require(tx, project), name)
@@ -102,7 +102,7 @@ def list_commits(
 
 
 def _along_first_parents(tx: Transaction, dataset_id: str, start: str, steps: int) -> Sequence[Row[Any]]:
-    """Return the rows of a commit, its first parent, the first parent of that, and so on, up to the place `steps`."""
+    """Return the rows of a commit and of at most `steps` earlier commits, from each commit to its first parent."""
     earlier = first_parents(dataset_id, start, steps)
     return tx.execute(
         select(dataset_commit)

@@ -119,7 +119,7 @@ def _parent_of(picked: Commit, parent: int | None) -> str | None:
 def _start(
     tx: Transaction, found: Row[Any], request: CombineRequest, theirs: str | None, message: str
 ) -> PreparedMerge:
-    """Return a merge of the commit `theirs` into the branch that `request` names, which is not computed yet.
+    """Return a merge of the commit `theirs` into the branch that `request` names; the result is not computed yet.
 
     `commit.recorded` is set if an earlier request has recorded the merge; `message` is used if the request has none.
     """
@@ -205,7 +205,7 @@ def _changed(store: StoredChunks, base: str, tree: str, most: int | None = None)
     found = list(islice(difference(store, base, tree), None if most is None else most + 1))
     if most is not None and len(found) > most:
         raise InvalidProblem(
-            f"One side has changed more than {most:,} entries, so the merge is not computed here; request its preview.",
+            f"One side has changed more than {most:,} entries, so its result is not computed; preview the merge.",
             code=LARGE_MERGE,
         )
     return compare_entries(found)

@@ -87,7 +87,7 @@ def create_dataset(tx: Transaction, project: str, request: DatasetCreate) -> Dat
 
 def _require_room(held: int, most: int, of_what: str, code: str) -> None:
     if held >= most:
-        raise ConflictProblem(f"The greatest number of {of_what} is {most:,}; delete one first.", code=code)
+        raise ConflictProblem(f"There can be at most {most:,} {of_what}; delete one first.", code=code)
 
 
 def read_dataset(tx: Transaction, project: str, name: str) -> Dataset:
@@ -154,9 +154,9 @@ def find_ref(tx: Transaction, dataset_id: str, name: str, *, lock: bool = False)
 
 
 def lock_refs(tx: Transaction, dataset_id: str) -> None:
-    """Let no other transaction delete or protect a branch of the dataset, or open a proposal.
+    """Lock the branches and proposals of a dataset until this transaction ends.
 
-    The lock ends with this transaction.
+    While the lock is held, no other transaction can delete or protect a branch, or open a proposal.
     """
     tx.lock(f"refs of {dataset_id}")
 
@@ -189,7 +189,7 @@ def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> 
 def move_branch(
     tx: Transaction, project: str, name: str, branch: str, request: RefMove, *, expected_rev: ExpectedRev
 ) -> Ref:
-    """Move a branch to any version of the dataset; the commits that it had stay.
+    """Move a branch to any version of the dataset. No commit is deleted.
 
     Raises `InvalidProblem` for a tag, `PreconditionFailedProblem` if the branch has moved since it was read, and
     `ConflictProblem` if the branch is protected.
@@ -215,7 +215,7 @@ def is_tag(name: str) -> InvalidProblem:
 def delete_ref(tx: Transaction, project: str, name: str, ref: str, *, expected_rev: ExpectedRev) -> None:
     """Delete a branch or a tag; the commits stay. The branch `main` cannot be deleted.
 
-    Raises `ConflictProblem` if the branch is protected, or if an open proposal is about it.
+    Raises `ConflictProblem` if the branch is protected, or is the source or target of an open proposal.
     """
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)
@@ -277,14 +277,15 @@ def resolve(tx: Transaction, dataset_id: str, version: str) -> str:
     found = tx.execute(select(chain.c.digest).where(chain.c.place == back)).scalar()
     if found is None:
         few = "There is no commit" if back == 1 else f"There are fewer than {back} commits"
-        raise NotFoundProblem(f"{few} before {name!r}.", code="no-version")
+        raise NotFoundProblem(f"{few} before {name!r}, so this version does not exist.", code="no-version")
     return str(found)
 
 
 def first_parents(dataset_id: str, start: str, steps: int) -> CTE:
-    """Return the query for the `digest` and `place` of a commit, its first parent, the first parent of that, and so on.
+    """Return a query for a commit and the commits before it, from each commit to its first parent.
 
-    `start` has the place 0; the query ends at the place `steps`.
+    The rows have the columns `digest` and `place`. The commit `start` has the place 0, its first parent the place 1,
+    and so on, up to the place `steps`.
     """
     first = (dataset_commit.c.dataset_id == dataset_id, dataset_commit.c.digest == start)
     chain = select(dataset_commit.c.digest, literal_column("0").label("place")).where(*first).cte(recursive=True)

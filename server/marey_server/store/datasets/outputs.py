@@ -1,8 +1,9 @@
 """Commits of the outputs of jobs, made in the transactions that end the jobs.
 
 The row of the branch is locked before its tree is read, so that commits of several jobs to one branch follow each
-other and none is lost. A job that started from an older commit of the branch is merged three ways: its outputs come
-to the paths that nobody has changed since then. If somebody has, the commit goes to a branch named after the job.
+other and none is lost. If the branch has moved since the job started, the outputs are merged with the changes of
+others. If others have changed the same part of an entry, the outputs are committed to a new branch, which is named after
+the job.
 """
 
 from __future__ import annotations
@@ -67,10 +68,12 @@ class OutputEntries:
 
 @dataclass(frozen=True)
 class CommittedOutputs:
-    """Commit that has the outputs, None if no entry changed, and the reason if it is not on the intended branch."""
+    """Result of committing the outputs of a job."""
 
     digest: str | None = None
+    """Commit with the outputs; None if no commit was made, for example because no entry changed."""
     conflict: CommitConflict | None = None
+    """Reason why the outputs are not on the intended branch."""
 
 
 def lock_branch(tx: Transaction, dataset_id: str, branch: str, mover: Mover) -> Row[tuple[object, ...]]:
@@ -213,8 +216,8 @@ def _record(
 ) -> str:
     """Store a commit and its chunks; return the commit's digest.
 
-    The same commit may be stored already: on branches of their own, identical jobs that end in one transaction make
-    the same commit.
+    The commit may be stored already: identical jobs that end in one transaction, each with a new branch of its own,
+    make the same commit.
     """
     at = datetime_of(tx.now_us).strftime(TIME_OF_COMMIT)
     record = CommitRecord(tree, tuple(parents), mover.name, wanted.message, at)
@@ -230,9 +233,10 @@ def _record(
 def _on_own_branch(
     tx: Transaction, wanted: OutputEntries, mover: Mover, store: StoredChunks, tree: str, merged: MergedEntries
 ) -> CommittedOutputs:
-    """Commit the outputs, the tree `tree`, to a new branch that starts where the job started.
+    """Commit `tree`, the tree with the outputs, to a new branch that begins at the commit from which the job started.
 
-    Returns the commit, and the conflicts in `merged` as the reason why it is not on the intended branch.
+    Returns the commit, and the conflicts in `merged` as the reason why it is not on the intended branch. If the dataset
+    has too many branches and tags, no commit is made.
     """
     paths = sorted({path_and_kind(one.key)[0] for one in merged.conflicts})
     changed = f"{counted(len(paths), 'path')} of the outputs changed on {wanted.branch!r} while the job ran"
@@ -268,7 +272,7 @@ def _create_branch(tx: Transaction, wanted: OutputEntries, digest: str) -> str:
 def _follow_in_folder(
     tx: Transaction, wanted: OutputEntries, before: str | None, digest: str, changes: Mapping[str, Value | None]
 ) -> None:
-    """Record the commit `digest` as checked out in the dataset's folder, if the folder has everything that it changed.
+    """Record the commit `digest` as checked out in the dataset's folder, if the folder contains its changes already.
 
     This is so if the commit `before` was checked out in the folder, and each entry in `changes` is the newest revision
     of an item at its path in the folder. Otherwise, nothing is recorded, and a user must check out the commit before

@@ -20,7 +20,10 @@ CODE = "branch-protected"
 
 @dataclass(frozen=True)
 class Mover:
-    """User on whose behalf a branch moves, and whether a proposal that was accepted moves it."""
+    """User on whose behalf a branch is moved.
+
+    `by_proposal` is true if the move is the merge of a proposal.
+    """
 
     name: str
     role: Role
@@ -63,10 +66,10 @@ def require_reset(ref: Row[Any]) -> None:
 
 
 def require_deletable(tx: Transaction, ref: Row[Any]) -> None:
-    """Raise `ConflictProblem` if a branch or a tag is protected, or if an open proposal is about it."""
+    """Raise `ConflictProblem` if a branch is protected, or is the source or target of an open proposal."""
     if ref.protection is not None:
         raise ConflictProblem(
-            f"The branch {ref.name!r} is protected; remove the protection before you delete it.", code=CODE
+            f"The branch {ref.name!r} is protected; remove the protection before you delete the branch.", code=CODE
         )
     followed = and_(proposal.c.source == ref.name, proposal.c.head.is_(None))
     about = select(proposal.c.number).where(
@@ -77,7 +80,7 @@ def require_deletable(tx: Transaction, ref: Row[Any]) -> None:
     number = tx.execute(about.limit(1)).scalar()
     if number is not None:
         raise ConflictProblem(
-            f"The open proposal {number} is about the branch {ref.name!r}; merge or close the proposal first.",
+            f"The open proposal {number} has the branch {ref.name!r} as source or target; merge or close it first.",
             code="proposal-open",
             context={"proposal": number},
         )

@@ -1,7 +1,8 @@
-"""Versions from archives and other servers: their revisions and commits, which keep their digests.
+"""Receipt of versions from archives and other servers; their revisions and commits keep their digests.
 
-The items of revisions that are the content of entries are in no folder. Those of other revisions, such as the skeleton
-of clips, are in the folder `IMPORTED`.
+For each received revision that the project lacks, a new item is created. If the revision is the content of a dataset
+entry, the item is hidden, and no folder shows it. Other items, such as the skeletons of clips, are in the folder
+`IMPORTED`.
 """
 
 from __future__ import annotations
@@ -91,8 +92,8 @@ def _stored(one: ReceivedRevision, part: str, content: str, local: LocalRevision
 def store_revisions(tx: Transaction, project: str, name: str, drafts: Mapping[str, Draft]) -> StoredRevisions:
     """Store received revisions; `drafts` maps the content digest of each to its draft.
 
-    The items of revisions that are the content of entries are hidden. Raises `InvalidProblem` if the content
-    digest of a stored revision is not the one that the request gives.
+    If a revision is the content of a dataset entry, its item is hidden. Raises `InvalidProblem` if the content digest
+    of a stored revision is not the one that the request gives.
     """
     project_row = projects.require(tx, project)
     folder = find_dataset(tx, project_row, name).path or ""

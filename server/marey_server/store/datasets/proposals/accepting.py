@@ -221,7 +221,7 @@ def _record(
 
 
 def withdraw_merge(tx: Transaction, project: str, name: str, number: int) -> Proposal:
-    """Stop a proposal from being merged automatically, as `when_green` requested; the proposal stays open."""
+    """Cancel the request (`when_green`) to merge a proposal automatically; the proposal stays open."""
     found = find_dataset(tx, projects.require(tx, project), name)
     row = lock_open(tx, found.id, number)
     if is_waiting(row):

@@ -33,7 +33,7 @@ _AUTHOR, _WAITING, _ENDING = user.alias("author"), user.alias("waiting"), user.a
 def find_proposal(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
     """Return the row of a proposal, with the names of the users in it.
 
-    The columns `head_now` and `target_now` are the newest commits of its source and its target.
+    The columns `head_now` and `target_now` are the newest commits of the proposal's source and of its target.
     """
     row = tx.execute(_rows(dataset_id).where(proposal.c.number == number)).first()
     if row is None:
@@ -58,7 +58,7 @@ def lock_open(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
 
 
 def require_newest(tx: Transaction, row: Row[Any], version: str | None) -> None:
-    """Raise `ConflictProblem` if a version is named that is not the newest commit of the proposal."""
+    """Raise `ConflictProblem` if `version` is given and is not the newest commit of the proposal."""
     if version is not None and resolve(tx, row.dataset_id, version) != row.head_now:
         raise ConflictProblem(
             "The proposal has a newer commit than the one that you name; review the newer one first.",
@@ -68,7 +68,7 @@ def require_newest(tx: Transaction, row: Row[Any], version: str | None) -> None:
 
 
 def is_proposal(dataset_id: str, number: int) -> tuple[ColumnElement[bool], ...]:
-    """Return the conditions for the row of a proposal."""
+    """Return the SQL conditions that select the row of a proposal."""
     return proposal.c.dataset_id == dataset_id, proposal.c.number == number
 
 
@@ -96,7 +96,10 @@ def _rows(dataset_id: str) -> Select[Any]:
 
 
 def is_waiting(row: Row[Any]) -> bool:
-    """Return whether a proposal waits to be merged (`when_green`); a new commit in its source cancels the request."""
+    """Return whether a proposal will be merged as soon as nothing is missing any more, as `when_green` requests.
+
+    A new commit in its source cancels the request.
+    """
     return row.when_green_id is not None and row.when_green_head == row.head_now
 
 
@@ -147,7 +150,7 @@ def _require_room(tx: Transaction, dataset_id: str) -> None:
     opened = (proposal.c.dataset_id == dataset_id, proposal.c.state == ProposalState.OPEN.value)
     if tx.execute(select(func.count()).where(*opened)).scalar_one() >= MOST_OPEN:
         raise ConflictProblem(
-            f"The greatest number of open proposals in a dataset is {MOST_OPEN:,}; merge or close one first.",
+            f"There can be at most {MOST_OPEN:,} open proposals in a dataset; merge or close one first.",
             code="too-many-proposals",
         )
 
