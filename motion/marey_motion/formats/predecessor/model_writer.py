@@ -1,8 +1,8 @@
 """Writer of motion primitives in the predecessor's layouts 3 and 2.
 
-The documents are right-handed, with lengths in centimetres and times in canonical frames. The
-spatial part is written exactly. The time function is converted to the predecessor's own form (see `time_functions`),
-which represents it approximately.
+The documents are right-handed, with lengths in centimetres and times in canonical frames. The spatial
+part is written exactly. The time function is converted to the predecessor's own form (see `time_functions`), which
+represents it approximately.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 The row of the branch is locked before its tree is read, so that commits of several jobs to one branch follow each
 other and none is lost. If the branch has moved since the job started, the outputs are merged with the changes of
-others. If others have changed the same part of an entry, the outputs are committed to a new branch, which is named after
-the job.
+others. If others have changed the same part of an entry, the outputs are committed to a new branch, which is named
+after the job.
 """
 
 from __future__ import annotations
