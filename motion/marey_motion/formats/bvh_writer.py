@@ -70,7 +70,7 @@ def _axes_of(skeleton: Skeleton, joint: int, rotation_order: str, source: Source
 
 
 def _depth_first(skeleton: Skeleton) -> list[int]:
-    """List the indices of the joints in depth-first order. An order that is depth-first already does not change."""
+    """List the indices of the joints in depth-first order, the children of a joint in the order of the skeleton."""
     order, waiting = [], [0]
     while waiting:
         joint = waiting.pop()

@@ -190,7 +190,7 @@ def _linear_fit(scores: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def _basis_over(steps: int) -> SplineBasis:
-    """Make a spline basis for functions with values at `steps` steps.
+    """Make a spline basis for functions of canonical time that have `steps` values.
 
     If `steps` is at most `KNOTS_AT_MOST`, there are at least as many coefficients as steps, so that any function is
     represented exactly. Its knots are at all steps but the second and the last but one. Evenly spaced knots would drift

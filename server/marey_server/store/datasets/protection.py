@@ -66,7 +66,7 @@ def require_reset(ref: Row[Any]) -> None:
 
 
 def require_deletable(tx: Transaction, ref: Row[Any]) -> None:
-    """Raise `ConflictProblem` if a branch is protected, or is the source or target of an open proposal."""
+    """Raise `ConflictProblem` if a branch or a tag is protected, or is the source or target of an open proposal."""
     if ref.protection is not None:
         raise ConflictProblem(
             f"The branch {ref.name!r} is protected; remove the protection before you delete the branch.", code=CODE
