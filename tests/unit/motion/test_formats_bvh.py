@@ -270,7 +270,7 @@ class TestRefusals:
             (bvh([ROW, ROW.replace("50", "1e400")]), 20, "Arm", "too large"),
             (bvh([ROW, ROW + " 70"]), 20, None, "10 values"),
             (bvh([ROW, "1 2 3 4"])[:-1], 20, None, "cut off"),
-            (bvh([], frames=5), 19, None, "contains none"),
+            (bvh([], frames=5), 19, None, "contains no frames"),
         ],
     )
     def test_what_is_wrong_is_named_with_its_line(self, data: bytes, line: int, joint: str | None, words: str) -> None:
