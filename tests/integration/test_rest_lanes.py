@@ -13,6 +13,7 @@ from tests.support.rest_server import PATIENCE_S, Server
 
 from marey_schemas.encoding.codecs import encode_tree
 from marey_server.access.principal import SYSTEM
+from marey_server.process.refusal_brake import FREE_REFUSALS
 from marey_server.store.database.lanes import Client
 
 STUDY = {"schema": "marey/document@1", "answer": 42}
@@ -46,6 +47,26 @@ def test_heartbeats_claims_readiness_and_callers_do_not_wait_behind_reads(server
     assert {name: answer.status_code for name, answer in answers.items()} == {
         "ready": 200, "me": 200, "claim": 200, "sign-in": 401, "heartbeat": 403
     }  # fmt: skip
+
+
+def test_a_token_that_is_refused_often_takes_its_turns_among_strangers(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clients: list[Client] = []
+    take = server.app.services.turns.take
+
+    def note(client: Client, *, reserved: bool) -> Any:
+        clients.append(client)
+        return take(client, reserved=reserved)
+
+    prober, reader = (server.client(server.make_user(name)) for name in ("prober", "reader"))
+    for one in (prober, reader):
+        assert one.get("/me").status_code == 200
+    for _ in range(FREE_REFUSALS + 1):
+        assert prober.get("/projects/none").status_code == 404
+    monkeypatch.setattr(server.app.services.turns, "take", note)
+    assert [one.get("/me").status_code for one in (prober, reader)] == [200, 200]
+    assert [client.known for client in clients] == [False, True]
 
 
 @pytest.mark.parametrize("method", ["GET", "HEAD"])

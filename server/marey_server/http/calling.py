@@ -71,7 +71,8 @@ class CallingExchange(Exchange):
 
     def _client_with(self, token: str | None) -> Client:
         if token is not None and self.services.knows(token):
-            return Client(hash_secret(token), is_gone=self.departure)
+            key = hash_secret(token)
+            return Client(key, known=not self.services.refusal_brake.is_often_refused(key), is_gone=self.departure)
         return Client(limited_address(self.client_address), known=False, is_gone=self.departure)
 
     async def compute(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:

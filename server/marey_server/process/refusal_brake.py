@@ -1,8 +1,9 @@
-"""Delay of refusals while the event loop is late: clients whose requests are refused wait, so that others do not.
+"""Clients whose requests are refused often: their refusals are delayed while the event loop is late.
 
 Every request costs a few milliseconds of the event loop, also a refused one. Two hundred connections that send nothing
 but such requests keep everybody else waiting for seconds. So if the event loop is late, a client that was refused
-several times must wait before it is refused again, and the event loop has time for others.
+several times must wait before it is refused again, and the event loop has time for others. A client that was refused
+that often also takes its turns among the strangers, so that its requests begin after those of well-behaved clients.
 """
 
 from __future__ import annotations
@@ -49,6 +50,11 @@ class RefusalBrake:
         if self.late_s <= TOLERATED_S or count < FREE_REFUSALS:
             return 0.0
         return min(LONGEST_S, DELAY_PER_LATENESS * self.late_s)
+
+    def is_often_refused(self, client: str) -> bool:
+        """Return whether a client was refused more than `FREE_REFUSALS` times within the last window."""
+        since_s, count = self._refusals.get(client) or (0.0, 0)
+        return count > FREE_REFUSALS and time.monotonic() - since_s <= WINDOW_S
 
     def _measure_later(self, now_s: float) -> None:
         self._due_s = now_s + EVERY_S

@@ -64,3 +64,21 @@ def test_refusals_are_counted_anew_after_a_window(monkeypatch: pytest.MonkeyPatc
         monkeypatch.undo()
 
     asyncio.run(main())
+
+
+def test_a_client_is_often_refused_after_its_free_refusals_until_the_window_ends(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def main() -> None:
+        brake = RefusalBrake()
+        refused(brake, "a", FREE_REFUSALS)
+        assert not brake.is_often_refused("a")
+        refused(brake, "a", 1)
+        assert brake.is_often_refused("a")
+        assert not brake.is_often_refused("b")
+        later_s = time.monotonic() + WINDOW_S + 1
+        monkeypatch.setattr(time, "monotonic", lambda: later_s)
+        assert not brake.is_often_refused("a")
+        monkeypatch.undo()
+
+    asyncio.run(main())

@@ -32,6 +32,7 @@ class Client:
 
     key: str
     known: bool = True
+    """Whether it is a token that the server has accepted before, and whose requests it has not often refused lately."""
     is_gone: Callable[[], bool] = bool
     """Whether nobody waits for the result any more; then the call is not begun."""
 
