@@ -1,7 +1,8 @@
 """Jobs that retarget clips and write them to BVH files with one worker, compared with pymotion in one process.
 
-Marey's times are those that a person waits, from the submission until the job has ended: clips are read from the
-server, computed by the worker, sent back, checked and published. pymotion computes from arrays in memory.
+The worker runs one job at a time, then two, each in its own process. Marey's times are those that a person waits, from
+the submission until the job has ended: clips are read from the server, computed by the worker, sent back, checked and
+published. pymotion computes from arrays in memory.
 """
 
 from __future__ import annotations
@@ -33,33 +34,45 @@ from marey_schemas.access import ProjectCreate
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.queue.jobs import CollectionInput, Job, JobCreate
 
-CLIPS, FRAMES, JOINTS = 96, 300, 31
+CLIPS, FRAMES, JOINTS = 328, 287, 31
+WARMING_CLIPS = 64
+"""Number of clips that are retargeted first, so that all processes of the worker have done such a job before."""
 GOAL_POSES_PER_S = 50_000
 
 Floats = NDArray[np.floating]
 
 
 def run() -> list[Row]:
-    """Measure one server and a worker that runs one job at a time."""
+    """Measure a worker with one slot and a worker with two, each with a server of its own."""
     clips = [captured_walk(FRAMES, JOINTS, seed) for seed in range(CLIPS)]
-    with local_server() as server, one_worker(server), server.client() as marey:
+    ours = {slots: _measure(clips, slots) for slots in (1, 2)}
+    plan = _plan(clips[0].skeleton, game_skeleton())
+    moved, peer_retargeting_s = _retarget_with_pymotion(clips, plan)
+    peer_writing_s = _write_with_pymotion(moved, plan.target)
+    return [
+        row
+        for slots, (retargeting_s, writing_s) in ours.items()
+        for row in (
+            _row("clips to retargeted clips", slots, retargeting_s, peer_retargeting_s, GOAL_POSES_PER_S),
+            _row("clips to BVH files", slots, writing_s, peer_writing_s, None),
+        )
+    ]
+
+
+def _measure(clips: list[Clip], slots: int) -> tuple[float, float]:
+    """Return the seconds in which one worker retargets the clips, and writes the results to BVH files."""
+    with local_server() as server, one_worker(server, slots=slots), server.client() as marey:
         project = marey.create_project(ProjectCreate(name=PROJECT))
         target = _seed(project, clips)
         marey.jobs.wait(project.retarget([CollectionInput(collection="first")], target, into="warm").id)
         takes, game = CollectionInput(collection="takes"), CollectionInput(collection="game")
         export = JobCreate(kind="export", inputs={"clips": (game,)}, params={"format": "bvh"})
         retargeting_s = _timed(marey, lambda: project.retarget([takes], target, into=game.collection))
-        writing_s = _timed(marey, lambda: project.submit(export))
-    plan = _plan(clips[0].skeleton, game_skeleton())
-    moved, peer_retargeting_s = _retarget_with_pymotion(clips, plan)
-    return [
-        _row("clips to retargeted clips", retargeting_s, peer_retargeting_s, GOAL_POSES_PER_S),
-        _row("clips to BVH files", writing_s, _write_with_pymotion(moved, plan.target), None),
-    ]
+        return retargeting_s, _timed(marey, lambda: project.submit(export))
 
 
 def _seed(project: ProjectHandle, clips: list[Clip]) -> str:
-    """Store the clips in the folder `takes`, one of them in `first`, and a skeleton to retarget to; return its id."""
+    """Store the clips in the folder `takes`, other clips in `first`, and a skeleton to retarget to; return its id."""
     skeletons = []
     for name, skeleton in (("studio", clips[0].skeleton), ("game", game_skeleton())):
         mapping = map_joints(skeleton)
@@ -71,7 +84,9 @@ def _seed(project: ProjectHandle, clips: list[Clip]) -> str:
     studio = RevisionRef(item=skeletons[0], revision=1)
     for number, clip in enumerate(clips):
         project.clips.create(f"take-{number:03}", clip_parts(clip, studio), collection="takes")
-    project.clips.create("warm-up", clip_parts(clips[0], studio), collection="first")
+    for number in range(WARMING_CLIPS):
+        warming = captured_walk(FRAMES, JOINTS, CLIPS + number)
+        project.clips.create(f"warm-up-{number:02}", clip_parts(warming, studio), collection="first")
     return skeletons[1]
 
 
@@ -127,11 +142,11 @@ def _write_with_pymotion(moved: list[Floats], target: Skeleton) -> float:
         return time.perf_counter() - started
 
 
-def _row(job: str, ours_s: float, peer_s: float, goal: int | None) -> Row:
+def _row(job: str, slots: int, ours_s: float, peer_s: float, goal: int | None) -> Row:
     poses = CLIPS * FRAMES
     return Row(
         job,
-        f"{CLIPS} clips of {FRAMES} frames, one worker",
+        f"{CLIPS} clips of {FRAMES} frames, one worker with {slots} {'slot' if slots == 1 else 'slots'}",
         f"{poses / ours_s:,.0f} poses/s",
         f"pymotion in one process, from memory: {poses / peer_s:,.0f} poses/s",
         peer_s / ours_s,

@@ -98,11 +98,11 @@ def running(data: Path, **settings: str) -> Iterator[LocalServer]:
 
 
 @contextmanager
-def one_worker(server: LocalServer) -> Iterator[None]:
-    """Run a worker that runs one job at a time, while the `with` block runs."""
+def one_worker(server: LocalServer, *, slots: int = 1) -> Iterator[None]:
+    """Run a worker that runs `slots` jobs at the same time, while the `with` block runs."""
     with tempfile.TemporaryDirectory(prefix="marey-bench-") as cache:
         process = subprocess.Popen(
-            [sys.executable, "-m", "marey_client.cli", "worker", "--cache", cache],
+            [sys.executable, "-m", "marey_client.cli", "worker", "--cache", cache, "--slots", str(slots)],
             env=clean_environment() | {"MAREY_URL": server.url, "MAREY_TOKEN": server.token},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
