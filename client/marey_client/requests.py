@@ -59,7 +59,7 @@ def annotate_request(project: ProjectItems, clips: Clips, params: AnnotateParams
 
 
 def cut_request(project: ProjectItems, annotations: Annotations, params: CutParams) -> JobCreate:
-    """Return the job request to cut along annotations; the clips that are cut are those of the annotations."""
+    """Return the job request to cut the clips of annotations along their segments."""
     found = {
         one.id: one
         for one in items_at(project.annotations, annotations, sort="id")

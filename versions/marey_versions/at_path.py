@@ -96,7 +96,7 @@ class PathComparer:
 
 
 def _stays(one: Changed) -> bool:
-    """Return whether an entry is in both versions with a part that did not change, so that it was not moved."""
+    """Return whether an entry was not moved: it is in both versions, and at least one of its parts is unchanged."""
     sides = [one.before, one.after]
     before, after = ({} if side is None else side["parts"] for side in sides)
     return bool(before.items() & after.items())

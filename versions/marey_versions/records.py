@@ -134,7 +134,10 @@ def contents_in(portable: Any) -> Iterator[str]:
 
 
 def _content_of(found: Mapping[str, Any]) -> str | None:
-    """Return the content digest of the revision that an object in a portable document refers to; None if to none."""
+    """Return the content digest of the revision that an object in a portable document refers to.
+
+    Returns None if the object is not a reference to a revision.
+    """
     content = found.get("content")
     if not isinstance(content, str) or "blob" in found or is_array_reference(found):
         return None

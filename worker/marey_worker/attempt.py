@@ -249,7 +249,7 @@ class RunningAttempt:
                 return stop
 
     def _check(self, child: ChildProcess | None) -> Stop | None:
-        """Send new output if it is due; return the reason to stop the attempt now, or None."""
+        """Start to send the new part of the log if that is due; return the reason to stop the attempt now, or None."""
         if time.monotonic() > self._log_due:
             self._transfers.submit(self._try_to_send_log)
             self._log_due = time.monotonic() + LOG_EVERY_S

@@ -140,7 +140,7 @@ def _labels_of(token: Token) -> str:
 
 
 def _end_of(token: Token) -> str:
-    """Return the end of a token, with the time left if that is less than `SOON_DAYS`."""
+    """Return the date on which a token expires as text, with the days left if these are fewer than `SOON_DAYS`."""
     if token.expires_at is None:
         return "never"
     left = token.expires_at - datetime.now(UTC)

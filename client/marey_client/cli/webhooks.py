@@ -110,11 +110,12 @@ def change(
     kind: Kinds = None,
     description: Description = None,
     pause: Annotated[
-        bool | None, typer.Option("--pause/--resume", help="Send nothing, or send again, starting with what waits.")
+        bool | None,
+        typer.Option("--pause/--resume", help="Pause deliveries, or resume them with the events that wait."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Change, pause or resume a webhook. --kind replaces all its kinds."""
+    """Change, pause or resume a webhook. --kind replaces all kinds of events that it is notified of."""
     from marey_schemas.webhooks import WebhookChange
 
     wanted = WebhookChange(url=url, kinds=_event_kinds(kind) or None, description=description, paused=pause)
@@ -209,7 +210,7 @@ def redeliver(
 
 @webhook.command("test")
 def send_test(context: typer.Context, project: ProjectName, webhook_id: WebhookId, as_json: AsJson = False) -> None:
-    """Send a test, and print the result. The exit status is 1 if it fails."""
+    """Send a test event to a webhook, and print the result. The exit status is 1 if it fails."""
     with connect(context) as marey:
         handle = marey.project(project).webhooks.at(webhook_id)
         found = handle.wait(handle.test().id)

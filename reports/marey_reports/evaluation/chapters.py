@@ -161,7 +161,10 @@ def recording_chapter(result: EvaluationResult, figures: Figures) -> Section:
 
 
 def baseline_chapter(result: EvaluationResult) -> Section:
-    """Write the chapter on the suite's numbers, beside those of a suite over generated clips that fill every cell."""
+    """Write the chapter on the suite's numbers, compared with the baseline.
+
+    The baseline is the same suite with generated clips, one for each speed and turn rate.
+    """
     base = result.baseline
     heads = ["measure", "this dataset", *(["generated baseline"] if base is not None else []), "unit"]
     rows: list[Sequence[Cell]] = []

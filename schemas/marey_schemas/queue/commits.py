@@ -47,7 +47,7 @@ class OutputsCommit(Request):
 
     @classmethod
     def of(cls, given: OutputsCommit | str | None) -> OutputsCommit | None:
-        """Return a commit that may be given as text."""
+        """Return a commit that is given as an object, or as text in the form that `at` accepts; None for None."""
         return cls.at(given) if isinstance(given, str) else given
 
 
@@ -69,7 +69,7 @@ class CommitOptions(Options):
         if self.commit_to is not None:
             return OutputsCommit.at(self.commit_to, message=self.commit_message or "", replace=self.commit_replace)
         if self.commit_message is not None or self.commit_replace:
-            raise ValueError("--commit-to is missing: the branch that gets the commit")
+            raise ValueError("--commit-message and --commit-replace need --commit-to, which names the branch")
         return None
 
 

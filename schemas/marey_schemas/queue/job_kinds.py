@@ -142,7 +142,7 @@ _RIGS = InputSpec(
 
 
 def _may_hold_graphs(params: Mapping[str, Any]) -> bool:
-    """Return whether an import may contain a graph, whose models are looked up by name."""
+    """Return whether the names of the files allow a graph of motion models, whose import looks up models by name."""
     rows = [row for row in IMPORTED if "graph" in row.reads]
     return any(row.names(file["name"]) for file in params["files"] for row in rows)
 

@@ -101,7 +101,7 @@ class DatasetInput(Request):
 
 
 class JobOutputsInput(Request):
-    """All outputs, of the input's kind, of another job of the project.
+    """Outputs of another job of the project: all items whose kind the input accepts.
 
     The job with this input waits for the other job, as for the jobs in `after`. The revisions of the outputs are fixed
     when the other job has succeeded.

@@ -66,7 +66,7 @@ class CallingExchange(Exchange):
 
     @cached_property
     def client(self) -> Client:
-        """Client for which this request counts in queues: a token that was accepted before, or else an address."""
+        """Client to which queues attribute this request: a token that was accepted before, or else an address."""
         return self._client_with(self.caller.token)
 
     def _client_with(self, token: str | None) -> Client:

@@ -97,12 +97,14 @@ def require_access(operation: Operation, principal: Principal) -> None:
         _require_attempt_access(operation, principal)
         return
     if access is Access.ATTEMPT:
-        raise ForbiddenProblem("This needs the token that a worker gets for a running job.", code="attempt-only")
+        raise ForbiddenProblem(
+            "This request needs the token that a worker gets for a running job.", code="attempt-only"
+        )
     if access is Access.ADMINISTRATOR and not principal.administrator:
         raise ForbiddenProblem("Only administrators may do this.", code="administrators-only")
     if operation.scope is not None and not scopes.reaches_somewhere(principal.scopes, operation.scope):
         raise ForbiddenProblem(
-            f"This needs a token with the scope {operation.scope!r}.",
+            f"This request needs a token with the scope {operation.scope!r}.",
             code="insufficient-scope",
             context={"scope": operation.scope},
         )

@@ -115,13 +115,13 @@ class Operation:
 
     @property
     def stores(self) -> bool:
-        """Whether the operation may need much disk space: it stores a body, and is not declared as `reserved`."""
+        """Whether the operation stores a request body, which may need much disk space. False if it is `reserved`."""
         changes = self.access is Access.ATTEMPT or self.scope in ("write", "jobs")
         return changes and self.body is not None and not self.reserved
 
     @property
     def shows_project(self) -> bool:
-        """Whether the operation changes a project and its answer shows content, which needs the scope `read`, too."""
+        """Whether the operation changes a project and its answer shows content, which also needs the scope `read`."""
         return self.scope == "write" and self.access.role is not None and self.etag and self.answer is not None
 
     @property
@@ -152,7 +152,7 @@ def reads(
 
     Parameters
     ----------
-    body : query that is too long for an address
+    body : query that may be too long for a URL
     answer : type of the answer, or, with `paged`, of one element of a page
     answer_types : media types of the answer, if they differ from those of models and documents
     also : further statuses, each with the type of its answer
@@ -190,7 +190,7 @@ def writes(
 
     Parameters
     ----------
-    access : not that of readers, because readers and guests of a project may not change it
+    access : minimum access; `Access.READER` is refused, because readers may not change a project
     precondition : `required` demands If-Match; `create` demands If-Match or `If-None-Match: *`; `optional` accepts both
     idempotency : `key` accepts Idempotency-Key; `nature` means that repeating the request has no further effect
     reserved, attempts : as for `reads`

@@ -41,9 +41,10 @@ log = logging.getLogger(__name__)
 
 
 class Departure:
-    """Whether the client of a request has closed the connection; a call returns the answer.
+    """Function without arguments that returns whether the client of a request has closed the connection.
 
-    It does not refer to the request, which refers to it: circles of references are freed only by the garbage collector.
+    The request has a reference to this object. The object has none to the request, because only the garbage collector
+    would free such a reference cycle.
     """
 
     gone = False

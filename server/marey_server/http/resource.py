@@ -148,7 +148,7 @@ class Resource(CallingExchange):
             self.services.note_use(self.caller.token, self.principal)
 
     async def _wait_for_refusal(self) -> None:
-        """Wait before a refusal is answered, if the event loop is late and this client was refused several times."""
+        """Delay the answer to a refused request if the event loop is late and this client was refused several times."""
         if hasattr(self, "caller") and (delay_s := self.services.refusal_brake.delay_s(self.client.key)):
             self.holding.release()
             await self.pause(delay_s)
@@ -204,7 +204,7 @@ class Resource(CallingExchange):
             await self.refuse(error)
 
     def _turn(self) -> asyncio.Future[None] | None:
-        """Return what the request must wait for before anything of it is checked, or None."""
+        """Return a future that ends when it is the turn of this request, or None if the request may begin at once."""
         operation = self._declared()
         token = None
         with suppress(UnauthenticatedProblem):

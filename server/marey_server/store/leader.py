@@ -43,7 +43,7 @@ def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | Non
 
 
 def holds_lead(tx: Transaction, lead: Lead) -> bool:
-    """Return whether the leadership has not passed to another process; it cannot pass before the transaction ends."""
+    """Return whether this process is still the leader, and if so, keep it the leader until the transaction ends."""
     which = (leader.c.name == lead.name, leader.c.holder == lead.holder, leader.c.fence == lead.fence)
     return tx.execute(select(leader.c.fence).where(*which).with_for_update(read=True)).first() is not None
 

@@ -1,9 +1,10 @@
 """Limits on wrong passwords, shared by all servers; a stranger cannot use them to lock out the owner of an account.
 
-Every try with a wrong password counts in a limit for the account from this address, in a limit for the address, and, if
-the address is unknown, in a limit for the account from all unknown addresses together. An address is unknown if nobody
-has signed in to the account from it. The last limit does not apply to known addresses, so guesses from elsewhere never
-lock out an owner who signs in from a known address (docs/decisions/0020-sign-in-limits.md).
+Every try with a wrong password counts towards two limits: that of this account from this address, and that of this
+address for all accounts. If the address is unknown, which means that nobody has signed in to the account from it, the
+try also counts towards a third limit: that of the account from all unknown addresses together. The third limit does not
+apply to known addresses. So guesses from elsewhere never lock out an owner who signs in from a known address
+(docs/decisions/0020-sign-in-limits.md).
 """
 
 from __future__ import annotations

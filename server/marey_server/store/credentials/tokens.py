@@ -373,7 +373,7 @@ def _require_user(principal: Principal, scope: str) -> str:
         )
     if not scopes.allows(principal.scopes, scope):
         raise ForbiddenProblem(
-            f"This needs a token with the scope {scope!r} for all projects.", code="insufficient-scope"
+            f"This request needs a token with the scope {scope!r} for all projects.", code="insufficient-scope"
         )
     return principal.user_id
 

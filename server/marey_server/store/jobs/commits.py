@@ -93,7 +93,11 @@ def kinds_made_by(kind: KindDeclaration) -> list[str]:
 def check_again(
     tx: Transaction, project: ProjectRow, kind: KindDeclaration, target: Target | None, into: str
 ) -> Target | None:
-    """Return the commit of a job that is retried, with the base of the first try. Raises as `check_target` does."""
+    """Check the commit of a job that is retried; return it, or None if the job makes no commit.
+
+    The commit keeps its base, unless the dataset was replaced by another one of the same name. Raises the errors of
+    `check_target`.
+    """
     if target is None:
         return None
     request = OutputsCommit.model_validate({name: target[name] for name in OutputsCommit.model_fields})
@@ -102,13 +106,16 @@ def check_again(
 
 
 def with_new_base(tx: Transaction, target: Target | None) -> Target | None:
-    """Return the commit of a job whose inputs are fixed now, so that it follows the present head of the branch."""
+    """Return the commit that a job is to make, with the present head of its branch as the base.
+
+    Called when the late inputs of a job are pinned. `target` is returned unchanged if the branch does not exist.
+    """
     ref = None if target is None else find_ref(tx, target["dataset_id"], target["branch"])
     return target if target is None or ref is None else {**target, "base": ref.digest}
 
 
 def shown_commit(row: Any) -> JobCommit | None:
-    """Return the commit of a job as a document, None if it makes none; a task leaves it to its parent job."""
+    """Return the commit of a job as a document, or None if the job makes none. Only parent jobs commit, not tasks."""
     target: Target | None = row.commit_to
     if target is None or row.parent_id is not None:
         return None
@@ -167,9 +174,10 @@ JOB_COLUMNS = (
 
 
 def publish_outputs(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> PublishedOutputs:
-    """Publish the drafts of a job, and commit them if the request for the job says so: all or nothing.
+    """Publish the drafts of a job, and commit them if the request for the job asks for a commit.
 
-    `row` has the columns `JOB_COLUMNS`. The result contains the published revisions, the commit or the failure.
+    A task only publishes its drafts, which its parent job commits later. If the commit is refused, nothing is
+    published, and the result contains the failure. `row` has the columns `JOB_COLUMNS`.
     """
     if row.commit_to is None:
         return PublishedOutputs(staging.publish_drafts(tx, row, drafts))
@@ -184,9 +192,9 @@ def publish_outputs(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]
 
 
 def commit_tasks(tx: Transaction, row: Any) -> PublishedOutputs:
-    """Commit the outputs of all tasks of a parent job, if the request for the job says so.
+    """Commit the outputs of all tasks of a parent job, if the request for the job asks for a commit.
 
-    `row` has the columns `JOB_COLUMNS`. The result contains the commit or the failure.
+    The result contains the commit, or the failure if it was refused. `row` has the columns `JOB_COLUMNS`.
     """
     if row.commit_to is None:
         return PublishedOutputs()

@@ -90,7 +90,8 @@ def request_of(row: Row[Any]) -> JobCreate:
 def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dict[str, result_cache.SharedResult]]:
     """Split jobs with known inputs into tasks, and give them their cache keys.
 
-    Returns the tasks; and, by id of each job whose result exists or is being computed, the job with that result.
+    Returns the tasks, and a mapping of the ids of jobs that share a result to the jobs with this result, which exists
+    or is being computed.
     """
     gathering = [one for one in heads if one.submission.kind.gathering is not None]
     sources = _find_results(tx, gathering)

@@ -75,7 +75,7 @@ def _announce(tx: Transaction, ended: Sequence[Ended]) -> None:
 
 
 def _facts_of(end: Ended) -> dict[str, Any]:
-    """Return the body of the event of an end: the failure, or the commit that has the outputs."""
+    """Return the body of the event that reports the end of a job: its failure, or the commit with its outputs."""
     return end.failure or ({} if end.commit is None else {"commit": end.commit})
 
 
@@ -142,9 +142,7 @@ def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
 def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
     """End a waiting job because the job `cause`, on which it depends, did not succeed; return the ended jobs.
 
-    Its tasks are cancelled.
-
-    The job fails, or is cancelled if its `on_failure` is `skip`.
+    The waiting job fails, or is cancelled if its `on_failure` is `skip`. Its tasks are cancelled.
     """
     waits = and_(job.c.id == row.id, job.c.state == WAITING)
     tasks = end_jobs(tx, and_(job.c.parent_id == row.id, job.c.state == WAITING), "cancelled")
@@ -157,7 +155,7 @@ def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
 
 
 def _open_fan_out(tx: Transaction, row: Row[Any]) -> list[Ended]:
-    """Start a parent job and make its tasks ready; return the jobs that have ended by this."""
+    """Start a parent job and make its tasks ready; return the jobs that ended as a result."""
     tasks = tx.execute(
         select(*READY_COLUMNS).where(job.c.parent_id == row.id, job.c.state == WAITING).order_by(job.c.position)
     ).all()

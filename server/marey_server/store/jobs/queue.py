@@ -138,8 +138,9 @@ def _issue_token(tx: Transaction, claim_id: str | None, row: Row[Any]) -> Issued
 def heartbeat(
     tx: Transaction, job_id: str, fence: int, request: Heartbeat, policy: QueuePolicy = DEFAULT_POLICY
 ) -> HeartbeatAnswer:
-    """Extend a lease, up to the end of the grace period of a cancellation or time limit.
+    """Extend the lease of an attempt, and store the progress that the worker reports.
 
+    After a cancellation, or at the time limit of the job, the lease is extended only to the end of the grace period.
     An expired lease is extended, too, unless the job was reclaimed. Raises `LeaseLostProblem` if the attempt no longer
     holds the job.
     """
@@ -252,7 +253,8 @@ def _pick_order(row: Row[Any]) -> tuple[Any, ...]:
 def _is_workable(candidate: FromClause, restriction: _Restriction) -> ColumnElement[bool]:
     """Return the condition that the caller, as a worker, may read and write data of the job's project.
 
-    It is evaluated for each row, so that no query plan starts with the projects instead of the order of the queue.
+    The condition is a correlated subquery, so that the database reads jobs in the order of the queue, and does not
+    begin with the projects.
     """
     conditions = [project.c.id == candidate.c.project_id, project.c.deleted_us.is_(None)]
     if restriction.named_projects:

@@ -28,8 +28,8 @@ PAGE = 256
 class StartGrace:
     """Delay of the reaper by the time of one lease, after this process has started or the database was unreachable.
 
-    Leases expire while nobody can renew them; during the delay, live workers renew theirs. A jump of the clock has the
-    same effect as an interruption; so has a long write that blocked all other writes, and therefore heartbeats.
+    Leases expire while nobody can renew them; during the delay, live workers renew theirs. The delay also starts after
+    a jump of the clock, and after a long write that blocked all other writes, and therefore heartbeats.
     """
 
     def __init__(self, policy: QueuePolicy = DEFAULT_POLICY) -> None:

@@ -88,7 +88,7 @@ def named_items(kind: KindDeclaration, params: Mapping[str, Any]) -> list[str]:
 
 
 def part_digests(tx: Transaction, inputs: Iterable[PinnedInputs]) -> dict[tuple[str, int], dict[str, str]]:
-    """Return the digest of each part, by item and revision, of all pinned inputs."""
+    """Return the digests of the parts of all pinned inputs: by item and revision number, then by name of the part."""
     items = sorted({pin["item"] for pins in inputs for many in pins.values() for pin in many})
     found: dict[tuple[str, int], dict[str, str]] = {}
     for start in range(0, len(items), IN_LIST):
@@ -194,10 +194,9 @@ def join(tx: Transaction, joining: Sequence[tuple[Any, SharedResult]]) -> list[E
 def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
     """Give waiting jobs the results of the finished jobs that their `cached_from` names; return the jobs that ended.
 
-    The number of outputs in one transaction is limited.
-
-    Only the `id` of the rows is read. The leading server process serves the remaining jobs later. A job whose result is
-    no longer stored, or cannot be published for it, is queued instead.
+    A transaction serves a limited number of jobs and outputs; the leading server process serves the remaining jobs
+    later. If the result is no longer stored, or cannot be published again, the waiting job is queued instead. Only the
+    `id` of the rows is read.
     """
     ended: list[Ended] = []
     for row in rows[:SHARED_AT_ONCE]:

@@ -176,7 +176,10 @@ def _late_pins(row: Row[Any], stand_ins: Mapping[str, str]) -> PinnedInputs:
 
 
 def _pins_of(tx: Transaction, row: Row[Any], fanned: str | None) -> PinnedInputs:
-    """Return the inputs of a job; for a parent job, the input `fanned`, which is split, is joined from its tasks."""
+    """Return the inputs of a job.
+
+    For a parent job whose input `fanned` was split among its tasks, the shares of the tasks are joined again.
+    """
     if row.size is None or fanned is None:
         return dict(row.inputs)
     statement = select(job.c.inputs).where(job.c.parent_id == row.id).order_by(job.c.position)

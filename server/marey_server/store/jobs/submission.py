@@ -176,7 +176,7 @@ def _lock_upstream(
     """Return the dependencies that exist, locked so that none ends before the dependent jobs are inserted.
 
     `to_be` are the ids reserved for jobs of the same request, which do not exist yet.
-    A job can depend only on existing jobs and on earlier ones of the same request, so no circle is possible.
+    A job can depend only on existing jobs and on earlier ones of the same request, so no cycle is possible.
     """
     places = {
         place: one

@@ -78,7 +78,10 @@ def request_test(tx: Transaction, project: str, webhook_id: str) -> WebhookDeliv
 
 
 def redeliver(tx: Transaction, project: str, webhook_id: str, delivery_id: str) -> WebhookDelivery:
-    """Request that a delivery which was given up or delivered is sent once more. Raises `ConflictProblem`."""
+    """Request that a delivery is sent once more, and return it.
+
+    Raises `ConflictProblem` if the webhook still repeats the delivery, is paused, or has too many requested deliveries.
+    """
     project_row = projects.require(tx, project)
     _require_active(tx, project_row, webhook_id)
     row = _find(tx, project_row, webhook_id, delivery_id)

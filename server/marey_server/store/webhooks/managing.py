@@ -158,7 +158,7 @@ def change_webhook(
 
 
 def give_up_retries(tx: Transaction, webhook_id: str) -> None:
-    """Mark the delivery that a webhook repeats as given up."""
+    """Give up the delivery of a webhook that failed and would be sent again."""
     which = (webhook_delivery.c.webhook_id == webhook_id, webhook_delivery.c.state == "retrying")
     tx.execute(update(webhook_delivery).where(*which).values(state="dead", updated_us=tx.now_us))
 

@@ -1,9 +1,9 @@
 """Work of the process that sends deliveries: what to send next, and the outcomes.
 
 The position of a webhook is the number of the last event that was delivered or given up, so events are sent in their
-order. An outcome moves the position in the transaction that records it. So a process that dies loses no delivery, and
-repeats at most those whose outcome was not recorded. Outcomes are recorded only under the lead for which the delivery
-was sent.
+order. The transaction that records an outcome also moves the position. So a process that dies loses no delivery, and
+its successor repeats at most the deliveries whose outcome was not recorded. Only the leading process sends deliveries;
+if it has lost the lead in the meantime, it does not record the outcome.
 """
 
 from __future__ import annotations
@@ -49,7 +49,11 @@ class Work(NamedTuple):
 
 
 def find_work(tx: Transaction, after: int | None) -> Work:
-    """Return the webhooks with events after the one numbered `after`, or with a retry that is due; None: all."""
+    """Return the webhooks that may have something to send.
+
+    These are the webhooks whose projects have events after the one numbered `after`, or whose retry is due. If `after`
+    is None, all webhooks that are not paused are returned.
+    """
     newest = events.newest_number(tx)
     active = webhook.c.paused.is_(False)
     due = and_(webhook.c.next_us > 0, webhook.c.next_us <= tx.now_us)
@@ -69,7 +73,11 @@ def find_work(tx: Transaction, after: int | None) -> Work:
 
 @dataclass(frozen=True)
 class Delivery:
-    """Delivery that can be sent. `requested` ones are sent once; others follow the position of the webhook."""
+    """Delivery that can be sent.
+
+    A delivery that a user requested (`requested`) is sent once. All others report the events after the position of the
+    webhook, in order, and their outcomes move the position.
+    """
 
     id: str
     webhook_id: str
@@ -98,9 +106,10 @@ class Batch:
 
 
 def next_batch(tx: Transaction, webhook_id: str, scanned: int) -> Batch | None:
-    """Return the next deliveries of a webhook; None if it is paused or deleted, or if its project is.
+    """Return the next deliveries of a webhook, or None if the webhook is paused or deleted, or its project is deleted.
 
-    Events up to the one numbered `scanned` are known not to concern the webhook if its position is lower.
+    The search for events begins after the position of the webhook, or after the event numbered `scanned` if that is
+    later: the caller knows that no event in between concerns the webhook.
     """
     statement = select(webhook, project.c.name.label("project")).join(project, project.c.id == webhook.c.project_id)
     alive = webhook.c.paused.is_(False), project.c.deleted_us.is_(None)
@@ -203,8 +212,8 @@ def record(
     """Record the result of an attempt, and return the outcome.
 
     `before` is the position of the webhook and its number of attempts when the delivery was sent. Returns None and
-    records nothing if another process leads now, or if the webhook was changed in the meantime. After failures only for
-    `failing_days`, the webhook is paused; 0 means never.
+    records nothing if another process leads now, or if the webhook was changed in the meantime. If every attempt has
+    failed for `failing_days` days, the webhook is paused; with 0, it is never paused.
     """
     if not leader.holds_lead(tx, lead):
         return None
@@ -273,7 +282,10 @@ def _note(tx: Transaction, delivery: Delivery, result: DeliveryResult, outcome: 
 
 
 def count_missed(tx: Transaction, last: int) -> None:
-    """Count the events up to the one numbered `last`, which are about to be deleted, for webhooks that miss them."""
+    """Count, for each webhook, the undelivered events up to the one numbered `last`, which are about to be deleted.
+
+    The webhook later reports how many events it missed. Its position moves to `last`.
+    """
     for row in tx.execute(select(webhook).where(webhook.c.position < last).with_for_update()).all():
         number = events.number_of(tx)
         concerned = (event.c.project_id == row.project_id, event.c.kind.in_(row.kinds), number <= last)
