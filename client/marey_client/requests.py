@@ -141,7 +141,7 @@ def plan_model(
     notice: Notice | None = None,
     **choices: Any,
 ) -> ModelPlan:
-    """Plan the jobs that make a model of takes. Takes that are files are uploaded; the jobs import them with `options`.
+    """Plan the jobs that build a model from takes. Files are uploaded, and the jobs import them with `options`.
 
     With a `layer`, clips are cut along their annotations in this layer, or aligned by them. The `choices` are fields of
     `ModelPlan`; by default, results are stored in a folder with the model's name. Raises `NoAnnotations` if no clip has

@@ -61,7 +61,7 @@ def find_holes(coverage: Coverage) -> list[CoverageGap]:
 
 
 def turning(low_deg_s: float, high_deg_s: float) -> str:
-    """Describe a range of turn rates of one side."""
+    """Describe a range of turn rates to one side, or straight motion, in words."""
     least, most = sorted((abs(low_deg_s), abs(high_deg_s)))
     if most <= STRAIGHT_DEG_S:
         return "straight ahead"
@@ -74,7 +74,10 @@ def _centres(edges: Floats) -> Floats:
 
 
 def _runs(lacking: NDArray[np.bool_], sides: Floats) -> list[tuple[int, int]]:
-    """Find the first and last cell of each run of cells that lack data, on one side."""
+    """Find runs of neighbouring cells that lack data and have the same side; return the first and last cell of each.
+
+    `sides` contains, for each cell, whether it has left turns, right turns or straight motion.
+    """
     runs: list[tuple[int, int]] = []
     for column in np.flatnonzero(lacking).tolist():
         if runs and runs[-1][1] == column - 1 and sides[column] == sides[column - 1]:

@@ -142,7 +142,10 @@ _RIGS = InputSpec(
 
 
 def _may_hold_graphs(params: Mapping[str, Any]) -> bool:
-    """Return whether the names of the files allow a graph of motion models, whose import looks up models by name."""
+    """Return whether, judging by its name, a file to import may be a graph of motion models.
+
+    The import of a graph looks up its models by name, so such jobs have no cached results.
+    """
     rows = [row for row in IMPORTED if "graph" in row.reads]
     return any(row.names(file["name"]) for file in params["files"] for row in rows)
 

@@ -17,7 +17,10 @@ StepName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]
 
 
 class StepOutputsInput(Request):
-    """All outputs of another step that have the input's kind. The step with this input waits for the other step."""
+    """Outputs of another step: all items whose kind the input accepts.
+
+    The step with this input waits for the other step.
+    """
 
     step: StepName
 

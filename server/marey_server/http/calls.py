@@ -52,7 +52,7 @@ class Caller:
     def sees_answer(self, project: str | None) -> bool:
         """Return whether the caller may read the answer, which may show content of the project.
 
-        An answer to a change needs the scope `read` in the project, too.
+        To read the answer to a change, the caller needs the scope `read` in the project, too.
         """
         held = self.principal.scopes if self.principal is not None else ()
         return not self.operation.shows_project or scopes.allows(held, "read", project)
@@ -62,7 +62,7 @@ class Caller:
 class BodyTarget:
     """Object that a request with a body is for: a project, by its name, or an attempt, by the job's id and the fence.
 
-    The caller needs a role in the project, or must be the attempt.
+    The caller needs a role in this project, or the token of this attempt.
     """
 
     project: str | None = None

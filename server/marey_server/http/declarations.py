@@ -68,7 +68,8 @@ class RequestBody:
     """Body of a request: a model, a document, bytes or files.
 
     `streamed` bodies are passed to the resource piece by piece while they are received. If `results` is true, the body
-    contains results of a job; their arrays may have up to `max_bytes` when decoded, and are stored as they arrive.
+    contains results of a job. Their arrays may have up to `max_bytes` when decoded, and are stored in the encoding in
+    which they are sent, if possible.
     """
 
     content: Content | type[Files]
@@ -193,7 +194,7 @@ def writes(
     access : minimum access; `Access.READER` is refused, because readers may not change a project
     precondition : `required` demands If-Match; `create` demands If-Match or `If-None-Match: *`; `optional` accepts both
     idempotency : `key` accepts Idempotency-Key; `nature` means that repeating the request has no further effect
-    reserved, attempts : as for `reads`
+    answer, also, headers, reserved, attempts : as for `reads`
     replays : whether an ended attempt may repeat the request
     """
     if access is Access.READER:

@@ -95,7 +95,7 @@ class AnswerForm:
 
 
 def settle(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Reply:
-    """Return a reply whose `Lasting` document is loaded, unless the client or the cache has the document already.
+    """Load the `Lasting` document of a reply, unless the client or the cache has it already; return the new reply.
 
     Must be called in the transaction.
     """

@@ -52,7 +52,10 @@ class ResultPlaces:
                 code="name-too-long",
             )
         if (kind, collection, name) in self._taken:
-            raise MotionError(f"another result of the job is called {name!r}", code="same-name")
+            raise MotionError(
+                f"another result of the job in the same folder is called {name!r}; rename one of the inputs",
+                code="same-name",
+            )
 
 
 def require_different(places: Iterable[tuple[str, str]]) -> None:

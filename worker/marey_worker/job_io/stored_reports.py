@@ -28,7 +28,7 @@ def store_report(
 
 
 def _scripts(page: str) -> tuple[str, ...]:
-    """Return the digest of the page's script, or nothing if it has none.
+    """Return the SHA-256 digest of the page's script, or an empty tuple if the page has none.
 
     The script is the last element that looks like one, because earlier ones can be names of clips.
     """

@@ -60,7 +60,7 @@ class Subject:
         return self.result.usage if trial is None else measure_usage(self.result.clips, [find_record(self, trial)])
 
     def switches(self, trial: str | None) -> NDArray[np.int64]:
-        """List jumps (S, 3) in one trial or in the whole suite: row before the jump, row after it, and count."""
+        """List jumps (S, 3) in one trial or the whole suite: database row before the jump, row after it, and count."""
         return self.result.switches if trial is None else count_switches(self.result.clips, [find_record(self, trial)])
 
 

@@ -165,9 +165,10 @@ def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_
 
 
 def _late_pins(row: Row[Any], stand_ins: Mapping[str, str]) -> PinnedInputs:
-    """Return the inputs of the retry of a job that ended before its late inputs were pinned.
+    """Return the inputs for the retry of a job that ended before its late inputs were pinned.
 
-    Each input that was the result of a job becomes the result of the retry of that job, which `stand_ins` names.
+    Inputs that refer to the results of another job then refer to the results of the retry of that job. `stand_ins` maps
+    the ids of jobs to the ids of their retries.
     """
     return {
         name: [{"job": stand_ins[entry["job"]]} if "job" in entry else entry for entry in entries]

@@ -92,7 +92,7 @@ class Delivery:
 
 @dataclass(frozen=True)
 class Batch:
-    """Next deliveries of a webhook in their order, and what sending them needs."""
+    """Next deliveries of a webhook in order, with the URL and the secrets for sending them."""
 
     url: str = field(repr=False)
     secrets: tuple[str, ...] = field(repr=False)
