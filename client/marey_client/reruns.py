@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -40,11 +40,12 @@ class ComparedOutput:
     """Difference of the content if the bytes differ; it is empty if only references to other outputs differ."""
 
 
-def rerun_request(job: Job, kind: JobKind, *, into: str | None = None) -> JobCreate:
+def rerun_request(job: Job, kind: JobKind, tasks: Iterable[Job] = (), *, into: str | None = None) -> JobCreate:
     """Return the request that repeats a job with the same revisions, parameters and seed, without cached results.
 
-    The results are stored in the folder `into`, by default `reruns/` and the id of the job. Raises `CannotRerun` for a
-    job that has not succeeded, a task of another job, and a job that replaced its sources.
+    `tasks` are the tasks of the job. If an input was distributed over them, only their records name its items. The
+    results are stored in the folder `into`, by default `reruns/` and the id of the job. Raises `CannotRerun` for a job
+    that has not succeeded, a task of another job, and a job that replaced its sources.
     """
     if job.state is not JobState.SUCCEEDED:
         raise CannotRerun(f"the job {job.id} has no result to repeat; its state is {job.state.value}")
@@ -55,9 +56,14 @@ def rerun_request(job: Job, kind: JobKind, *, into: str | None = None) -> JobCre
         raise CannotRerun(
             f"the job {job.id} wrote new revisions of its inputs (--in-place); repeating it would change them again"
         )
+    in_order = sorted(tasks, key=lambda task: task.position or 0)
+    inputs = {
+        name: [pin for task in in_order for pin in task.inputs[name]] if isinstance(recorded, Mapping) else recorded
+        for name, recorded in job.inputs.items()
+    }
     return JobCreate(
         kind=job.kind,
-        inputs={name: _inputs(pins, many=kind.inputs[name].many) for name, pins in job.inputs.items()},
+        inputs={name: _inputs(pins, many=kind.inputs[name].many) for name, pins in inputs.items()},
         params=job.params,
         seed=job.seed,
         into=f"{RERUNS}/{job.id}" if into is None else into,

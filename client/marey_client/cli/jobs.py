@@ -244,7 +244,8 @@ def rerun_job(
     with connect(context) as marey:
         first = marey.jobs.get(job_id)
         try:
-            request = rerun_request(first, _kind_of_job(marey, first.kind), into=into and into.strip("/"))
+            tasks = marey.jobs.list(first.project, filters={"parent": first.id}) if first.size else ()
+            request = rerun_request(first, _kind_of_job(marey, first.kind), tasks, into=into and into.strip("/"))
         except CannotRerun as error:
             raise WrongUsage(str(error)) from None
         project = marey.project(first.project)

@@ -105,6 +105,22 @@ def test_a_job_is_repeated_from_its_record_and_its_results_are_compared(
     assert "wrote new revisions of its inputs" in run("job", "rerun", in_place.id, status=2).stderr
 
 
+def test_a_job_whose_clips_were_distributed_over_tasks_is_repeated(
+    marey: Marey, lab: ProjectHandle, run: CommandLine, tmp_path: Path
+) -> None:
+    edit_kind = next(kind for kind in marey.jobs.kinds() if kind.name == "edit")
+    count = edit_kind.batch_size + 1
+    steps = tmp_path / "steps"
+    steps.mkdir()
+    for number in range(count):
+        (steps / f"step {number}.bvh").write_bytes(write_bvh(generate_gait(1.0 + number / 50, 0.0, 0.5, 30)))
+    run("upload", str(steps), "--project", "lab", "--collection", "many")
+    job = ended(marey, lab.edit("many", [{"command": "trim", "start": 5}], into="cut"))
+    assert job.size == 2
+    done = run("job", "rerun", job.id)
+    assert f"{count} outputs, {count} identical, 0 with equal content, 0 different" in done.stderr
+
+
 def test_a_list_is_searched_sorted_and_limited_to_stale_results(
     marey: Marey, lab: ProjectHandle, run: CommandLine
 ) -> None:
