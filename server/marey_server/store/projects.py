@@ -118,7 +118,8 @@ def require(
         )
     if not seen.guest and not scopes.allows(tx.principal.scopes, required.scope, name):
         raise ForbiddenProblem(
-            f"This needs a token with the scope {required.scope!r} in the project {name!r}.", code="insufficient-scope"
+            f"This request needs a token with the scope {required.scope!r} in the project {name!r}.",
+            code="insufficient-scope",
         )
     return seen
 
@@ -252,7 +253,8 @@ def create_project(tx: Transaction, request: ProjectCreate) -> Project:
         raise UnauthenticatedProblem("Sign in to create a project.")
     if principal.kind == "attempt" or not scopes.allows(principal.scopes, "write", request.name):
         raise ForbiddenProblem(
-            f"This needs a user's token with the scope 'write' for all projects, or for the project {request.name!r}.",
+            "This request needs a user's token with the scope 'write' for all projects, or for the project "
+            f"{request.name!r}.",
             code="insufficient-scope",
         )
     quotas.require_room(tx, "user_projects")

@@ -67,7 +67,7 @@ def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
     """Return a user's numbers of items and bytes, with the limits. Only administrators may read those of others."""
     if not scopes.allows(tx.principal.scopes, "read"):  # the numbers are about all projects of the user
         raise ForbiddenProblem(
-            "This needs a token with the scope 'read' for all projects, because quotas count items of every project.",
+            "This request needs a token with the scope 'read' for all projects: quotas count items of all of them.",
             code="insufficient-scope",
         )
     return quotas.show_quotas(tx, "user", find_user(tx, name).id)
@@ -132,7 +132,9 @@ def _require_changes(principal: Principal, name: str, request: UserChange) -> bo
     if not itself:
         require_administrator(principal, hidden=_no_user(name))
     elif not scopes.allows(principal.scopes, "write"):
-        raise ForbiddenProblem("This needs a token with the scope 'write' for all projects.", code="insufficient-scope")
+        raise ForbiddenProblem(
+            "This request needs a token with the scope 'write' for all projects.", code="insufficient-scope"
+        )
     if not is_administrator(principal) and (request.administrator is not None or request.disabled is not None):
         raise ForbiddenProblem(
             "Only administrators can disable a user or make a user an administrator.", code="administrators-only"
