@@ -223,9 +223,9 @@ def _checked_limit(among: VersionRange, evaluations: VersionEvaluations, limit: 
             raise CannotBisect(f"{values}, so no value is half-way between them")
         limit = Limit((good + bad) / 2, above=bad > good)
     if limit.exceeded_by(good):
-        raise CannotBisect(f"{values}; the good one is {limit}, too, so it is not good")
+        raise CannotBisect(f"{values}; values {limit} are bad, so the good version is bad, too")
     if not limit.exceeded_by(bad):
-        raise CannotBisect(f"{values}; the bad one is not {limit}, so it is not bad")
+        raise CannotBisect(f"{values}; only values {limit} are bad, so the bad version is good")
     return limit
 
 

@@ -59,7 +59,7 @@ def evaluate_locomotion(
     folder: Path,
     advance: Advance,
 ) -> DemoEvaluation:
-    """Evaluate the clips that are locomotion as the version has them, and write the report to `folder`.
+    """Evaluate those clips of the version that are locomotion, and write the report to `folder`.
 
     `clips` are given by the paths of their entries; `root` is their root joint. Without a version, there are no clips.
     """

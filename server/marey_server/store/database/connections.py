@@ -206,7 +206,7 @@ class Database:
     def queue_read(
         self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False
     ) -> Future[T]:
-        """Run `read` for a client in a thread, or with `reserved` in a reserved thread.
+        """Run `self.read(principal, function)` for a client, in a thread for ordinary or for reserved reads.
 
         Raises `UnavailableProblem` if too many calls wait.
         """
@@ -216,10 +216,10 @@ class Database:
     def queue_write(
         self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False
     ) -> Future[T]:
-        """Run `write` for a client in a thread; on SQLite, a reserved write runs before the other waiting writes.
+        """Run `self.write(principal, function)` for a client in a thread.
 
-        The write runs even if the client has closed the connection. Raises `UnavailableProblem` if too many writes
-        wait.
+        On SQLite, a reserved write runs before the other waiting writes. The write runs even if the client has closed
+        the connection. Raises `UnavailableProblem` if too many writes wait.
         """
         client = Client(client.key, client.known)
         if self._write_lane is not None:

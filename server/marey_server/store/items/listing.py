@@ -57,7 +57,7 @@ class ItemFilters:
 
     @property
     def looks_up_name(self) -> bool:
-        """Whether `name` is one name, or ends in `**`: `walk**` selects the names that begin with `walk*`."""
+        """Whether the filter `name` is a whole name, or a prefix that itself ends in `*` and is written with a second `*`."""
         return bool(self.name) and (not str(self.name).endswith("*") or str(self.name).endswith("**"))
 
 
