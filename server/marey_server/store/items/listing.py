@@ -57,7 +57,7 @@ class ItemFilters:
 
     @property
     def looks_up_name(self) -> bool:
-        """Whether the filter `name` is a whole name, or a prefix that itself ends in `*` and is written with a second `*`."""
+        """Whether `name` is a whole name, or `**` ends it: `walk**` selects names that begin with the text `walk*`."""
         return bool(self.name) and (not str(self.name).endswith("*") or str(self.name).endswith("**"))
 
 
