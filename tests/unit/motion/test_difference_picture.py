@@ -96,7 +96,7 @@ def test_pictures_have_the_same_bytes_each_time(name: str) -> None:
 
 
 def test_only_differences_with_values_to_draw_have_a_picture() -> None:
-    with pytest.raises(ValueError, match="only differences between motions and between annotations"):
+    with pytest.raises(ValueError, match="only differences between two motions or between two annotations"):
         draw_difference(difference_of(), "png")
 
 
