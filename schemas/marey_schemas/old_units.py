@@ -20,7 +20,7 @@ def in_centimetres(name: str) -> Any:
 
 
 def read_old_unit(model: Request, name: str, old: str) -> None:
-    """Move the value of the field `old`, in centimetres, to the field `name`, in metres.
+    """Convert the value of the field `old` from centimetres to metres, and move it to the field `name`.
 
     Raises `ValueError` if both fields are given.
     """

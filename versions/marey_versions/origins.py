@@ -104,10 +104,11 @@ def find_origins(
 
 
 def _pass_to_parents(search: _OriginSearch, commit: str, key: str, names: set[str]) -> set[str]:
-    """Continue the search for the entry with `key` in the parents of `commit`, and return the names that continue.
+    """Continue the search in those parents of `commit` whose entry is partly the same, and return what is searched for.
 
-    `names` are parts, the path or the tags of the entry. The search of a name continues in the first parent whose entry
-    has the same value for it; for all other names, the commit is the origin.
+    `key` is the key of the entry in the commit. `names` are names of its parts, `PATH` or `TAGS`. Each name whose value
+    is the same in the entry of a parent is searched for in the first such parent. The returned set contains these
+    names; the commit is the origin of the others.
     """
     present = search.entry(commit, key)
     assert present is not None

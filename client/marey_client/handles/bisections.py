@@ -53,7 +53,7 @@ class VersionRange:
         return None if chosen is None else self.commits[chosen]
 
     def search(self) -> BadCommitSearch:
-        """Return a search over these versions that has not begun."""
+        """Return a new search for the first bad one of these versions."""
         return BadCommitSearch(self.parents, self.bad.digest)
 
 

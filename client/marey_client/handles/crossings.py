@@ -161,7 +161,7 @@ class VersionEvaluations:
             jobs.cancel(submitted.id)
             raise
         if ended.state is JobState.CANCELLED:
-            raise JobUnsuccessful(f"job {ended.id} was cancelled", ended)
+            raise JobUnsuccessful(f"the evaluation job {ended.id} was cancelled; repeat the search", ended)
         if ended.state is not JobState.SUCCEEDED:
             return Measurement(commit, None, reason=f"job {ended.id} failed" + _detail(ended))
         (output,) = jobs.outputs(ended.id)
@@ -182,7 +182,11 @@ class VersionEvaluations:
         return jobs.submit(self.project.name, request.model_copy(update=chosen))
 
     def interval(self, before: Measurement, after: Measurement) -> tuple[float, float] | None:
-        """Return the bounds of the mean change of the metric from one version to another, as in `ParentChange`."""
+        """Return the bounds, at 95 % confidence, of the mean change of a trial from one version to another.
+
+        Returns None if the metric is no mean over trials, if a version was not evaluated, or if fewer than two trials
+        define the metric.
+        """
         metric = HEADLINE_METRICS[self.metric].of_trials
         if metric is None or before.output is None or after.output is None:
             return None

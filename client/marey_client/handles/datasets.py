@@ -317,7 +317,8 @@ class DatasetHandle:
         is bad, or None if it cannot be tested. With `first_parent`, only the first parents of merges are followed.
         `ProjectHandle.bisect` tests a metric of the evaluation of each version.
 
-        Raises `CannotBisect` if `good` is not among the versions before `bad`, or if an end is not what it is given as.
+        Raises `CannotBisect` if `good` is not among the versions before `bad`, if the test finds `good` bad, or if it
+        does not find `bad` bad.
         """
         return bisect(read_range(self, good, bad, first_parent=first_parent), is_bad, on_step)
 
@@ -349,7 +350,10 @@ class DatasetHandle:
         return write_archive(self, version, Path(path), on_progress, since=bases)
 
     def receive(self, archive: Archive, *, into: str = MAIN, on_progress: OnProgress = _silent) -> ImportedVersion:
-        """Record the versions of an archive without checking it; move the branch `into` as `import_archive` does."""
+        """Record the versions of an archive without checking it, and move the branch `into` to the newest of them.
+
+        The branch stays where it is if its newest commit is not an ancestor of that version.
+        """
         from marey_client.receiving import send_versions
 
         ref = self.find_ref(into)
@@ -358,7 +362,10 @@ class DatasetHandle:
         return self.forward(into, made)
 
     def forward(self, branch: str, commit: Commit) -> ImportedVersion:
-        """Move a branch to a commit if the commit follows the branch's newest one; create a branch that is missing."""
+        """Move a branch to a commit if the branch's newest commit is one of its ancestors.
+
+        A branch that does not exist is created. The result contains whether the branch is at the commit now.
+        """
         ref = self.find_ref(branch)
         if ref is None:
             self.create_branch(branch, commit.digest)

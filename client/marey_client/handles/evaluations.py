@@ -155,7 +155,10 @@ def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def clip_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Return one row for each clip of an evaluation's document: number of frames at the trials' rate, and use."""
+    """Yield one row for each clip of an evaluation's document: its number of frames, and how much the trials used it.
+
+    Frames are counted at the rate of the trials.
+    """
     usage = document["usage"]
     columns = zip(*(usage[name].tolist() for name in ("ticks", "share", "entries", "trials")), strict=True)
     for clip, (ticks, share, entries, trials) in zip(document["clips"], columns, strict=True):

@@ -74,7 +74,11 @@ class ModelHandle(SearchableHandle):
         unit: str | None = None,
         revision: int | None = None,
     ) -> list[Path]:
-        """Draw `n` motions and write each to a file (bvh, npz or predecessor), or all to one file (json)."""
+        """Draw `n` motions, write each to a file of its own, and return the paths of the files.
+
+        `format` is "bvh", "npz", or "predecessor", the format of Marey's predecessor; "json" writes all motions to one
+        file.
+        """
         if format == "json":
             target = Path(folder) / safe_file_name(f"{self.name} {seed}.json")
             return [_saved(target, encode_tree(self._samples(n, seed, revision), JSON))]

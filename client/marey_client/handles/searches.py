@@ -79,5 +79,5 @@ class SearchableHandle(ReportedHandle):
 
 
 def search_request(constraints: Constraints, **options: Any) -> SearchRequest:
-    """Return a search request with the given constraints."""
+    """Return a search request with the given constraints; `options` are further fields of `SearchRequest`."""
     return SearchRequest.model_validate({"constraints": several(constraints), **options})

@@ -78,8 +78,8 @@ def _add_velocity(poses, places, successors, joints, moved, row, rate, velocitie
 def _show(pose, place, joints, moved, offsets, shown, shown_places):  # type: ignore[no-untyped-def]
     """Fill `shown` (3 + 4·K) and `shown_places` (M, 3) with K joints of a row's pose and M of its translations.
 
-    `pose` and `place` are the row's. The `offsets` (1 + M + K, 3) of the root's position, of the translations and of
-    the rotations are added.
+    `pose` and `place` are the pose and all translations of the row. `offsets` (1 + M + K, 3), which belong to the
+    root's position, the translations and the rotations, are added to the result.
     """
     for c in range(3):
         shown[c] = pose[c] + offsets[0, c]
@@ -93,7 +93,7 @@ def _show(pose, place, joints, moved, offsets, shown, shown_places):  # type: ig
 
 @compiled
 def _show_row(pose, place, joints, moved, shown, shown_places):  # type: ignore[no-untyped-def]
-    """Fill the same arrays as `_show`, but without offsets."""
+    """Fill `shown` and `shown_places` with joints and translations of a row, as `_show` does, but add no offsets."""
     shown[:3] = pose[:3]
     for m in range(moved.shape[0]):
         shown_places[m] = place[moved[m]]
@@ -103,7 +103,10 @@ def _show_row(pose, place, joints, moved, shown, shown_places):  # type: ignore[
 
 @compiled
 def _take_offsets(shown, shown_places, pose, place, joints, moved, offsets):  # type: ignore[no-untyped-def]
-    """Fill `offsets` (1 + M + K, 3) with the displayed pose, `shown` and `shown_places`, minus that of a row."""
+    """Fill `offsets` (1 + M + K, 3) with the difference of the displayed pose from the pose of a row.
+
+    `shown` and `shown_places` are the displayed pose and translations; `pose` and `place` are those of the row.
+    """
     for c in range(3):
         offsets[0, c] = shown[c] - pose[c]
         for m in range(moved.shape[0]):

@@ -99,7 +99,8 @@ def _require_joints(options: DatabaseOptions, body: MatchingBody) -> None:
     missing = [name for name in options.extra_joints if name not in body.standard_joints]
     if missing:
         raise MotionError(
-            f"the skeleton has no {', '.join(missing)}; it has {', '.join(sorted(body.standard_joints))}",
+            f"the joint mapping of the skeleton has no {', '.join(missing)}; "
+            f"it has {', '.join(sorted(body.standard_joints))}",
             code="unknown-joint",
             where="extra_joints",
         )

@@ -136,7 +136,10 @@ def _wanted_frames(
 
 
 def _moves(clip: Clip, skeleton: Skeleton) -> bool:
-    """Return whether a clip moves the given skeleton; end sites and offsets that translations replace may differ."""
+    """Return whether the clip's own skeleton has the same joints as `skeleton`.
+
+    End sites may differ, and so may the offsets of the root and of joints whose translations the clip contains.
+    """
     own = clip.skeleton
     if own is skeleton:
         return True

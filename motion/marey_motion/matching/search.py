@@ -130,7 +130,8 @@ def _check(rows: NDArray[np.float64], starts: NDArray[np.int64], selectable: NDA
     if not (rows.max() <= LARGEST and rows.min() >= -LARGEST):
         row, dimension = np.argwhere(~(np.abs(rows) <= LARGEST))[0]
         raise MotionError(
-            f"the value is {rows[row, dimension]}; normalised features are finite and at most {LARGEST:g}",
+            f"the value is {rows[row, dimension]}; the magnitude of a normalised feature must be finite and at most "
+            f"{LARGEST:g}",
             where=f"row {row}, dimension {dimension}",
         )
 

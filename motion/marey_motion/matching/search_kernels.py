@@ -246,7 +246,7 @@ def nearest_of_each(index, queries, weights, warm_rows, skips, rows, costs):  # 
     """Fill `rows` and `costs` (Q,) with the nearest row of each query (Q, D), and its cost.
 
     `weights` (D,) multiply the squared differences. `warm_rows` (Q,) are rows likely to be near, or -1; `skips` (Q, 2)
-    are the ranges of rows that are not found, all as for `nearest`.
+    are the ranges [start, stop) of rows that are not considered.
     """
     for q in range(queries.shape[0]):
         rows[q], costs[q] = _nearest(index, queries[q], weights, warm_rows[q], skips[q, 0], skips[q, 1])

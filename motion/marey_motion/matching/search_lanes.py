@@ -50,8 +50,8 @@ def _from_box(builder: ir.IRBuilder, sides: Values, query: ir.Value) -> ir.Value
 def _summed(gap: Gap, operands: int) -> Any:
     """Make a compiled function that sums weight · gap² over dimensions, for sixteen rows or boxes at once.
 
-    `gap` writes the instructions for the gap between a query and a row or box, which is stored as `operands` vectors
-    per dimension.
+    `gap` generates the instructions for one dimension that compute the gap between a query and sixteen rows or boxes.
+    `operands` is the number of vectors stored per dimension: 1 for rows, 2 for the low and high sides of boxes.
     """
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Values) -> ir.Value:

@@ -122,7 +122,7 @@ def rest_heading(body: MatchingBody) -> float:
 
     Raises
     ------
-    MotionError    if it has no facing direction
+    MotionError    if the body faces no direction on the ground in the rest pose
     """
     positions = body.skeleton.rest_global_positions[None]
     return float(headings(forward_directions(positions, body.lefts, body.rights))[0])
@@ -144,7 +144,11 @@ def window_frames(window_s: float, rate_hz: float) -> int:
 
 
 def _smoothed(values: Floats, window: int) -> Floats:
-    """Filter values (F, C) over `window` frames, or the largest odd number that a shorter clip has."""
+    """Smooth values (F, C) by a Savitzky-Golay filter over `window` frames.
+
+    For a clip that is shorter than the window, the window is the greatest odd number of frames of the clip; if this is
+    less than `SHORTEST_WINDOW`, the values are returned unchanged.
+    """
     from scipy.signal import savgol_filter
 
     window = min(window, len(values) - (len(values) + 1) % 2)

@@ -159,7 +159,10 @@ class ChildProcess(ConnectedChild):
     """
 
     def __init__(self, module: str, arguments: Sequence[str] = (), *, threads: int, at_most: bool = False) -> None:
-        """Start the process; with `at_most`, settings of numeric libraries cannot allow it more than `threads`."""
+        """Start the process, with `threads` threads for numeric libraries.
+
+        Variables of this process's environment, such as `OMP_NUM_THREADS`, take precedence, unless `at_most` is true.
+        """
         self._reaping = threading.Lock()
         ours, theirs = socket.socketpair()
         with theirs:
@@ -215,7 +218,10 @@ class ChildProcess(ConnectedChild):
 
 
 def exit_status(pid: int) -> int | None:
-    """Return the exit status of a child that has ended, and None otherwise; its process id stays in use."""
+    """Return the exit status of a child process, or None if it has not ended; a negative number is a signal.
+
+    The system does not give the process id to another process until the caller waits for the child.
+    """
     ended = os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     if ended is None:
         return None

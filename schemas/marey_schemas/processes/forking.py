@@ -1,11 +1,12 @@
 """Fork server: a process that loads modules once, and then forks children that have them already.
 
 Loading numeric modules and compiled kernels takes two seconds of processor time and 200 MB for each process. A forked
-child is ready in milliseconds and shares this memory. The fork server has no other thread, since the locks of other
-threads would stay locked in its children for ever, and it never reads what children read.
+child is ready in milliseconds and shares this memory. The fork server has only one thread, since locks that other
+threads hold would stay locked in its children for ever. It never reads the messages from the parent to a child.
 
-Parent and fork server exchange these messages: `FORK`, followed by a socket for the new child; the process id of a
-child and its exit status (`STARTED` for a new one); the process id of a child that the parent will not signal any more.
+The parent sends `FORK`, followed by a socket for the new child. It sends the process id of an ended child when it will
+not signal this child any more. The fork server sends the process id of a child with `STARTED`, and later with the exit
+status of the child.
 """
 
 from __future__ import annotations
@@ -253,9 +254,10 @@ def fork_children(pipe: Connection, serve: Callable[[Connection], None]) -> None
 def _carry_out(
     pipe: Connection, serve: Callable[[Connection], None], others: tuple[socket.socket, socket.socket]
 ) -> set[int]:
-    """Carry out one order of the parent; return the process id of the child that it has started, if any.
+    """Read one message of the parent, and fork a child or release the process id of one.
 
-    The child closes `others`. Raises `EOFError` if the parent has closed the pipe.
+    Returns a set with the process id of the new child, or an empty set. A new child closes `others`, the sockets that
+    only the fork server needs. Raises `EOFError` if the parent has closed the pipe.
     """
     order = pipe.recv_bytes()
     if order != FORK:

@@ -159,7 +159,11 @@ def _hold(tx: Transaction, of: str, owner_id: str, more: Held) -> None:
 
 
 def limit_of(tx: Transaction, of: str, name: str, limits: Mapping[str, int]) -> int:
-    """Return the limit that is set for one project or user, or else that of the settings."""
+    """Return the value of a quota for one project or user.
+
+    `of` is "project" or "user", and `name` is "items" or "stored_bytes". `limits` are the values that an administrator
+    has set for this project or user; a quota that is not among them has its value from the server's settings.
+    """
     return limits.get(name, getattr(tx.quotas, f"{of}_{name}"))
 
 

@@ -116,7 +116,7 @@ def change_user(
         if verified_hash is None:
             raise
         raise PreconditionFailedProblem(
-            "Another request changed the password at the same time; try again with the new password.",
+            "Another request changed the password at the same time; try again with the password that is valid now.",
             code="wrong-password",
         ) from None
     _require_some_administrator(tx)

@@ -124,5 +124,5 @@ def test_options_that_make_no_sense_are_refused_by_name(options: dict[str, objec
 
 
 def test_a_joint_that_the_skeleton_lacks_is_refused_by_name() -> None:
-    with pytest.raises(MotionError, match="extra_joints: the skeleton has no tail; it has head"):
+    with pytest.raises(MotionError, match="extra_joints: the joint mapping of the skeleton has no tail; it has head"):
         built(CLIPS["5 frames"], DatabaseOptions(extra_joints=("tail",)))

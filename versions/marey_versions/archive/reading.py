@@ -56,7 +56,7 @@ class EntryChange(NamedTuple):
 class Archive:
     """Archive that is open for reading; a member is read, and compared with its digest, when it is requested.
 
-    Raises `BadArchive` if the file is not a complete archive, or has members with names that archives do not have.
+    Raises `BadArchive` if the file is not a complete archive, or if the name of a member is not valid.
     """
 
     def __init__(self, file: BinaryIO) -> None:

@@ -59,9 +59,10 @@ def evaluate_locomotion(
     folder: Path,
     advance: Advance,
 ) -> DemoEvaluation:
-    """Evaluate those clips of the version that are locomotion, and write the report to `folder`.
+    """Evaluate those clips that are locomotion, as they are in the version, and write the report to `folder`.
 
-    `clips` are given by the paths of their entries; `root` is their root joint. Without a version, there are no clips.
+    `clips` maps the paths of the version's entries to their clips; `root` is the name of their root joint. If no clip
+    is locomotion, or if there is no version because there are no clips, nothing is evaluated.
     """
     chosen = []
     for done, (path, clip) in enumerate(clips.items()):

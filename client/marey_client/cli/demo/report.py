@@ -118,7 +118,7 @@ def print_report(report: DemoReport) -> None:
 
 
 def _command() -> str:
-    """Return the command line that starts `marey` here, even if it is not on the path."""
+    """Return the command that starts `marey`: the path of this program if `marey` is not in a folder of `PATH`."""
     return "marey" if shutil.which("marey") else shlex.quote(sys.argv[0])
 
 

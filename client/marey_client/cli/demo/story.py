@@ -208,7 +208,7 @@ def _demo_project(marey: Marey) -> ProjectHandle:
 
 
 def _source_path(result: ClipHandle) -> str:
-    """Return the path of a result's source: the path of the result, relative to the folder of all results."""
+    """Return the path of the take that was retargeted: the path of the result without the first folder."""
     return result.path.removeprefix(f"{RESULTS}/")
 
 

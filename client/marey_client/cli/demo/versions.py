@@ -53,9 +53,10 @@ class DemoVersion:
 def version_results(
     project: ProjectHandle, results: Mapping[str, ClipHandle], skeleton: SkeletonHandle, folder: Path
 ) -> DemoVersion:
-    """Commit the results, given by the paths of their entries; smooth the longest on a branch, merge it, set a tag.
+    """Commit the results, smooth the longest one on a branch, merge the branch, and tag the merged version.
 
-    If the newest tag has all of this already, it is returned. A picture of the difference is written to `folder`.
+    `results` maps the paths of entries to the clips that they will contain. If the newest tag already names a version
+    with all of this, no new tag is set. A picture of what smoothing changed is written to `folder`.
     """
     dataset = _opened(project)
     smoothed = {clip.path.removeprefix(f"{EDITED}/") for clip in project.clips.list(collection=EDITED)}

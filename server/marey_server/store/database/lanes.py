@@ -1,7 +1,8 @@
 """Lanes: groups of threads with a limited queue, in which clients take turns.
 
 A client that sends many requests delays only its own requests: the queue alternates between known clients and
-strangers, and between the clients within each group. A queue is limited in total and for each client.
+strangers, and between the clients within each group. A client is known if the server has accepted its token before. A
+queue is limited in total and for each client.
 """
 
 from __future__ import annotations

@@ -109,7 +109,10 @@ class WriteAheadLog:
         return max(pages, 0) * FRAME_BYTES
 
     def _restart(self, connection: sqlite3.Connection, patience_ms: int) -> None:
-        """Copy the rest, and restart the log unless readers use it for longer than `patience_ms`."""
+        """Copy the rest of the log into the database, then restart the log.
+
+        The log is not restarted if readers use it for longer than `patience_ms`.
+        """
         (usual_ms,) = connection.execute("PRAGMA busy_timeout").fetchone()
         connection.execute(f"PRAGMA busy_timeout = {patience_ms}")
         try:

@@ -27,7 +27,10 @@ class FoundAnnotation:
 
 @dataclass(frozen=True, slots=True)
 class ChangedAnnotation:
-    """Result of editing an annotation whose item had the number `rev`: the new document, or the error of the edit."""
+    """Result of editing an annotation: the new document, or the error of the edit.
+
+    `rev` is the `rev` of the annotation's item when the annotation was read.
+    """
 
     rev: int
     made: PreparedDocument | ApiProblem

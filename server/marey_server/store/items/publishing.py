@@ -209,7 +209,7 @@ class _Publication:
     def _store(self, group: Sequence[_Loaded]) -> list[_Ready]:
         """Store the documents of drafts, and return the drafts with the digests of their documents.
 
-        References to earlier drafts are replaced by references to the revisions that these became.
+        References to drafts that were published before are replaced by references to their revisions.
         """
         fresh: list[PreparedDocument] = []
         variants: list[tuple[str, Tree]] = []
