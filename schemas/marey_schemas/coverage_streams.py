@@ -1,6 +1,6 @@
 """Coverage streams: frames sent during a recording, and answers with the motions that are still missing.
 
-Ground positions are metres, headings radians about +Y, 0 towards +z and growing to the left.
+Ground positions are in metres. Headings are in radians about +Y: 0 faces +z, and a left turn increases the heading.
 """
 
 from __future__ import annotations

@@ -75,9 +75,9 @@ class Bisection:
 
     Parameters
     ----------
-    range : the versions among which it was searched for
-    suspects : the first bad version; if versions that could not be tested hide it: all versions that can be the first
-        bad one, of which the last is bad
+    range : the versions among which the first bad one was searched for
+    suspects : the first bad version. If some versions could not be tested, there may be several suspects: all versions
+        that can be the first bad one; only the last of them was tested and is bad
     tests : all tests in their order; the first two are those of the ends
     """
 

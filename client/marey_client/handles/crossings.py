@@ -77,10 +77,10 @@ class Crossing:
 
     Parameters
     ----------
-    search : the tests of versions, and the version or the versions that they leave
-    metric, limit : what was tested
+    search : the tests of versions, and the versions that can be the first bad one after these tests
+    metric, limit : name of the metric, and the value that it has crossed
     measurements : values at the tested versions and at the parents of the first bad one, in the order of measuring
-    changes : if a single version is left, the change from each of its parents
+    changes : if there is a single first bad version, the change of the metric from each of its parents
     """
 
     search: Bisection
@@ -110,10 +110,11 @@ class VersionEvaluations:
     Parameters
     ----------
     project, dataset : the dataset and its project
-    metric : name of a metric of the headline
-    params : options of the evaluations; each gets a name of its own
+    metric : name of the metric, one of `HEADLINE_METRICS`
+    params : options of the evaluations; their name is replaced by digits of the version's digest
     path : folder of the dataset whose clips are evaluated; empty: all clips
     into : folder that receives the evaluations; None: the name of the dataset with `-bisect` at its end
+    normaliser : evaluation whose scales of features are used, given as a handle or an id; None: each fits its own
 
     Raises `CannotBisect` if there is no such metric.
     """

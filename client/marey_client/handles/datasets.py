@@ -65,8 +65,8 @@ class Datasets:
         """Check an archive, and record its versions in a dataset, which is created if it does not exist.
 
         The versions keep their digests, and no folder is changed. The branch `into` is created if it does not exist. It
-        moves to the newest imported version unless it has commits that this version does not follow; then merge the
-        version into the branch.
+        moves to the newest imported version if its newest commit is an ancestor of this version. Otherwise it does not
+        move, and the caller can merge the version into it.
 
         Raises `marey_versions.archive.members.BadArchive`, which names the member that was changed or is missing, and
         `EarlierVersionsMissing` if the archive builds on a version that the dataset does not have.

@@ -95,7 +95,10 @@ class WebhookHandle:
         return self.transport.post(WebhookDelivery, f"{self.url}/test", repeatable=False)
 
     def wait(self, delivery_id: str, *, timeout_s: float = 30.0) -> WebhookDelivery:
-        """Return a requested delivery after its attempt, or after `timeout_s` although it still waits."""
+        """Wait until a requested delivery has been attempted, and return it.
+
+        After `timeout_s`, the delivery is returned even if it is still waiting.
+        """
         deadline = time.monotonic() + timeout_s
         found = self.delivery(delivery_id)
         while found.state == "waiting" and time.monotonic() < deadline:

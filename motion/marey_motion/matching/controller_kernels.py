@@ -1,7 +1,7 @@
 """The compiled loop of motion matching, kept apart so that importing the rest of the package does not load numba.
 
-Ground positions are (x, z) in metres; headings are in radians and grow to the left. Parameters with the same name have
-the same meaning in all functions:
+Ground positions are (x, z) in metres; headings are in radians and increase in a left turn. Parameters with the same
+name have the same meaning in all functions:
 
 * `index` is a `search.SearchIndex`.
 * `wish` is the desired path, a `controller.TrajectoryArrays`; `when` is a moment of this path, in ticks.

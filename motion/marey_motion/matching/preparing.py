@@ -38,6 +38,7 @@ class PreparedClip:
     Parameters
     ----------
     seam : transition from the end of a loop to its start, if rows look ahead across it; None if the clip just ends
+    notes : remarks on data that were left out or look doubtful
     mirrored : whether left and right are exchanged
     first_s : time of the first frame in the recording, seconds
     """
@@ -70,7 +71,7 @@ def prepare_clip(
 
     Returns
     -------
-    PreparedClip    the frames with notes
+    PreparedClip    the resampled frames, with remarks on data that were left out or look doubtful
 
     Raises
     ------
@@ -98,7 +99,7 @@ def mirror_prepared(clip: PreparedClip, body: MatchingBody, *, keep_notes: bool)
     ----------
     clip : PreparedClip    the clip
     body : MatchingBody    pairs of joints
-    keep_notes : bool    whether to copy the notes, too
+    keep_notes : bool    whether the copy has the remarks of the clip, too
 
     Returns
     -------

@@ -175,7 +175,10 @@ def _boxes(low: NDArray[np.float32], high: NDArray[np.float32], starts: NDArray[
 
 
 def _boxes_pay(index: SearchIndex) -> bool:
-    """Test whether boxes save enough comparisons, with queries whose halves come from two different rows."""
+    """Return whether searches that use boxes save enough comparisons.
+
+    This is measured by searches for queries whose first and second halves come from two random rows.
+    """
     from marey_motion.matching import search_kernels as kernels
 
     draws = np.random.default_rng(0).choice(np.flatnonzero(index.selectable), size=(2, _PROBES))

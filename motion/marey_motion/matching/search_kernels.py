@@ -42,7 +42,7 @@ class _Query(NamedTuple):
     ----------
     exact, exact_weights : (D,) float64 the query, and the weights of the squared differences
     rounded, weights : the same in float32, padded with zeros to the dimensions of the index
-    skip_start, skip_stop : rows from `skip_start` up to, but not including, `skip_stop` are not found
+    skip_start, skip_stop : the rows [skip_start, skip_stop) are not considered
     reach, margin, least : terms of the bound that `_limit` computes
     sums, bounds : (16,) float32 arrays for the float32 costs of the rows of a block, and for those of 16 boxes
     """

@@ -1,8 +1,9 @@
-"""Sixteen squared distances at a time, written for vector registers.
+"""Computation of sixteen squared distances at a time with vector instructions.
 
-A compiler cannot keep sixteen running sums in registers when they live in an array that might overlap its inputs, so
-this loop is written as vector instructions, which the compiler fits to the width of the processor. Each sum is made in
-the same order everywhere, without contraction, so that equal inputs give equal bits on every machine.
+If sixteen running sums are stored in an array that might overlap the inputs, a compiler cannot keep them in registers.
+So the loop over the dimensions is written as LLVM vector instructions, which the compiler adapts to the vector width of
+the processor. The terms of a sum are always added in the same order, without fused multiply-add, so that equal inputs
+give equal bits on every machine.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class BadMessage(Exception):
 class ConnectedChild(ABC):
     """Process in its own session, with which this process exchanges messages through a socket.
 
-    One thread uses and kills it. Other threads may send messages and abort it.
+    Only one thread may receive messages, kill the process and close it; other threads may send messages and abort it.
     """
 
     def __init__(self, connected: socket.socket) -> None:

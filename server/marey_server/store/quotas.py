@@ -1,7 +1,8 @@
 """Quotas: limits on what one user, or one project, may have.
 
 The transaction that adds something counts it, so the count is always exact. Items and their bytes have counters in the
-table `holding`, for the project and for the user who created the item. Everything else is counted when one is added.
+table `holding`, for the project and for the user who created the item. All other things, such
+as tokens and jobs, are counted each time another one is added.
 """
 
 from __future__ import annotations
@@ -52,10 +53,11 @@ _RULES = {
 
 
 def require_room(tx: Transaction, quota: str, more: int = 1) -> None:
-    """Check that the caller can add `more` without exceeding a quota.
+    """Check that the caller can add `more` things of the kind that a quota limits, without exceeding this quota.
 
-    `quota` is a field of `Quotas`. The server and attempts of jobs have no quotas. Concurrent checks of one user run
-    one after another. Raises `QuotaExceededProblem`.
+    `quota` is a field of `Quotas`, such as "user_uploads"; for quotas of bytes, `more` is a number of bytes. The server
+    and attempts of jobs have no quotas. Concurrent checks of one user run one after another. Raises
+    `QuotaExceededProblem`.
     """
     user_id = tx.principal.user_id
     if user_id is None or tx.principal.kind != "user":

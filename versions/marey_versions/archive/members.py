@@ -69,7 +69,7 @@ class ArchiveMember(NamedTuple):
         except ValueError:
             member = None
         if member is None or member.name != name:
-            raise BadArchive(f"{name}: members of an archive do not have such names")
+            raise BadArchive(f"{name}: this is not a valid name of a member of an archive")
         return member
 
 

@@ -103,7 +103,7 @@ def _commit(dataset: DatasetHandle, message: str, changes: Sequence[PutEntry]) -
 
 
 def _smooth_on_branch(project: ProjectHandle, dataset: DatasetHandle, path: str) -> None:
-    """Smooth a clip of the newest version, by a job that commits the result to a branch which starts there."""
+    """Start a branch at the newest version, and run a job that smooths a clip and commits the result to this branch."""
     if dataset.find_ref(BRANCH) is None:
         dataset.create_branch(BRANCH)
     else:

@@ -85,7 +85,7 @@ def run_text(connection: Connection, text: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Form:
-    """Compiled text of a statement for one database and one length of each list."""
+    """Text of a statement, compiled for one database and for one length of each list parameter."""
 
     text: str
     constants: Mapping[str, Any]
