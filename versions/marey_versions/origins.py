@@ -104,11 +104,11 @@ def find_origins(
 
 
 def _pass_to_parents(search: _OriginSearch, commit: str, key: str, names: set[str]) -> set[str]:
-    """Continue the search in those parents of `commit` whose entry is partly the same, and return what is searched for.
+    """Continue the search in the parents of `commit`, and return the names that are searched for there.
 
-    `key` is the key of the entry in the commit. `names` are names of its parts, `PATH` or `TAGS`. Each name whose value
-    is the same in the entry of a parent is searched for in the first such parent. The returned set contains these
-    names; the commit is the origin of the others.
+    `key` is the key of the entry in the commit; `names` are names of its parts, `PATH` or `TAGS`. A name is searched
+    for in the first parent whose entry has the same value for this name. If there is no such parent, the commit is the
+    origin of the name.
     """
     present = search.entry(commit, key)
     assert present is not None

@@ -77,7 +77,7 @@ class Crossing:
 
     Parameters
     ----------
-    search : the tests of versions, and the versions that can be the first bad one after these tests
+    search : the tests of versions, and the versions that, according to these, can be the first bad one
     metric, limit : name of the metric, and the value that it has crossed
     measurements : values at the tested versions and at the parents of the first bad one, in the order of measuring
     changes : if there is a single first bad version, the change of the metric from each of its parents
@@ -111,7 +111,7 @@ class VersionEvaluations:
     ----------
     project, dataset : the dataset and its project
     metric : name of the metric, one of `HEADLINE_METRICS`
-    params : options of the evaluations; their name is replaced by digits of the version's digest
+    params : options of the evaluations; each evaluation is named after the digest of its version
     path : folder of the dataset whose clips are evaluated; empty: all clips
     into : folder that receives the evaluations; None: the name of the dataset with `-bisect` at its end
     normaliser : evaluation whose scales of features are used, given as a handle or an id; None: each fits its own
@@ -183,7 +183,7 @@ class VersionEvaluations:
         return jobs.submit(self.project.name, request.model_copy(update=chosen))
 
     def interval(self, before: Measurement, after: Measurement) -> tuple[float, float] | None:
-        """Return the bounds, at 95 % confidence, of the mean change of a trial from one version to another.
+        """Return the bounds, at 95 % confidence, of the mean change of the metric over the trials of two versions.
 
         Returns None if the metric is no mean over trials, if a version was not evaluated, or if fewer than two trials
         define the metric.

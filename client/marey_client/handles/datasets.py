@@ -317,8 +317,8 @@ class DatasetHandle:
         is bad, or None if it cannot be tested. With `first_parent`, only the first parents of merges are followed.
         `ProjectHandle.bisect` tests a metric of the evaluation of each version.
 
-        Raises `CannotBisect` if `good` is not among the versions before `bad`, if the test finds `good` bad, or if it
-        does not find `bad` bad.
+        Raises `CannotBisect` if `good` is not among the versions before `bad`, or if the tests of the two ends do not
+        show that `good` is good and `bad` is bad.
         """
         return bisect(read_range(self, good, bad, first_parent=first_parent), is_bad, on_step)
 

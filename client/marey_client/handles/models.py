@@ -74,10 +74,10 @@ class ModelHandle(SearchableHandle):
         unit: str | None = None,
         revision: int | None = None,
     ) -> list[Path]:
-        """Draw `n` motions, write each to a file of its own, and return the paths of the files.
+        """Draw `n` motions, write them to files in `folder`, and return the paths of the files.
 
-        `format` is "bvh", "npz", or "predecessor", the format of Marey's predecessor; "json" writes all motions to one
-        file.
+        `format` is "bvh", "npz" or "predecessor" (the format of Marey's predecessor) for one file per motion, or "json"
+        for one file with all motions.
         """
         if format == "json":
             target = Path(folder) / safe_file_name(f"{self.name} {seed}.json")

@@ -1,5 +1,5 @@
 """Motion matching: search for the frame in a set of clips that best continues a motion along a desired trajectory.
 
-The conventions of `marey_motion.kinematics` apply; ground positions are (x, z) in metres, and a heading
-increases in a left turn.
+The conventions of `marey_motion.kinematics` apply. Ground positions are (x, z) in metres, and a left turn increases the
+heading.
 """

@@ -78,8 +78,8 @@ def _add_velocity(poses, places, successors, joints, moved, row, rate, velocitie
 def _show(pose, place, joints, moved, offsets, shown, shown_places):  # type: ignore[no-untyped-def]
     """Fill `shown` (3 + 4·K) and `shown_places` (M, 3) with K joints of a row's pose and M of its translations.
 
-    `pose` and `place` are the pose and all translations of the row. `offsets` (1 + M + K, 3), which belong to the
-    root's position, the translations and the rotations, are added to the result.
+    `pose` and `place` are the pose and all translations of the row. The `offsets` (1 + M + K, 3) of the root's
+    position, the translations and the rotations are added to them.
     """
     for c in range(3):
         shown[c] = pose[c] + offsets[0, c]

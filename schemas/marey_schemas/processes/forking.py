@@ -254,7 +254,7 @@ def fork_children(pipe: Connection, serve: Callable[[Connection], None]) -> None
 def _carry_out(
     pipe: Connection, serve: Callable[[Connection], None], others: tuple[socket.socket, socket.socket]
 ) -> set[int]:
-    """Read one message of the parent, and fork a child or release the process id of one.
+    """Read one message of the parent, and fork a child or release the process id of an ended child.
 
     Returns a set with the process id of the new child, or an empty set. A new child closes `others`, the sockets that
     only the fork server needs. Raises `EOFError` if the parent has closed the pipe.

@@ -1,8 +1,8 @@
 """Quotas: limits on what one user, or one project, may have.
 
 The transaction that adds something counts it, so the count is always exact. Items and their bytes have counters in the
-table `holding`, for the project and for the user who created the item. All other things, such
-as tokens and jobs, are counted each time another one is added.
+table `holding`, for the project and for the user who created the item. All other things,
+such as tokens and jobs, are counted each time another one is added.
 """
 
 from __future__ import annotations

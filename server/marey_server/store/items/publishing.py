@@ -47,10 +47,10 @@ def publish(
     """Create items and revisions from drafts, all or none; return them in the order of the drafts.
 
     In a document, `{"output": name}` refers to another draft and is replaced by the item and revision published from
-    it. If the draft of a model has a sample tree, the tree's `model_digest` may be a
-    reference, too, and is replaced by the digest of the draft's model. With `refer_to_deleted`, documents may
-    refer to items that are deleted. If an item already has the content of a draft, no new revision is created. The
-    caller must have checked that the user may write.
+    it. If the draft of a model has a sample tree, the tree's `model_digest` may be a reference, too, and is replaced by
+    the digest of the draft's model. With `refer_to_deleted`, documents may refer to items that are deleted. If an item
+    already has the content of a draft, no new revision is created. The caller must have checked that the user may
+    write.
 
     Raises `InvalidProblem` for a draft that is not valid, `ConflictProblem` for a name that is taken.
     """

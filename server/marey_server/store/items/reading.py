@@ -224,9 +224,9 @@ MOST_BYTES_AT_ONCE = 32 << 20
 def load_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace]) -> list[dict[str, Any] | None]:
     """Load the documents of parts with encoded arrays, in the order of the request; None for a missing part.
 
-    The parts of deleted items count as missing. The only exception are inputs of the calling attempt's job, because a
-    version of a dataset may contain items that were deleted later. If the documents together are too large, the list
-    ends before the first one that does not fit; the first document is always loaded.
+    The parts of deleted items count as missing. Only an attempt of a job can load them, if they are inputs of the job,
+    because a version of a dataset may contain items that were deleted later. If the documents together are too large,
+    the list ends before the first one that does not fit; the first document is always loaded.
     """
     project_row = projects.require(tx, project)
     keys = {
