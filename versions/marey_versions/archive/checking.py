@@ -45,7 +45,7 @@ class _Check:
                 if unchanged and not self.archive.manifest.base:
                     raise BadArchive(
                         f"{ArchiveMember(MemberKind.CHANGES, commit).name}: the member refers to an earlier archive, "
-                        "but this archive contains the whole history"
+                        "but this archive contains the whole history; it was altered"
                     )
                 documents = [digest for part, digest in value["parts"].items() if part not in unchanged]
                 self._revision(revision_content(path_and_kind(key)[1], value["parts"]), documents)

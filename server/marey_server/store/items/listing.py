@@ -96,7 +96,9 @@ def _shown(tx: Transaction, rows: Any, fields: Collection[str] | None) -> list[A
     if fields is None:
         return shown_items(tx, rows)
     if unknown := sorted(set(fields) - set(Item.model_fields)):
-        raise BadRequestProblem(f"An item has no field {unknown[0]!r}.", code="bad-fields")
+        raise BadRequestProblem(
+            f"An item has no field {unknown[0]!r}; remove it from the parameter `fields`.", code="bad-fields"
+        )
     shown = shown_items(tx, rows, tags="tags" in fields, parts="parts" in fields)
     return [found.model_dump(mode="json", include=set(fields)) for found in shown]
 
