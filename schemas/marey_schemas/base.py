@@ -40,14 +40,15 @@ class Options(Request):
 
 
 def require_tag(schema: dict[str, Any], model: type[Any]) -> None:
-    """Add the tag of `model` to the required properties of its JSON Schema."""
+    """Add the tag field of the `Tagged` class `model` to the required properties of its JSON Schema."""
     schema["required"] = list(dict.fromkeys((model.tag, *schema.get("required", ()))))
 
 
 class Tagged(Options):
-    """Options with several alternative classes, which are distinguished by the value of one field, the tag.
+    """Base of options that are one of several alternative classes; the value of a field, the tag, identifies the class.
 
-    Documents must contain the tag. In Python it may be omitted, because each class has its own value as default.
+    `tag` is the name of this field. Documents must contain the field. In Python it may be omitted, because its default
+    in each class is the value of this class.
     """
 
     model_config = ConfigDict(json_schema_extra=require_tag)

@@ -87,7 +87,7 @@ class LineageJob(Answer):
 
 
 class LineageGraph(Answer):
-    """Revisions that a revision was made from, or that were made from it, through any number of jobs."""
+    """Graph of the sources of a revision, or of the results made from it, through any number of jobs."""
 
     revisions: tuple[LineageRevision, ...] = Field(description="The revision that the graph starts from is the first.")
     links: tuple[LineageLink, ...]
@@ -109,7 +109,14 @@ class LineageGroup(NamedTuple):
 
 
 class GroupLink(NamedTuple):
-    """Links from a group of revisions to a group that jobs made from it; `used` counts the revisions that were used."""
+    """Link between two groups of revisions: jobs used revisions of the group `source` to create the group `result`.
+
+    Parameters
+    ----------
+    source, result : indices of the groups
+    role : name of the job input for which the sources were used
+    used : number of revisions of `source` that were used
+    """
 
     source: int
     result: int

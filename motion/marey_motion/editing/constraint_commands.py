@@ -195,7 +195,10 @@ def _target(rig: _Rig, joint: int, asked: AnyConstraint, start: int, stop: int) 
 
 
 def _looking_axis(rig: _Rig, joint: int) -> NDArray[np.float64]:
-    """Choose the axis (3,), in the joint's frame, that looks: the front of head or trunk, or the bone's direction."""
+    """Choose the axis (3,), in the joint's frame, that a look-at constraint directs at its target.
+
+    It is the forward axis of head and trunk joints, and the direction of the bone for all other joints.
+    """
     try:
         axes = rig.axes_of(joint)
     except MappingError as error:

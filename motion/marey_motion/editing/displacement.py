@@ -109,7 +109,11 @@ def displace(motion: Motion, frames: AnyInts, changed: Motion, windows: Sequence
 
 
 def _check_windows(frames: AnyInts, windows: Sequence[Window]) -> None:
-    """Check that each window contains a given frame, and each given frame is in a window but not at a smooth end."""
+    """Check that each window contains a given frame, and that each given frame is in a window.
+
+    The first frame of a window does not count if `smooth_start` is set, nor the last frame if `smooth_stop` is set:
+    the displacement is zero there.
+    """
     inside = np.zeros(len(frames), dtype=np.bool_)
     for window in windows:
         start, stop = window.start + window.smooth_start, window.stop - window.smooth_stop
@@ -193,10 +197,11 @@ def _curve(frames: AnyInts, values: Floats, window: Window, swing: float) -> Flo
 
 
 def _energy(count: int, window: Window, swing: float) -> Floats:
-    """Compute the bending and tension of a curve with `count` control points, as a quadratic form of these.
+    """Compute the matrix of the quadratic form that gives the bending and tension energy of a curve.
 
-    Returns the lower diagonals (4, count) of the matrix of the form; `swing` is as in `_curve`.
-    Beyond a smooth end all control points are zero; beyond an end that is not smooth there are no control points.
+    The form applies to the `count` control points of the curve. Returns the main diagonal and the three diagonals
+    below it (4, count); `swing` is as in `_curve`. Control points beyond a smooth end of the window are zero; beyond
+    other ends there are none.
     """
     bands = np.zeros((4, count))
     tension = swing**-2
@@ -216,9 +221,9 @@ def _rotation_vectors(before: Floats, after: Floats) -> Floats:
 
 
 def _continued(values: Floats, joints: int) -> Floats:
-    """Let rotation vectors exceed half a turn where this makes them continuous.
+    """Return displacements with rotation vectors that are continuous over time, and may exceed half a turn.
 
-    `values` (n, 3 + 3·joints) are displacements of the root and rotation vectors of `joints` joints.
+    `values` (n, 3·joints + 3) are rotation vectors of `joints` joints, followed by displacements of the root.
     """
     vectors = values[:, : 3 * joints].reshape(len(values), joints, 3)
     if np.linalg.norm(vectors, axis=-1).max(initial=0.0) < 0.5 * np.pi:

@@ -224,7 +224,10 @@ def _standing_heels(contacts: FootContacts, blend: int) -> Flags:
 
 
 def _blended(flags: Flags, values: Floats, blend: int) -> Floats:
-    """Keep values (F, c) where flags (F,) are set, and blend from and to zero within `blend` frames around them."""
+    """Return values (F, c) that are kept in frames with a flag, and fade to zero before and after these frames.
+
+    `flags` (F,) mark the frames to keep. The values fade within `blend` frames; all other frames are zero.
+    """
     frames = np.flatnonzero(flags)
     blended = np.zeros_like(values)
     for window in windows_around(frames, blend, len(flags)):
@@ -249,7 +252,7 @@ def _turn_between(before: Floats, after: Floats) -> Floats:
 
 
 def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], zone: float, blend: int) -> Floats:
-    """Compute distances (F,), in metres, to lower the root so that planted feet are in reach with bent knees.
+    """Compute how far (F,), in metres, the root must be lowered so that legs reach planted feet with bent knees.
 
     `zone` is the angle from the straight leg, in radians, in which knees are damped (see `solve_two_bone`).
     """

@@ -121,10 +121,10 @@ def _same_rate(take: Take, source: str) -> Take:
 
 
 def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
-    """Find the rotation and shift on the ground that attach the clip `after` to the end of `before`.
+    """Compute the rotation about the vertical and the shift on the ground that attach `after` to the end of `before`.
 
-    If the last `overlap` frames of one are blended with the first frames of the other, they are matched at the middle
-    of this overlap.
+    `overlap` is the number of frames at the end of `before` that are blended with the first frames of `after`. If it
+    is not 0, position and heading of the two bodies agree in the middle of the overlap.
     """
     if overlap:
         there, here = before.frame_count - overlap + overlap // 2, overlap // 2

@@ -62,7 +62,7 @@ def close_loop(take: Take, command: CloseLoop) -> Take:
 def _in_place(motion: Motion, places: Floats, seam: LoopSeam) -> Motion:
     """Remove the travel and turn of one cycle, `seam`, evenly over the frames.
 
-    `places` (F, 3) are the positions of the pelvis; each frame is turned about its own.
+    `places` (F, 3) are the positions of the pelvis. Each frame is rotated about the vertical through its pelvis.
     """
     shares = np.arange(motion.frame_count) / motion.frame_count
     start = places[0, [0, 2]]

@@ -127,9 +127,10 @@ def _reflected(end: Floats, rotations: Floats) -> Floats:
 
 
 def _averaged(padded: Floats, weights: Floats) -> Floats:
-    """Compute weighted means (F, ...) over time of values that are continued by n frames at both ends.
+    """Compute the weighted mean (F, ...) of the frames around each frame.
 
-    `padded` (n + F + n, ...) are these values; `weights` (2 n + 1,) are those of the frames around each frame.
+    `padded` (n + F + n, ...) are the values of all frames, extended by n frames at either end; `weights` (2 n + 1,)
+    are the weights of the n frames before a frame, of the frame itself, and of the n frames after it.
     """
     from scipy.ndimage import correlate1d
 

@@ -1,4 +1,4 @@
-"""Functions that make two motions store translations for the same joints."""
+"""Functions that add translations of joints to motions, so that two motions store translations for the same joints."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ def translated(motion: Motion, skeleton: Skeleton, joints: tuple[int, ...]) -> M
 
 
 def with_equal_joints(a: Motion, b: Motion, skeleton: Skeleton) -> tuple[Motion, Motion]:
-    """Make two motions of one skeleton store translations for the same joints: all that either of them translates.
+    """Add translations to two motions of one skeleton, so that both store translations for the same joints.
+
+    These are all joints for which `a` or `b` stores translations.
 
     Parameters
     ----------
@@ -39,7 +41,7 @@ def with_equal_joints(a: Motion, b: Motion, skeleton: Skeleton) -> tuple[Motion,
 
     Returns
     -------
-    (Motion, Motion)    the same motions
+    (Motion, Motion)    `a` and `b` with the added translations; poses do not change
     """
     joints = tuple(sorted({*a.translated_joints, *b.translated_joints}))
     return translated(a, skeleton, joints), translated(b, skeleton, joints)

@@ -1,4 +1,8 @@
-"""Conversion of graphs read by `formats.predecessor` to graphs of models of the project, which are found by name."""
+"""Conversion of imported graphs of models: each node is linked to the model of the project that has the node's name.
+
+Such graphs come from files of the predecessor, the system that Marey replaces (`formats.predecessor`). They name the
+models of one or several actions, and the possible transitions between these models.
+"""
 
 from __future__ import annotations
 
@@ -32,12 +36,14 @@ FindModels = Callable[[str, str | None], tuple[int, Sequence[NamedModel]]]
 
 
 def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
-    """Make the item of a graph: each node refers to the model with the node's name, preferably in the same collection.
+    """Make the item of a graph, in which each node refers to the model with the node's name.
+
+    A model in the collection of the graph is preferred to models in other collections.
 
     Parameters
     ----------
     graph : ImportedGraph    the graph
-    find : callable    finds the models of a name
+    find : callable    returns the models with a given name
 
     Returns
     -------
@@ -71,7 +77,10 @@ def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
 
 
 def _find_model(find: FindModels, name: str, collection: str) -> dict[str, Any]:
-    """Find the model with a name in the graph's collection or, failing that, the only such model of the project."""
+    """Return the reference to the model called `name` in `collection`, or to the only one of that name in the project.
+
+    Raises `FormatError` if there is no such model, or if there are several.
+    """
     count, models = find(name, collection)
     if count != 1:
         count, models = find(name, None)

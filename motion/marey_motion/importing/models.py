@@ -1,4 +1,7 @@
-"""Import of files of `formats.predecessor` without motion: models, trees over samples of models, and graphs."""
+"""Import of the predecessor's files that contain no motion: models, trees over samples of models, and graphs.
+
+The predecessor is the system that Marey replaces; `marey_motion.formats.predecessor` reads its files.
+"""
 
 from __future__ import annotations
 

@@ -214,9 +214,10 @@ def _likely_axes(*axes: tuple[UpAxis, float]) -> str:
 
 
 def _body_axis(positions: NDArray[np.float64], landmarks: Landmarks) -> tuple[UpAxis, float]:
-    """Find the signed axis nearest to the mean direction from the feet to the head (or hips), and its cosine.
+    """Find the signed coordinate axis nearest to the mean direction from the feet to the head (or hips).
 
-    The cosine is 0 if legs and trunk are folded onto each other, as by a rest pose with all bones on one line.
+    Also returns the cosine of the angle between this axis and the direction. The cosine is 0 if legs and trunk are
+    folded onto each other, as in a rest pose with all bones on one line.
     """
     assert landmarks.feet is not None
     assert landmarks.hips is not None

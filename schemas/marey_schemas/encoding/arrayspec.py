@@ -75,7 +75,7 @@ class ArraySpec:
     def require(self, max_bytes: int) -> None:
         """Raise `ArrayError` unless the array fits in `max_bytes`."""
         if self.nbytes > max_bytes:
-            raise ArrayError("too-large", f"an array of {self} is larger than the {max_bytes} bytes that are allowed")
+            raise ArrayError("too-large", f"the array {self} is larger than the {max_bytes} bytes that are allowed")
 
 
 def little_endian(array: NDArray[Any]) -> NDArray[Any]:

@@ -60,7 +60,9 @@ def encode_tree(tree: Any, media_type: str, *, arrays: ArrayForm = "plain") -> b
     _require_media_type(media_type)
     if media_type == JSON and arrays == "blocks":
         raise CodecError(
-            "bad-media-type", "", "JSON cannot contain blocks; use application/msgpack or application/bson"
+            "bad-media-type",
+            "",
+            "JSON cannot contain block-encoded arrays; use application/msgpack or application/bson",
         )
 
     def leaf(value: NDArray[Any] | EncodedArray) -> dict[str, Any]:
@@ -148,7 +150,7 @@ def _finite_array(value: NDArray[Any] | EncodedArray) -> NDArray[Any]:
 
 
 class _Count:
-    """Count of the objects and lists of a document while it is parsed, and of the members of its objects."""
+    """Counter that refuses a document with too many objects, lists or members of objects while it is parsed."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -255,7 +257,7 @@ _BSON_OBJECT = b"\x03"
 
 
 def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not JSON")
+    raise ValueError(f"JSON does not allow {name}; all numbers must be finite")
 
 
 # Values of one format only, though Python takes them for a str or a tuple.
@@ -263,9 +265,10 @@ _FOREIGN = (bson.Code, msgpack.ExtType)
 
 
 class _Walk:
-    """Traversal of a tree that checks every value and converts every array, in either direction.
+    """Traversal of a tree that checks every value and converts every array.
 
-    With `on_array` it turns arrays into leaves; without it, leaves into arrays.
+    For encoding, `on_array` converts arrays to array leaves, the objects that represent arrays in documents (see
+    `arrays`). For decoding, `on_array` is None, and array leaves are converted to arrays.
     """
 
     def __init__(

@@ -55,7 +55,7 @@ def unpack(data: bytes | memoryview, dtype: np.dtype[Any], frames: int, columns:
         size = zstandard.frame_content_size(data)
         if not 0 < size <= 2 + 2 * columns + frames * columns * dtype.itemsize:
             raise TileError(
-                f"the tile declares {size} bytes, which {frames} frames of {columns} columns of {dtype.str} cannot have"
+                f"the tile declares {size} bytes, which is not possible for {frames} x {columns} values of {dtype.str}"
             )
         content = zstandard.ZstdDecompressor().decompress(data, max_output_size=size, allow_extra_data=False)
     except zstandard.ZstdError as error:
@@ -94,7 +94,7 @@ def _restore(content: Bytes, dtype: np.dtype[Any], frames: int, columns: int) ->
     elif form == QUATERNIONS and dtype == np.dtype("<f4"):
         tile = _from_integers(_undo_prediction(body, columns, frames), dtype).T
     else:
-        raise TileError(f"the tile has the form {form}, which is not allowed for the dtype {dtype.str}")
+        raise TileError(f"the tile has the form {form}, which does not exist for the dtype {dtype.str}")
     body.require_end()
     return tile
 
@@ -158,7 +158,7 @@ def _unfold_sign(folded: Integers) -> Integers:
 
 
 def _difference(channels: Integers) -> list[Bytes]:
-    """Replace each channel by its differences of that order which needs the fewest bits.
+    """Replace each channel by its differences, of the order (0 to `MAX_ORDER`) that needs the fewest bits.
 
     Returns the order of each channel (one byte), then the byte planes of the differences, lowest byte first.
     """
@@ -176,9 +176,10 @@ def _difference(channels: Integers) -> list[Bytes]:
 
 
 def _bits_needed(folded: Integers) -> NDArray[np.int64]:
-    """Return an estimate of the bits that each channel needs; it grows with the sum of log2 of the channel's numbers.
+    """Return a measure of the bits that each channel needs, for comparison: larger values mean more bits.
 
-    The bits of a positive float, read as an integer, grow almost linearly with log2 of the float.
+    The measure is the sum over the channel's numbers of their float32 bits, read as an integer, because this integer
+    grows almost linearly with log2 of the number.
     """
     logarithms = (folded | 1).astype(np.float32).view(np.int32)
     cost: NDArray[np.int64] = logarithms.sum(axis=1, dtype=np.int64)

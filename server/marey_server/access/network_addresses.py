@@ -61,9 +61,9 @@ def _parsed(address: str) -> Address:
 
 
 def literal_address(host: str) -> str | None:
-    """Return the numeric address that a host of a URL is, or None for a name that must be resolved.
+    """Convert the host of a URL to a numeric address; return None if it is a name that must be resolved.
 
-    Old forms of IPv4 addresses, such as `127.1` or `0x7f000001`, are addresses, too, and so is `localhost`.
+    Old forms of IPv4 addresses, such as `127.1` or `0x7f000001`, are converted, too, and so is `localhost`.
     """
     name = host.rstrip(".").lower()
     if name == "localhost" or name.endswith(".localhost"):

@@ -26,7 +26,10 @@ class _Parsed(NamedTuple):
 
 
 def hash_password(password: str) -> str:
-    """Return `scrypt$15$8$1$<salt>$<key>`. It takes about 0.1 s, so it must not run on the event loop."""
+    """Hash a password with a random salt, and return `scrypt$15$8$1$<salt>$<key>`.
+
+    This takes about 0.1 s, so it must not run on the event loop.
+    """
     salt = secrets.token_bytes(16)
     key = _derive(password, salt, LOG2_N, _BLOCK, _PARALLEL, _KEY_BYTES)
     return "$".join(("scrypt", str(LOG2_N), str(_BLOCK), str(_PARALLEL), _text(salt), _text(key)))

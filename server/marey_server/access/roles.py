@@ -48,5 +48,5 @@ def require_administrator(principal: Principal, *, hidden: NotFoundProblem | Non
     if is_administrator(principal):
         return
     if principal.kind == "anonymous":
-        raise UnauthenticatedProblem("Sign in as an administrator.")
+        raise UnauthenticatedProblem("Only administrators may do this; send the token of an administrator.")
     raise hidden or ForbiddenProblem("Only administrators may do this.", code="administrators-only")

@@ -44,12 +44,20 @@ def derive_token_key(secret: str) -> bytes:
 
 
 def derive_attempt_token(token_key: bytes, claim_id: str, job_id: str, fence: int) -> IssuedToken:
-    """Derive the token of an attempt; a repeated claim with the same user's token gets the same token again."""
+    """Derive the token of an attempt; the same arguments always give the same token.
+
+    So a worker that repeats a claim with the same user token gets the same attempt token again. `fence` is the
+    number of the claim among those of the job.
+    """
     return _attempt_token(hmac.digest(token_key, f"{claim_id} {job_id} {fence}".encode(), "sha256").hex())
 
 
 def derive_successor(token_key: bytes, rotation_id: str, prefix: str) -> IssuedToken:
-    """Derive the token that replaces a user's token; a repeated rotation with the same `rotation_id` gets it again."""
+    """Derive the token that replaces a user's token; the same arguments always give the same token.
+
+    So a rotation that is repeated with the same `rotation_id` returns the same token again. `prefix` is the prefix of
+    the new token.
+    """
     # A rotation_id contains no space, so this message is different from that of every attempt.
     return _user_token(prefix, hmac.digest(token_key, f"rotation {rotation_id}".encode(), "sha256").hex())
 

@@ -1,4 +1,4 @@
-"""Secrets of webhooks, and signatures of what webhooks send, after the specification Standard Webhooks 1.0.
+"""Secrets of webhooks, and signatures of their deliveries, as specified by Standard Webhooks 1.0.
 
 A secret is `whsec_` and 32 random bytes in Base64. The signature is the HMAC-SHA256 of the delivery's id, the time in
 seconds and the body, joined by full stops.
@@ -35,7 +35,7 @@ def is_secret(text: str) -> bool:
 
 
 def sign(secret: str, delivery_id: str, timestamp: int, body: bytes) -> str:
-    """Return the signature of a delivery: `v1,` and Base64.
+    """Return the signature of a delivery: `v1,` followed by the HMAC in Base64.
 
     Parameters
     ----------

@@ -128,10 +128,10 @@ def delete_documents(tx: Transaction, digests: Sequence[str], grace_us: int = GR
 
 
 def _staged_documents(tx: Transaction) -> set[str]:
-    """Return the documents that running attempts have staged.
+    """Return the digests of the documents of staged outputs: results that a running job has not published yet.
 
-    A document staged after this read is not garbage either, because staging updates the time of its row. What
-    completed attempts staged is kept only while something else refers to it.
+    Documents that are staged after this read are not deleted either, because staging updates the time of their rows.
+    Documents that completed attempts staged are kept only while something else refers to them.
     """
     running = select(job.c.id).where(job.c.state == JobState.RUNNING.value)
     staged = select(staged_output.c.draft).where(staged_output.c.job_id.in_(running))

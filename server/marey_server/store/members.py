@@ -94,7 +94,7 @@ def remove_member(tx: Transaction, project_name: str, user_name: str, *, expecte
 
 
 def _lock(tx: Transaction, project_name: str) -> ProjectRow:
-    """Lock the members of a project and return it, so that two owners cannot remove each other at the same time."""
+    """Return a project after locking its members, so that two owners cannot remove each other at the same time."""
     project_row = projects.require(tx, project_name)
     tx.execute(select(project.c.id).where(project.c.id == project_row.id).with_for_update(key_share=True))
     return projects.require(tx, project_name)  # the one before may have ended the caller's role

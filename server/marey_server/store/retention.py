@@ -74,7 +74,10 @@ def _retire_events(database: Database, days: int) -> int:
 
 
 def _delete_oldest(tx: Transaction, age_us: int) -> int:
-    """Delete some old events; count those that a webhook has not delivered, so that it reports them."""
+    """Delete some old events and return their number.
+
+    Before, the events that a webhook has not delivered yet are counted, so that the webhook can report them as missed.
+    """
     old = events.find_oldest(tx, age_us)
     if old is None:
         return 0
@@ -95,7 +98,10 @@ def _retire_logs(database: Database, days: int) -> int:
 
 
 def _old_logs(tx: Transaction, age_us: int, after: tuple[str, int]) -> list[tuple[str, int]]:
-    """Return the next attempts (job id and fence) that ended long ago and have a log."""
+    """Return the next attempts, after the attempt `after`, that ended long ago and have a log.
+
+    An attempt is identified by the id of its job and by its fence, the number of the claim that started it.
+    """
     statement = (
         select(attempt.c.job_id, attempt.c.fence)
         .where(
@@ -138,9 +144,10 @@ task = job.alias("task")
 
 
 def _old_jobs(tx: Transaction, age_us: int, after: str) -> list[str]:
-    """Return the next jobs that can be deleted.
+    """Return the ids of the next jobs, after the id `after`, that can be deleted.
 
-    They ended long ago, neither they nor their tasks created a revision or a commit, and no other job depends on them.
+    These jobs ended long ago, neither they nor their tasks created a revision or a commit, and no other job depends on
+    them.
     """
     tasks = select(task.c.id).where(task.c.parent_id == job.c.id)
     with_tasks = or_(job_dependency.c.on_job_id == job.c.id, job_dependency.c.on_job_id.in_(tasks))

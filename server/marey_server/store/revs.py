@@ -1,5 +1,7 @@
-"""Conditional changes of rows with a `rev`: the condition is part of the UPDATE, and the row count shows whether it was
-true.
+"""Changes of rows on the condition that nobody else has changed them since they were read.
+
+The column `rev` of a row is a number that grows with each change. A change names the `rev` that it expects. This
+condition is part of the UPDATE statement; if no row is returned, the condition was false.
 """
 
 from __future__ import annotations

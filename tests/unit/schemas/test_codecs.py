@@ -86,7 +86,7 @@ def _leaf_of(array: NDArray[Any]) -> dict[str, Any]:
 
 
 def test_json_cannot_carry_blocks() -> None:
-    with pytest.raises(CodecError, match="JSON cannot contain blocks"):
+    with pytest.raises(CodecError, match="JSON cannot contain block-encoded arrays"):
         encode_tree({"a": np.zeros(3)}, JSON, arrays="blocks")
     text = '{"a": {"dtype": "<f4", "shape": [1], "encoding": "blocks", "data": "TVJCMQ=="}}'
     assert refusal(text.encode(), JSON).pointer == "/a"

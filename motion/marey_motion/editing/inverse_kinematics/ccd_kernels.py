@@ -42,11 +42,12 @@ STAYING = 1e-9
 
 @compiled
 def _pair_up(targets, frame, k, body, place, tips, turns, matrix):  # type: ignore[no-untyped-def]
-    """Collect pairs of a vector a that joint k turns, and the vector b to which a target asks it to turn.
+    """Fill `matrix` (3, 3) with the sum Σ w·b·aᵀ over the pairs of vectors (a, b) that the targets define for joint k.
 
-    `place` is the position of joint k; `tips` and `turns` are positions and rotations of the targets' points. `matrix`
-    (3, 3) is filled with the sum Σ w·b·aᵀ over the pairs, weighted by w. Returns the number of pairs, and a and b of
-    the last pair as unit vectors.
+    Joint k rotates the vector a, and the target is reached when a coincides with b; w is the squared scale of the
+    target's error, for orientations half of it. `place` is the position of joint k; `tips` and `turns` are positions
+    and rotations of the targets' points. Returns the number of pairs, and a and b of the last position or look-at
+    pair as unit vectors.
     """
     matrix[:] = 0.0
     pairs = 0
@@ -250,9 +251,10 @@ def _sweep(body, targets, frame, local, work):  # type: ignore[no-untyped-def]
 
 @compiled
 def descend(body, targets, ends, roots, rotations, work, found):  # type: ignore[no-untyped-def]
-    """Solve each frame independently: `rotations` (F, K, 4) are changed in place, `found`, a `SolverResult`, is filled.
+    """Solve each frame independently; change `rotations` (F, K, 4) in place, and fill the `SolverResult` `found`.
 
-    `ends` are the maximum number of sweeps, the tolerance in metres and the tolerance in radians.
+    `ends` holds the three criteria for ending: the maximum number of sweeps, and the tolerances in metres and in
+    radians.
     """
     most_sweeps, tolerance_m, tolerance_rad = ends
     best = np.empty(rotations.shape[1:])

@@ -131,10 +131,10 @@ def fill_jacobian(body, targets, frame, work, jacobian):  # type: ignore[no-unty
 
 @compiled
 def _displace(body, local, root, first_local, first_root, work):  # type: ignore[no-untyped-def]
-    """Fill `work.displacement` (3·V + 3,), and return the sum of the weighted squares.
+    """Fill `work.displacement` (3·V + 3,), and return the weighted sum of its squares.
 
-    They are the displacements of the V movable joints and the root from the initial pose, `first_local` and
-    `first_root`, to the pose `local` and `root`.
+    These are the displacements of the V movable joints and of the root, from the initial pose (`first_local`,
+    `first_root`) to the pose (`local`, `root`).
     """
     columns, cost = 0, 0.0
     for k in range(local.shape[0]):
@@ -187,9 +187,9 @@ def _soften(work, vector, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def _solve_positive(matrix, right):  # type: ignore[no-untyped-def]
-    """Solve matrix·x = right for a positive definite matrix (m, m): replace `right` (m,) by x, and the matrix's values.
+    """Solve matrix·x = right for a positive definite matrix (m, m), and write x into `right` (m,).
 
-    The matrix is replaced by its Cholesky factor.
+    The lower triangle of `matrix` is overwritten by its Cholesky factor.
     """
     m = right.shape[0]
     for i in range(m):
@@ -235,9 +235,11 @@ def _fill_step(work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _block(work, v, over):  # type: ignore[no-untyped-def]
-    """Exclude the direction `over` from the steps of movable joint v; return False if all directions were excluded.
+    """Exclude the direction `over` from further steps of movable joint v.
 
-    `work.outward` is the excluded direction, or, if two are excluded, the direction that remains free.
+    `work.blocked` counts the excluded directions of each joint. `work.outward` contains the excluded direction if
+    there is one, and the only direction that remains free if there are two. Returns False, without a change, if all
+    three directions were excluded before the call.
     """
     known = work.blocked[v]
     if known == 1:
@@ -250,9 +252,9 @@ def _block(work, v, over):  # type: ignore[no-untyped-def]
 
 @compiled
 def _take_step(body, local, root, work):  # type: ignore[no-untyped-def]
-    """Fill the trial pose: the pose `local` (K, 4) and `root` (3,) moved by `work.step`, within the limits.
+    """Fill the trial pose `work.trial` and `work.trial_root`: `local` (K, 4) and `root` (3,) moved by `work.step`.
 
-    Returns whether a joint ran into a limit that was not yet known to block it.
+    Joints stay within their limits. Returns whether a limit excluded a further direction for any joint (see `_block`).
     """
     longest = 0.0
     for n in range(3 * work.blocked.shape[0]):
@@ -311,7 +313,7 @@ def _prepare(body, targets, frame, work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _try_step(body, damping, local, root, work):  # type: ignore[no-untyped-def]
-    """Compute the pose to which a damped step leads from `local` and `root`: `work.trial` and `work.trial_root`.
+    """Take a damped step from the pose `local` and `root`; fill `work.trial` and `work.trial_root` with the new pose.
 
     Joints at their limits slide along them.
     """
@@ -377,11 +379,10 @@ def _solve_frame(body, targets, frame, offsets, ends, local, root, work, before,
 
 @compiled
 def solve_frames(body, targets, ends, roots, rotations, work, found):  # type: ignore[no-untyped-def]
-    """Solve each frame independently: `roots` (F, 3) and `rotations` (F, K, 4) are changed in place.
+    """Solve each frame independently; change `roots` (F, 3) and `rotations` (F, K, 4) in place.
 
-    `found`, a `SolverResult`, is filled.
-
-    `ends` are the maximum number of steps, the tolerance in metres and the tolerance in radians.
+    Also fills the `SolverResult` `found`. `ends` holds the three criteria for ending: the maximum number of steps, and
+    the tolerances in metres and in radians.
     """
     for f in range(rotations.shape[0]):
         frame = min(f, targets.values.shape[0] - 1)

@@ -88,11 +88,10 @@ def target_error(targets, c, frame, tip, turn):  # type: ignore[no-untyped-def]
 
 @compiled
 def weigh_errors(targets, frame, tips, turns, errors, tolerance_m, tolerance_rad):  # type: ignore[no-untyped-def]
-    """Fill `errors` (C, 3): how far the pose is from each target.
+    """Fill `errors` (C, 3) with the error of each target in a pose.
 
-    In this pose, the points that should reach the targets have the positions `tips` and the rotations `turns`.
-
-    Returns the weighted sum of the squared errors, and whether all are within the tolerances.
+    In the pose, the targets' points have the positions `tips` (C, 3), and their joints the rotations `turns` (C, 4).
+    Returns the weighted sum of the squared errors, and whether all errors are within the tolerances.
     """
     cost, reached = 0.0, True
     for c in range(targets.kinds.shape[0]):
@@ -135,7 +134,10 @@ def nearest_in_range(angle, low, high):  # type: ignore[no-untyped-def]
 
 @compiled
 def within_limits(row, q):  # type: ignore[no-untyped-def]
-    """Return the local rotation `q` moved into the limits of a joint, its row of `JointChains.limits`."""
+    """Return the local rotation `q` of a joint, changed so that it is within the joint's limits.
+
+    `row` (14,) is the joint's row of `JointChains.limits`.
+    """
     reference = (row[0], row[1], row[2], row[3])
     axis, side = (row[4], row[5], row[6]), (row[7], row[8], row[9])
     turn = product(inverse(reference), q)

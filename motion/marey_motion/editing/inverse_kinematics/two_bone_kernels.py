@@ -146,7 +146,11 @@ def _reach(limb, body, offsets, root, local, target, rotation, work):  # type: i
 
 @compiled
 def _turn(body, work, local, k, turn):  # type: ignore[no-untyped-def]
-    """Turn joint k by a world rotation that was computed before the joint's ancestors were turned."""
+    """Rotate joint k of the pose `local` by `turn`, a rotation about world axes.
+
+    `turn` was computed for the pose before any joint of the limb was turned. `work.spins` are the rotations of the
+    joints in the world in that pose.
+    """
     parent = body.parents[k]
     spin = product(turn, rotation_at(work.spins, k))
     if parent >= 0:
