@@ -55,7 +55,8 @@ CommitTo = OutputsCommit | str | None
 class ProjectHandle(ProjectItems):
     """Handle of a project, given by name; requests are sent only by its methods.
 
-    Methods that submit a job take `commit`, such as "gaits@main/studio", to commit its results when it succeeds.
+    Methods that submit a job take `commit`: if the job succeeds, its results are committed to a branch of a dataset.
+    For example, "gaits@main/studio" is the folder `studio` on the branch `main` of the dataset `gaits`.
     """
 
     def __repr__(self) -> str:
@@ -237,8 +238,8 @@ class ProjectHandle(ProjectItems):
     ) -> Job:
         """Submit a job that edits clips, or folders given by path, by commands or a stored edit.
 
-        The results go to the folder `into`, or get a `suffix`, or with `in_place=True` are the next revisions of the
-        clips themselves. `options` are those of `EditParams`.
+        The results are new clips in the folder `into`, or, with the option `suffix`, beside the edited clips. With
+        `in_place=True`, they are new revisions of these clips instead. `options` are those of `EditParams`.
         """
         request = edit_request(self, clips, commands, options)
         chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
@@ -295,7 +296,8 @@ class ProjectHandle(ProjectItems):
         search is interrupted, the same call continues it, because existing evaluations are reused.
 
         `options` are those of `EvaluateParams`. Raises `CannotBisect` if there is no such metric, if `good` is not
-        among the versions before `bad`, or if an end is not what it is given as.
+        among the versions before `bad`, if one of these two versions cannot be evaluated, or if their values do not
+        fit: if the value of `good` is bad or that of `bad` is not.
         """
         handle = self.datasets.at(dataset)
         evaluations = VersionEvaluations(

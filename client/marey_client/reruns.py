@@ -54,7 +54,7 @@ def rerun_request(job: Job, kind: JobKind, tasks: Iterable[Job] = (), *, into: s
     declared = job_kinds().get(job.kind)
     if declared is not None and declared.in_place and job.params.get(declared.in_place):
         raise CannotRerun(
-            f"the job {job.id} wrote new revisions of its inputs (--in-place); repeating it would change them again"
+            f"the job {job.id} wrote new revisions of its inputs (--in-place), so it cannot be repeated"
         )
     in_order = sorted(tasks, key=lambda task: task.position or 0)
     inputs = {

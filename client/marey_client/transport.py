@@ -1,4 +1,4 @@
-"""Requests and answers: authentication, safe repetition, problem documents, media types."""
+"""HTTP connections to a server: requests with authentication and retries, and their answers as models or errors."""
 
 from __future__ import annotations
 
@@ -103,7 +103,10 @@ class Transport:
         return other
 
     def with_present_token(self) -> Transport:
-        """Return a transport with the same connections and the current token; a later change of its file is ignored."""
+        """Return a transport with the same connections that always sends the current token.
+
+        If the token was read from a file, later changes of this file have no effect on the new transport.
+        """
         return self if self._auth is None else self.with_token(self._auth.token)
 
     def has_token_of(self, other: Transport) -> bool:
@@ -182,7 +185,8 @@ class Transport:
     def repeat(self, once: Callable[[], T], *, repeatable: bool, what: str) -> T:
         """Call `once` until it succeeds, at most `retries.tries` times, and return its result.
 
-        An error that a retry cannot solve is raised at once.
+        An error that a retry cannot solve is raised at once. If `repeatable` is False, a broken connection is such an
+        error, because the request may have arrived. `what` names the request in the log.
         """
         started = time.monotonic()
         for tried in range(1, self.retries.tries + 1):
@@ -215,7 +219,7 @@ class Transport:
         return read_tree(response), response.headers.get("ETag")
 
     def send_tree(self, method: str, path: str, tree: Any, **options: Any) -> httpx.Response:
-        """Send a document; numpy arrays in it are encoded as blocks."""
+        """Send a document as MessagePack, with its numpy arrays in the block encoding."""
         body = encode_tree(tree, "application/msgpack", arrays="blocks")
         return self.send(method, path, content=body, media_type=BLOCKS, **options)
 

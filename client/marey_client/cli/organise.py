@@ -300,8 +300,9 @@ def _do_each(
 ) -> None:
     """Apply a function to each folder or item, and print refusals. Raises `Refused` at the end if there were any.
 
-    Items that a query has selected do not depend on each other and may be many: then several requests are sent at a
-    time, and the number of items is printed.
+    `done` is the past participle for messages, such as "moved". `selected` says that a query has selected the items:
+    they may be many and do not depend on each other, so several requests are sent at a time, and the number of items
+    is printed.
     """
     from marey_client.errors import RequestFailed
 

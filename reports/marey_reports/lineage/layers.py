@@ -1,8 +1,8 @@
 """Positions of the boxes of an acyclic directed graph, in layers from left to right.
 
-The method of Sugiyama, Tagawa and Toda (1981): every box stands to the right of all boxes that have arrows to it; an
-arrow that passes over layers gets a node in each of them; the nodes of a layer are sorted by the mean positions of
-their neighbours.
+The method is that of Sugiyama, Tagawa and Toda (1981). Every box is to the right of all boxes that have arrows to it.
+An arrow that crosses layers gets a node in each of them. The nodes of a layer are sorted by the mean positions of their
+neighbours.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MOST_PASSED = 100_000
 
 
 class Layout(NamedTuple):
-    """Places of boxes in layers, and the way of each arrow.
+    """Layers of a graph with the boxes in them, and the route of each arrow.
 
     A node is a number. With n boxes, the numbers 0 to n - 1 are the boxes, and greater numbers are points at which
     arrows cross a layer.
@@ -71,7 +71,7 @@ def _depths(count: int, arrows: Sequence[tuple[int, int]]) -> list[int]:
             if not waiting[target]:
                 order.append(target)
     if len(order) < count:
-        raise ValueError("the arrows form a cycle")
+        raise ValueError("the graph cannot be drawn in layers, because its arrows form a cycle")
     for box in reversed(order):
         if not before[box] and after[box]:
             depth[box] = min(depth[target] for target in after[box]) - 1
@@ -95,7 +95,7 @@ def _reorder(layers: list[list[int]], routes: Sequence[Sequence[int]]) -> None:
 
 
 def _number(layer: list[int], position: dict[int, float]) -> None:
-    """Write the position of each node of a layer, from 0 at the top to 1 at the bottom."""
+    """Set the position of each node of a layer in `position`, from 0 at the top to 1 at the bottom."""
     position.update((node, (index + 0.5) / len(layer)) for index, node in enumerate(layer))
 
 

@@ -76,7 +76,7 @@ def _retire_events(database: Database, days: int) -> int:
 def _delete_oldest(tx: Transaction, age_us: int) -> int:
     """Delete some old events and return their number.
 
-    Before, the events that a webhook has not delivered yet are counted, so that the webhook can report them as missed.
+    Events that a webhook has not delivered yet are counted first, so that the webhook can report them as missed.
     """
     old = events.find_oldest(tx, age_us)
     if old is None:

@@ -1,4 +1,4 @@
-"""The axis of canonical time, which is common to figures of alignments and models."""
+"""Axis of canonical time, the common time to which examples are aligned, in figures of alignments and models."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LONGEST_LABEL = 24
 
 
 def percents(frame_count: int) -> NDArray[np.float64]:
-    """Convert canonical frames (N,) to percent of canonical time."""
+    """Return the canonical time (N,), in percent, of each of `frame_count` (N) canonical frames."""
     return np.linspace(0.0, 100.0, frame_count)
 
 

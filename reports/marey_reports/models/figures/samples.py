@@ -33,7 +33,10 @@ WIDTH, LEAST_WIDTH, LEAST_HEIGHT, MOST_HEIGHT = 4.2, 2.6, 1.0, 3.2
 
 
 class Reach(NamedTuple):
-    """Space that one joint reaches: least and greatest x (left), y (up) and z (forward), (3, 2) in metres."""
+    """Space that a joint reaches in the examples and in the samples.
+
+    `examples_m` and `samples_m` (3, 2) are the least and the greatest x (left), y (up) and z (forward), in metres.
+    """
 
     joint: str
     examples_m: Floats
@@ -143,7 +146,7 @@ def _followed(subject: ModelSubject) -> dict[str, int]:
 
 
 def _extent(places: Floats) -> tuple[Floats, Floats]:
-    """Compute the centre of positions (n, 3), and the length of an axis that contains them."""
+    """Compute the centre (3,) and the size (3,), with a margin, of the region of a plot that shows positions (n, 3)."""
     low, high = places.min(axis=0), places.max(axis=0)
     return 0.5 * (low + high), np.maximum(1.08 * (high - low), 0.2)
 

@@ -1,4 +1,4 @@
-"""Figure of the errors of a search, over targets that the model should reach."""
+"""Figure of the errors of searches for motions of a model that bring a joint to a given target position."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ BINS = 30
 
 
 def draw_search_check(subject: ModelSubject) -> Sketch | None:
-    """Draw the errors of searches for positions of hands and feet in examples; return None if not measured."""
+    """Draw the errors of searches whose targets are positions of hands and feet in examples.
+
+    Returns None if the accuracy of searches was not measured for this model.
+    """
     check = subject.check
     if check is None:
         return None

@@ -1,4 +1,8 @@
-"""Subjects of the figures of a model: the model, its examples, and data for drawing both."""
+"""Subjects of the figures of a model: the model, its examples, and data for drawing both.
+
+Canonical time is the common time to which the examples were aligned; its N frames are the canonical frames. A strip is
+a row of pictures of the body at some of these frames.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +76,7 @@ class ModelSubject:
 
     @cached_property
     def seen_from_rad(self) -> float:
-        """Direction of the view in strips: motions that travel are seen more from the side than motions in place."""
+        """Direction from which strips show the body, in radians; further to the side if the motion travels."""
         way = self.mean_poses[[0, -1], :3]
         return FROM_ASIDE_RAD if np.linalg.norm((way[1] - way[0])[[0, 2]]) > TRAVELS_M else FROM_AHEAD_RAD
 
@@ -91,7 +95,10 @@ class ModelSubject:
         return points_of(self.primitive.skeleton, poses)
 
     def moments(self, count: int = MOMENTS) -> tuple[NDArray[np.int64], StripMoments]:
-        """Choose the frames in canonical time that strips show, one per column, with the mean motion in the middle."""
+        """Choose `count` canonical frames as the columns of strips; return these frames, and the columns.
+
+        Each column is centred on the position of the mean motion at its frame.
+        """
         return choose_moments(self, count)
 
 
@@ -108,7 +115,10 @@ def points_of(skeleton: Skeleton, poses: Floats) -> Floats:
 
 
 def choose_moments(subject: ModelSubject, count: int) -> tuple[NDArray[np.int64], StripMoments]:
-    """Choose evenly spaced canonical frames, and replace those nearest to keyframes by the keyframes."""
+    """Choose evenly spaced canonical frames, and replace those nearest to keyframes by the keyframes.
+
+    Returns the frames in ascending order, and the columns of strips that show them.
+    """
     last = subject.primitive.frame_count - 1
     frames = np.unique(np.rint(np.linspace(0, last, count)).astype(np.int64))
     labels = [""] * len(frames)
