@@ -53,9 +53,7 @@ def rerun_request(job: Job, kind: JobKind, tasks: Iterable[Job] = (), *, into: s
         raise CannotRerun(f"{job.id} is a task of the job {job.parent}; repeat that job")
     declared = job_kinds().get(job.kind)
     if declared is not None and declared.in_place and job.params.get(declared.in_place):
-        raise CannotRerun(
-            f"the job {job.id} wrote new revisions of its inputs (--in-place), so it cannot be repeated"
-        )
+        raise CannotRerun(f"the job {job.id} wrote new revisions of its inputs (--in-place), so it cannot be repeated")
     in_order = sorted(tasks, key=lambda task: task.position or 0)
     inputs = {
         name: [pin for task in in_order for pin in task.inputs[name]] if isinstance(recorded, Mapping) else recorded

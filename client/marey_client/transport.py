@@ -103,7 +103,7 @@ class Transport:
         return other
 
     def with_present_token(self) -> Transport:
-        """Return a transport with the same connections that always sends the current token.
+        """Return a transport with the same connections that keeps sending the token that is current now.
 
         If the token was read from a file, later changes of this file have no effect on the new transport.
         """

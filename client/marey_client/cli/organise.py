@@ -161,7 +161,7 @@ def revert(
     with connect(context) as marey:
         item, revision = require_revision(marey, Address.parse(place), list(Kind))
         if revision is None:
-            raise WrongUsage(f"{place} names no revision; write project/folder/name@2 for the second one")
+            raise WrongUsage(f"{place} names no revision; write project/folder/name@2 for the second revision")
         before = item.item.revision
         made = item.revert(revision, message=message)
     if as_json:

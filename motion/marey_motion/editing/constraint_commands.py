@@ -139,7 +139,7 @@ class _Rig:
         name = self.take.skeleton.joint_names[joint]
         if name not in self.axes:
             raise MappingError(
-                "the axes of this joint are unknown, because the joint mapping does not contain it", where=name
+                "the axes of this joint are unknown; add the joint to the joint mapping of the skeleton", where=name
             )
         return self.axes[name]
 
@@ -202,7 +202,7 @@ def _looking_axis(rig: _Rig, joint: int) -> NDArray[np.float64]:
     try:
         axes = rig.axes_of(joint)
     except MappingError as error:
-        raise MappingError(f"{error.message}; complete the mapping or set the axis", where="axis") from error
+        raise MappingError(f"{error.message}; alternatively, set the axis of the constraint", where="axis") from error
     mapping = rig.take.body.mapping.joints
     name = rig.take.skeleton.joint_names[joint]
     looks = any(mapping.get(standard) == name for standard in _LOOKING)

@@ -111,8 +111,8 @@ def displace(motion: Motion, frames: AnyInts, changed: Motion, windows: Sequence
 def _check_windows(frames: AnyInts, windows: Sequence[Window]) -> None:
     """Check that each window contains a given frame, and that each given frame is in a window.
 
-    The first frame of a window does not count if `smooth_start` is set, nor the last frame if `smooth_stop` is set:
-    the displacement is zero there.
+    Frames at a smooth end of a window (`smooth_start`, `smooth_stop`) do not count as inside, because the displacement
+    is zero there.
     """
     inside = np.zeros(len(frames), dtype=np.bool_)
     for window in windows:
