@@ -296,8 +296,8 @@ class ProjectHandle(ProjectItems):
         search is interrupted, the same call continues it, because existing evaluations are reused.
 
         `options` are those of `EvaluateParams`. Raises `CannotBisect` if there is no such metric, if `good` is not
-        among the versions before `bad`, if one of these two versions cannot be evaluated, or if their values do not
-        fit: if the value of `good` is bad or that of `bad` is not.
+        among the versions before `bad`, if one of these two versions cannot be evaluated, if by `limit` the version
+        `good` is bad or `bad` is good, or if there is no value half-way between theirs.
         """
         handle = self.datasets.at(dataset)
         evaluations = VersionEvaluations(
