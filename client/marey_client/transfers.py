@@ -25,9 +25,10 @@ class MissingCommits(NamedTuple):
 
 
 def find_missing(source: DatasetReader, head: Commit, has: Callable[[str], bool]) -> MissingCommits:
-    """Return those of `head` and its ancestors that another dataset lacks; `has` returns whether it has a commit.
+    """Return which commits, among `head` and its ancestors, another dataset lacks.
 
-    `has` is not called for ancestors of a commit that the other dataset has, because it has these, too.
+    `has` returns whether the other dataset has the commit with a digest. A dataset that has a commit also has the
+    ancestors of the commit, so `has` is not called for these.
     """
     missing: dict[str, None] = {}
     bases: dict[str, None] = {}

@@ -173,7 +173,7 @@ def _frozen(values: NDArray[np.generic], field: str, ndim: int) -> NDArray[np.fl
 
 
 def _surely_unit(rotations: NDArray[np.float32]) -> bool:
-    """Check quickly whether all rotations (F, J, 4) have unit length; after False, the full check decides."""
+    """Check quickly whether all rotations (F, J, 4) have unit length; False means that the full check must decide."""
     with np.errstate(over="ignore"):  # the check names the rotation
         squares = rotations * rotations
     lengths = squares[..., 0] + squares[..., 1]

@@ -106,7 +106,10 @@ def write_motion_file(
 
 
 def _source(clip: Clip, info: Mapping[str, Any]) -> SourceInfo | None:
-    """Read the rotation orders of the file from which a clip was imported; None if the clip has other joints now."""
+    """Return the channels of the file from which a clip was imported, as stored in its document `info`.
+
+    Returns None if `info` does not contain them, or if the number of joints has changed since.
+    """
     details = info.get("source", {}).get("details", {})
     channels = tuple(tuple(names) for names in details.get("channels", ()))
     if len(channels) != clip.skeleton.joint_count:

@@ -70,7 +70,7 @@ def spins_of(motion: Motion, skeleton: Skeleton, joint: int) -> Floats:
 
 
 def root_stands(motion: Motion, skeleton: Skeleton, carrier: int) -> bool:
-    """Check whether no joint above the carrier ever turns, as with a static reference.
+    """Check whether all joints above the carrier keep their rotations, as they do if the root is a static reference.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def root_stands(motion: Motion, skeleton: Skeleton, carrier: int) -> bool:
 
     Returns
     -------
-    bool    False if the root is the carrier
+    bool    True if no joint above the carrier turns; False also if the root is the carrier
     """
     above = motion.rotations[:, skeleton.path_to_root(carrier)[1:]]
     return above.size > 0 and bool(np.ptp(above, axis=0).max() < STILL)

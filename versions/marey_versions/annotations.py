@@ -157,7 +157,7 @@ def merge_segments(
     places = [([one.start for one in side], [one.end for one in side]) for side in added]
 
     def overlapping(one: LabelledRange, side: int) -> Sequence[LabelledRange]:
-        """Return the added segments of a side that overlap a segment; neighbours, because they do not overlap."""
+        """Return the added segments of a side that overlap `one`; they follow each other in the sorted list."""
         starts, ends = places[side]
         return added[side][bisect_right(ends, one.start) : bisect_left(starts, one.end)]
 

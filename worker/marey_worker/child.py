@@ -118,9 +118,10 @@ def write_output_to(path: Path) -> None:
 
 
 def _perform(kind: KindDeclaration, context: Context, run: Run) -> dict[str, Any]:
-    """Run the functions of a kind that a task, a parent job or an undivided job needs.
+    """Run a job with the functions of its kind, and return the result.
 
-    If the kind has a gathering function, an undivided job runs both functions.
+    A task runs the implementation. A parent job runs the gathering function, which combines the results of its tasks. A
+    job that is not divided runs the implementation and then, if the kind has one, the gathering function.
     """
     params = kind.params.model_validate(run.params)
     is_task, gathers = run.position is not None, run.position is None and run.size is not None

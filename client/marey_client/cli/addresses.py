@@ -245,8 +245,9 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
 
 
 def items_selected(marey: Marey, places: Sequence[str], query: str, kind: str | None) -> list[SingleItem]:
-    """Return the items of a kind, by default clips, that a query selects in projects or folders, and in their
-    subfolders; by path in each place, and no item twice.
+    """Return the items of a kind, by default clips, that a query selects in projects or folders and their subfolders.
+
+    The items of each place are sorted by path; an item in several places is returned once.
 
     Raises `WrongUsage` if a place is not a project or folder, or if the query selects nothing.
     """

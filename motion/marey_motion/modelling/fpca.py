@@ -73,7 +73,7 @@ def find_components(
     keep : Keep    number of components to keep
     inner_product : str    "coefficients" sums products of coefficients; "l2" integrates products of functions over
         canonical time, so that the result does not depend on the position of the knots (Ramsay and Silverman 2005,
-        8.4.2)
+        section 8.4.2)
 
     Returns
     -------
@@ -137,7 +137,8 @@ def _inner_products(
 ) -> tuple[Floats, float]:
     """Compute inner products of m examples whose channels are multiplied by `weights`.
 
-    Returns those of the examples' deviations from their mean (m, m), and the norm of all examples together.
+    Returns the inner products (m, m) of the examples' deviations from their mean, and the norm of the vector that
+    consists of all examples.
     """
     weighted, weighted_mean = deviations * weights, mean * weights
     if inner_product == "l2":

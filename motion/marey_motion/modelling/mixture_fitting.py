@@ -74,7 +74,7 @@ class FittedMixture:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Run linear algebra and clustering on one thread: the rounding of sums depends on the number of threads.
+    """Run linear algebra and clustering on one thread, because the rounding of sums depends on the number of threads.
 
     Yields
     ------

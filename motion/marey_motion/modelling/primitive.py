@@ -134,7 +134,8 @@ class MotionPrimitive:
     def __post_init__(self) -> None:
         if self.spatial.mean.shape[1] != 3 + 4 * self.skeleton.joint_count:
             raise MotionError(
-                f"{self.spatial.mean.shape[1]} channels do not match a skeleton of {self.skeleton.joint_count} joints"
+                f"the spatial components have {self.spatial.mean.shape[1]} channels, but a skeleton of "
+                f"{self.skeleton.joint_count} joints needs 3, and 4 for each joint"
             )
         if self.temporal.basis.frame_count != self.frame_count - 1:
             raise MotionError(
@@ -165,7 +166,9 @@ class MotionPrimitive:
 
     @property
     def log_slope_bounds(self) -> tuple[float, float]:
-        """Limits of the logarithms of steps: `log_slope_range`, or the limits for any motion."""
+        """Limits of the temporal function: `log_slope_range` if it is given, otherwise -MOST_LOG_SLOPE and
+        MOST_LOG_SLOPE.
+        """
         return self.log_slope_range or (-MOST_LOG_SLOPE, MOST_LOG_SLOPE)
 
     # -- from latent vectors -------------------------------------------------------------------------------------------

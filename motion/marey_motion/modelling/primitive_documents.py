@@ -128,7 +128,7 @@ def _components_to_tree(components: FunctionalComponents) -> Tree:
 
 
 def _components_from_tree(tree: Mapping[str, Any], columns: NDArray[np.int64] | None) -> FunctionalComponents:
-    """Read components with their channels in the order `columns`."""
+    """Read components from a document, with the channels `columns` in this order; None keeps the document's order."""
     arrays = {name: np.asarray(tree[name]) for name in _COMPONENTS}
     if columns is not None:
         for name in ("mean", "directions", "projections"):
@@ -137,7 +137,7 @@ def _components_from_tree(tree: Mapping[str, Any], columns: NDArray[np.int64] | 
 
 
 def _columns(joints: list[str], skeleton: Skeleton) -> NDArray[np.int64] | None:
-    """Find the channels of the skeleton's joints among a document's channels; None if they are in order."""
+    """Return the index in a document of each channel of the skeleton; None if the document has the same order."""
     if tuple(joints) == skeleton.joint_names:
         return None
     if sorted(joints) != sorted(skeleton.joint_names) or joints[0] != skeleton.joint_names[0]:

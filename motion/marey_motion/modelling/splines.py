@@ -52,7 +52,7 @@ class SplineBasis:
         if knots.ndim != 1 or len(knots) < 2 * (self.degree + 1) or not np.isfinite(knots).all():
             raise MotionError(f"a spline of degree {self.degree} needs at least {2 * (self.degree + 1)} finite knots")
         if (np.diff(knots) < 0).any() or knots[self.degree] >= knots[-self.degree - 1]:
-            raise MotionError("knots must not decrease, and must span a range")
+            raise MotionError("knots must not decrease, and must span a range of more than 0 frames")
         object.__setattr__(self, "knots", knots)
 
     @classmethod

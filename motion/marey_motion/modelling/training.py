@@ -70,7 +70,9 @@ def train_primitive(
     threads: int = 1,
     progress: Progress = _silent,
 ) -> TrainedPrimitive:
-    """Train a generative model of aligned examples: splines, principal components, a mixture (Herrmann et al. 2019, 3).
+    """Train a generative model of aligned examples (Herrmann et al. 2019, section 3).
+
+    The model consists of splines, their principal components, and a mixture of normal distributions.
 
     Parameters
     ----------
@@ -78,7 +80,7 @@ def train_primitive(
     options : ModelOptions    options
     name : str    name of the action
     seed : int    seed of the mixture's starts, the folds and the samples of the report
-    threads : int    threads for leaving examples out; the result does not depend on their number
+    threads : int    threads for leave-one-out reconstructions; the result does not depend on their number
     progress : callable    called as progress(steps done, total where known, name of the step)
 
     Returns

@@ -175,7 +175,7 @@ def _resting_body(skeleton: Skeleton, mapping: JointMapping) -> _PosedBody:
 
 def _moving_body(skeleton: Skeleton, motion: Clip, joints: Mapping[str, int]) -> _PosedBody:
     if not same_hierarchy(skeleton, motion.skeleton):
-        raise ClipError("the skeleton of this motion differs from the one whose axes are computed", where="motion")
+        raise ClipError("the skeleton of the motion must be the one whose axes are computed", where="motion")
     count = min(motion.frame_count, FRAMES_READ)
     frames = np.linspace(0, motion.frame_count - 1, count).round().astype(np.intp)
     seen = replace(
@@ -197,7 +197,10 @@ class _PosedBody:
     rotations: Floats
 
     def way(self, start: str, end: str) -> Floats | None:
-        """Compute unit directions (K, 3) between standard joints; None if one is unmapped, zero if both coincide."""
+        """Compute unit directions (K, 3) from one standard joint to another.
+
+        Returns None if one of them is not mapped. The direction is zero in frames in which both coincide.
+        """
         if start not in self.joints or end not in self.joints:
             return None
         return _unit(self.positions[:, self.joints[end]] - self.positions[:, self.joints[start]])

@@ -178,9 +178,9 @@ def _left_direction(skeleton: Skeleton, legs: LimbReading, joints: dict[str, int
 
 
 def _foot(skeleton: Skeleton, ankle: int | None, toe: int | None) -> Floats:
-    """Compute the vector (3,), in the rest pose, from an ankle to its toe, or else to the tip of the foot.
+    """Compute the vector (3,), in the rest pose, from an ankle to the toe joint or, without one, to the foot's tip.
 
-    It is zero if there is neither.
+    The vector is zero if the skeleton has neither a toe joint nor a tip.
     """
     if ankle is not None and toe is not None:
         way: Floats = skeleton.rest_global_positions[toe] - skeleton.rest_global_positions[ankle]

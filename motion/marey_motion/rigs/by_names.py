@@ -100,7 +100,10 @@ def _parsed_names(rig: KnownRig) -> tuple[tuple[str, tuple[JointName, ...]], ...
 
 
 def _prefixes(pelvis: tuple[JointName, ...], joints: dict[JointName, int]) -> list[str]:
-    """List prefixes that all joint names may share: the texts before the rig's name of the pelvis in any joint name."""
+    """List prefixes that all joint names may share, the shortest first.
+
+    A prefix is the text before the rig's name of the pelvis in a joint name that ends with it.
+    """
     prefixes = {
         joint.base[: len(joint.base) - len(name.base)]
         for name in pelvis

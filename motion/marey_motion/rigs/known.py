@@ -62,7 +62,11 @@ def _alternatives(names: Names) -> tuple[str, ...]:
 
 
 def _fingers(pattern: str, fingers: tuple[str, ...], levels: tuple[str, ...]) -> dict[str, Names]:
-    """Build templates of thumb and fingers from a pattern with <finger> and <level>; the last levels are optional."""
+    """Build templates for the joints of thumb and fingers.
+
+    In `pattern`, <finger> is replaced by each of `fingers`, the rig's names of the fingers, thumb first. <level> is
+    replaced by each of `levels`, the rig's names of base, mid, tip and end of a finger; the last ones may be omitted.
+    """
     named = zip(("thumb", *(f"{finger}_finger" for finger in FINGERS)), fingers, strict=True)
     return {
         f"{standard}_{part}": pattern.replace("<finger>", finger).replace("<level>", level)
@@ -77,7 +81,10 @@ def _finger_roots(pattern: str, fingers: tuple[str, ...]) -> dict[str, Names]:
 
 
 def _everyday_fingers() -> dict[str, Names]:
-    """Build templates of fingers numbered (Index1, HandIndex1, Index01) or named by bones, as in Unity and VRM."""
+    """Build templates for the joints of fingers in common words.
+
+    The joints are numbered (Index1, HandIndex1, Index01), or named by bones (IndexProximal) as in Unity and VRM.
+    """
     bones = {"base": ("1", "Proximal"), "mid": ("2", "Intermediate", "Medial"), "tip": ("3", "Distal")}
     thumb = {"base": ("1", "Metacarpal", "Proximal"), "mid": ("2", "Intermediate"), "tip": ("3", "Distal")}
     words = {

@@ -132,7 +132,8 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
 def require_trust(mapping: JointMapping) -> JointMapping:
     """Refuse a mapping in which hardly any joint was recognised.
 
-    The few joints may also be those of an animal, so a person must check such a mapping before it is used.
+    The skeleton may be that of an animal, or the few recognised joints may be wrong. So a person must check the mapping
+    before it is used.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ ChangeKind = Literal["added", "removed", "moved", "changed"]
 
 
 class ListedCommit(Commit):
-    """Commit in a list of commits. In the list of a path, it says what it did with the entries at this path."""
+    """Commit in a list of commits; if the list is limited to a path, with the changes of the entries at this path."""
 
     changes: dict[ChangeKind, int] | None = Field(
         None,

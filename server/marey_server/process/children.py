@@ -101,7 +101,7 @@ class ChildTask(Generic[T]):
             _after(ABANDONED_S, self.stop, "client-gone")
 
     def succeed(self, payload: bytes) -> None:
-        """Convert the bytes of the result with `read`, and end the task with it; if that fails, end with the error."""
+        """End the task with the result that `read` makes of the bytes, or with the error that `read` raises."""
         try:
             result = self.read(payload)
         except Exception as error:  # noqa: BLE001 - whoever waits for the task gets it

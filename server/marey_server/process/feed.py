@@ -65,7 +65,7 @@ async def _follow(services: Services) -> None:
 
 
 class _FeedPosition:
-    """Position of this process in the feed and in the times at which retries become due."""
+    """Number of the last event that this process has read, and time up to which it has announced due retries."""
 
     def __init__(self, services: Services) -> None:
         self._services = services

@@ -70,7 +70,10 @@ async def _give_up_lead(services: Services, holder: str) -> None:
 
 
 async def _repeat(services: Services, holder: str, first_s: float, every_s: float, chore: Chore) -> None:
-    """Run a function periodically. A failure is logged and does not stop the repetition."""
+    """Call `chore` after `first_s` seconds, and then again `every_s` seconds after each call has ended.
+
+    A failure is logged and does not stop the repetition.
+    """
     await asyncio.sleep(first_s)
     while True:
         try:

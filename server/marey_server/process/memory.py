@@ -30,7 +30,11 @@ class RequestMemory:
         self._lock = threading.Lock()
 
     def take(self, owner: str, bytes_now: int, more: int, *, reserved: bool) -> None:
-        """Count `more` bytes of a request that holds `bytes_now`. Raises `UnavailableProblem` above a limit."""
+        """Count `more` bytes for `owner`, whose request already holds `bytes_now` bytes.
+
+        Reserved operations are limited only by the total, which is higher for them. Raises `UnavailableProblem` if a
+        limit would be exceeded.
+        """
         with self._lock:
             others = self.held_bytes > bytes_now
             share = STRANGERS_SHARE if owner == STRANGERS else CLIENT_SHARE

@@ -63,9 +63,7 @@ def configure_logging(form: LogForm, level: str) -> None:
 def without_received_text(record: logging.LogRecord) -> bool:
     """Replace what the client sent in Tornado's messages about malformed requests; return True to log the message.
 
-    Only the kind of the fault stays, because a header may contain a token.
-
-    The messages quote what the client sent, and a header may contain a token.
+    Only the kind of the fault is kept. The rest is removed, because it may quote a header that contains a token.
     """
     if isinstance(record.args, tuple):
         record.args = tuple(_kind_of_fault(arg) if isinstance(arg, Exception) else arg for arg in record.args)
@@ -152,8 +150,8 @@ class Metrics:
     async def exposition(self) -> tuple[bytes, str]:
         """Return all metrics in the text format of Prometheus, and its media type.
 
-        Rendering thousands of lines takes the event loop 50 ms, so it goes on with other work after each metric, and
-        all who ask during one rendering share the next one.
+        Rendering all metrics takes 50 ms, so the event loop handles other work after each metric. Calls that arrive
+        while the metrics are being rendered wait, and share the result of the next rendering.
         """
         wanted = self._renderings + 1
         async with self._rendering:

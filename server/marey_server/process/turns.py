@@ -33,7 +33,10 @@ class Turns:
         return len(self._reserved) + len(self._ordinary)
 
     def take(self, client: Client, *, reserved: bool) -> asyncio.Future[None] | None:
-        """Return what a request must wait for before it begins, or None if it may begin at once."""
+        """Return a future that ends when a request may begin, or None if it may begin at once.
+
+        With `reserved`, the request has one of the places that each round keeps for reserved operations.
+        """
         if not self._in_round:
             self._in_round = True
             asyncio.get_running_loop().call_soon(self._begin_round)

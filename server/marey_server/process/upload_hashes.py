@@ -49,6 +49,9 @@ class _RunningHash:
 class UploadHashes:
     """Hashes of the uploads that this process receives. Methods block, and may be called by several threads.
 
+    If the database stores blobs as files, each upload is also copied to a file, which becomes the blob when the upload
+    is complete.
+
     After a restart, or if another server received some of the pieces, the hash is computed again from the stored
     pieces.
     """
@@ -66,9 +69,9 @@ class UploadHashes:
                 running.add(data)
 
     def finish(self, principal: Principal, upload: uploads.StoredUpload) -> tuple[str, Path | None] | None:
-        """Return the digest of a complete upload, and its copy.
+        """Return the digest of a complete upload and the path of its copy, which is None if there is no copy.
 
-        If bytes are not hashed yet, hash some of them and return None.
+        Hash at most `STEP_BYTES` of the bytes that are not hashed yet; if bytes remain after this, return None.
         """
         running = self._running(upload.id)
         with running.lock:

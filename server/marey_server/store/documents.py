@@ -261,7 +261,7 @@ _STORED_BYTES = Prepared(
 
 
 def stored_bytes_of(tx: Transaction, digests: Iterable[str]) -> dict[str, int]:
-    """Return, by digest, the bytes for which documents count in quotas: text, arrays, and the files that they name."""
+    """Return, by digest, how many bytes a document uses of a quota: those of its text, its arrays and its files."""
     wanted = sorted(set(digests))
     return {
         row.digest: row.stored_bytes

@@ -111,7 +111,7 @@ def _mac(tx: Transaction, payload: bytes) -> bytes:
 
 
 def make_cursor_key(tx: Transaction) -> None:
-    """Create the key that signs cursors if it does not exist."""
+    """Create the key that signs cursors, unless the database already contains one."""
     row = {"key": _KEY_NAME, "value": secrets.token_hex(32)}
     tx.execute(tx.insert_or_ignore(server_state, row))
 

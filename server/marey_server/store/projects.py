@@ -164,7 +164,7 @@ def _row(row: Row[Any], role: Role, *, guest: bool) -> ProjectRow:
 def is_visible(principal: Principal) -> ColumnElement[bool]:
     """Return the condition for rows of `project` that are not deleted and that the caller may read.
 
-    Attempts of jobs may read none.
+    If the caller is an attempt of a job, the condition is always false.
     """
     alive = project.c.deleted_us.is_(None)
     if principal.kind == "attempt":
@@ -179,7 +179,7 @@ def is_visible(principal: Principal) -> ColumnElement[bool]:
 
 
 def writable_projects(tx: Transaction, names: Iterable[str]) -> list[str]:
-    """Return the ids of the named projects in which the user of the caller may write."""
+    """Return the ids of those named projects in which the caller, as a user, has a role that may write."""
     statement = select(project.c.id).where(project.c.name.in_(list(names)), project.c.deleted_us.is_(None))
     if not tx.principal.administrator:
         statement = statement.join(member, member.c.project_id == project.c.id)
@@ -227,7 +227,10 @@ def meets_hidden(tx: Transaction, name: str, guesses_per_hour: int) -> bool:
 
 
 def count_guess(tx: Transaction, guesses_per_hour: int) -> None:
-    """Count that the caller has tried the name of a hidden project. Raises `TooManyRequestsProblem`."""
+    """Count that the caller has tried the name of a hidden project.
+
+    Raises `TooManyRequestsProblem` if the caller has tried too many within an hour.
+    """
     if wait_s := rate_limits.count(tx, _guess_limit(tx, guesses_per_hour)):
         raise _too_many_guesses(wait_s)
 

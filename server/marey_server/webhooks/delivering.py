@@ -136,7 +136,7 @@ class Deliverer:
         self._lead_until_s = asked_s + LEAD_TTL_S / 2
 
     def _leads(self) -> bool:
-        """Return whether this process certainly leads."""
+        """Return whether this process leads, and its lease has enough time left that no other process can lead."""
         return self._lead is not None and time.monotonic() < self._lead_until_s
 
     def _start(self, webhook_id: str) -> None:
@@ -159,7 +159,8 @@ class Deliverer:
     async def _serve(self, webhook_id: str) -> None:
         """Send everything that a webhook has to send, until an attempt fails.
 
-        If it is interrupted for another reason, the next search for work considers all webhooks again.
+        If this process loses the lead, or if an error of the server interrupts the task, the next search for work
+        considers all webhooks again.
         """
         interrupted = True
         try:
@@ -198,7 +199,7 @@ class Deliverer:
         return not batch.complete
 
     async def _note_scanned(self, webhook_id: str, position: int, newest: int) -> None:
-        """Remember that no event up to the one numbered `newest` concerns a webhook; store this now and then."""
+        """Remember that no event up to the one numbered `newest` concerns a webhook; store this from time to time."""
         self._scanned[webhook_id] = newest
         if newest - position > outbox.SKIPPED_MOST:
             await self._write(outbox.move_on, webhook_id, position, newest)

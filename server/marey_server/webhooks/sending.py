@@ -120,7 +120,7 @@ class Sender:
 
 
 def _status(first_lines: Sequence[str]) -> int | None:
-    """Return the status in the last of the first lines of answers; the others announce it (100 Continue)."""
+    """Return the status in the last status line; earlier lines are those of interim answers, such as 100 Continue."""
     with suppress(IndexError, ValueError):
         return int(first_lines[-1].split()[1])
     return None

@@ -35,7 +35,7 @@ class ChunkReader:
         return store if isinstance(store, ChunkReader) else cls(store)
 
     def one(self, digest: str) -> Chunk:
-        """Return a chunk. Raises `DamagedChunk`."""
+        """Return a chunk. Raises `DamagedChunk` if it is missing or damaged."""
         return self.several([digest])[0]
 
     def several(self, digests: Sequence[str]) -> list[Chunk]:

@@ -54,7 +54,7 @@ def frame_at(primitive: MotionPrimitive, at: Moment) -> float:
     Parameters
     ----------
     primitive : MotionPrimitive    the model
-    at : str or float    the moment
+    at : str or float    label of a keyframe, "start", "end", or a canonical frame
 
     Returns
     -------

@@ -101,7 +101,7 @@ def _constrained(
 
 
 def _chain(found: FoundMotion, joint: int, pelvis: int) -> tuple[int, ...]:
-    """List a joint and its ancestors up to, but without, the pelvis, which would turn the whole body."""
+    """List a joint and its ancestors below the pelvis; the pelvis is left out because it would turn the whole body."""
     path = found.skeleton.path_to_root(joint)
     return path[: path.index(pelvis)] if pelvis in path else path[:-1]
 

@@ -37,13 +37,13 @@ class FoundMotion:
     passed: tuple[Floats, ...]
 
     def frame_of(self, step: int, primitive: MotionPrimitive, at: Moment) -> int:
-        """Find the frame nearest to a moment of a step.
+        """Find the frame of the motion that is nearest to a moment of a step.
 
         Parameters
         ----------
         step : int    number of the step
         primitive : MotionPrimitive    its model
-        at : str or float    the moment
+        at : str or float    label of a keyframe, "start", "end", or a canonical frame
 
         Returns
         -------
@@ -81,7 +81,7 @@ def found_motion(steps: Sequence[Step], sequel: Sequel) -> FoundMotion:
     for number, step in enumerate(steps):
         if not same_hierarchy(step.primitive.skeleton, first.skeleton, tolerance_m=SAME_OFFSET_M):
             raise InvalidConstraint(
-                "the model of this step was made for another skeleton than the model of the first step",
+                "the models of all steps need the same skeleton, but this one and that of the first step differ",
                 where=f"steps[{number}]",
             )
         if step.primitive.frame_rate_hz != first.frame_rate_hz:

@@ -27,8 +27,9 @@ _SMALL = 1e-4
 def _pose(chains, latent, channels, local, positions, rotations):  # type: ignore[no-untyped-def]
     """Compute the poses of the V joints of `chains` for one latent vector, in canonical coordinates.
 
-    Fills `channels` (X,), the mean channels plus those of the scores; `local` (V, 5), each joint's local rotation of
-    unit length and the length of its quaternion before; `positions` (V, 3) and `rotations` (V, 4).
+    Fills `channels` (X,) with the values of the channels for the scores in `latent`; `local` (V, 5) with the unit
+    quaternion of each joint's local rotation, followed by the length of this quaternion before normalisation; and
+    `positions` (V, 3) and `rotations` (V, 4) with the global position and rotation of each joint.
     """
     channels[:] = chains.mean
     for component in range(chains.directions.shape[0]):

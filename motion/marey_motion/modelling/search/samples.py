@@ -24,7 +24,7 @@ class FoundSamples:
 
     Parameters
     ----------
-    samples : (t,) indices of the samples in the tree; -1 for latent vectors that a further pass found between samples
+    samples : (t,) indices of the samples in the tree; -1 for latent vectors from a further pass, which are not samples
     latents : (t, L) latent vectors
     costs : (t,) costs as in `Objective.costs`
     evaluations : number of motions that were evaluated

@@ -72,8 +72,9 @@ def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-u
 def track(chains, placement, moved, latent, first, points, turns, point_slopes, turn_slopes):  # type: ignore[no-untyped-def]
     """Fill `points` (n, 3) and `turns` (n, 4) with the tracked points and rotations, in the world.
 
-    `point_slopes` and `turn_slopes` (n, 3, W) are filled with their derivatives with respect to the stacked latent
-    vectors `latent` (W,).
+    Fills `point_slopes` and `turn_slopes` (n, 3, W) with their derivatives with respect to the stacked latent vectors
+    `latent` (W,). `placement` is the start of this step in the world; `moved` and `first` are described in the
+    introduction of this module.
     """
     nodes, scores = chains.parents.shape[0], chains.directions.shape[0]
     channels, local = np.empty(chains.mean.shape[0]), np.empty((nodes, 5))

@@ -107,7 +107,7 @@ def _require_finite(*found: Floats) -> None:
 def _search_step(
     step: Step, tree: SampleTree, begun: CarriedOn, candidates: int, passes: int, transitions: TransitionOptions
 ) -> FoundSamples:
-    """Find the best motion in the tree of a step that begins as `begun` says, at the end of the previous step."""
+    """Find the best motion in the tree of a step; `begun` is its start, at the end of the previous step."""
     _require_finite(*begun.joints.values())
     # The end of a motion may lie outside of the range that requests are limited to, so these are not validated.
     going_on = tuple(

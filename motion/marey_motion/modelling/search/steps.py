@@ -257,8 +257,8 @@ class SeveralSteps:
 def _ends(step: Step, joints: Sequence[str]) -> tuple[Tracked, ...]:
     """List points of a step whose positions are compared with those of its neighbours. Raises `MappingError`.
 
-    First those at the start of the step: the pelvis, the axis of the body from right to left, and the transition
-    joints `joints`; then the same at its end.
+    The points at the start of the step come first: the pelvis, the axis of the body from right to left, and the
+    transition joints `joints`. The same points at the end of the step follow.
     """
     return tuple(
         one

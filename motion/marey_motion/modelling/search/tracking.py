@@ -35,7 +35,10 @@ class Tracked(NamedTuple):
 
 
 class Chains(NamedTuple):
-    """Arrays for n tracked points: V joints at some moments, with X channels in all.
+    """Arrays from which n tracked points are computed for a latent vector.
+
+    V is the number of joints that the points need, where a joint is counted once for each moment; X is the number of
+    channels of all these joints.
 
     Parameters
     ----------

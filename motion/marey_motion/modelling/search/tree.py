@@ -1,7 +1,8 @@
 """A tree over samples of a primitive, made by recursive k-means, so that a search evaluates only a few of many samples.
 
-Herrmann et al. 2019, section 3. The tree contains the samples themselves, in single precision and in the order of the
-tree. So a tree stays valid even if the random generator changes, and the samples of each node are a contiguous range.
+The method is that of Herrmann et al. 2019, section 3. The tree contains the samples themselves, in single precision and
+in the order of the tree. So a tree stays valid even if the random generator changes, and the samples of each node are a
+contiguous range.
 """
 
 from __future__ import annotations
@@ -50,9 +51,7 @@ class SampleTree:
         nodes = len(self.sizes)
         sound = nodes > 0 and self.samples.ndim == 2 and self.sizes.shape == self.children.shape == (nodes,)
         if not sound or self.sizes[0] != len(self.samples) or self.sizes.min() < 1 or self.children.min() < 0:
-            raise MotionError(
-                "the numbers of samples, sizes and children of the tree do not match", code="tree-invalid"
-            )
+            raise MotionError("the arrays samples, sizes and children of the tree do not match", code="tree-invalid")
         if 1 + int(self.children.sum()) != nodes or (self.first_children > nodes).any():
             raise MotionError(
                 "each node of the tree except the first must have exactly one parent", code="tree-invalid"
@@ -73,12 +72,12 @@ class SampleTree:
 
     @cached_property
     def first_children(self) -> Ints32:
-        """First child of each node that has any, (M,) int32."""
+        """Index (M,) of each node's first child, int32; meaningless for nodes without children."""
         return np.asarray(1 + np.cumsum(self.children) - self.children, dtype=np.int32)
 
     @cached_property
     def starts(self) -> Ints32:
-        """First sample of each node, (M,) int32."""
+        """Index (M,) of each node's first sample, int32."""
         starts = np.zeros(len(self.sizes), dtype=np.int32)
         kernels.locate(self.sizes, self.children, starts)
         return starts

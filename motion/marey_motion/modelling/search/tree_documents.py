@@ -44,15 +44,15 @@ def sample_tree_to_tree(
 
 
 def sample_tree_from_tree(tree: Mapping[str, Any]) -> SampleTree:
-    """Read a part `tree`.
+    """Convert the document that is stored as the part `tree` of a model to a tree of samples.
 
     Parameters
     ----------
-    tree : mapping    plain values and arrays
+    tree : mapping    the document, as plain values and arrays
 
     Returns
     -------
-    SampleTree    the samples
+    SampleTree    the samples, grouped in a tree
 
     Raises
     ------
