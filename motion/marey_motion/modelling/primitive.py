@@ -166,9 +166,7 @@ class MotionPrimitive:
 
     @property
     def log_slope_bounds(self) -> tuple[float, float]:
-        """Limits of the temporal function: `log_slope_range` if it is given, otherwise -MOST_LOG_SLOPE and
-        MOST_LOG_SLOPE.
-        """
+        """Limits of the temporal function: `log_slope_range`, by default -`MOST_LOG_SLOPE` to `MOST_LOG_SLOPE`."""
         return self.log_slope_range or (-MOST_LOG_SLOPE, MOST_LOG_SLOPE)
 
     # -- from latent vectors -------------------------------------------------------------------------------------------

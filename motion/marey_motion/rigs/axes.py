@@ -175,7 +175,10 @@ def _resting_body(skeleton: Skeleton, mapping: JointMapping) -> _PosedBody:
 
 def _moving_body(skeleton: Skeleton, motion: Clip, joints: Mapping[str, int]) -> _PosedBody:
     if not same_hierarchy(skeleton, motion.skeleton):
-        raise ClipError("the skeleton of the motion must be the one whose axes are computed", where="motion")
+        raise ClipError(
+            "the skeleton of this motion differs from the one whose axes are computed; give a motion of that skeleton",
+            where="motion",
+        )
     count = min(motion.frame_count, FRAMES_READ)
     frames = np.linspace(0, motion.frame_count - 1, count).round().astype(np.intp)
     seen = replace(

@@ -35,7 +35,7 @@ class Turns:
     def take(self, client: Client, *, reserved: bool) -> asyncio.Future[None] | None:
         """Return a future that ends when a request may begin, or None if it may begin at once.
 
-        With `reserved`, the request has one of the places that each round keeps for reserved operations.
+        With `reserved`, the request waits in the line of reserved operations, for which each round keeps places.
         """
         if not self._in_round:
             self._in_round = True

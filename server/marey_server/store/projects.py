@@ -229,7 +229,7 @@ def meets_hidden(tx: Transaction, name: str, guesses_per_hour: int) -> bool:
 def count_guess(tx: Transaction, guesses_per_hour: int) -> None:
     """Count that the caller has tried the name of a hidden project.
 
-    Raises `TooManyRequestsProblem` if the caller has tried too many within an hour.
+    Raises `TooManyRequestsProblem` if the caller has tried too many of these names.
     """
     if wait_s := rate_limits.count(tx, _guess_limit(tx, guesses_per_hour)):
         raise _too_many_guesses(wait_s)

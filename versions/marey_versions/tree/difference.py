@@ -34,7 +34,7 @@ def difference(store: ChunkStore | ChunkReader, before: str, after: str, *, pref
 
 
 def _before_all_with(prefix: str) -> str | None:
-    """Return a text less than all texts with the prefix, and as great as possible; None for an empty prefix."""
+    """Return a text that is less than all texts with the prefix, but close to them; None for an empty prefix."""
     if not prefix:
         return None
     last = ord(prefix[-1])

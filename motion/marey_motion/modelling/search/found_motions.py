@@ -81,7 +81,8 @@ def found_motion(steps: Sequence[Step], sequel: Sequel) -> FoundMotion:
     for number, step in enumerate(steps):
         if not same_hierarchy(step.primitive.skeleton, first.skeleton, tolerance_m=SAME_OFFSET_M):
             raise InvalidConstraint(
-                "the models of all steps need the same skeleton, but this one and that of the first step differ",
+                "the model of this step was made for another skeleton than the model of the first step; "
+                "use models of one skeleton",
                 where=f"steps[{number}]",
             )
         if step.primitive.frame_rate_hz != first.frame_rate_hz:
