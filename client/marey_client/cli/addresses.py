@@ -252,7 +252,7 @@ def items_selected(marey: Marey, places: Sequence[str], query: str, kind: str | 
     Raises `WrongUsage` if a place is not a project or folder, or if the query selects nothing.
     """
     if kind == FOLDER:
-        raise WrongUsage("--query selects items, not folders; give another kind with --kind, or none for clips")
+        raise WrongUsage("--query selects items, not folders; give another --kind, or leave out --kind to select clips")
     wanted = kind_named(kind or "clip")
     found: dict[str, ItemHandle] = {}
     for place in places:

@@ -49,7 +49,7 @@ def create(
 ) -> None:
     """Create a webhook, and print its secret, which is never shown again.
 
-    Without --kind, it is notified of moved branches, proposals and ends of jobs.
+    Without --kind, the webhook reports moved branches, proposals and ends of jobs.
     """
     from marey_schemas.event_kinds import DEFAULT_WEBHOOK_KINDS
 
@@ -115,7 +115,7 @@ def change(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Change, pause or resume a webhook. --kind replaces all kinds of events that it is notified of."""
+    """Change, pause or resume a webhook. --kind replaces all kinds of events that it reports."""
     from marey_schemas.webhooks import WebhookChange
 
     wanted = WebhookChange(url=url, kinds=_event_kinds(kind) or None, description=description, paused=pause)

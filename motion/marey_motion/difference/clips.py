@@ -131,7 +131,7 @@ def _compare_moved(before: Poses, after: Poses, rate_ratio: float) -> tuple[Timi
 def _paths(timing: Timing, after: Poses, move: Move | None) -> tuple[Floats, Floats]:
     """Return the positions of the body in n matched frames: of the old clip (n, 3), and of the new clip (n, 3).
 
-    If `move` was applied to the old clip, the positions before this movement are returned.
+    If `move` was applied to the old clip, its positions are those before this movement.
     """
     pairs = timing.matching.pairs
     before = timing.before.roots[pairs[:, 0]].astype(np.float64)

@@ -54,14 +54,14 @@ def _word(text, i):  # type: ignore[no-untyped-def]
 
 @compiled
 def _bytes_before(marks):  # type: ignore[no-untyped-def]
-    """Count the bytes of a word before the first byte whose highest bit is set; 7 if no byte has it."""
+    """Count the bytes of an integer of 8 bytes before the first byte whose highest bit is set; 7 if no byte has it."""
     first = marks & (~marks + _ONE)
     return ((((first - _ONE) & _ONES) * _ONES) >> _SEVEN_BYTES) - _ONE
 
 
 @compiled
 def _length(first, second):  # type: ignore[no-untyped-def]
-    """Count the bytes before the first white space in two words; 15 if there is none."""
+    """Count the bytes before the first white space in two integers of 8 bytes each; 15 if there is none."""
     # A borrow can mark only bytes after a white space, which do not matter.
     in_first = (first - _PRINTED) & ~first & _HIGH_BITS
     in_second = (second - _PRINTED) & ~second & _HIGH_BITS

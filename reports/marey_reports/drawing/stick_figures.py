@@ -137,7 +137,7 @@ def stances_at(clip: Clip, body: StickFigure, frames: Indices) -> Stances:
 
 
 def _tips(skeleton: Skeleton, pelvis: int, sides: dict[int, int]) -> list[tuple[int, int]]:
-    """List the bones to end sites of the chains that are drawn."""
+    """List the last bone of each drawn chain: the index of its end site, after all joints, and its last joint."""
     size = float(np.ptp(skeleton.rest_global_positions[[pelvis, *sides]], axis=0).max())
     inner = {int(skeleton.parents[joint]) for joint in sides}
     return [

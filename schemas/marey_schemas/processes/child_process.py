@@ -229,7 +229,7 @@ def exit_status(pid: int) -> int | None:
 
 
 def connect_to_parent() -> Connection:
-    """Return the pipe to the parent, whose file descriptor is the first argument of this process."""
+    """Return the pipe to the parent; the first argument of this process is the pipe's file descriptor."""
     die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at a terminal reaches the parent, which decides
     faulthandler.enable()

@@ -157,8 +157,8 @@ def make_preview(packed: bytes) -> bytes:
     start, stop = request.frames
     stop = min(wanted.clip.frame_count, wanted.clip.frame_count if stop is None else stop)
     if start >= stop:
-        held = counted(wanted.clip.frame_count, "frame")
-        raise _invalid("/frames", "no-frames", f"The new clip has {held}; the range contains none of them.")
+        frames = counted(wanted.clip.frame_count, "frame")
+        raise _invalid("/frames", "no-frames", f"The new clip has {frames}; the range contains none of them.")
     shown = wanted.clip.sliced(start, stop)
     if shown.poses.size > order.most_shown:
         raise TooLargeProblem(

@@ -1,4 +1,4 @@
-"""Sends events to webhooks, in one process of all that share the database.
+"""Sends events to webhooks. Of all processes that share the database, only the leading one does this.
 
 The leading process wakes up when there are events, and starts a task for each webhook that may have something to
 send. A task sends the deliveries of its webhook one after another, so a slow receiver delays only its own webhook.

@@ -27,7 +27,7 @@ archive = typer.Typer(
 )
 
 ArchivePath = Annotated[
-    Path, typer.Argument(metavar="FILE", help="The archive.", exists=True, dir_okay=False, readable=True)
+    Path, typer.Argument(metavar="FILE", help="The archive, a tar file.", exists=True, dir_okay=False, readable=True)
 ]
 
 
