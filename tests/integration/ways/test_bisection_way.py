@@ -217,7 +217,7 @@ def test_ends_that_do_not_fit_are_refused_with_their_values(gaits: DatasetHandle
     assert "no value is half-way between them" in run(*BISECT, status=1).stderr
     told = run(*BISECT_WITHOUT_LIMIT, "--above", "0", status=1).stderr
     assert re.search(
-        r"offset_mean_m is 0\.\d+ at the good version and 0\.\d+ at the bad one; the good one is above 0", told
+        r"offset_mean_m is 0\.\d+ at the good version and 0\.\d+ at the bad one; values above 0 are bad", told
     )
     told = run(*BISECT_WITHOUT_LIMIT, "--above", "9", status=1).stderr
     assert "only values above 9 are bad, so the bad version is good" in told
