@@ -61,7 +61,7 @@ class PathComparer:
     """Number of differing entries that were read."""
 
     def change(self, before: str | None, after: str) -> ChangeAtPath | None:
-        """Return the change at the path from one tree to another, or None if nothing differs there.
+        """Return how the tree `after` differs from the tree `before` at the path, or None if it does not.
 
         `before` is None if there is no version before `after`.
         """

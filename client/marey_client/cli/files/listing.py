@@ -76,7 +76,8 @@ def ls(
         bool, typer.Option("--stale", help="List only results of which an input has a newer revision.")
     ] = False,
     sort: Annotated[
-        str, typer.Option(help="Column by which the items are sorted; - before it reverses the order, as in -updated.")
+        str,
+        typer.Option(help="Column by which the items are sorted; with a minus sign before it, in reverse (-updated)."),
     ] = "name",
     columns: Annotated[
         str,

@@ -192,7 +192,7 @@ def source_seconds(
 
 
 def _less(missing: Floats, seconds: Floats, options: EvaluationOptions) -> Floats:
-    """Compute the seconds that each cell lacks after adding `seconds` (V, O) of data to the `missing` (V, O) cells.
+    """Compute the seconds that each cell still lacks: `missing` (V, O), less the `seconds` (V, O) of data added.
 
     A value below half a frame is set to 0.
     """

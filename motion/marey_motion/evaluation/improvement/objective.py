@@ -37,7 +37,7 @@ def objective_value(weights: ObjectiveOptions, results: Sequence[TrialResult], s
 
 
 def headline_means(results: Sequence[TrialResult]) -> dict[str, float]:
-    """Compute the mean of each headline metric over the trials that define it; 0 if no trial does.
+    """Compute the mean of each headline metric over the trials in which it has a value; 0 if there are none.
 
     Parameters
     ----------

@@ -171,7 +171,7 @@ class _LineageWalk:
     def _jobs(self, makers: Mapping[str, Row[Any]], parents: Mapping[str, str]) -> Iterator[LineageJob]:
         """Yield the jobs of the graph.
 
-        The code versions of a parent job are those of its tasks that created revisions of the graph.
+        A parent job gets the code versions of its tasks, but only of tasks that created a revision in the graph.
         """
         whole = {**makers, **self._makers(set(parents.values()) - makers.keys())}
         commits = self._commits(set(parents.values()))

@@ -43,7 +43,7 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
 
 
 def take_record(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of the take record that the part `info` of a clip has."""
+    """Return those fields of the take record that are set in the part `info` of a clip."""
     return {name: info[name] for name in TakeRecord.model_fields if info.get(name)}
 
 
