@@ -107,7 +107,7 @@ class SearchRequest(RefineOptions):
 
 
 class ConstraintError(Answer):
-    """Error of a constraint before inverse kinematics, in one of the fields `error_cm`, `error_deg` and `error_s`."""
+    """Error of the motion at a constraint, before inverse kinematics: `error_cm`, `error_deg` or `error_s`."""
 
     step: int = Field(description="Index of the step, from 0.")
     constraint: int = Field(description="Index of the constraint within its step, from 0.")

@@ -125,8 +125,8 @@ def local_document(value: Any, revision_of: Callable[[str], RevisionKey | None])
 def contents_in(portable: Any) -> Iterator[str]:
     """Return the content digests of the revisions that a portable document refers to.
 
-    References to arrays and records of imported files, which have a member `blob`, also have a member `content`, but
-    are skipped.
+    Array references, and objects with a member `blob` (records of imported files), also have a member `content`. They
+    do not refer to revisions and are skipped.
     """
     for found in _objects(portable):
         if (content := _content_of(found)) is not None:

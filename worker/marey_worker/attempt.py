@@ -295,7 +295,10 @@ class RunningAttempt:
                 return None
 
     def _read_parts(self, places: Sequence[PartPlace]) -> list[bytes | None]:
-        """Return documents from the cache or the server. If their total size is large, the last ones are omitted."""
+        """Return encoded documents from the cache or the server, and None for a document that does not exist.
+
+        If the documents together exceed `ANSWER_LIMIT_BYTES`, those at the end are omitted, but never the first.
+        """
         keys = [self._cache_key(f"{place.item}@{place.revision}/{place.part}") for place in places]
         found = self._cache.get_many(keys, lambda missing: self._api.read_parts([places[index] for index in missing]))
         sizes = accumulate(len(data or b"") for data in found)

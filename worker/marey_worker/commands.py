@@ -67,7 +67,7 @@ def work(
 
 
 def main() -> None:
-    """Run `python -m marey_worker`, which `marey serve` starts."""
+    """Run the command line of `python -m marey_worker`; `marey serve` starts workers with it."""
     parser = argparse.ArgumentParser(prog="python -m marey_worker", description="Run jobs of a Marey server.")
     parser.add_argument("--server", help="address of the server; default: that of MAREY_URL or of the stored login")
     parser.add_argument("--slots", type=int, default=1, help="number of jobs that run at the same time; default: 1")

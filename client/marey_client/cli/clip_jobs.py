@@ -141,7 +141,7 @@ def _print_warnings(result: dict[str, Any]) -> None:
 
 
 def _reference(marey: Marey, text: str) -> str:
-    """Return the reference clip as the job takes it: the name of the rule that chooses it, or the id of the clip."""
+    """Return the parameter `reference` of the job: the name of a rule that chooses the clip, or the id of a clip."""
     from marey_schemas.kinds import Kind
 
     return text if text in REFERENCES else str(require_item(marey, Address.parse(text), [Kind.CLIP]).id)

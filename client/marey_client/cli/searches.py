@@ -83,7 +83,8 @@ def search(
         Many, typer.Option(help="Put the body at a position on the ground: WHEN=x,z in metres, such as end=0,1.5.")
     ] = None,
     face: Annotated[
-        Many, typer.Option(help="Turn the body to a heading: WHEN=degrees from +z, positive to the left.")
+        Many,
+        typer.Option(help="Turn the body to a heading: WHEN=degrees from +z, positive to the left, such as end=90."),
     ] = None,
     time: Annotated[Many, typer.Option(help="Set the time of a keyframe in seconds: KEYFRAME=seconds.")] = None,
     start: Annotated[str | None, typer.Option(help="Position and heading of the motion's start: x,z,degrees.")] = None,
@@ -94,7 +95,8 @@ def search(
         float | None, typer.Option(help="Tolerance of rotations and directions, in degrees; default: 5.")
     ] = None,
     request: Annotated[
-        Path | None, typer.Option(help="JSON file with the whole request; needed for several steps.")
+        Path | None,
+        typer.Option(help="JSON file with the whole request; needed to search for several consecutive motions."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "--output", "-o", help="File or folder to write the motion to.")
@@ -189,7 +191,7 @@ def _constraint(
 
 
 def _moment(text: str) -> str | float:
-    """Return a time as a canonical frame if it is a number, else as a label."""
+    """Parse the time of a constraint: a number is a canonical frame, any other text is a label."""
     try:
         return float(text)
     except ValueError:

@@ -140,7 +140,8 @@ def rotate(
     project: ProjectName,
     webhook_id: WebhookId,
     grace_minutes: Annotated[
-        int, typer.Option(min=0, max=30 * 24 * 60, help="Minutes for which the old secret signs deliveries, too.")
+        int,
+        typer.Option(min=0, max=30 * 24 * 60, help="Minutes for which deliveries are also signed with the old secret."),
     ] = 24 * 60,
     as_json: AsJson = False,
 ) -> None:

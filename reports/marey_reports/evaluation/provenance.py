@@ -1,4 +1,4 @@
-"""Origin of a report's numbers."""
+"""Part of a report that names the data, options and code version of its numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commits that jobs make of their outputs: what a submission asks for, and what a job answers."""
+"""Commits of job outputs to datasets: the fields of a submission that request one, and the result in a job."""
 
 from __future__ import annotations
 

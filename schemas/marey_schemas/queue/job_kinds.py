@@ -84,10 +84,16 @@ class KindDeclaration:
             )
         for name in (*self.never_cached_without, *filter(None, [self.named_after])):
             if name not in self.inputs:
-                raise ValueError(f"job kind {self.name}: the declaration has no input {name!r}")
+                raise ValueError(
+                    f"job kind {self.name}: never_cached_without and named_after must name inputs of the kind, "
+                    f"and {name!r} is none of them"
+                )
         for name in (*self.newest_of, *filter(None, [self.in_place])):
             if name not in self.params.model_fields:
-                raise ValueError(f"job kind {self.name}: the declaration has no parameter {name!r}")
+                raise ValueError(
+                    f"job kind {self.name}: newest_of and in_place must name parameters of the kind, "
+                    f"and {name!r} is none of them"
+                )
         for name, spec in self.inputs.items():
             if unknown := set(spec.parts) - PARTS[spec.kind].keys():
                 raise ValueError(

@@ -29,7 +29,7 @@ StepInput = JobInput | StepOutputsInput
 
 
 class PipelineStep(Request):
-    """Job of a pipeline. The field `into` and all fields below it default to the values of the pipeline."""
+    """Job of a pipeline. `into` and the fields declared after it default to the values of the pipeline."""
 
     kind: str = Field(min_length=1, max_length=64)
     inputs: dict[str, StepInput | tuple[StepInput, ...]] = Field(default_factory=dict)

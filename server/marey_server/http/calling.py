@@ -135,4 +135,4 @@ class CallingExchange(Exchange):
 
 
 def _identify(_tx: Transaction) -> None:
-    """Do nothing. It is run in a transaction only because every transaction identifies the caller."""
+    """Do nothing; called only to start a transaction, because every transaction identifies the caller."""

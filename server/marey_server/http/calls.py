@@ -1,7 +1,7 @@
 """Execution of a request in one transaction: identifies the caller, runs the function and renders the answer.
 
-All of it runs in one thread of the database's pool, so that an ordinary request leaves the event loop once; only
-documents that were loaded are rendered in another thread.
+These steps run in one thread of the database's pool, so that an ordinary request leaves the event loop only once.
+Only documents that were loaded from the store are encoded in another thread.
 """
 
 from __future__ import annotations

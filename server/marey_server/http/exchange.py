@@ -154,7 +154,7 @@ class Exchange(RequestHandler):
         return not self.departure.gone and not self.services.draining.is_set()
 
     async def pause(self, seconds: float) -> bool:
-        """Wait for a time; if the server is stopping, return True at once."""
+        """Wait for `seconds` and return False, or return True as soon as the server is stopping."""
         try:
             await asyncio.wait_for(self.services.draining.wait(), seconds)
         except TimeoutError:
@@ -181,7 +181,7 @@ class Exchange(RequestHandler):
             self.set_header(name, value)
 
     def compute_etag(self) -> None:
-        """Return no tag: resources set their own ETags; hashing an answer, as Tornado does, costs more than sending."""
+        """Disable the ETags of Tornado: resources set their own, and hashing an answer costs more than sending it."""
 
     def send_error(self, status_code: int = 500, **kwargs: Any) -> None:
         """Answer with an error document.

@@ -154,7 +154,7 @@ def number_events(tx: Transaction) -> int:
 
 
 class News(NamedTuple):
-    """Topics of wake-ups, and the number of the last event that was read for them."""
+    """Topics that new events announce to waiting requests, and the number of the last event that was read."""
 
     topics: frozenset[str]
     last: int

@@ -76,7 +76,7 @@ def _named(context: Context, groups: dict[tuple[str, str], _Group]) -> Iterator[
 
 
 def _build(context: Context, group: _Group, database: MatchingDatabase) -> MatchingDatabase:
-    """Return the matching database of a group of clips; it shares the set's body if the skeletons are equal."""
+    """Return the matching database of a group; if the skeletons are equal, it uses the body of `database`."""
     newest = max(map(_skeleton_of, group.motions), key=lambda ref: ref.revision)
     rigged = read_rigged(context, Rig.as_stored(newest))
     body = database.body

@@ -1,4 +1,4 @@
-"""Evaluations as inputs of jobs, with their sets of clips; and result files of such jobs."""
+"""Evaluations and their sets of clips as inputs of jobs, and storage of the result files of these jobs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from marey_worker.job_io.matching_clips import MatchingClips, read_evaluated_cli
 
 @dataclass(frozen=True)
 class EvaluatedSet:
-    """Evaluation with the records of its trials, and its clips, with features scaled by its normaliser."""
+    """Evaluation with the records of its trials, and the matching database of its clips, with the same scaling."""
 
     result: EvaluationResult
     clips: MatchingClips

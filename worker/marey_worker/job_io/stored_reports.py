@@ -1,4 +1,4 @@
-"""Storage of reports and their figures as files that a document names."""
+"""Storage of reports: pages and figures as files, and the document that refers to these files."""
 
 from __future__ import annotations
 

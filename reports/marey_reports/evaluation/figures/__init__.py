@@ -1,4 +1,4 @@
-"""The figures of an evaluation, or of two: those of Abichequer Sangalli et al. (2022) and a few more.
+"""Figures of one evaluation, or of two in comparison: those of Abichequer Sangalli et al. (2022), and a few more.
 
 matplotlib is loaded when the first figure is drawn. The same result gives the same bytes.
 """
@@ -120,7 +120,7 @@ def draw_figures(
     labels: tuple[str, str] = ("before", "after"),
     options: FigureOptions | None = None,
 ) -> dict[str, DrawnFigure]:
-    """Draw every possible figure of a result, or of two, by name.
+    """Draw all figures of one result, or of two results in comparison; return them by name.
 
     Figures are left out if their trials are missing, or if they need records that were not stored.
     """

@@ -1,4 +1,4 @@
-"""Axes that several figures of an evaluation have: speed, and turn rate to the left and right."""
+"""Axes that several figures of an evaluation share: speed, and turn rate to the left and right."""
 
 from __future__ import annotations
 

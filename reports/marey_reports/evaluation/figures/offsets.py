@@ -43,7 +43,7 @@ class _Field(NamedTuple):
 
 
 def draw_offsets(subjects: Sequence[Subject], _trial: str | None, _options: FigureOptions) -> Sketch:
-    """Draw the mean offsets: a row per family of trials, a column per subject, and a column of changes for two."""
+    """Draw the mean offsets: a row per family of trials, a column per subject, and for two subjects, their change."""
     families = [family for family in subjects[0].result.options.families if family in FAMILY_TITLES]
     fields = [[_field(subject, family) for subject in subjects] for family in families]
     levels = nice_levels(max(_largest(field) for row in fields for field in row))
@@ -141,7 +141,10 @@ def _draw_field(
     levels: Floats,
     colours: str,
 ) -> Any:
-    """Draw filled contours and one dot per trial; only dots if the trials span no area. Return None without trials."""
+    """Draw filled contours and one dot per trial, or only dots if the trials span no area.
+
+    Returns the drawn contours or dots, from which the colour scale can be made, or None if there are no trials.
+    """
     panel = add_panel(figure, place, title=title, grid=False, **labels)
     known = np.isfinite(field.offset_m)
     if not known.any():

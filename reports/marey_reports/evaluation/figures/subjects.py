@@ -1,4 +1,4 @@
-"""Subjects of figures: the result of one evaluation, or the named results of two, and single trials of them."""
+"""Subjects of figures: the results of one or two evaluations that a figure shows, and single trials of them."""
 
 from __future__ import annotations
 

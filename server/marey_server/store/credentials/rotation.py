@@ -1,4 +1,4 @@
-"""Rotation of tokens: a token is replaced by a successor with the same rights, and ends after a period of grace."""
+"""Rotation of tokens: a token is replaced by a successor with the same rights, and ends after a grace period."""
 
 from __future__ import annotations
 

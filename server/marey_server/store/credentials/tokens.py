@@ -229,7 +229,7 @@ def _end_of(tx: Transaction, request: TokenCreate) -> int | None:
 
 
 def _in_words(seconds: int) -> str:
-    """Return a time in the largest unit that it fills, rounded down: days, hours or minutes."""
+    """Return a duration as text in days, hours or minutes, rounded down, such as "3 days"."""
     unit, size = next(
         (unit for unit in (("day", 86_400), ("hour", 3600)) if seconds >= unit[1]),
         ("minute", 60),
@@ -302,7 +302,7 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
 
 
 def _connected_with(which: ColumnElement[bool]) -> Select[Any]:
-    """Return a query for the ids of tokens and of all tokens connected with them, recursively.
+    """Return a query for the ids of the tokens that meet `which`, and of all tokens connected with them, recursively.
 
     A token is connected with its predecessor, with its successor, and with the tokens that were created with it.
     """

@@ -147,7 +147,7 @@ def _joined(*names: str) -> str:
 class PublishedOutputs:
     """Published outputs of a job, and the values of the columns that its commit determines.
 
-    With a `failure`, the outputs were not published, because the commit is not allowed.
+    If `failure` is set, nothing was published, because the commit is not allowed.
     """
 
     outputs: list[dict[str, Any]] = field(default_factory=list)
@@ -269,7 +269,7 @@ def _entries_of(tx: Transaction, row: Any, outputs: Sequence[Mapping[str, Any]])
 def _free_path(output: Mapping[str, Any], taken: Mapping[str, RevisionKey]) -> str:
     """Return the path of an output, with a number if another item of the same job has the path.
 
-    Two outputs may have one name if items with equal content are reused.
+    Two outputs may have the same name if items with equal content are reused.
     """
     for number in count(1):
         path = output["entry"] if number == 1 else f"{output['entry']}-{number}"

@@ -69,9 +69,9 @@ def release_tasks(tx: Transaction, gathered: Collection[str]) -> None:
 
 
 def combine_results(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    """Combine results of tasks: numbers are added, lists concatenated (first thousand entries), tables merged.
+    """Combine results of tasks: numbers are added, lists concatenated (first thousand entries), objects merged.
 
-    Other facts are not combined; they are in the results of the tasks.
+    Values of other types are omitted; they remain in the results of the tasks.
     """
     combined: dict[str, Any] = {}
     for result in results:
@@ -81,7 +81,7 @@ def combine_results(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _combine(known: Any, value: Any) -> Any:
-    """Return `known` combined with `value`: numbers are added, lists joined and tables merged.
+    """Return `known` combined with `value`: numbers are added, lists joined and objects merged.
 
     A value of another type is ignored, and so is a `known` that has another type than `value`.
     """

@@ -194,9 +194,9 @@ def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: st
 def _entries_of(
     tx: Transaction, project: ProjectRow, spec: InputSpec, choice: DatasetInput, place: str, errors: list[FieldError]
 ) -> Iterator[Pin]:
-    """Yield pins for the entries of the version of a dataset that `choice` names; faults are added to `errors`.
+    """Yield a pin for each entry of the dataset version that `choice` names, and add faults to `errors`.
 
-    Each pin has the name and the folder of the entry in this version. `place` is the pointer to the choice in the
+    Each pin has the name and the folder of the entry in this version. `place` is the JSON Pointer to `choice` in the
     request.
     """
     try:

@@ -126,7 +126,7 @@ class _Made(NamedTuple):
     pins: list[Pin]
 
     def below(self, one: Pin) -> str:
-        """Return the path of an output relative to `into`, or its whole path if it was moved elsewhere."""
+        """Return the collection of an output, relative to `into` if it is below `into`, otherwise in full."""
         path: str = one["collection"]
         return f"{path}/".removeprefix(f"{self.into}/").rstrip("/") if self.into else path
 

@@ -114,7 +114,10 @@ def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_c
 
 
 def _spread(head: NewJob) -> list[NewJob]:
-    """If a job has several tasks, make it a parent job and return the tasks, which start when this job starts."""
+    """Make a job with several tasks a parent job, and return its tasks, which start when it starts.
+
+    A job with one task is unchanged, and the result is empty.
+    """
     shares = _shares(head.submission)
     if len(shares) < 2:
         return []

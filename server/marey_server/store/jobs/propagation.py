@@ -172,7 +172,7 @@ def _open_fan_out(tx: Transaction, row: Row[Any]) -> list[Ended]:
 def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
     """Update the number of unfinished tasks of parent jobs; end the parent jobs whose last task has ended.
 
-    Returns the jobs that have ended by this.
+    Returns the jobs that ended as a result.
     """
     following = _stop_idle_tasks(tx, {end.parent_id for end in ended if end.state == "failed"} - {None})
     for parent_id, count in sorted(Counter(end.parent_id for end in ended if end.parent_id is not None).items()):
@@ -188,9 +188,9 @@ def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 
 
 def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
-    """Cancel the tasks of parent jobs, each of which has a failed task, and return the cancelled tasks.
+    """Cancel the unstarted tasks of parent jobs in which a task has failed; return the cancelled tasks.
 
-    Only tasks that have not started are cancelled, and only those of parent jobs whose results a worker would combine.
+    Applies only to parent jobs for which a worker would combine the results of the tasks.
     """
     if not parents:
         return []

@@ -110,7 +110,8 @@ _CLAIMED_BEFORE = Prepared(
 def _claimed_before(tx: Transaction, claim_id: str, policy: QueuePolicy) -> list[Lease]:
     """Renew and return the leases of an earlier claim with the same `claim_id`; empty if there was none.
 
-    Two concurrent claims with the same `claim_id` run one after the other. Raises `LeaseLostProblem`.
+    Two concurrent claims with the same `claim_id` run one after the other. Raises `LeaseLostProblem` if all leases of
+    the earlier claim have ended.
     """
     token_id = tx.principal.token_id
     tx.lock(f"claim {token_id} {claim_id}")
@@ -332,7 +333,7 @@ def _leases(
 
 
 def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
-    """Return the number of tasks of each job to which the given tasks belong."""
+    """Return the number of tasks of each parent job of the given tasks, by the id of the parent job."""
     parents = {row.parent_id for row in rows if row.parent_id is not None}
     if not parents:
         return {}

@@ -73,7 +73,7 @@ def cache_key(
 def has_key(kind: KindDeclaration, params: Mapping[str, Any], inputs: Collection[str]) -> bool:
     """Return whether jobs of the kind with these parameters and inputs have a cache key.
 
-    They have one if the result depends on nothing but what the key contains.
+    A job has a cache key if its result depends only on the values from which the key is computed.
     """
     in_place = kind.in_place is not None and params.get(kind.in_place)
     by_names = not set(kind.never_cached_without) <= set(inputs)
@@ -236,9 +236,9 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
 
 
 def _publish_anew(tx: Transaction, job_id: str) -> list[Ended]:
-    """Publish the shared result as the result of a waiting job; return the jobs that have ended by this.
+    """Publish the shared result as the result of a waiting job; return the jobs that ended as a result.
 
-    No job ends if the result is no longer stored. Raises the errors of `publish`.
+    No job ends if the shared result is no longer stored. Raises the errors of `publish`.
     """
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")

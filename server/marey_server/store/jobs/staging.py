@@ -179,7 +179,11 @@ def _of_attempts(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
 
 
 def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: PinnedInputs) -> dict[str, StagedDraft]:
-    """Return the drafts of an identical job, with the revisions in their sources replaced by this job's inputs."""
+    """Return the drafts of an identical job as drafts of this job.
+
+    In their sources, each revision from the inputs of that job (`theirs`) is replaced by the revision of the same input
+    of this job (`ours`).
+    """
     revisions = {
         (role, their["item"], their["revision"]): our["revision"]
         for role, many in theirs.items()

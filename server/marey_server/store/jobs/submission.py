@@ -275,10 +275,10 @@ def submit_pipeline(tx: Transaction, project: str, pipeline: PipelineCreate) -> 
 
 
 def _placed(request: JobCreate, step: PipelineStep) -> JobCreate:
-    """Return the job request of a step, without settings of the whole pipeline that the step cannot use.
+    """Return the job request of a step, without those settings of the pipeline that do not apply to the step.
 
-    The collection is left out if the results of the step have a fixed place, as trees have. The commit is left out if
-    the step creates no items.
+    The field `into` is left out if the results have a fixed place, such as a tree in its model. The field `commit` is
+    left out if the step creates no items.
     """
     try:
         kind = find_kind(request.kind)

@@ -1,1 +1,1 @@
-"""Webhooks of projects, and the work that their deliveries need from the database."""
+"""Webhooks of projects, and the database side of their deliveries."""

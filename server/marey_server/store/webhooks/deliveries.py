@@ -47,7 +47,8 @@ def _find(tx: Transaction, project_row: ProjectRow, webhook_id: str, delivery_id
     row = tx.execute(select(webhook_delivery).where(*which)).first()
     if row is None:
         raise NotFoundProblem(
-            f"The webhook has no delivery {delivery_id!r} that failed or was requested.", code="no-delivery"
+            f"The webhook has no delivery {delivery_id!r}. Only deliveries that failed or were requested are stored.",
+            code="no-delivery",
         )
     return row
 
@@ -80,14 +81,16 @@ def request_test(tx: Transaction, project: str, webhook_id: str) -> WebhookDeliv
 def redeliver(tx: Transaction, project: str, webhook_id: str, delivery_id: str) -> WebhookDelivery:
     """Request that a delivery is sent once more, and return it.
 
-    Raises `ConflictProblem` if the webhook still repeats the delivery, is paused, or has too many requested deliveries.
+    Raises `ConflictProblem` if the delivery is still being retried, or if the webhook is paused or has too many
+    requested deliveries.
     """
     project_row = projects.require(tx, project)
     _require_active(tx, project_row, webhook_id)
     row = _find(tx, project_row, webhook_id, delivery_id)
     if row.state == "retrying":
         raise ConflictProblem(
-            "The server still repeats this delivery. Resume the webhook to try it immediately.", code="still-retrying"
+            "The server is still retrying this delivery. To retry it at once, resume the webhook.",
+            code="still-retrying",
         )
     values = {"state": "waiting", "updated_us": tx.now_us}
     tx.execute(update(webhook_delivery).where(webhook_delivery.c.id == row.id).values(**values))
