@@ -13,7 +13,8 @@ from marey_schemas.encoding.arrayspec import require_finite
 from marey_schemas.queue.worker_protocol import StagedOutput
 from marey_worker.context import Context, JobRefused
 
-BYTES_PER_STAGE = 2 << 20
+BYTES_PER_STAGE = 4 << 20
+"""Bytes of arrays, before compression, after which results are sent. A task of ordinary clips needs one request."""
 OUTPUTS_PER_STAGE = 64
 
 _encoder = ThreadPoolExecutor(1, thread_name_prefix="marey-encode")
