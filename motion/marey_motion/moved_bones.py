@@ -1,8 +1,8 @@
 """Directions of bones in poses whose joints move relative to their parents.
 
 Some takes store a part of the body's shape in position channels: examples are a shoulder blade that slides, and a rig
-whose offsets are not those of its performer. In such a take, the direction of a bone is not given by the rotation of
-its joint. It is the direction from the position of this joint to that of the next one.
+whose offsets differ from the proportions of its performer. In such a take, the direction of a bone is not given by the
+rotation of its joint. It is the direction from the position of this joint to the position of the next joint.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class FollowedBones:
 
     Parameters
     ----------
-    rotations : (F, 4·J) float32    local rotations; those of the clip if no bone has moved
+    rotations : (F, 4·J) float32    local rotations; the clip's own rotations if no bone has moved
     largest_turn_deg : mapping of str to float    largest turn of each turned joint over all frames, in degrees, by the
         name of the joint
     """
@@ -48,8 +48,8 @@ class FollowedBones:
         return CheckWarning(
             "bones-moved-by-translations",
             f"joints move relative to their parents, so that the directions of {len(self.largest_turn_deg)} bones "
-            f"differ from those that their rotations give, most at {name}: up to {most:.1f} degrees; the result "
-            "follows the directions between the positions of the joints",
+            f"differ from the rotations of their joints, most at {name}: by up to {most:.1f} degrees; the bones of the "
+            "result point from joint position to joint position",
             joints=tuple(self.largest_turn_deg),
             values={"largest_turn_deg": most},
         )

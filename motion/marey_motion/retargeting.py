@@ -6,9 +6,10 @@ standard name (Herrmann et al. 2019, Algorithm 1, after Monzani et al. 2000).
 
 The paper rotates twist onto twist, then swing onto swing, for every pose. As both axes are fixed in their joints, this
 is the same as one constant rotation per joint: with the axes of source and target as the columns of orthonormal
-matrices S and T, the target's global orientation is G·S·Tᵀ if that of the source is G. There are two differences from
-the printed algorithm. The second rotation turns only about the twist axis, so it does not undo the first one. It is
-also applied after the first one, whereas line 12 prints the product in the opposite order.
+matrices S and T, the target's global orientation is G·S·Tᵀ if the source's global orientation is G. There are two
+differences from the printed algorithm. The second rotation turns only about the twist axis, so it does not undo the
+first rotation. The second rotation is also applied after the first one, whereas line 12 prints the product in the
+opposite order.
 """
 
 from __future__ import annotations
@@ -127,7 +128,9 @@ def plan_retarget(
 
     Raises
     ------
-    MappingError    naming the standard joints or axes that are missing
+    MappingError    if too few joints are mapped, if the axes of a mapped joint are missing or parallel, or if the scale
+        is invalid or cannot be computed
+    SkeletonError    if a mapping names a joint that its skeleton does not have
 
     Examples
     --------
@@ -173,9 +176,9 @@ def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None)
 
     A mapped joint takes the orientation of its source joint. Any other joint keeps its rest rotation or, if both
     skeletons are copies of one rig, copies the local rotation of the source joint with its name. Bones keep the lengths
-    of the target. If the source has translations, the target's bones point in the directions of the source's translated
-    bones; if the target is the source skeleton itself, the clip keeps its translations. The pelvis travels as in the
-    source, times the plan's scale; a root above the pelvis moves along without turning.
+    of the target. If the clip translates joints, the target's bones point in the directions of the clip's translated
+    bones; if the target is the source skeleton itself, the clip keeps its translations. The path of the pelvis is the
+    source's path times the plan's scale; a root above the pelvis moves with the pelvis without turning.
 
     Parameters
     ----------
@@ -185,7 +188,7 @@ def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None)
 
     Returns
     -------
-    Clip    the motion of the target skeleton, at the same rate
+    Clip    the motion of the target skeleton, at the same frame rate
 
     Raises
     ------
@@ -290,7 +293,9 @@ def _check_enough(pairs: tuple[JointPair, ...], source_mapping: JointMapping, ta
 def _axes_of(axes: Mapping[str, JointAxes], joint: str, which: str) -> NDArray[np.float64]:
     """Make the orthonormal matrix (3, 3) of twist, swing and their cross product as columns, in the joint's frame."""
     if joint not in axes:
-        raise MappingError(f"the {which} skeleton has no twist and swing axes for this joint", where=joint)
+        raise MappingError(
+            f"the {which} skeleton has no twist and swing axes for this joint; define both axes", where=joint
+        )
     twist, swing = np.array(axes[joint].twist), np.array(axes[joint].swing)
     cross = np.cross(twist, swing)
     if not np.linalg.norm(cross) > 1e-6 * np.linalg.norm(twist) * np.linalg.norm(swing):
@@ -357,7 +362,10 @@ def _heights(
 
 
 def _are_same_rig(source: Skeleton, target: Skeleton) -> bool:
-    """Return whether both skeletons have the same joint names, hierarchy and rest rotations; lengths may differ."""
+    """Return whether both skeletons have equal joint names, hierarchy and rest rotations, and similar bone directions.
+
+    Bone lengths may differ.
+    """
     if source.joint_names != target.joint_names or not np.array_equal(source.parents, target.parents):
         return False
     turned = quaternions.angle_between(source.rest_rotations, target.rest_rotations)

@@ -57,7 +57,11 @@ class MetricChange:
 
     @property
     def verdict(self) -> str:
-        """Verdict: same, better, worse, changed (a metric without direction) or unclear (the interval contains 0)."""
+        """Verdict: same, better, worse, changed or unclear.
+
+        "changed" is for metrics of which neither direction is better; "unclear" means that the interval contains 0 or
+        that there is only one trial.
+        """
         if self.low == self.high == 0.0:
             return "same"
         if self.low <= 0.0 <= self.high or self.trials < 2:
@@ -83,7 +87,7 @@ class TrialChange:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two results of the same trials.
+    """Differences between two evaluations of the same trials.
 
     Parameters
     ----------

@@ -174,6 +174,10 @@ def cell_edges(values: Sequence[float], step: float) -> Floats:
     Returns
     -------
     (n + 1,) float64    in the unit of the values
+
+    Raises
+    ------
+    MotionError    if there are no values
     """
     centres = np.unique(np.asarray(values, dtype=np.float64))
     if not len(centres):

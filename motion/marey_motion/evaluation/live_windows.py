@@ -90,7 +90,7 @@ class LiveWindows:
 
     @property
     def newest_window(self) -> Windows | None:
-        """The last window of the current take, with scalars instead of arrays."""
+        """The last window of the current take, with scalars instead of arrays; None if no window is complete."""
         from marey_motion.evaluation import live_kernels
 
         window = np.empty(4)
@@ -200,6 +200,7 @@ def smoother(window: int) -> Floats:
 def _shortened(matrix: Floats, frame_count: int) -> Floats:
     """Return the smoother for a take of `frame_count` frames.
 
-    If the take is shorter than the window of `matrix`, the smoother's window is the largest odd number of its frames.
+    If the take is shorter than the window of `matrix`, the smoother's window has the largest odd number of frames that
+    fits into the take.
     """
     return matrix if frame_count >= len(matrix) else smoother(frame_count - (frame_count + 1) % 2)

@@ -322,7 +322,7 @@ def _p95(values: Floats) -> float:
 
 
 SUMMED = ("transitions", "clip_ends", "response_missed")
-"""Metrics that are counts; a metric of a suite is the sum over its trials."""
+"""Metrics that are counts; the suite's value is the sum over its trials."""
 
 
 def pooled_metrics(results: Sequence[TrialResult]) -> dict[str, float | None]:

@@ -117,7 +117,7 @@ class OnlineCoverage:
         Parameters
         ----------
         body : MatchingBody    joints of the clip's skeleton
-        clip : Clip    frames at this rate
+        clip : Clip    frames at `rate_hz`
 
         Returns
         -------

@@ -22,8 +22,8 @@ from marey_schemas.options.evaluation import EvaluationOptions
 def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials: Sequence[Trial]) -> Provenance:
     """Compute the digests of the data, the cost function and the trials.
 
-    `dataset` is the digest of the motion that was played, without the names of the clips. `clips` is the digest of the
-    documents of the clips, or of the motion of a clip whose document is not known.
+    `dataset` is the digest of the motion that was played, without the names of the clips. `clips` maps the uid of each
+    clip to the digest of its document or, if the document is not known, of its motion.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def require_comparable(before: Provenance, after: Provenance) -> None:
 
     Raises
     ------
-    MotionError    naming all differences
+    MotionError    if they differ; the error names all differences
     """
     different = {
         name: f"their {plural} differ ({_short(first)} and {_short(second)}): {remedy}"

@@ -64,7 +64,7 @@ def clips_of_rows(clips: Sequence[DatabaseClip], rows: NDArray[np.integer]) -> N
 
 
 def find_jumps(clips: Sequence[DatabaseClip], record: TrialRecord) -> Jumps:
-    """Find every jump of a trial, in the order of time. The restart of a loop is no jump.
+    """Find every jump of a trial, in the order of time. The restart of a loop counts only if a search chose it.
 
     Parameters
     ----------

@@ -14,14 +14,14 @@ from marey_motion.matching.record import TrialRecord
 from marey_schemas.options.evaluation import EvaluationOptions
 
 Metrics = Mapping[str, float | None]
-"""Value of each metric by name, in the unit in which the name ends. None if it is undefined, as a response time is when
-there is no response.
+"""Value of each metric by name, in the unit in which the name ends. None if the metric is undefined: for example, a
+response time without a response.
 """
 
 
 @dataclass(frozen=True)
 class TrialResult:
-    """Metrics of one trial, and of each regime ("base", "switched") if its speed switches."""
+    """Metrics of one trial, and of each regime (`metrics.REGIMES`) if several regimes are measured."""
 
     trial: Trial
     metrics: Metrics
@@ -34,10 +34,11 @@ class ClipUsage:
 
     Parameters
     ----------
-    ticks, entries : number of ticks that displayed the clip; number of jumps to it, chosen or forced by the end of a
-        clip
+    ticks : number of ticks that displayed the clip
+    share : share of all ticks of the suite, 0 to 1
+    entries : number of jumps to the clip, chosen or forced by the end of a clip
+    trials : number of trials that displayed the clip
     popularity : (frames,) int64    number of ticks in which each frame was displayed
-    trials : number of trials that displayed it
     """
 
     clip: int
@@ -60,7 +61,7 @@ class Coverage:
     speed_edges_m_s, turn_rate_edges_deg_s : (V + 1,), (O + 1,)    cells centred on the trial grid
     seconds : (V, O) float64    seconds of data in each cell
     deficit_s : (V, O) float64    seconds that each cell lacks
-    index : share of the target cells with enough data
+    index : share of the cells with enough data, 0 to 1
     symmetry : 1 if turning left and right are covered equally, 0 if only one of them is covered
     too_short : indices of the clips that have no window, because they last one second or less
     """

@@ -122,7 +122,7 @@ def options_from_tree(tree: Mapping[str, Any]) -> EvaluationOptions:
 
     Raises
     ------
-    ValidationError    for values out of range
+    ValidationError    if a value is out of range
     """
     flat = {**tree, **tree["grid"]}
     return EvaluationOptions.model_validate({name: flat[name] for name in EvaluationOptions.model_fields})
@@ -156,6 +156,10 @@ def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> 
     Returns
     -------
     dict    plain values and arrays
+
+    Raises
+    ------
+    MotionError    if there is not one record per trial, or if the records have different rates
     """
     rates = {record.rate_hz for record in records}
     if len(trials) != len(records) or len(rates) != 1:

@@ -69,7 +69,7 @@ def demand(trial: Trial) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A trial's trajectory, sampled at every tick and `look_ahead` ticks beyond its end.
+    """A trial's trajectory, sampled at every tick and at L ticks beyond the end of the trial.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float =
     ----------
     trial : Trial    the trial
     rate_hz : float    ticks per second
-    look_ahead_s : float    seconds beyond its end
+    look_ahead_s : float    seconds beyond the end of the trial
 
     Returns
     -------
@@ -155,7 +155,7 @@ def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float =
 
     Raises
     ------
-    MotionError    if the trial has no ticks, or if its speed switches without an interval
+    MotionError    if the trial has no ticks, or if the interval between its speed switches is not positive
     """
     tick_count = round((trial.approach_s + trial.duration_s) * rate_hz)
     if tick_count < 1 or trial.approach_s < 0.0 or trial.duration_s < 0.0:

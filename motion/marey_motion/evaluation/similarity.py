@@ -23,8 +23,8 @@ from marey_motion.matching.record import Status, TrialRecord
 ProgressCallback = Callable[[int, int, str], None]
 
 MOST_FRAMES = 2_000
-"""Maximum number of frames of a cell that are measured; if there are more, every k-th is measured. All frames can be
-matches.
+"""Maximum number of frames of a cell that are measured; if there are more, every k-th frame is measured. The nearest
+frame is searched among all frames of the cell.
 """
 
 
@@ -78,7 +78,7 @@ def measure_similarity(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> PoseSimilarity:
-    """Compare the frames of every cell of the database's coverage map.
+    """Compare the frames in each cell of the coverage map with the frames of other sources in the same cell.
 
     Distances are exact. Progress counts cells with frames.
 
@@ -94,6 +94,11 @@ def measure_similarity(
     Returns
     -------
     PoseSimilarity    distances and shares per cell
+
+    Raises
+    ------
+    MotionError    if the threshold is not above 0
+    EvaluationCancelled    if cancelled
     """
     if not (np.isfinite(threshold_m) and threshold_m > 0.0):
         raise MotionError("the threshold must be a distance in metres above 0", where="threshold_m")

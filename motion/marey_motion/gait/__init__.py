@@ -1,6 +1,6 @@
 """Generated walks, runs, side steps and turns whose root follows an exact path: ground truth for tests, data for demos.
 
-Positions are metres with Y up and the floor at y = 0; a heading of 0 faces +Z and grows to the left.
+Positions are metres with Y up and the floor at y = 0. Headings are radians: 0 faces +Z, a turn to the left is positive.
 """
 
 from marey_motion.gait.footfalls import FootMotion

@@ -35,7 +35,7 @@ class GaitMoments:
     Parameters
     ----------
     times_s : (n,)    seconds
-    phases : (n,)    number of strides done
+    phases : (n,)    strides done since time 0
     root : RootState    the exact path
     """
 

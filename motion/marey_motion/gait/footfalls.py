@@ -30,7 +30,7 @@ SHORT_STEP_M = 0.12  # shorter steps are lifted less; no step, no lift
 
 @dataclass(frozen=True)
 class FootShape:
-    """Lengths of the leg and foot that stepping depends on, metres.
+    """Lengths of leg and foot, in metres, from which the steps are computed.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class FootShape:
 
 @dataclass(frozen=True)
 class Cadence:
-    """Strides over time: the phase grows by one with each stride, continuously, at a rate that suits the speed.
+    """Phase of a gait over time: it grows continuously, by one per stride, at a rate that depends on the speed.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class _Foot(NamedTuple):
     Parameters
     ----------
     ground : (n,) complex    ground position of the ball of the foot, z + i·x in metres
-    heights : (n,)    metres that the ball is higher than in the rest pose
+    heights : (n,)    height of the ball above its height in the rest pose, metres
     pitches, toe_pitches, yaws, freedom : (n,)    as in `FootMotion`
     """
 

@@ -39,7 +39,7 @@ class PathSegment:
         for field in ("duration_s", "speed_m_s", "turn_rate_rad_s", "final_speed_m_s", "travel_angle_rad"):
             value = getattr(self, field)
             if not np.isfinite(value):
-                raise MotionError(f"{value} is not a finite number", code="gait-invalid", where=field)
+                raise MotionError(f"a segment needs finite numbers, not {value}", code="gait-invalid", where=field)
         if self.duration_s <= 0:
             raise MotionError(
                 f"the duration of a segment must be positive, not {self.duration_s} s",
@@ -93,7 +93,8 @@ class RootState:
 class RootPath:
     """Segments one after the other, starting at the origin and heading along +Z at time 0.
 
-    Before time 0 and after `duration_s` the path continues with the speed and turn rate of its start and of its end.
+    Before time 0, the path continues with the speed and turn rate of its start; after `duration_s`, with the speed and
+    turn rate of its end.
 
     Parameters
     ----------
@@ -109,7 +110,7 @@ class RootPath:
 
     @property
     def duration_s(self) -> float:
-        """Seconds from the first segment's start to the last one's end."""
+        """Total duration of the segments, in seconds."""
         return float(self.starts_s[-1])
 
     @cached_property
@@ -127,7 +128,7 @@ class RootPath:
         return (before, *self.segments, after)
 
     def rescaled(self, *, length: float, time: float) -> RootPath:
-        """Multiply all lengths and all times of the path.
+        """Return a path whose lengths and times are multiplied by factors.
 
         Parameters
         ----------

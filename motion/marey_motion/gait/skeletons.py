@@ -1,6 +1,4 @@
-"""The two built-in human skeletons: one for generated gaits, and one that differs from it in names, proportions, rest
-pose and axes.
-"""
+"""Two built-in human skeletons: one for generated gaits, and one with other names, proportions, rest pose and axes."""
 
 from __future__ import annotations
 
@@ -94,7 +92,7 @@ _GAME_TIPS: dict[str, Point] = {
 
 @lru_cache(maxsize=16)
 def studio_skeleton(stature_m: float = STUDIO_STATURE_M) -> Skeleton:
-    """Build an adult in a T-pose, facing +Z on the floor y = 0, without rest rotations.
+    """Build the skeleton of an adult in a T-pose, facing +Z on the floor y = 0, without rest rotations.
 
     Parameters
     ----------
@@ -127,8 +125,9 @@ def studio_skeleton(stature_m: float = STUDIO_STATURE_M) -> Skeleton:
 
 
 def game_skeleton() -> Skeleton:
-    """Build a taller figure in an A-pose with other names, proportions and local axes, twist joints and a prop.
+    """Build a skeleton in an A-pose with twist joints and a prop, which differs from the studio skeleton.
 
+    The figure is taller than the studio skeleton and has other joint names, proportions and local axes.
     The x axis of the joints of the trunk and of the left side points along the bone; on the mirrored right side, it
     points against the bone. The root is rotated by a quarter turn about x, as in files converted from a Z-up world.
 

@@ -77,7 +77,7 @@ class GaitStyle:
 
 
 def eased(x: AnyFloats | float) -> AnyFloats:
-    """Ease from 0 at x <= 0 to 1 at x >= 1 with level ends.
+    """Compute a smooth step: 0 for x <= 0, 1 for x >= 1, with slope 0 at both ends.
 
     Parameters
     ----------

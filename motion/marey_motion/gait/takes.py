@@ -42,7 +42,7 @@ def generate_gait(
     stature_m: float = STUDIO_STATURE_M,
     style: GaitStyle | None = None,
 ) -> Clip:
-    """Generate a walk, a run, a turn on the spot or an idle motion, on an exact arc from the origin along +Z.
+    """Generate a walk, run, turn on the spot or idle motion; its root follows an exact arc from the origin, facing +Z.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def generate_gait(
 
     Raises
     ------
-    MotionError    if a parameter is invalid (the message names it), or if the gait needs longer legs
+    MotionError    if a parameter is invalid (the message names it), or if a step would be longer than the leg
 
     Examples
     --------

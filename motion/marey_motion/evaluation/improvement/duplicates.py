@@ -69,13 +69,17 @@ def find_near_duplicates(
     ----------
     database : MatchingDatabase    the clips
     threshold_cm : float    centimetres per frame
-    threads : int    threads to use
+    threads : int, optional    threads to use, one per processor if None
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
 
     Returns
     -------
     NearDuplicates    pairs, the nearest first
+
+    Raises
+    ------
+    EvaluationCancelled    if cancelled
     """
     families = _Families(database)
     found: list[NearDuplicate] = []
@@ -168,8 +172,8 @@ def spared_sources(
 ) -> tuple[tuple[str, NearDuplicate], ...]:
     """Choose source clips to remove so that no pair of near-duplicates is left.
 
-    Of each pair, the source that is displayed for fewer ticks is removed; if both are displayed equally, the shorter
-    one, and then the one with the higher uid.
+    Of each pair, the source that is displayed for fewer ticks is removed. If both are displayed for equally many ticks,
+    the shorter source is removed; if they are also equally long, the source with the higher uid is removed.
 
     Parameters
     ----------

@@ -102,6 +102,10 @@ def rank_fillings(
     Returns
     -------
     tuple of Filling    the best first
+
+    Raises
+    ------
+    EvaluationCancelled    if cancelled
     """
     seconds = {name: source_seconds(other, options) for name, other in collections.items()}
     total, done = sum(map(len, seconds.values())), 0
@@ -130,9 +134,10 @@ def plan_fillings(
     collections: Mapping[str, MatchingDatabase],
     options: EvaluationOptions,
 ) -> tuple[Addition, ...]:
-    """Order candidates by adding, step by step, the one that best provides the data that is still missing.
+    """Order candidates: each step adds the candidate that supplies most of the data still missing.
 
-    The order ends when no candidate provides missing data. Candidates of another skeleton come after all others.
+    The seconds that a candidate supplies are multiplied by its blendable share; a candidate with a share of 0 is left
+    out. Candidates of another skeleton come after all others. The order ends when no candidate supplies missing data.
 
     Parameters
     ----------

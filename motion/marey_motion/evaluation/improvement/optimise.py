@@ -51,7 +51,10 @@ class OptimisationStep:
 
 @dataclass(frozen=True)
 class Optimisation:
-    """Steps of an optimisation, beginning with the unchanged set ("start"), and the reason for its end."""
+    """Steps of an optimisation, beginning with the unchanged set ("start"), and the reason for its end.
+
+    `ended` is "no gain" if no candidate lowers the objective enough, "steps" or "evaluations" if that limit is reached.
+    """
 
     steps: tuple[OptimisationStep, ...]
     ended: Literal["no gain", "steps", "evaluations"]

@@ -50,7 +50,7 @@ class Resimulation:
 
     Parameters
     ----------
-    trials : the trials; those of the suite if None
+    trials : the trials; all trials of the suite if None
     records : records of these trials over the whole database, if they exist already
     threads, cancelled : as in `suite.run_suite`
 

@@ -58,7 +58,7 @@ def require_sources(known: Collection[str], wanted: Collection[str]) -> None:
 
     Raises
     ------
-    MotionError    naming the first wanted source that is not known
+    MotionError    if a wanted source is not known; the error names the first such source
     """
     unknown = sorted(set(wanted) - set(known))
     if unknown:
@@ -134,7 +134,7 @@ def joined(first: MatchingDatabase, second: MatchingDatabase) -> MatchingDatabas
 
 
 def _translating(database: MatchingDatabase, joints: tuple[int, ...]) -> MatchingDatabase:
-    """Store local translations of exactly `joints`; those without translations in the database get their offsets."""
+    """Store local translations of exactly `joints`; joints without stored translations get their offsets."""
     if joints == database.translated_joints:
         return database
     translations = np.empty((database.row_count, len(joints), 3), np.float32)
@@ -180,7 +180,7 @@ def require_same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> 
     """
     if not same_skeleton(first, second):
         raise MotionError(
-            "the clips to add have a different skeleton from those of the database; retarget them first",
+            "the clips to add and the database have different skeletons; retarget the clips to add first",
             code="skeleton-mismatch",
             where="skeleton",
         )

@@ -93,7 +93,7 @@ def suggest(
 
     Raises
     ------
-    MotionError    if the evaluation does not belong to this database
+    MotionError    if the evaluation does not belong to this database, or if it was read without its records
     EvaluationCancelled    if cancelled
     """
     how, others = options or SuggestionOptions(), dict(collections or {})

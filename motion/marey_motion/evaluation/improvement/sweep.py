@@ -96,15 +96,20 @@ def sweep_weights(
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
     settings : sequence of FeatureWeights    weights to try
-    objective : ObjectiveOptions    measure of the result
-    trials : sequence of Trial, optional    trials to run; those of the suite if None
-    threads : int, optional    trials at once
+    objective : ObjectiveOptions, optional    measure of the result; its default weights if None
+    trials : sequence of Trial, optional    trials to run; all trials of the suite if None
+    threads : int, optional    number of trials to run at once
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
 
     Returns
     -------
     tuple of SweepRow    one per setting
+
+    Raises
+    ------
+    MotionError    if a setting changes a weight that is 0 in the database
+    EvaluationCancelled    if cancelled
     """
     wanted = suite_trials(options) if trials is None else tuple(trials)
     aim = objective or ObjectiveOptions()
@@ -167,7 +172,7 @@ def group_influences(rows: Sequence[SweepRow]) -> tuple[Influence, ...]:
 
     Parameters
     ----------
-    rows : sequence of SweepRow    results of a sweep
+    rows : sequence of SweepRow    results of a sweep, the baseline first
 
     Returns
     -------
