@@ -73,8 +73,8 @@ def run_suite(
         not run again
     index : SearchIndex, optional    index of the database's normalised features, built if None
     threads : int, optional    number of trials at a time; one per processor if None
-    progress : callable, optional    called as progress(trials done, total, name of the last one)
-    finished : callable, optional    called with each trial and its record as soon as it is made
+    progress : callable, optional    called as progress(trials done, total, name of the last trial)
+    finished : callable, optional    called with each trial and its record as soon as the trial ends
     cancelled : callable, optional    called before each trial; returns True to stop
 
     Returns
@@ -147,7 +147,7 @@ def _run_ahead(
                 running[pool.submit(run, trial)] = trial
             if stopping and not running:
                 raise EvaluationCancelled(
-                    f"the evaluation was stopped before {len(waiting)} of {len(trials)} trials had begun"
+                    f"the evaluation was stopped; {len(waiting)} of {len(trials)} trials were not run"
                 )
             ended, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in sorted(ended, key=lambda one: running[one].name):
@@ -319,7 +319,7 @@ def baseline_clips(options: EvaluationOptions) -> tuple[list[SourceClip], list[s
 
 
 def baseline_database(options: EvaluationOptions) -> tuple[MatchingDatabase, list[str]]:
-    """Build a database of the generated clips, with a normaliser of their own.
+    """Build a database of the generated clips, with a normaliser fitted to these clips.
 
     Parameters
     ----------
@@ -329,11 +329,15 @@ def baseline_database(options: EvaluationOptions) -> tuple[MatchingDatabase, lis
     -------
     database : MatchingDatabase    the gaits
     notes : list of str    pairs of speed and turn rate at which no gait can be generated
+
+    Raises
+    ------
+    MotionError    if no gait can be generated for any pair
     """
     clips, notes = baseline_clips(options)
     if not clips:
         raise MotionError(
-            "the generator cannot walk at any speed and turn rate of the grid; choose slower "
+            "no walk can be generated for any speed and turn rate of the grid; choose slower "
             "speeds or lower turn rates",
             where="grid",
         )

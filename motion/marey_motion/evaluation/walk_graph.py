@@ -168,7 +168,7 @@ def _readable(text: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ClipGraph:
-    """Switches between clips.
+    """Displayed clips and the jumps between them.
 
     Parameters
     ----------

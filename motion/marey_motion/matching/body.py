@@ -63,7 +63,7 @@ class MatchingBody:
 
         Raises
         ------
-        MappingError    naming the standard joints that are missing
+        MappingError    if required standard joints are not mapped; the error names them
         """
         hips, left_foot, right_foot = mapping.indices(skeleton, ("pelvis", "left_ankle", "right_ankle"))
 

@@ -46,7 +46,7 @@ def build_database(
     options : DatabaseOptions    rate, horizons and weights
     normaliser : Normaliser, optional    a normaliser fitted earlier ("pinned"), with its own weights; if None, one is
         fitted to these clips
-    progress : callable, optional    called as progress(clips done, total, name of the last one)
+    progress : callable, optional    called as progress(clips done, total, name of the last clip)
 
     Returns
     -------

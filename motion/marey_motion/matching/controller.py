@@ -95,7 +95,7 @@ class DatabaseArrays(NamedTuple):
     ----------
     successors, steps, starts : as in `RootMotion` and `MatchingDatabase`
     points : (N, P, 3) positions of the pose joints of each row, in metres
-    offset, scale : (D,) those of the normaliser
+    offset, scale : (D,) as in the normaliser
     horizons_s, horizons_ticks : (H,) times ahead at which the trajectory is compared, in seconds and in ticks
     """
 
@@ -138,7 +138,7 @@ def run_trial(
 
     Raises
     ------
-    MotionError    for invalid options, or if index, trajectory and database do not belong together
+    MotionError    if an option is invalid, or if index, trajectory and database do not belong together
     """
     from marey_motion.matching import controller_kernels as kernels
 

@@ -1,6 +1,4 @@
-"""Displayed motion of a trial: the chosen poses, blended by inertialisation and placed at the recorded positions of the
-root.
-"""
+"""Displayed motion of a trial: chosen poses, blended by inertialisation and placed at the recorded root positions."""
 
 from __future__ import annotations
 

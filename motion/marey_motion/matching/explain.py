@@ -27,7 +27,9 @@ from marey_schemas.options.matching import ControllerOptions
 Reason = Literal["started", "not_searched", "continued", "switched", "clip_ended"]
 
 POSE_DISTANCE = "pose_distance"
-"""Name of the group with the summed distance of the pose joints, in metres, for options that compare poses by it."""
+"""Name of the group that replaces the pose features if poses are compared by the summed distance of their joints, in
+metres.
+"""
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ def explain_choice(
 
     Raises
     ------
-    MotionError    for ticks and rows that do not exist
+    MotionError    if the tick or a row does not exist, or if the record belongs to another database
     """
     if record.rows.max(initial=0) >= database.row_count:
         raise MotionError(

@@ -46,7 +46,10 @@ class FeatureLayout:
 
     @property
     def pose_dimensions(self) -> int:
-        """Number of dimensions of the pose. Those of the trajectory follow: (x, z) at each horizon, then directions."""
+        """Number of dimensions of the pose.
+
+        The dimensions of the trajectory follow: positions (x, z) at each horizon, then directions (x, z).
+        """
         return self.dimension_count - 4 * len(self.horizons_s)
 
     @property
@@ -69,7 +72,7 @@ def feature_layout(options: DatabaseOptions, body: MatchingBody) -> FeatureLayou
 
     Raises
     ------
-    MotionError    for a joint that the body lacks
+    MotionError    if the body lacks a joint
     """
     _require_joints(options, body)
     weights = options.weights
@@ -107,7 +110,7 @@ def _require_joints(options: DatabaseOptions, body: MatchingBody) -> None:
 
 
 def in_root_frame(points: Floats, root: SimulationRoot) -> Floats:
-    """Convert positions to the frame of each frame's root.
+    """Convert positions from the world to coordinates relative to the root, in each frame of a clip.
 
     Parameters
     ----------
@@ -124,7 +127,7 @@ def in_root_frame(points: Floats, root: SimulationRoot) -> Floats:
 
 
 def turned_to_root(vectors: Floats, root: SimulationRoot) -> Floats:
-    """Convert vectors to the axes of each frame's root.
+    """Convert vectors from the axes of the world to the axes of the root, in each frame of a clip.
 
     Parameters
     ----------

@@ -1,5 +1,4 @@
-"""Inertialisation: blending in which the difference between the old and the new motion is added to the new one, and
-decays.
+"""Inertialisation: blending that adds the decaying difference between the old and the new motion to the new motion.
 
 The difference x decays like a critically damped spring with half-life h. Its value is computed in closed form, so that
 it does not depend on the length of the ticks: x(t) = e^(-y·t)·(x0 + (v0 + y·x0)·t) with y = 2·ln 2 / h, where x0 and v0

@@ -119,7 +119,7 @@ class Normaliser:
 
         Raises
         ------
-        MotionError    naming the member that is invalid or was altered
+        MotionError    if a member is missing or invalid, or if the numbers were changed after the digest was computed
         """
         try:
             offset, scale = (np.asarray(tree[name], dtype=np.float64) for name in ("offset", "scale"))
@@ -138,7 +138,9 @@ class Normaliser:
             )
         if not np.all(np.isfinite(offset)) or not np.all(np.isfinite(scale) & (scale > 0.0)):
             raise MotionError(
-                "offsets must be finite and scales positive", code="normaliser-invalid", where="normaliser"
+                "the offsets must be finite, and the scales finite and positive",
+                code="normaliser-invalid",
+                where="normaliser",
             )
         result = cls(offset, scale, fitted_on, names, floored)
         if result.digest != digest:
@@ -170,7 +172,7 @@ def fit_normaliser(features: Floats, layout: FeatureLayout, fitted_on: str) -> N
     MotionError    if there are no rows
     """
     if not len(features):
-        raise MotionError("no features were given to fit the normaliser to", code="no-features")
+        raise MotionError("a normaliser needs at least one row of features, but none was given", code="no-features")
     offset = features.mean(axis=0)
     deviations = np.array([features[:, d].std() for d in range(layout.dimension_count)])
     scale = np.empty(layout.dimension_count)

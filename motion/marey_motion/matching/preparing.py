@@ -37,7 +37,7 @@ class PreparedClip:
 
     Parameters
     ----------
-    seam : transition from the end of a loop to its start, if rows look ahead across it; None if the clip just ends
+    seam : transition from the end of a loop to its start, if rows look ahead across it; None if the clip does not wrap
     notes : remarks on data that were left out or look doubtful
     mirrored : whether left and right are exchanged
     first_s : time of the first frame in the recording, seconds
@@ -122,7 +122,7 @@ def _wanted_frames(
     clip, first = source.clip, 0
     if not _moves(clip, body.skeleton):
         raise MotionError(
-            "the clip has a different skeleton from the database; retarget it first", code="skeleton-mismatch"
+            "the clip has a different skeleton from the database; retarget the clip first", code="skeleton-mismatch"
         )
     if source.frames is not None:
         clip, first = clip.sliced(*source.frames), source.frames[0]

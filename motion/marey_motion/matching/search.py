@@ -212,6 +212,10 @@ def find_nearest(
     -------
     rows : (Q,) int64    -1 where all rows are skipped
     costs : (Q,) float64    infinite where all rows are skipped
+
+    Raises
+    ------
+    MotionError    if the queries or weights have another number of dimensions than the index, or invalid values
     """
     from marey_motion.matching import search_kernels as kernels
 
@@ -246,6 +250,10 @@ def find_best(
     -------
     rows : (count,) int64    the rows
     costs : (count,) float64    the same costs as in `find_nearest`, bit for bit
+
+    Raises
+    ------
+    MotionError    as for `find_nearest`
     """
     from marey_motion.matching import search_kernels as kernels
 
@@ -267,7 +275,7 @@ def _as_queries(index: SearchIndex, queries: NDArray[np.float64]) -> NDArray[np.
             f"each query must have {index.rows.shape[1]} dimensions, but the queries have the shape {queries.shape}"
         )
     if not (np.abs(queries) <= LARGEST).all():
-        raise MotionError(f"the numbers of a query must be finite and at most {LARGEST:g}")
+        raise MotionError(f"the numbers of a query must be finite, with a magnitude of at most {LARGEST:g}")
     return queries
 
 

@@ -56,7 +56,7 @@ class TakePair(NamedTuple):
 def contact_sheet(
     takes: Sequence[TakePair], *, heading: str = "Retargeting", moments: int = 6, total: int | None = None
 ) -> bytes:
-    """Draw a PNG with one row per take: at each moment the figure of the source beside that of the result.
+    """Draw a PNG with one row per take: at each moment, the figure of the source beside the figure of the result.
 
     The result has a tinted background. The figures of a take have the same scale and the same view: from the front left
     of the source in its first frame. Each figure is drawn over its own patch of the floor y = 0, with an arrow in its
@@ -67,18 +67,18 @@ def contact_sheet(
     takes : takes to draw, at most `MAX_TAKES`
     heading : title of the page
     moments : number of evenly spaced moments of each take, at most `MAX_MOMENTS` and one per frame
-    total : number of takes that the drawn ones were chosen from; default: the drawn ones are all
+    total : number of takes from which the drawn takes were chosen; None if all takes are drawn
 
     Raises
     ------
-    MotionError    for no takes or moments, or too many
+    MotionError    if there are no takes or no moments, or too many
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     if not (1 <= len(takes) <= MAX_TAKES and 1 <= moments <= MAX_MOMENTS):
         raise MotionError(
-            f"a sheet shows 1 to {MAX_TAKES} takes at 1 to {MAX_MOMENTS} moments, not {len(takes)} at {moments}",
+            f"a sheet shows 1 to {MAX_TAKES} takes at 1 to {MAX_MOMENTS} moments, not {len(takes)} takes at {moments}",
             code="figure-size",
         )
     rows = [_staged(take, moments) for take in takes]

@@ -34,7 +34,7 @@ class Sketch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DrawnFigure:
-    """A figure, whose pictures are made when they are first asked for.
+    """A figure; the PNG and the SVG are written when they are first requested.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class DrawnFigure:
 
     @property
     def data(self) -> dict[str, Any]:
-        """The tables as a tree of dicts, lists, texts, numbers and None, which replaces NaN."""
+        """Name, number, title, caption and tables as plain values; None replaces NaN and infinite numbers."""
         tables = {
             name: {column: listed(values) for column, values in table.items()} for name, table in self.tables.items()
         }
@@ -95,7 +95,7 @@ class DrawnFigure:
 
 
 def listed(values: Column) -> list[Any]:
-    """Convert a column to a list of plain values; None replaces NaN."""
+    """Convert a column to a list of plain values; None replaces NaN and infinite numbers."""
     rows = values.tolist() if isinstance(values, np.ndarray) else [_plain(value) for value in values]
     return [None if isinstance(value, float) and not math.isfinite(value) else value for value in rows]
 

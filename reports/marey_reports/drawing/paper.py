@@ -134,7 +134,7 @@ def tick_whole_numbers(axis: Axis) -> None:
 
 
 def plain(text: str) -> str:
-    """Return a name on one line, without characters that cannot be drawn or written to an SVG."""
+    """Return a text on one line; U+FFFD replaces characters that cannot be drawn or written to an SVG."""
     return "".join(sign if sign.isprintable() else "�" for sign in text)
 
 
@@ -180,7 +180,7 @@ def labels_of(names: Sequence[str], longest: int = LONGEST_NAME) -> list[str]:
 
 
 def shortened(name: str, longest: int = LONGEST_NAME) -> str:
-    """Shorten a name in its middle, where names of takes differ least."""
+    """Shorten a name to `longest` characters by cutting its middle, where names of takes differ least."""
     if len(name) <= longest:
         return name
     tail = (longest - 1) // 2
@@ -196,7 +196,7 @@ def reach(values: NDArray[np.floating[Any]], wanted: float) -> float:
 
 
 def nice_ceiling(value: float) -> float:
-    """Round up to 1, 1.5, 2, 3, 4, 5, 6 or 8 times a power of ten; 1 for a number not above zero."""
+    """Round up to 1, 1.5, 2, 3, 4, 5, 6 or 8 times a power of ten; return 1 if `value` is not positive and finite."""
     if not value > 0.0 or not np.isfinite(value):
         return 1.0
     scale = 10.0 ** np.floor(np.log10(value))

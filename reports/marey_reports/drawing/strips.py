@@ -154,8 +154,9 @@ def _draw_label(axes: Axes, row: StripRow, middle: float) -> None:
 
 
 class _Look(NamedTuple):
-    """Style of a body: its colour, or None for the colours of the left and right sides, and the rim that separates it
-    from the background.
+    """Style of the lines of a body.
+
+    `colour` is None for the colours of the left and right sides; a `rim` separates overlapping sides of the body.
     """
 
     width: float

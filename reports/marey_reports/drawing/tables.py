@@ -24,7 +24,7 @@ Cell = Number | Content
 
 
 def number(value: float | None, digits: int = 2, *, signed: bool = False, look: str = "") -> Number:
-    """Format a number with the given number of decimals; None gives a dash."""
+    """Format a number with the given number of decimals; None, NaN and infinite numbers give a dash."""
     if value is None or not math.isfinite(value):
         return Number(None, "–")
     written = round(value, digits) + 0.0  # not -0.00

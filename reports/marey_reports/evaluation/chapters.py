@@ -269,7 +269,7 @@ def _listed(names: Iterable[str], most: int = 12) -> str:
 
 
 def notes(result: EvaluationResult) -> Html | None:
-    """Write the chapter on the notes of the evaluation about its clips."""
+    """Write the notes of the evaluation about its clips; return None if there are no notes."""
     if not result.notes:
         return None
     listing = element("ul", [element("li", note) for note in result.notes])

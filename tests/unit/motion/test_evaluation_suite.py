@@ -123,7 +123,7 @@ def test_a_cancelled_suite_hands_over_what_it_finished_and_can_be_resumed(
     database: MatchingDatabase, records: list[TrialRecord]
 ) -> None:
     kept = {}
-    with pytest.raises(EvaluationCancelled, match="of 12 trials had begun"):
+    with pytest.raises(EvaluationCancelled, match="of 12 trials were not run"):
         run_suite(
             database,
             OPTIONS,
