@@ -130,7 +130,7 @@ def plan_retarget(
     ------
     MappingError    if too few joints are mapped, if the axes of a mapped joint are missing or parallel, or if the scale
         is invalid or cannot be computed
-    SkeletonError    if a mapping names a joint that its skeleton does not have
+    UnknownJoint    if a mapping names a joint that its skeleton does not have
 
     Examples
     --------

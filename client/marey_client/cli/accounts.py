@@ -179,7 +179,7 @@ def change_user(
     name: UserName,
     display_name: Annotated[str | None, typer.Option(help="Name that is shown to other users.")] = None,
     administrator: Annotated[
-        bool | None, typer.Option(help="Give the user the rights of an administrator, or take them away.")
+        bool | None, typer.Option(help="Grant the user the rights of an administrator, or revoke them.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -53,7 +53,7 @@ class Address:
 
 
 def find_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> ItemHandle | None:
-    """Return the item at an address, or None. `kinds` are tried in order."""
+    """Return the item at an address; None if there is no item of the given kinds, which are tried in order."""
     project = marey.project(address.project)
     if not address.path:
         return None
@@ -79,8 +79,9 @@ def require_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> Any:
 
 
 def _missing(marey: Marey, address: Address, what: str) -> WrongUsage:
-    """Return the error for an address without an item of the wanted kind; it names the command that lists the folder or
-    the project.
+    """Return the error for an address without an item of the wanted kind.
+
+    The error names the command that lists the folder or the project.
     """
     if address.path and marey.project(address.project).collections.at(address.path) is not None:
         return WrongUsage(f"{address} is a folder; marey ls {address} lists it")
@@ -98,7 +99,7 @@ def addresses_in_one_project(places: Sequence[str]) -> list[Address]:
 
 
 def kind_named(name: str) -> Kind:
-    """Return the kind of item with the given name. Raises `WrongUsage`."""
+    """Return the kind of item with the given name. Raises `WrongUsage` if there is no such kind."""
     from marey_schemas.kinds import Kind
 
     try:
@@ -285,7 +286,7 @@ def require_apart(things: Sequence[Thing]) -> None:
 def _things(project: ProjectHandle, address: Address, kind: str | None, *, deleted: bool) -> Iterator[Thing]:
     """Yield the folders and items at an address, folders first.
 
-    With `deleted`, these are the deleted ones; those of one kind begin with the one that was deleted last.
+    With `deleted`, these are deleted folders and items; in each kind, the item that was deleted last comes first.
     """
     from marey_schemas.kinds import Kind
 

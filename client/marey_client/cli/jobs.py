@@ -67,7 +67,8 @@ def submit_job(
     kind: Annotated[
         str,
         typer.Argument(
-            help="Kind of the job; marey job kinds lists them, and marey job kinds KIND its inputs and parameters."
+            help="Kind of the job; marey job kinds lists all kinds, and marey job kinds KIND lists the inputs and "
+            "parameters of one kind."
         ),
     ],
     job: Chosen,
@@ -230,7 +231,7 @@ def rerun_job(
     context: typer.Context,
     job_id: JobId,
     into: Annotated[
-        str | None, typer.Option(help="Folder that receives the repeated results; default: reruns/ and the job's id.")
+        str | None, typer.Option(help="Folder for the repeated results; default: reruns/ID, with the id of the job.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

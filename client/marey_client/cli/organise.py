@@ -109,8 +109,8 @@ def rm(
 ) -> None:
     """Remove items, and folders with their contents; `marey restore` restores them.
 
-    Each item or folder is removed by a request of its own. If the server refuses one, for example because somebody has
-    changed it since it was selected, the others are removed, and the exit status is 1.
+    Each item or folder is removed by a request of its own. If the server refuses to remove one of them, for example
+    because somebody has changed it since it was selected, the others are still removed, and the exit status is 1.
     """
     with connect(context) as marey:
         things = _named_or_selected(marey, places, kind, query)
@@ -141,7 +141,7 @@ def restore(context: typer.Context, places: Places, kind: KindOf = None, as_json
             try:
                 restored = thing.restore()
             except Conflict as error:
-                error.add_note("first move the item at that place away, with marey mv")
+                error.add_note("first move or rename the item that has this address now, with marey mv")
                 raise
             print_message(f"{thing.place} is back")
             return restored
@@ -155,7 +155,7 @@ def revert(
     message: Annotated[str, typer.Option("--message", "-m", help="Message of the new revision.")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Create a revision of an item with the content of an earlier one. Name, folder and tags stay."""
+    """Create a revision of an item with the content of an earlier revision. Name, folder and tags do not change."""
     from marey_schemas.kinds import Kind
 
     with connect(context) as marey:
@@ -189,8 +189,8 @@ def tag(
 ) -> None:
     """Add tags to items, and remove others; `marey ls --tag` lists items by tag.
 
-    Each item is changed by a request of its own. If the server refuses one, for example because somebody has changed
-    it since it was selected, the others are changed, and the exit status is 1.
+    Each item is changed by a request of its own. If the server refuses to change one of them, for example because
+    somebody has changed it since it was selected, the others are still changed, and the exit status is 1.
     """
     from marey_schemas.items import ItemChange
 
@@ -298,7 +298,7 @@ def _ask(question: str) -> None:
 def _do_each(
     things: Sequence[AnyThing], do: Callable[[AnyThing], Any], done: str, as_json: bool, *, selected: bool = False
 ) -> None:
-    """Apply a function to each folder or item, and print refusals. Raises `Refused` at the end if there were any.
+    """Apply a function to each folder or item, and print refusals. Raises `Refused` at the end if there were refusals.
 
     `done` is the past participle for messages, such as "moved". `selected` says that a query has selected the items:
     they may be many and do not depend on each other, so several requests are sent at a time, and the number of items

@@ -66,7 +66,7 @@ def build_model(
     name: Annotated[str, typer.Option(help="Name of the model and of the action.")],
     propose: Chosen,
     job: Chosen,
-    project: Annotated[str | None, typer.Option(help="The project that receives local files.")] = None,
+    project: Annotated[str | None, typer.Option(help="Project to which local files are uploaded.")] = None,
     to: Annotated[str | None, typer.Option(help="Skeleton to retarget the takes to: project/folder/name.")] = None,
     into: Annotated[str | None, typer.Option(help="Folder of the results; default: the name of the model.")] = None,
     layer: Annotated[
@@ -181,7 +181,8 @@ def _skeleton(marey: Marey, to: str, project: str) -> str:
 def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> None:
     """Wait for the jobs of a pipeline if requested, and print their states.
 
-    Raises `JobUnsuccessful`, and `Refused` if jobs refused some of their inputs.
+    Raises `JobUnsuccessful` if a job did not succeed, and `Refused` if jobs refused some of their inputs or if results
+    could not be committed to the requested branch.
     """
     if not wait:
         return print_steps(run, as_json)
@@ -211,7 +212,7 @@ def _refused(job: Job) -> list[Mapping[str, Any]]:
 
 
 def _print_shortfalls(run: PipelineRun) -> None:
-    """Print for each step the inputs that it refused, those in which it found nothing, and the notes of its job."""
+    """Print for each step the inputs that it refused or in which it found nothing, the notes, and the commit."""
     for step, job in run.steps.items():
         if refused := _refused(job):
             print_message(f"{step} refused {len(refused)}:")

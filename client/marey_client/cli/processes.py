@@ -39,7 +39,8 @@ def serve(
     data: DataFolder = None,
     host: Annotated[str | None, typer.Option(help=f"Address to listen on; default: {DEFAULT_HOST}.")] = None,
     port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help=f"Port to listen on; 0: any free one; default: {DEFAULT_PORT}.")
+        int | None,
+        typer.Option(min=0, max=65535, help=f"Port to listen on; 0: any free port; default: {DEFAULT_PORT}."),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=0, help="Number of worker processes that the server starts; default: 1.")
@@ -185,7 +186,7 @@ def set_clock(
 @db.command("admin-token")
 def make_admin_token(
     user: Annotated[
-        str | None, typer.Option(help="Name of the administrator; default: the first one that was created.")
+        str | None, typer.Option(help="Name of the administrator; default: the administrator that was created first.")
     ] = None,
     data: DataFolder = None,
     database_url: DatabaseUrl = None,

@@ -23,7 +23,10 @@ _VERSION = re.compile(r"([^/@]+)@([^/@]+)(?:/(.+))?")
 
 
 def require_revision(marey: Marey, address: Address, kinds: Sequence[Kind]) -> tuple[Any, int | None]:
-    """Return the item at an address, and the revision after its `@`, if one is given. Raises `WrongUsage`."""
+    """Return the item at an address, and the revision after its `@`, or None if no revision is given.
+
+    Raises `WrongUsage` if there is no item.
+    """
     found = find_revision(marey, address, kinds)
     return found if found is not None else (require_item(marey, address, kinds), None)
 

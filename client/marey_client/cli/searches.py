@@ -63,7 +63,8 @@ def search(
     at: Annotated[
         Many,
         typer.Option(
-            help="Put a joint at a position in metres: WHEN:JOINT=x,y,z, such as end:left_wrist=0.2,_,1; _ is free."
+            help="Put a joint at a position in metres: WHEN:JOINT=x,y,z, such as end:left_wrist=0.2,_,1; _ leaves a "
+            "coordinate free."
         ),
     ] = None,
     turned: Annotated[
@@ -106,7 +107,8 @@ def search(
 ) -> None:
     """Find the motion of a model that best meets constraints.
 
-    WHEN in an option is the label of a keyframe, `start`, `end`, or the number of a canonical frame.
+    WHEN in an option is the label of a keyframe, `start`, `end`, or the number of a canonical frame: a frame of the
+    common time to which the examples of the model were aligned.
     """
     from marey_schemas.search import SearchRequest
 

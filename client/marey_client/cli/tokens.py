@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 token = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage your tokens.")
 
 SOON_DAYS = 14
-"""Number of days before its end from which a list shows the time left to a token."""
+"""For tokens that expire in fewer days than this, lists show the number of days left."""
 
 
 def add_to(app: typer.Typer) -> None:
@@ -231,7 +231,7 @@ def revoke_token(
 ) -> None:
     """Revoke a token, at once. Administrators may revoke the tokens of others."""
     if (token_id is None) == (all_of is None):
-        raise WrongUsage("give the id of a token, or a user with --all-of")
+        raise WrongUsage("give either the id of a token, or a user with --all-of")
     with connect(context) as marey:
         if all_of is not None:
             marey.users.end_tokens(all_of)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 webhook = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Notify other programs of events in a project.")
 
 WebhookId = Annotated[str, typer.Argument(metavar="ID", help="Id of the webhook; marey webhook ls lists the ids.")]
-Url = Annotated[str, typer.Argument(help="Address that gets the requests, such as https://ci.example.org/marey.")]
+Url = Annotated[str, typer.Argument(help="Address to which requests are sent, such as https://ci.example.org/marey.")]
 Kinds = Annotated[
     list[str] | None,
     typer.Option(
@@ -68,7 +68,7 @@ def _event_kinds(given: Sequence[str] | None) -> tuple[ProjectEventKind, ...]:
 
     unknown = [one for one in given or () if one not in PROJECT_EVENT_KINDS]
     if unknown:
-        raise WrongUsage(f"{unknown[0]!r} is no kind of event; the kinds are {', '.join(PROJECT_EVENT_KINDS)}")
+        raise WrongUsage(f"{unknown[0]!r} is not a kind of event; the kinds are {', '.join(PROJECT_EVENT_KINDS)}")
     return tuple(one for one in PROJECT_EVENT_KINDS if one in (given or ()))
 
 
@@ -106,12 +106,12 @@ def change(
     context: typer.Context,
     project: ProjectName,
     webhook_id: WebhookId,
-    url: Annotated[str | None, typer.Option(help="New address that gets the requests.")] = None,
+    url: Annotated[str | None, typer.Option(help="New address to which requests are sent.")] = None,
     kind: Kinds = None,
     description: Description = None,
     pause: Annotated[
         bool | None,
-        typer.Option("--pause/--resume", help="Pause deliveries, or resume them with the events that wait."),
+        typer.Option("--pause/--resume", help="Pause deliveries, or resume them and send the waiting events."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -182,7 +182,7 @@ def _delivery_state(text: str | None) -> DeliveryState | None:
             return state
     if text is None:
         return None
-    raise WrongUsage(f"{text!r} is no state of a delivery; the states are {', '.join(get_args(DeliveryState))}")
+    raise WrongUsage(f"{text!r} is not a state of a delivery; the states are {', '.join(get_args(DeliveryState))}")
 
 
 @webhook.command("redeliver")
@@ -194,12 +194,12 @@ def redeliver(
         str | None,
         typer.Argument(metavar="DELIVERY", help="Id of the delivery; marey webhook deliveries lists the ids."),
     ] = None,
-    all_dead: Annotated[bool, typer.Option("--all", help="Send all deliveries again that were given up.")] = False,
+    all_dead: Annotated[bool, typer.Option("--all", help="Send again all deliveries that were given up.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Send a delivery once more, or all that were given up. The exit status is 1 if a delivery fails."""
+    """Send a delivery again, or all deliveries that were given up. The exit status is 1 if a delivery fails."""
     if (delivery is None) != all_dead:
-        raise WrongUsage("give the id of a delivery, or --all")
+        raise WrongUsage("give either the id of a delivery, or --all")
     with connect(context) as marey:
         handle = marey.project(project).webhooks.at(webhook_id)
         ids = [one.id for one in handle.deliveries("dead")] if delivery is None else [delivery]

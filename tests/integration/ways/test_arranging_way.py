@@ -157,7 +157,7 @@ def test_of_several_that_were_removed_at_one_place_the_last_comes_back_and_each_
     assert next(lab.clips.list(path="raw/a")).id == second
     told = run("restore", f"lab/{first}", status=1).stderr
     assert "The collection now contains another clip named 'a'." in told
-    assert "first move the item at that place away, with marey mv" in told
+    assert "first move or rename the item that has this address now, with marey mv" in told
     run("mv", "lab/raw/a", "lab/raw/b")
     run("restore", f"lab/{first}")
     assert next(lab.clips.list(path="raw/a")).id == first

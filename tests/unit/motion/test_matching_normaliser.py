@@ -74,7 +74,7 @@ def test_a_normaliser_survives_being_kept_as_a_tree() -> None:
     ("change", "message"),
     [
         ({"offset": np.zeros(27)}, "the numbers of the normaliser were changed"),
-        ({"scale": np.zeros(27)}, "scales positive"),
+        ({"scale": np.zeros(27)}, "scales finite and positive"),
         ({"scale": np.ones(3)}, "do not match"),
         ({"offset": np.full(27, np.nan)}, "must be finite"),
         ({"names": None}, "not a valid normaliser"),

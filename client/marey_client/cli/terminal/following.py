@@ -26,7 +26,7 @@ _COMMIT = OptionsOf("marey_schemas.queue.commits:CommitOptions")
 
 @dataclass(frozen=True)
 class _CommittingJob(OptionsOf):
-    """Options of a job that creates items: those of the job, and those of the commit of its results."""
+    """Options of a job that creates items: options of the job, and options of the commit of its results."""
 
     @cached_property
     def options(self) -> tuple[Any, ...]:
@@ -63,7 +63,7 @@ Sources = Annotated[
         "project/dataset@version[/folder]."
     ),
 ]
-Into = Annotated[str, typer.Option(help="Folder of the project that receives the results.")]
+Into = Annotated[str, typer.Option(help="Folder for the results, in the same project.")]
 Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the job has ended.")]
 
 
@@ -95,7 +95,8 @@ def follow(
     """Wait until a job has ended, and show a progress bar.
 
     The progress of a job with tasks is counted in tasks; if `count` is given, it is scaled to `count` units, which
-    `unit` names. Without `wait`, print the job's id and return None. Raises `JobUnsuccessful`.
+    `unit` names. Without `wait`, print the job's id and return None. Raises `JobUnsuccessful` if the job did not
+    succeed.
     """
     if not wait:
         print_json(submitted) if as_json else typer.echo(submitted.id)
@@ -133,7 +134,8 @@ def show_progress(now: Job, advance: Advance, count: int | None = None, unit: st
 def print_ended(ended: Job, as_json: bool, show: Callable[[dict[str, Any]], None] | None = None) -> None:
     """Print the refused inputs of a job, then call `show` with its result; without `show`, print the counts in it.
 
-    Raises `Refused` if inputs were refused, or if the results are not on the branch that was to get them."""
+    Raises `Refused` if inputs were refused, or if the results could not be committed to the requested branch.
+    """
     result = ended.result or {}
     refused = result.get("refused", ())
     if as_json:
@@ -147,7 +149,7 @@ def print_ended(ended: Job, as_json: bool, show: Callable[[dict[str, Any]], None
 
 
 def print_commit(ended: Job) -> None:
-    """Print which commit has the results of a job. Raises `Refused` if it is not on the branch that was to get it."""
+    """Print the commit with the results of a job. Raises `Refused` if it could not be put on the requested branch."""
     if ended.commit is not None:
         print_message(commit_text(ended))
     if ended.publish_conflict is not None:

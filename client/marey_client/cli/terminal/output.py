@@ -59,7 +59,7 @@ def print_rows(rows: Iterable[tuple[str, str, str]]) -> None:
 
 
 def print_pairs(pairs: Iterable[tuple[str, object]]) -> None:
-    """Print names and values, one pair on each line."""
+    """Print names and values, one pair on each line; pairs without a value are skipped."""
     shown = [(name, value) for name, value in pairs if value not in (None, "", ())]
     width = max((len(name) for name, _ in shown), default=0)
     for name, value in shown:

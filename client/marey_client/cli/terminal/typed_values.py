@@ -24,7 +24,7 @@ MOST_VALUES = 200
 """Greatest number of values in a range if the schema sets no limit."""
 EVEN = 1e-9
 GREATEST_SHOWN_BOUND = 1e15
-"""Bounds above this are those of machine integers, and are not shown."""
+"""Larger bounds are the limits of machine integers; they are not shown."""
 
 
 # -- schemas --
@@ -184,7 +184,10 @@ def named_number(text: str, names: Mapping[str, Any] | None = None) -> tuple[str
 
 
 def read_numbers(text: str, most: int | None = None) -> list[float]:
-    """Return the values of a range `1:3:0.25`, including the last one, or of `1,2,3`. Raises `WrongUsage`."""
+    """Return the values of a range `1:3:0.25`, including the last one, or of a list `1,2,3`.
+
+    Raises `WrongUsage` if the text has another form, or if the range has more than `most` values.
+    """
     try:
         numbers = [float(part) for part in text.replace(",", ":").split(":")]
     except ValueError:
@@ -204,7 +207,7 @@ def read_numbers(text: str, most: int | None = None) -> list[float]:
     most = most or MOST_VALUES
     steps = (last - first) / step + EVEN
     if steps >= most:
-        raise WrongUsage(f"{text!r}: the range has more than {most} values")
+        raise WrongUsage(f"{text!r}: the range has more than {most} values; use a larger step or a shorter range")
     return [first + index * step for index in range(int(steps) + 1)]
 
 

@@ -1,4 +1,4 @@
-"""Figures of one evaluation, or of two in comparison: those of Abichequer Sangalli et al. (2022), and a few more.
+"""Figures of one evaluation or of two: the figures of Abichequer Sangalli et al. (2022), and a few more.
 
 matplotlib is loaded when the first figure is drawn. The same result gives the same bytes.
 """
@@ -76,7 +76,7 @@ COVERAGE_FIGURES = ("density", "points", "holes", "directions")
 SCENARIO_FIGURES = ("scenario-circle", "scenario-switching")
 TRIAL_FIGURES = ("transition-cost", "errors")
 USE_FIGURES = ("usage", "frame-use", "clip-graph")
-"""Figures that a chapter shows together, in the report of one evaluation and in that of two."""
+"""Figures that a chapter shows together, in a report of one evaluation or of two."""
 
 
 def draw_figure(
@@ -100,7 +100,8 @@ def draw_figure(
 
     Raises
     ------
-    MotionError    for an unknown figure or trial, or a trial without its record
+    MotionError    if the figure or the trial is unknown, if the record of the trial is missing, or if a trial is given
+        for a figure that always shows the suite
     """
     kind = FIGURES.get(name)
     if kind is None:

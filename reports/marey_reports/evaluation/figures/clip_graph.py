@@ -196,8 +196,9 @@ def _labels(subjects: Sequence[Subject], uids: Collection[str], longest: int) ->
 
 
 def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str]) -> None:
-    """Draw the outline of each clip, open at the top, with its name outside; the outline is dotted if the evaluation
-    does not contain the clip.
+    """Draw the outline of each clip, open at the top, with its name outside.
+
+    The outline is dotted if the evaluation does not contain the clip.
     """
     from matplotlib.patches import Arc
 

@@ -69,8 +69,9 @@ def arrange(frames: Mapping[str, int], links: Mapping[tuple[str, str], int]) -> 
 
 
 def _neighbours(uids: Sequence[str], links: Mapping[tuple[str, str], int]) -> list[str]:
-    """Order clips: begin with the first one, and continue each time with the clip that has most transitions to or from
-    the previous one.
+    """Order clips so that clips with many transitions between them are neighbours.
+
+    The order begins with the first clip. Each next clip is the one with most transitions to or from the previous clip.
     """
     left, order = list(uids), list[str]()
     while left:

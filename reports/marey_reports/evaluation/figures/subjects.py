@@ -56,11 +56,14 @@ class Subject:
         return f"{self.label}_{name}" if self.label else name
 
     def usage(self, trial: str | None) -> tuple[ClipUsage, ...]:
-        """Use of every clip in one trial, or in the whole suite."""
+        """Return the use of every clip in one trial, or in the whole suite if `trial` is None."""
         return self.result.usage if trial is None else measure_usage(self.result.clips, [find_record(self, trial)])
 
     def switches(self, trial: str | None) -> NDArray[np.int64]:
-        """List jumps (S, 3) in one trial or the whole suite: database row before the jump, row after it, and count."""
+        """Return the jumps (S, 3) in one trial, or in the whole suite if `trial` is None.
+
+        Columns are the database row before the jump, the row after the jump, and the number of these jumps.
+        """
         return self.result.switches if trial is None else count_switches(self.result.clips, [find_record(self, trial)])
 
 

@@ -115,7 +115,7 @@ def points_of(skeleton: Skeleton, poses: Floats) -> Floats:
 
 
 def choose_moments(subject: ModelSubject, count: int) -> tuple[NDArray[np.int64], StripMoments]:
-    """Choose evenly spaced canonical frames, and replace those nearest to keyframes by the keyframes.
+    """Choose evenly spaced canonical frames, and replace the frames nearest to keyframes by the keyframes.
 
     Returns the frames in ascending order, and the columns of strips that show them.
     """
