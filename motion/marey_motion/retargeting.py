@@ -1,8 +1,8 @@
 """Retargeting: transfer of the motion of one skeleton to another, with any rest poses, proportions and local axes.
 
 Both skeletons give each joint two axes in its own frame: twist along the bone and swing across it (`rigs.guess_axes`).
-A target joint gets the global orientation in which its two axes coincide with those of the source joint with the same
-standard name (Herrmann et al. 2019, Algorithm 1, after Monzani et al. 2000).
+A target joint gets the global orientation in which its two axes coincide with the two axes of the source joint with the
+same standard name (Herrmann et al. 2019, Algorithm 1, after Monzani et al. 2000).
 
 The paper rotates twist onto twist, then swing onto swing, for every pose. As both axes are fixed in their joints, this
 is the same as one constant rotation per joint: with the axes of source and target as the columns of orthonormal

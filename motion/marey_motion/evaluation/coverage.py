@@ -194,7 +194,7 @@ def symmetry(speeds: Floats, turn_rates_deg_s: Floats, speed_edges: Floats, turn
     The value is 1 - ½ Σ|h(v, ω) - h(v, -ω)| / Σ h, summed over the cells, where h is the number of windows in the cell
     of speed v and turn rate ω; without data, it is 1.
 
-    The cells are those of the map and, if the grid contains only one side, also their mirror images.
+    The cells are the cells of the map and, if the grid contains only one side, also their mirror images.
 
     Parameters
     ----------

@@ -116,7 +116,7 @@ def receive(take, filters, frames, duration_s, shortest_mean, windows):  # type:
 def finish(take, filters, duration_s, shortest_mean, windows):  # type: ignore[no-untyped-def]
     """Smooth the last frames of a take; write the windows that they complete and return their number.
 
-    The parameters are those of `receive`.
+    The parameters are as in `receive`.
     """
     written = 0
     for frame in range(take.counters[SMOOTHED], take.counters[RECEIVED]):

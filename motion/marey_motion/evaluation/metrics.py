@@ -265,7 +265,7 @@ def _switch_metrics(record: TrialRecord, window: Flags) -> dict[str, float | Non
 def _cost_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]:
     """Compute statistics of the costs that are recorded at the ticks of the window, except the last tick of the record.
 
-    The costs recorded at tick i are those of the row that is displayed at tick i + 1.
+    The costs recorded at tick i belong to the row that is displayed at tick i + 1.
     """
     entered = window & (record.status[1:] == Status.REPLACING)
     series = {

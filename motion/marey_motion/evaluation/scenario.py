@@ -195,7 +195,7 @@ def _pieces(trial: Trial, end_s: float) -> tuple[Floats, Floats, Floats]:
 
 
 def _piece_origins(starts: Floats, speeds: Floats, turn_rates: Floats) -> tuple[Floats, Floats]:
-    """Compute positions (P, 2) and headings (P,) at the starts of the pieces; each starts where the last one ended."""
+    """Compute positions (P, 2) and headings (P,) at the starts of the pieces; each piece continues the previous one."""
     durations = np.diff(starts)
     headings = np.concatenate(([0.0], np.cumsum(turn_rates[:-1] * durations)))
     steps, _ = _arc(speeds[:-1], turn_rates[:-1], headings[:-1], durations)

@@ -1,7 +1,7 @@
 """Directed graph of the frames that characters display and of the jumps between them.
 
-The terms are those of Kovar et al. (2002): clips that lead to each other and back form a strongly connected component;
-a dead end is a component that is entered and never left.
+The terms follow Kovar et al. (2002): clips that lead to each other and back form a strongly connected component; a dead
+end is a component that is entered and never left.
 """
 
 from __future__ import annotations

@@ -223,14 +223,14 @@ def trajectory_arrays(guide: Trajectory) -> TrajectoryArrays:
 
     Raises
     ------
-    MotionError    if an array has fewer than T rows
+    MotionError    if the trajectory has no tick, or if an array has fewer than T rows
     """
     arrays = (guide.positions, guide.headings, guide.speeds_m_s, guide.turn_rates_rad_s)
     positions, headings, speeds, turn_rates = (np.ascontiguousarray(array, dtype=np.float64) for array in arrays)
     if not 1 <= guide.tick_count <= min(map(len, arrays)):
         raise MotionError(
-            f"the trajectory has {guide.tick_count} ticks, but its shortest array has only "
-            f"{min(map(len, arrays))} samples"
+            f"the trajectory has {guide.tick_count} ticks; it needs at least one tick, and at most "
+            f"{min(map(len, arrays))} ticks, the length of its shortest array"
         )
     return TrajectoryArrays(positions, headings, speeds, turn_rates, 1.0 / guide.rate_hz)
 

@@ -86,7 +86,7 @@ def explain_choice(
 ) -> Explanation:
     """List the cheapest candidates at a tick of a trial, and the reason for the choice at that tick.
 
-    At ticks without a search, the candidates are those that a search would have had.
+    At a tick without a search, the candidates are the rows that a search at this tick would have compared.
 
     Parameters
     ----------

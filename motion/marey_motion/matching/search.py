@@ -123,8 +123,8 @@ def _check(rows: NDArray[np.float64], starts: NDArray[np.int64], selectable: NDA
         raise MotionError(f"the first rows of the clips must ascend from 0 to the number of rows, {len(rows)}")
     if not selectable.any():
         raise MotionError(
-            "no row of the database can be selected, because every clip is shorter than the look-ahead that "
-            "a row needs; add longer clips",
+            "no row of the database can be selected: a clip that is shorter than the look-ahead has no selectable "
+            "rows; add longer clips",
             code="nothing-selectable",
         )
     if not (rows.max() <= LARGEST and rows.min() >= -LARGEST):

@@ -49,7 +49,7 @@ METRICS = {
         "left-right difference", "m", 2, "mean difference of the distance between a left turn and the same right turn"
     ),
 }
-"""Metrics in the order of the report; those that a result does not have are left out."""
+"""Metrics in the order of the report; metrics that a result does not have are left out."""
 
 # What the published text leaves open, as printed there and as it is read here.
 _READINGS = (

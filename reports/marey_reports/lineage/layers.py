@@ -1,6 +1,6 @@
 """Positions of the boxes of an acyclic directed graph, in layers from left to right.
 
-The method is that of Sugiyama, Tagawa and Toda (1981). Every box is to the right of all boxes that have arrows to it.
+The method follows Sugiyama, Tagawa and Toda (1981). Every box is to the right of all boxes that have arrows to it.
 An arrow that crosses layers gets a node in each of them. The nodes of a layer are sorted by the mean positions of their
 neighbours.
 """

@@ -30,7 +30,7 @@ class _CommittingJob(OptionsOf):
 
     @cached_property
     def options(self) -> tuple[Any, ...]:
-        """The options of the job, then those of the commit."""
+        """The options of the job, then the options of the commit."""
         return (*self._job.options, *_COMMIT.options)
 
     def read(self, typed: Mapping[str, Any]) -> Chosen:

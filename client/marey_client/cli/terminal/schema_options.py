@@ -40,7 +40,7 @@ Chosen = dict[str, Any]
 """Values of the options given on the command line, by field of the model."""
 
 NONE = "none"
-"""Text that stands for null in options with another default."""
+"""Text that means null in options whose default is not null."""
 
 
 @dataclass(frozen=True)

@@ -202,7 +202,7 @@ class _Search:
         return candidates
 
     def _additions(self, absent: Sources) -> list[str]:
-        """List the absent sources to try, at most `consider`; those that supply most of the missing seconds come first.
+        """List at most `consider` absent sources to try; sources that supply most of the missing seconds come first.
 
         A cell lacks data if the present sources have less than `_least` seconds in it. Sources whose addition would
         exceed `max_data_s` are left out.

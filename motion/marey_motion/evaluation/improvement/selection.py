@@ -58,7 +58,7 @@ def require_sources(known: Collection[str], wanted: Collection[str]) -> None:
 
     Raises
     ------
-    MotionError    if a wanted source is not known; the error names the first such source
+    MotionError    if a wanted source is not known; the error names the first unknown source
     """
     unknown = sorted(set(wanted) - set(known))
     if unknown:

@@ -59,7 +59,7 @@ def draw_time_warps(aligned: AlignedSet) -> Sketch:
 
 
 def _most_unlike(aligned: AlignedSet, reference: int) -> list[int]:
-    """Find the clips whose time functions, scaled to the same duration, differ most from that of the reference."""
+    """Find the clips whose time functions, scaled to the same duration, differ most from the reference's function."""
     paths = aligned.time_functions / aligned.time_functions[:, -1:]
     apart = np.abs(paths - paths[reference]).max(axis=1)
     order = sorted(range(len(paths)), key=lambda place: (-apart[place], aligned.clips[place].uid))
