@@ -40,7 +40,7 @@ MAX_LOGIN_BYTES = 4 * KIB
 
 
 def read_me(tx: Transaction) -> Me:
-    """Return the caller, with the scopes of the credential."""
+    """Return the caller, who is a user or a job, with the scopes of the credential."""
     principal = tx.principal
     if principal.kind == "attempt" or principal.user_name is None:
         return Me(user=None, scopes=principal.scopes, job=principal.job_id)
@@ -50,14 +50,20 @@ def read_me(tx: Transaction) -> Me:
 
 
 def sign_in(tx: Transaction, attempt: SignInTry, verified_hash: str, expires_in_s: int) -> NewToken:
-    """Return a session for a user whose password matched `verified_hash`. Raises `UnauthenticatedProblem`."""
+    """Create a session for a user whose password matched `verified_hash`, and return its token.
+
+    Raises `UnauthenticatedProblem` if the user was disabled or has another password now.
+    """
     tx.principal = users.authenticated(tx, attempt.name, verified_hash)
     sign_ins.forgive(tx, attempt)
     return tokens.create_session(tx, expires_in_s)
 
 
 def count_try(tx: Transaction, attempt: SignInTry) -> str | None:
-    """Count a try to sign in; return the hash that the password must match, or None if the user does not exist."""
+    """Count a try to sign in; return the hash that the password must match.
+
+    Return None if no active user with a password has this name. Raises `TooManyRequestsProblem`.
+    """
     sign_ins.count(tx, attempt)
     return users.stored_hash(tx, attempt.name)
 
@@ -84,10 +90,10 @@ class PasswordResource(Resource):
     """Base class of resources that check passwords."""
 
     async def check_password(self, name: str, password: str) -> tuple[SignInTry, str | None]:
-        """Count a try to sign in and check its password; return the stored hash if the password matches, or else None.
+        """Count a try to sign in and check its password.
 
-        The check takes the same time for a user who does not exist. Raises `TooManyRequestsProblem` or
-        `UnavailableProblem`.
+        Return the try, and the stored hash if the password matches, otherwise None. The check takes the same time for a
+        user who does not exist. Raises `TooManyRequestsProblem` or `UnavailableProblem`.
         """
         services = self.services
         address = limited_address(self.client_address)
@@ -105,7 +111,7 @@ class PasswordResource(Resource):
         return attempt, stored if matches else None
 
     async def hash_password(self, password: str) -> str:
-        """Return the hash of a new password, for a caller who may set one."""
+        """Return the hash of a new password; call this only for a caller who may set the password."""
         lane = self.services.password_lane
         with lane.place(limited_address(self.client_address)):
             return await lane.run(passwords.hash_password, password)
@@ -261,7 +267,10 @@ class UserResource(PasswordResource):
 
     @writes(access=Access.USER, body=UserChange, answer=User, precondition="required", etag=True)
     async def patch(self, user: str, body: UserChange) -> Rendered:
-        """Change a user: administrators may change all fields, users their own display name and password."""
+        """Change a user.
+
+        Users may change their own display name and password; administrators may change all fields of all users.
+        """
         password_hash = verified_hash = None
         if body.password is not None:
             await self.look_up(users.find_user, user)
@@ -302,7 +311,10 @@ class UserQuotas(Resource):
 
     @reads(access=Access.USER, answer=QuotasInUse)
     async def get(self, user: str) -> Rendered:
-        """Return a user's numbers of items and bytes, with the limits. Only administrators may read those of others."""
+        """Return the numbers of items and bytes of a user, with the limits.
+
+        Only administrators may read the quotas of other users.
+        """
         return await self.answer(users.read_quotas, user)
 
     @writes(access=Access.ADMINISTRATOR, scope="admin", body=QuotaChange, answer=QuotasInUse)

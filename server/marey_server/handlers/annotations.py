@@ -14,7 +14,7 @@ from marey_server.motions.annotating import apply_commands, prepare_annotation
 from marey_server.store import items
 
 MOST_TRIES = 5
-"""Attempts to apply commands sent with `If-Match: *` when other requests change the annotation at the same time."""
+"""Greatest number of attempts to apply commands sent with `If-Match: *` while other requests change the annotation."""
 
 
 class AnnotationCommands(Resource):
@@ -34,8 +34,8 @@ class AnnotationCommands(Resource):
     async def post(self, project: str, kind: str, item: str, body: AnnotationChange) -> Rendered:
         """Apply commands to an annotation (kind `annotations`); together they create one new revision.
 
-        Each command is applied to the result of the previous one. If a command cannot be applied, none is, and the
-        answer is 422 with a pointer to this command.
+        Each command is applied to the result of the previous one. If a command cannot be applied, the annotation does
+        not change, and the answer is 422 with a pointer to this command.
         """
         if kind_of(kind) is not Kind.ANNOTATION:
             raise NotFoundProblem(

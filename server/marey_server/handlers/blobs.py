@@ -19,7 +19,7 @@ MAX_BLOB_BYTES = 1024 * MIB
 
 
 def require_digest(text: str) -> str:
-    """Return the text if it is a digest. Raises `NotFoundProblem`."""
+    """Return the text if it is a digest; otherwise raise `NotFoundProblem`."""
     if not is_digest(text):
         raise NotFoundProblem(
             "This is not the digest of a blob; a digest is sha256: followed by 64 hexadecimal digits.", code="no-blob"
@@ -50,7 +50,7 @@ class Blob(BlobSender):
     async def put(self, digest: str) -> Rendered:
         """Store bytes under their digest.
 
-        Others can read them once a document refers to them; bytes without a reference are deleted after a day.
+        Other users can read them once a document refers to them; bytes without a reference are deleted after a day.
         """
         with await self.receiver.finish() as spool:
             if spool.digest == digest:
@@ -72,14 +72,14 @@ class Blob(BlobSender):
 
 
 class MissingBlobs(Resource):
-    """Blobs that the server does not have."""
+    """Blobs that the caller must send before documents can refer to them."""
 
     path = "/blobs/missing"
     tag = "Blobs"
 
     @writes(access=Access.SIGNED_IN, scope="read", body=BlobsQuery, answer=BlobsMissing)
     async def post(self, body: BlobsQuery) -> Reply:
-        """Return those of the given digests whose bytes the caller must send before referring to them."""
+        """Return the digests, among the given ones, of blobs that must be sent before documents can refer to them."""
         missing = await self.look_up(blobs.missing, body.digests)
         return Reply(BlobsMissing(missing=tuple(missing)))
 

@@ -15,7 +15,7 @@ from marey_server.store import collections
 class CollectionsQuery(PageQuery):
     """Query parameters of a list of folders."""
 
-    path: str = Field("", max_length=1024, description="Folder whose subtree is listed, itself included.")
+    path: str = Field("", max_length=1024, description="Folder to list, with all folders below it; empty: all folders.")
     deleted: bool = Field(False, description="List deleted folders instead of existing ones.")
 
 
@@ -46,7 +46,7 @@ class ProjectCollections(Resource):
         idempotency="key",
     )
     async def post(self, project: str, body: CollectionCreate) -> Rendered:
-        """Create a folder, with its parents if they are missing."""
+        """Create a folder, and its parent folders if they are missing."""
         return await self.answer_with(
             lambda made: Reply(made, rev=made.rev, location=f"/projects/{project}/collections/{made.id}"),
             collections.create_collection,

@@ -1,6 +1,7 @@
 """Resources that measure coverage during a recording: they receive frames and return motions to record next.
 
-A stream is stored in a row, which is updated before each answer, so that nothing is lost if the server dies.
+A stream is stored in a row of the database, which is updated before each answer. So no acknowledged frame is lost if
+the server crashes.
 """
 
 from __future__ import annotations
@@ -49,9 +50,10 @@ class ProjectCoverageStreams(Resource):
         idempotency="key",
     )
     async def post(self, project: str, body: CoverageStreamCreate) -> Rendered:
-        """Start to measure the coverage of a recording; the coverage is empty at first, or that of an evaluation.
+        """Create a stream, which measures the coverage of a recording.
 
-        A stream that receives no frames for a day is deleted; the number of streams of a project is limited.
+        The coverage is empty at first, or starts with the coverage of an evaluation. A stream that receives no frames
+        for a day is deleted; the number of streams of a project is limited.
         """
         given = await self.look_up(coverage.read_given, project, body)
         order = partial(coverage.begin_order, body, given)
@@ -99,8 +101,8 @@ class CoverageStreamFrames(Resource):
         """Send the next frames of a stream; the answer lists the speeds and turn rates that are still missing.
 
         Frames are poses of the stream's skeleton, or root positions. If the last frames are sent again at the same
-        offset, the answer is repeated. If the offset is not that of the stream, the answer is 409 with the current
-        offset in the context.
+        offset, the answer is repeated. If the offset is not the number of frames of the stream, the answer is 409 with
+        this number in `context.offset`.
         """
         held = await self.look_up(coverage_streams.read_to_advance, project, stream)
         given = await self.compute(coverage.next_frames, held, body)

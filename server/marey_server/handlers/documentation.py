@@ -32,7 +32,7 @@ class ApiRoot(Resource):
 
     @reads(access=Access.ANYONE, scope=None, answer=Service, also=((303, None),))
     async def get(self) -> Reply:
-        """Return the version of this server and the addresses of its documentation; browsers are redirected."""
+        """Return the version of this server and the addresses of its documentation; redirect browsers to `/docs`."""
         if "text/html" in self.request.headers.get("Accept", ""):
             return Reply(status=303, location="/docs")
         return Reply(Service(version=version("marey")))

@@ -51,7 +51,8 @@ class ExportQuery(Request):
     )
     layout: Literal["2", "3"] | None = Field(
         None,
-        description="For models in the predecessor's format: version of the layout; absent: the imported one, else 3.",
+        description="For models in the predecessor's format: version of the layout; absent: the layout of the file "
+        "from which an unchanged model was imported; otherwise 3.",
     )
     time: ExportTime = Field(
         "canonical",

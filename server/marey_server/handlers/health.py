@@ -26,7 +26,7 @@ class Healthz(Resource):
 
     @reads(access=Access.ANYONE, scope=None, answer=Health)
     async def get(self) -> Reply:
-        """Answer with success if the process can answer at all."""
+        """Return the status `ok`, which shows that the process answers requests."""
         return Reply(Health(status="ok"), headers={"Cache-Control": "no-store"})
 
 

@@ -120,9 +120,9 @@ class ProjectImports(Resource):
     async def post(self, project: str) -> Reply:
         """Import motion files; the answer has one entry for each file, and a faulty file does not affect others.
 
-        Send files as multipart/form-data, with the options as form fields, or name files by digest. A file whose
-        content the project has already changes nothing. Many files, or many bytes, are imported by a job (202), whose
-        result has the form of the answer.
+        Send files as multipart/form-data, with the options as form fields, or name files by digest. If the project
+        already has the content of a file, importing the file changes nothing. Many files, or many bytes, are imported
+        by a job (202), whose result has the same fields as this answer.
         """
         if self.parts is not None:
             self.parts.finish()
@@ -132,7 +132,7 @@ class ProjectImports(Resource):
             options = ImportOptions.model_validate(request.model_dump(exclude={"files"}, exclude_unset=True))
             self.files = await self.look_up(_stored_files, request)
         if not self.files:
-            raise BadRequestProblem("The request contains no files.", code="no-files")
+            raise BadRequestProblem("The request contains no files; send at least one.", code="no-files")
         if self._is_large(self.files):
             return await self._submit(project, options)
         async with self.using_children():
@@ -229,7 +229,7 @@ class ProjectImports(Resource):
 
 
 async def _give_up(tasks: Iterable[asyncio.Task[Any]]) -> None:
-    """Cancel tasks that have not ended, and wait for all."""
+    """Cancel tasks that have not ended, and wait until all tasks have ended."""
     left = list(tasks)
     for task in left:
         task.cancel()
@@ -245,7 +245,7 @@ def _keep(tx: Transaction, project: str, spool: blobs.Spool) -> None:
 
 
 def _form_options(form: dict[str, bytearray]) -> ImportOptions:
-    """Return the options in form fields. Raises `InvalidProblem`, which names the field."""
+    """Return the options in form fields. Raises `InvalidProblem`, which names the first invalid field."""
     try:
         values: dict[str, Any] = {name: value.decode() for name, value in form.items()}
     except UnicodeDecodeError:
@@ -260,7 +260,7 @@ def _form_options(form: dict[str, bytearray]) -> ImportOptions:
 
 
 def _stored_files(tx: Transaction, request: ImportRequest) -> list[SourceFile]:
-    """Return files named by digest. Raises `NotFoundProblem` if the caller may not read one."""
+    """Return the files that the request names by digest. Raises `NotFoundProblem` if the caller may not read a file."""
     sizes = blobs.sizes_of_readable(tx, [file.blob for file in request.files])
     return [SourceFile(file.name, file.blob, sizes[file.blob], None) for file in request.files]
 

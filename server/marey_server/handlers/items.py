@@ -52,7 +52,11 @@ class ItemsQuery(CountedPageQuery):
         description="Query, such as `subject = 02 and frames > 120 and not warning = foot-slide`.",
     )
     deleted: bool = Field(False, description="Return deleted items instead of existing ones.")
-    sort: str = Field("-created_at", max_length=100, description="Sort keys: id, name, created_at, updated_at, frames.")
+    sort: str = Field(
+        "-created_at",
+        max_length=100,
+        description="Sort keys: id, name, created_at, updated_at, frames; a leading - sorts in descending order.",
+    )
     fields: CommaSeparated | None = Field(None, description="Members of each item to return; absent: all.")
 
     def filters(self) -> ItemFilters:
@@ -78,7 +82,9 @@ def kind_of(plural: str) -> Kind:
     try:
         return Kind.from_plural(plural)
     except KeyError:
-        raise NotFoundProblem(f"There is no kind of item called {plural!r}.", code="no-kind") from None
+        raise NotFoundProblem(
+            f"There is no kind of item called {plural!r}; use a plural such as clips.", code="no-kind"
+        ) from None
 
 
 class ItemsOfKind(Resource):
@@ -166,7 +172,7 @@ class ItemReversion(Resource):
 
     @writes(access=Access.CONTRIBUTOR, body=ItemRevert, answer=Item, precondition="required", etag=True)
     async def post(self, project: str, kind: str, item: str, body: ItemRevert) -> Rendered:
-        """Create a revision with the content of an earlier one; name, folder and tags stay."""
+        """Create a revision with the content of an earlier revision; name, folder and tags do not change."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(items.revert_item, project, kind_of(kind), item, body, expected_rev=expected_rev)
 
@@ -200,7 +206,9 @@ class RevisionResource(Resource):
 class LineageQuery(Request):
     """Query parameters of a lineage: the revision from which it starts."""
 
-    revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision to return; absent: the newest.")
+    revision: int | None = Field(
+        None, ge=1, le=MAX_INTEGER, description="Revision whose lineage is returned; absent: the newest."
+    )
 
 
 class LineageResource(Resource):
@@ -223,7 +231,7 @@ class LineageGraphResource(Resource):
 
     @reads(access=Access.READER, query=LineageRequest, answer=LineageGraph)
     async def get(self, project: str, kind: str, item: str, query: LineageRequest) -> Rendered:
-        """Return the revisions that a revision was made from, those made from it, and the jobs between them."""
+        """Return the revisions from which a revision was made, the revisions made from it, and the jobs in between."""
         return await self.answer(items.read_lineage_graph, project, kind_of(kind), item, query)
 
 

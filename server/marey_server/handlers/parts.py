@@ -40,7 +40,7 @@ class PartQuery(Request):
 
 
 class PartChange(Request):
-    """Query parameters for replacing a part: the message of the new revision."""
+    """Query parameter for replacing a part: the message of the new revision."""
 
     message: Message = Field("", description="Message shown in the history.")
 
@@ -48,9 +48,10 @@ class PartChange(Request):
 def read_part(
     tx: Transaction, project: str, kind: Kind, item: str, part: str, query: PartQuery, *, encoded: bool
 ) -> Reply:
-    """Read a part of an item, whole or only some frames or joints; with `encoded`, the arrays of these stay encoded.
+    """Return a part of an item, or only some of its frames and joints.
 
-    If the query gives a revision, clients may keep the answer, because a part of a revision never changes.
+    With `encoded`, the arrays of some frames or joints are returned encoded, as they are stored. If the query gives a
+    revision, clients may keep the answer, because a part of a revision never changes.
     """
     found = items.find_part(tx, project, kind, item, part, revision=query.revision)
     load = partial(items.load_part, tx, found)

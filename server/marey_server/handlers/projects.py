@@ -30,7 +30,7 @@ class Projects(Resource):
 
     @reads(access=Access.ANYONE, query=ProjectsQuery, answer=Project, paged=True)
     async def get(self, query: ProjectsQuery) -> Rendered:
-        """List your projects and public ones."""
+        """List the projects that you may read: your projects and public projects."""
         return await self.answer(projects.list_projects, sort=query.sort, cursor=query.cursor, limit=query.limit)
 
     @writes(
@@ -138,7 +138,7 @@ class MemberResource(Resource):
 
     @writes(access=Access.OWNER, precondition="required")
     async def delete(self, project: str, user: str) -> Rendered:
-        """Remove a member; a project keeps at least one owner."""
+        """Remove a member; the last owner of a project cannot be removed."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(members.remove_member, project, user, expected_rev=expected_rev)
 

@@ -1,4 +1,4 @@
-"""Resources of the reports of evaluations and models and of their figures, which are stored with the item."""
+"""Resources of the reports of evaluations and models, and of the figures in these reports."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ class FigureQuery(ReportQuery):
         None, max_length=100, description="Name of the trial; only for figures of a single trial."
     )
     table: str | None = Field(
-        None, max_length=100, description="Table of the figure to return as CSV; absent: the first."
+        None, max_length=100, description="Table of the figure to return as CSV; absent: the first table."
     )
 
 
 class StoredFileSender(BlobSender):
-    """Base of resources that answer with a file named by a document."""
+    """Base of resources that answer with a file to which a document refers."""
 
     async def send_file(self, file: StoredFile, query: ReportQuery, media_type: str, sandbox: str) -> Rendered | None:
         """Answer with the file, which a browser displays under a content security policy that contains `sandbox`."""
@@ -118,7 +118,7 @@ def _scripts(report: ReportDocument) -> str:
 
 
 def read_report(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ReportDocument:
-    """Return the report of an item of any kind that has one. Raises `NotFoundProblem`."""
+    """Return the report of an item, such as an evaluation or a model. Raises `NotFoundProblem` if it has no report."""
     part: dict[str, Any] = items.read_part(tx, project, kind, item_id, "report", revision=revision, arrays="none").tree
     return _REPORT_OF[part["schema"]].model_validate(part)
 
@@ -141,7 +141,7 @@ def find_figure(report: ReportDocument, name: str, trial: str | None) -> StoredF
 
 
 def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:
-    """Return the requested form of a figure. Raises `NotFoundProblem`."""
+    """Return the requested form of a figure. Raises `NotFoundProblem` if the figure does not have the table."""
     if query.format != "csv":
         return {"png": figure.png, "svg": figure.svg, "json": figure.json_}[query.format]
     table = query.table or next(iter(figure.csv), None)
@@ -170,8 +170,8 @@ class EvaluationWalkGraph(Resource):
     async def get(self, project: str, kind: str, item: str, query: WalkGraphQuery) -> Reply:
         """Return the frames displayed by the trials of an evaluation (kind `evaluations`) and the jumps between them.
 
-        Nodes are frames of clips, with the number of ticks for which each was displayed. Edges are jumps, with the
-        number of times that each was taken. Walks list the edges of each trial in order.
+        Nodes are frames of clips, with the number of ticks (time steps) for which each was displayed. Edges are jumps,
+        with the number of times that each occurred. Walks list the edges of each trial in order.
         """
         source = await self.look_up(walk_graphs.read_walks, project, kind_of(kind), item, query.revision)
         order = partial(walk_graphs.walk_order, source, query.trial, query.format)

@@ -103,7 +103,7 @@ class SampleFiles(ModelUser):
 
 
 def _state(found: FoundModel, query: SampleQuery) -> str:
-    """Return the entity tag of samples, from content and revision of the model, number and seed."""
+    """Return the entity tag of samples: digest and revision of the model, number of samples, and seed."""
     return f"{found.part.digest.removeprefix('sha256:')[:32]}.{found.part.revision}.{query.n}.{query.seed}"
 
 

@@ -1,7 +1,7 @@
 """Resumable uploads: creation, receipt of pieces, state, and storage as blobs.
 
-Long bodies of other requests are stored in the same way, because one transaction for all their bytes would delay the
-writes of others.
+Long bodies of other requests are also stored piece by piece, because one transaction for all bytes of a body would
+delay the writes of other requests.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from marey_server.store import blobs, uploads
 PIECE_BYTES = MIB
 """Number of bytes written at a time; an interrupted request loses at most this number."""
 LONGEST_PAUSE_S = 0.2
-"""Longest time that a piece waits until the database has caught up, so that uploads do not delay other writes."""
+"""Longest time that a piece waits for earlier writes of the database, so that uploads do not delay other writes."""
 PAUSE_STEP_S = 0.01
 LONG_BODY_BYTES = 4 * MIB
-"""Size of a body above which it is stored in pieces, in a transaction each, before it becomes a blob."""
+"""Size above which a body is stored in pieces before it becomes a blob, each piece in its own transaction."""
 CHUNKS_PER_WRITE = 4
 """Number of chunks of a long body that are stored in one transaction."""
 
@@ -104,18 +104,18 @@ class UploadResource(Resource):
     tag = "Blobs"
 
     async def begin(self, upload: str) -> None:
-        """Check the offset of the piece before it is received."""
+        """Check the header Upload-Offset before the bytes of the piece are received."""
         text = self.request.headers.get("Upload-Offset", "")
         if not text.isascii() or not text.isdigit() or len(text) > 12:
             raise BadRequestProblem(
-                "The header Upload-Offset is missing; it must be the offset of this piece in the file, in bytes.",
+                "The header Upload-Offset must be the offset of this piece in the file, in bytes.",
                 code="bad-offset",
             )
         self.upload_id, self.offset, self.piece = upload, int(text), bytearray()
         await self._append()
 
     async def receive(self, chunk: bytes) -> None:
-        """Store the next bytes; complete parts of a piece are kept even if the connection breaks."""
+        """Receive the next bytes; pieces of `PIECE_BYTES` are stored, and kept if the connection breaks."""
         self.piece += chunk
         if len(self.piece) >= PIECE_BYTES:
             await self._append()
@@ -146,9 +146,9 @@ class UploadResource(Resource):
         attempts=True,
     )
     async def patch(self, upload: str) -> Reply:
-        """Send the next piece. With the last one the upload becomes a blob, whose digest is returned.
+        """Send the next piece. After the last piece, the upload becomes a blob, whose digest is returned.
 
-        For a wrong offset, the answer is 409 with the current one in the header Upload-Offset and in the context.
+        If the offset is wrong, the answer is 409 with the right offset in the header Upload-Offset and in the context.
         """
         if self.piece:
             await self._append()

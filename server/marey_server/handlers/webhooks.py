@@ -83,7 +83,10 @@ class WebhookSecret(Resource):
 
     @writes(access=Access.OWNER, body=WebhookRotation, answer=NewWebhook)
     async def post(self, project: str, webhook: str, body: WebhookRotation) -> Rendered:
-        """Replace the secret; the new one is shown only once. For a time, deliveries are signed with both."""
+        """Replace the secret of a webhook; the new secret is shown only once.
+
+        For `grace_s` seconds, deliveries are signed with both secrets.
+        """
         return await self.answer_with(
             lambda made: Reply(made, headers=PRIVATE), managing.rotate_secret, project, webhook, body
         )
@@ -140,7 +143,7 @@ class WebhookRedelivery(Resource):
 
     @writes(access=Access.OWNER, answer=WebhookDelivery, status=202)
     async def post(self, project: str, webhook: str, delivery: str) -> Rendered:
-        """Request that a delivery which was given up or delivered is sent once more."""
+        """Send a delivery again that has succeeded, or for which the server has given up."""
         return await self.answer(deliveries.redeliver, project, webhook, delivery)
 
 

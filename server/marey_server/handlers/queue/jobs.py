@@ -77,7 +77,11 @@ class JobsQuery(CountedPageQuery):
         None, max_length=64, description="Return the tasks of this job; absent: jobs that are not tasks."
     )
     author: str | None = Field(None, max_length=64, description="Return jobs that the user with this name submitted.")
-    sort: str = Field("-created_at", max_length=100, description="Sort keys: id, created_at, priority.")
+    sort: str = Field(
+        "-created_at",
+        max_length=100,
+        description="Sort keys: id, created_at, priority; a leading - sorts in descending order.",
+    )
 
     def filters(self) -> JobFilters:
         """Return the filters for the store."""
@@ -146,7 +150,7 @@ class ProjectJobBatch(Resource):
         idempotency="key",
     )
     async def post(self, project: str, body: JobBatch) -> Rendered:
-        """Submit many jobs, all or none."""
+        """Submit many jobs; if one of them is not valid, no job is submitted."""
         return await self.answer_with(
             lambda made: Reply(JobList(jobs=tuple(made))), submission.submit, project, body.jobs
         )
@@ -174,7 +178,10 @@ def wait_preferred(resource: Resource) -> float:
 
 
 async def wait_for_end(resource: Resource, job_id: str, wait_s: float) -> Job:
-    """Return the job when it has ended, the time is over, the client has disconnected, or the server is stopping."""
+    """Wait until a job has ended, and return it.
+
+    The wait also ends after `wait_s` seconds, if the client has disconnected, or if the server is stopping.
+    """
     loop = asyncio.get_running_loop()
     deadline = loop.time() + wait_s
     with wakeups.listen([job_topic(job_id)]) as listener:

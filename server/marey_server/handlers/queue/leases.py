@@ -44,7 +44,7 @@ class Leases(Resource):
 
     @writes(access=Access.WORKER, scope="work", body=ClaimRequest, answer=LeaseList, reserved=True)
     async def post(self, body: ClaimRequest) -> Reply:
-        """Claim jobs; with `wait_s`, wait until there are some. A lease that is not renewed expires."""
+        """Claim jobs; wait up to `wait_s` seconds until there are jobs. A lease that is not renewed expires."""
         loop = asyncio.get_running_loop()
         deadline = loop.time() + body.wait_s
         with wakeups.listen([work_topic(kind) for kind in body.kinds]) as listener:
@@ -115,14 +115,15 @@ class AttemptLog(Resource):
         headers=("Upload-Offset",),
     )
     async def post(self, job: str, fence: int, body: bytes | None) -> Rendered:
-        """Append to the attempt's log at the offset `Upload-Offset`.
+        """Append to the attempt's log at the offset in the header `Upload-Offset`.
 
-        If this is not the end of the log, the answer is 409 with the right offset.
+        If this is not the end of the log, the answer is 409 with the right offset in `context.offset`.
         """
         text = self.request.headers.get("Upload-Offset", "")
         if not (text.isascii() and text.isdigit() and len(text) <= 15):
             raise BadRequestProblem(
-                "Upload-Offset must be the number of bytes that the stored log already has.", code="bad-upload-offset"
+                "The header Upload-Offset must be the number of bytes that the stored log already has.",
+                code="bad-upload-offset",
             )
         policy = self.services.queue_policy
         return await self.answer(logs.append_log, job, fence, int(text), body or b"", policy)

@@ -25,7 +25,7 @@ class ProjectPipelines(Resource):
         idempotency="key",
     )
     async def post(self, project: str, body: PipelineCreate) -> Rendered:
-        """Submit several jobs, all or none; jobs can read the outputs of others.
+        """Submit several jobs, some of which read outputs of others; if one job is not valid, no job is submitted.
 
         An input `{"step": name}` means all outputs of that step that have the input's kind, at the revisions that
         the step creates. Cached results are used: if a pipeline is submitted again, only the jobs that a change affects

@@ -15,7 +15,7 @@ MAX_RECEIVED_BYTES = 64 * MIB
 
 
 class ProjectContents(Resource):
-    """Revisions and documents in the form that is the same on every server."""
+    """Revisions and documents in a form that is the same on every server."""
 
     path = "/projects/{project}/contents"
     tag = "ProjectDatasets"
@@ -26,8 +26,9 @@ class ProjectContents(Resource):
 
         The answer is `{"revisions": [...], "documents": [...]}` in the order of the request. A revision has its `kind`
         and the content digests of its `parts`. In documents, references to revisions are replaced by `{"content":
-        digest}`, so that a document has the same digest on every server. What the project does not have is null. If the
-        documents together are too large, the last ones are missing from the list: request them again.
+        digest}`, so that a document has the same digest on every server. A revision or document that the project does
+        not have is null. If the documents together are too large, the last ones are missing from the list: request them
+        again.
         """
         found = await self.look_up(datasets.load_contents, project, body)
         return await self.render_document(Reply(found))
@@ -48,9 +49,9 @@ class ReceivedContents(Resource):
         """Store revisions from an archive or another server, so that received commits can refer to them.
 
         A revision must come after the revisions that it refers to; a reference gives the content digest of a revision.
-        The revision of an entry gets an item that is deleted at once; a checkout of a version with the entry restores
-        the item. Other revisions get items in the folder `imported`. Because quotas do not count deleted items, only
-        maintainers may do this.
+        The server creates an item for each revision. The item of a revision that an entry has is deleted at once; a
+        checkout of a version with the entry restores it. The other items are created in the folder `imported`. Because
+        quotas do not count deleted items, only maintainers may send this request.
         """
         local = await self.look_up(datasets.find_local, project, body.revisions)
         drafts = await self.compute(datasets.prepare_revisions, body.revisions, local)

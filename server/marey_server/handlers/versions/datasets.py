@@ -57,7 +57,7 @@ class DatasetResource(Resource):
 
     @writes(access=Access.MAINTAINER, precondition="required")
     async def delete(self, project: str, dataset: str) -> Rendered:
-        """Delete a dataset; its items stay."""
+        """Delete a dataset; its items are not deleted."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(datasets.delete_dataset, project, dataset, expected_rev=expected_rev)
 
@@ -92,13 +92,13 @@ class DatasetRef(Resource):
 
     @writes(access=Access.MAINTAINER, body=RefMove, answer=Ref, etag=True, precondition="required")
     async def patch(self, project: str, dataset: str, ref: str, body: RefMove) -> Rendered:
-        """Move a branch to any version of the dataset; the commits that it had stay."""
+        """Move a branch to any version of the dataset; no commit is deleted."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(datasets.move_branch, project, dataset, ref, body, expected_rev=expected_rev)
 
     @writes(access=Access.MAINTAINER, precondition="required")
     async def delete(self, project: str, dataset: str, ref: str) -> Rendered:
-        """Delete a branch or a tag; the commits stay."""
+        """Delete a branch or a tag; no commit is deleted."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(datasets.delete_ref, project, dataset, ref, expected_rev=expected_rev)
 
@@ -141,7 +141,7 @@ class DatasetCommits(Resource):
 
     @reads(access=Access.READER, query=CommitsQuery, answer=ListedCommit, paged=True)
     async def get(self, project: str, dataset: str, query: CommitsQuery) -> Rendered:
-        """List a version and the versions before it, newest first; of a merge, only the first parent is followed."""
+        """List a version and the versions before it, newest first; only the first parent of a merge is followed."""
         return await self.answer(
             datasets.list_commits,
             project,
@@ -221,7 +221,7 @@ class DatasetReverts(Resource):
         idempotency="key",
     )
     async def post(self, project: str, dataset: str, body: PickRequest) -> Rendered:
-        """Undo the changes of one commit on a branch, or preview the result. Later changes stay.
+        """Undo the changes of one commit on a branch, but not later changes, or preview the result.
 
         Conflicts without a resolution are answered with 409 and listed in `context`; then nothing changes.
         """
@@ -240,7 +240,7 @@ class FolderCheckout(Resource):
         """Bring the folder of the dataset to the state of a version: items are added, changed, moved and removed.
 
         If the folder has changes that no commit has recorded, the request is refused with 409, unless it asks to
-        discard them. Removed items can be restored, and earlier revisions stay.
+        discard them. Removed items can be restored, and earlier revisions of items remain.
         """
         return await self.answer(datasets.check_out, project, dataset, body)
 

@@ -31,7 +31,7 @@ from marey_server.store.datasets import proposals
 from marey_server.store.datasets.committing import BRANCH_MOVED
 
 TRIES = 3
-"""Number of times that a merge is prepared if branches move meanwhile."""
+"""Greatest number of times that a merge is prepared, if branches move in the meantime."""
 
 
 class ProposalsQuery(PageQuery):
@@ -176,9 +176,8 @@ class ProposalMerges(Resource):
     async def post(self, project: str, dataset: str, proposal: int, body: ProposalMerge) -> Rendered:
         """Merge a proposal into its target.
 
-        If something is missing, the request is refused with 409, and `context.missing` lists what is missing. With
-        `when_green`, it is accepted, and the proposal is merged as soon as a review or a check adds the last missing
-        thing.
+        If requirements are not met, the request is refused with 409, and `context.missing` lists these requirements.
+        With `when_green`, the request is accepted, and the proposal is merged as soon as all requirements are met.
         """
         prepared = await self.look_up(proposals.prepare_acceptance, project, dataset, proposal, body)
         return await self.answer(proposals.merge_proposal, project, dataset, proposal, body, prepared)
