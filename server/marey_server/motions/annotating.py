@@ -17,16 +17,17 @@ from marey_server.store.items.annotating import AnnotatedClip, ChangedAnnotation
 from marey_server.store.revs import ExpectedRev, is_expected, moved_on
 
 MOST_WORK = 30_000_000
-"""Greatest product of the numbers of commands and of segments and keyframes; its computation takes some seconds."""
+"""Greatest sum, over the commands of a request, of the numbers of segments and keyframes; it takes some seconds."""
 
 
 def apply_commands(
     found: FoundAnnotation, change: AnnotationChange, *, expected_rev: ExpectedRev = None
 ) -> ChangedAnnotation:
-    """Apply commands to an annotation in order, all or none. Needs no database.
+    """Apply commands to an annotation in order; return the changed annotation, or the error of the first that fails.
 
-    An error is returned, not raised. `put_changed` raises it later, inside the transaction that stores the answer under
-    the idempotency key. So a repeated request gets the same error, even if the annotation has changed since.
+    If a command fails, no command is applied. The function needs no database. An error is returned, not raised.
+    `put_changed` raises it later, inside the transaction that stores the answer under the idempotency key. So a
+    repeated request gets the same error, even if the annotation has changed since.
     """
     if not is_expected(found.rev, expected_rev):
         return ChangedAnnotation(found.rev, moved_on(found.rev))
@@ -57,7 +58,7 @@ def _changed(found: FoundAnnotation, change: AnnotationChange) -> PreparedDocume
             layer = COMMANDS[command.command](layer, **command_arguments(command))
         except MotionError as error:
             wrong = FieldError(pointer=f"/commands/{index}", code=error.code, detail=str(error))
-            detail = f"Command {index} ({command.command}) cannot be carried out, so none was: {error}"
+            detail = f"Command {index} ({command.command}) cannot be carried out, so no command was: {error}"
             raise InvalidProblem(detail, code="command-refused", errors=[wrong]) from error
     changed = documents.layer_to_document(layer, annotation.clip, annotation.layer, annotation.made_by)
     return prepare_part(Kind.ANNOTATION, "annotation", changed.model_dump(mode="json", by_alias=True))

@@ -5,8 +5,8 @@ It carries out one order after another, each within limits of memory and time. A
 Messages between server and child are MessagePack that the receiver validates; nothing is pickled.
 
 Arguments: the pipe's file descriptor, the memory in bytes that orders may use, `FORK_SERVER` or `SINGLE`, and functions
-to call first, which load modules. The parent kills a child if an order takes too long, or if the client that waits for
-its result has closed the connection.
+to call at the start, which load modules. The parent kills a child if an order takes too long, or if the client that
+waits for its result has closed the connection.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from marey_schemas.processes.memory import keep_freed_memory
 from marey_server.errors import ApiProblem, TooLargeProblem
 
 FORK_SERVER, SINGLE = "fork-server", "single"
-"""Values of the third argument: fork children that carry out orders, or carry out orders."""
+"""Values of the third argument: fork children, which carry out the orders, or carry out the orders in this process."""
 
 
 class Message(BaseModel):
@@ -52,7 +52,7 @@ class Message(BaseModel):
             return cls.model_validate(fields)
         except (ValueError, TypeError, RecursionError, msgpack.UnpackException, ValidationError) as error:
             raise BadMessage(
-                f"a child process sent {len(data)} bytes that cannot be read as a {cls.__name__}: {error}"
+                f"{len(data)} bytes from another process cannot be read as a {cls.__name__}: {error}"
             ) from error
 
 
@@ -81,17 +81,19 @@ def pack_tree(tree: Any) -> bytes:
 
 
 def unpack_tree(packed: bytes) -> Any:
-    """Decode a document that was packed by `pack_tree`, with its arrays. Raises `TooLargeProblem`."""
+    """Decode a document, with its arrays, that `pack_tree` has encoded. Raises `TooLargeProblem` if it is too large."""
     try:
         return decode_tree(packed, MSGPACK)
     except CodecError as error:
-        raise TooLargeProblem(f"A document is too large to be answered at once: {error}; submit a job.") from error
+        raise TooLargeProblem(
+            f"A document is too large for an immediate answer: {error}; submit a job instead."
+        ) from error
 
 
 class ChildOrder(Message):
-    """Message that asks a child process to call a function, `module:function`, with bytes; it returns bytes.
+    """Message that asks a child process to call `function`, written `module:function`, with `payload`.
 
-    The function may use `processor_s` seconds of processor time.
+    The function returns bytes. It may use `processor_s` seconds of processor time.
     """
 
     function: str

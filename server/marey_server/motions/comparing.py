@@ -85,7 +85,8 @@ def read_difference(
 ) -> DifferenceSource:
     """Read the parts that differ between two revisions, and return them.
 
-    Raises `NotFoundProblem` if an item or a revision does not exist, and `TooLargeProblem` if the parts are too large.
+    Raises `NotFoundProblem` if an item or a revision does not exist, and `TooLargeProblem` if the motions are too
+    large.
     """
     item = items.read_item(tx, project, kind, item_id)
     other = item if request.to_item is None else items.read_item(tx, project, kind, request.to_item)
@@ -93,7 +94,8 @@ def read_difference(
     before = request.from_ or (after - 1 if other.id == item.id else item.revision)
     if before < 1:
         raise NotFoundProblem(
-            "The item has no revision before this one; name two revisions, or another item.", code="no-revision"
+            "The item has no revision before revision 1; give another `from` and `to`, or another item as `to_item`.",
+            code="no-revision",
         )
     numbers = {"after": (other, after), "before": (item, before)}  # a revision that was asked for is missed first
     parts = {side: items.read_revision(tx, project, kind, one.id, n).parts for side, (one, n) in numbers.items()}
@@ -125,7 +127,7 @@ def _require_room(source: DifferenceSource) -> None:
     if sum(int(motion["poses"].shape[0] * motion["poses"].shape[1]) for motion in motions) > MOST_NUMBERS:
         raise TooLargeProblem(
             f"The motions have more than {MOST_NUMBERS:,} values together, which is too much to compare at once; "
-            "download both revisions, or compare parts of the clip.",
+            "download both revisions, or compare shorter clips.",
             code="difference-too-large",
         )
 

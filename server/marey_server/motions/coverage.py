@@ -1,4 +1,4 @@
-"""Coverage of streams of frames: computed in a child process between reading and writing the row of a stream."""
+"""Coverage of streams of frames, which a child process computes after the row of a stream is read."""
 
 from __future__ import annotations
 
@@ -49,7 +49,11 @@ ADVANCE_COVERAGE = "marey_server.motions.coverage:advance_coverage"
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """Documents that a new stream refers to, and the revisions to which they belong."""
+    """Skeleton and evaluation that a new stream refers to.
+
+    `skeleton` and `evaluation` are references to revisions; `rig` is the encoded skeleton with its joint mapping, and
+    `measured` is the part `evaluation` of the evaluation.
+    """
 
     skeleton: Tree | None = None
     rig: bytes | None = None
@@ -79,9 +83,8 @@ class BeginOrder(Message):
 class StreamOrder(Message):
     """Message that asks a child process to add `frames` to a stored stream.
 
-    If `frames` is None, the child process only computes the coverage of the stream.
-
-    `rig` is the skeleton of the stream's poses with its joint mapping, as bytes.
+    If `frames` is None, the child process only computes the coverage of the stream. `rig` is the skeleton of the
+    stream's poses with its joint mapping, as bytes.
     """
 
     settings: Tree
@@ -117,7 +120,7 @@ class AdvancedStream(Message):
 def read_given(tx: Transaction, project: str, request: CoverageStreamCreate) -> Given:
     """Return the skeleton and the evaluation that the request for a stream names, with their documents.
 
-    Raises `NotFoundProblem`.
+    Raises `NotFoundProblem` if one of them does not exist.
     """
     projects.require(tx, project)
     skeleton = rig = evaluation = measured = None
@@ -136,7 +139,7 @@ def read_given(tx: Transaction, project: str, request: CoverageStreamCreate) -> 
 def _mapping(tx: Transaction, project: str, skeleton: str, revision: int) -> Tree | None:
     try:
         return items.read_part(tx, project, Kind.SKELETON, skeleton, "mapping", revision=revision).tree
-    except NotFoundProblem:  # an optional part: it is then guessed
+    except NotFoundProblem:  # an optional part: without it, the mapping is guessed
         return None
 
 
@@ -210,7 +213,7 @@ def advance_coverage(packed: bytes) -> bytes:
 
 
 def begin(request: CoverageStreamCreate, given: Given) -> BegunStream:
-    """Start a coverage stream, and return its computed state."""
+    """Start a coverage stream, and return its state. Raises `InvalidProblem` if the skeleton cannot be used."""
     from marey_motion.evaluation.online import OnlineCoverage
     from marey_schemas.options.evaluation import COVERAGE_LEAST_S, Grid
 
@@ -240,7 +243,7 @@ def begin(request: CoverageStreamCreate, given: Given) -> BegunStream:
 
 
 def advance(order: StreamOrder, frames: CoverageFrames) -> AdvancedStream:
-    """Add frames to a stream; return its new state and the answer to the request."""
+    """Add frames to a stream; return its new state and the answer to the request. Raises `InvalidProblem`."""
     online = _online(order.state)
     before = online.counts.copy()
     windows = 0
@@ -335,7 +338,7 @@ def _load_kernels(body: MatchingBody | None) -> None:
 
 @contextmanager
 def refusing(field: str) -> Iterator[None]:
-    """Convert motion errors in the `with` block to errors that point at the field `field` of the request."""
+    """Convert motion and validation errors in the `with` block to an `InvalidProblem` for a field of the request."""
     from marey_motion.errors import MotionError
 
     try:
@@ -371,7 +374,7 @@ def _state(online: OnlineCoverage, settings: Tree) -> Tree:
 
 
 def _now(online: OnlineCoverage, settings: Tree) -> Tree:
-    """Return the members of `CoverageNow` for a stream."""
+    """Return the members of `CoverageNow` for a stream: missing time, targets and performer."""
     targets = online.targets(settings["target_count"], path_s=settings["path_s"])
     performer = _performer(online)
     return {

@@ -49,7 +49,7 @@ class ExportOrder(Message):
 
 
 def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ItemToExport:
-    """Return the documents that any file format of an item may need. Raises `NotFoundProblem`."""
+    """Return an item with all documents that a file format may need. Raises `NotFoundProblem`."""
     found = items.read_item(tx, project, kind, item_id)
     number = found.revision if revision is None else revision
     held = items.read_revision(tx, project, kind, item_id, number).parts
@@ -64,9 +64,9 @@ def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revisio
 def find_unchanged_original(
     tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None, options: PredecessorOptions
 ) -> OriginalFile | None:
-    """Return the file that a model, a tree or a graph was imported from, if the item is unchanged.
+    """Return the file that a model, a tree or a graph was imported from; return None if the item was changed since.
 
-    Raises `NotFoundProblem`.
+    Also return None for other kinds. Raises `NotFoundProblem` if the item or the revision does not exist.
     """
     if kind not in (Kind.MODEL, Kind.GRAPH):
         return None
@@ -84,9 +84,9 @@ def find_unchanged_original(
 def find_original(
     tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None, options: PredecessorOptions
 ) -> OriginalFile:
-    """Return the file that an item, or a model's tree, was imported from.
+    """Return the file that a clip, a model, a model's tree or a graph was imported from.
 
-    Raises `NotFoundProblem` if it was not imported from a file.
+    Raises `NotFoundProblem` if the item was not imported from a file, or if a model, tree or graph was changed since.
     """
     if kind in (Kind.MODEL, Kind.GRAPH):
         asked = PredecessorOptions(part=options.part)  # in whatever layout it came
@@ -98,8 +98,8 @@ def find_original(
         if (original := original_of_clip(item_id, info)) is not None:
             return original
     raise NotFoundProblem(
-        "The item has no original file, because it was not imported from one; request another format, such as json, or "
-        "bvh for a clip.",
+        "The item has no original file, because it was not imported from a file or was changed since; request another "
+        "format, such as json, or bvh for a clip.",
         code="no-original",
     )
 
@@ -128,7 +128,7 @@ def export_order(
 
 
 def export_item(packed: bytes) -> bytes:
-    """Carry out an `ExportOrder` and return a `ComputedFile`."""
+    """Carry out an `ExportOrder` and return a packed `ComputedFile`."""
     order = ExportOrder.unpack(packed)
     return write_file(order.source(), order.format, order.unit, order.time, order.options).pack()
 
@@ -139,7 +139,7 @@ def write_file(
     """Return the file of an item in a format. Raises `InvalidProblem` if the format cannot represent the item."""
     if time == "source" and source.kind is not Kind.PROCESSED:
         raise InvalidProblem(
-            "Only aligned clips can be exported with the timing of their source clip (time=source).",
+            "Only aligned clips can be exported with the timing of their source clip (time=source); leave out `time`.",
             code="no-such-export",
         )
     beside = source.kind is Kind.PROCESSED and options.part == "alignment"
@@ -149,7 +149,9 @@ def write_file(
     if file_format == "json":
         return ComputedFile(name=f"{source.name}.json", media_type=codecs.JSON, data=item_as_json(source))
     if source.kind not in WITH_MOTION or source.hierarchy is None:
-        raise InvalidProblem(f"An item of the kind {source.kind} can only be exported as json.", code="no-such-export")
+        raise InvalidProblem(
+            f"An item of the kind {source.kind} has no file in this format; request json.", code="no-such-export"
+        )
     from marey_motion.errors import MotionError
     from marey_motion.exporting import write_motion_file
 

@@ -20,12 +20,12 @@ from marey_server.store.items import Draft, ItemFilters, Published
 from marey_server.store.projects import ProjectRow
 from marey_server.store.transaction import Transaction
 
-if TYPE_CHECKING:  # numeric modules take a second to load: only who imports files pays for them
+if TYPE_CHECKING:  # numeric modules take a second to load, so they are loaded only for imports
     from marey_motion.importing.items import GivenSkeleton, ImportedGraph
     from marey_motion.importing.plan import PlannedFile
 
 REFUSED_ALTOGETHER = (401, 403, 404, 499, 503, 507)
-"""Errors that concern the whole request and not a single file."""
+"""HTTP status codes of errors that concern the whole request and not a single file."""
 
 READ_FILE = "marey_server.motions.reading:read_file"
 FIND_MAPPING = "marey_server.motions.reading:find_mapping"
@@ -64,7 +64,7 @@ class PreparedImport:
 
 
 def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
-    """Read the skeleton named in the options of an import. Raises `NotFoundProblem`."""
+    """Return the skeleton that the options of an import name. Raises `NotFoundProblem` if it does not exist."""
     with LOADING:
         from marey_motion.importing.items import GivenSkeleton
 
@@ -81,7 +81,7 @@ def plan(names: Sequence[str]) -> list[PlannedFile]:
 
 
 def planned_entry(planned: PlannedFile) -> PreparedImport | None:
-    """Return the entry of a file that is not read on its own (a companion file, or a refused name), or else None."""
+    """Return the entry of a companion file or of a file with a refused name; return None for files to be read."""
     with LOADING:
         from marey_motion.importing.files import planned_entry
 
@@ -150,7 +150,7 @@ def firsts_of_skeletons(files: Sequence[PreparedImport], new: Collection[str]) -
 
 
 def mapping_order(file: PreparedImport) -> bytes:
-    """Return the packed message that asks a child process to derive joint mapping and axes of a file's skeleton."""
+    """Return the packed message that asks a child process to find the joint mapping and axes of a file's skeleton."""
     with LOADING:
         from marey_server.motions.reading import MappingOrder, ReadDocument
 
@@ -162,7 +162,7 @@ def mapping_order(file: PreparedImport) -> bytes:
 
 
 def found_mapping(answer: bytes) -> PreparedDocument:
-    """Return the part `mapping` that a child process derived."""
+    """Return the part `mapping` that a child process has found."""
     with LOADING:
         from marey_server.motions.reading import ReadDocument
 
@@ -170,7 +170,7 @@ def found_mapping(answer: bytes) -> PreparedDocument:
 
 
 def add_mapping(files: Sequence[PreparedImport], digest: str, mapping: PreparedDocument) -> list[PreparedImport]:
-    """Return the files with `mapping`, which contains joints and axes, in each new skeleton of the given digest."""
+    """Return the files; the part `mapping` is added to the skeleton with the given digest in each file that has it."""
 
     def with_mapping(draft: Draft) -> Draft:
         if draft.kind is not Kind.SKELETON:
@@ -184,9 +184,9 @@ def add_mapping(files: Sequence[PreparedImport], digest: str, mapping: PreparedD
 
 
 def refuse_with_skeleton(files: Sequence[PreparedImport], digest: str, error: ApiProblem) -> list[PreparedImport]:
-    """Return the files; those that contain the skeleton of this digest become refusals with `error`.
+    """Return the files; each file that contains the skeleton with this digest is replaced by a refusal.
 
-    Used if no joint mapping could be derived for the skeleton.
+    `error` is the reason why no joint mapping could be derived for the skeleton.
     """
     return [refused_import(file.name, error) if _has_skeleton(file, digest) else file for file in files]
 

@@ -66,7 +66,7 @@ class PackedModel(Message):
 
 
 class SampleOrder(Message):
-    """Message that asks a child process to draw samples from a model, as a document."""
+    """Message that asks a child process to draw samples from a model and return them as a document."""
 
     found: FoundModel
     model: bytes
@@ -76,7 +76,7 @@ class SampleOrder(Message):
 
 
 class SampleFileOrder(Message):
-    """Message that asks a child process to draw samples from a model, as a file."""
+    """Message that asks a child process to draw samples from a model and return them as a file."""
 
     found: FoundModel
     model: bytes
@@ -95,7 +95,7 @@ class UsableModel:
 
 
 def find_model(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> FoundModel:
-    """Return the model of an item. Raises `NotFoundProblem`."""
+    """Return the model of an item. Raises `NotFoundProblem` if the item is not a model or does not exist."""
     if kind is not Kind.MODEL:
         raise NotFoundProblem(
             f"Motions can be generated only from models, not from an item of the kind {kind}.", code="not-a-model"
@@ -133,7 +133,7 @@ def draw_samples(packed: bytes) -> bytes:
 
 
 def write_samples(packed: bytes) -> bytes:
-    """Carry out a `SampleFileOrder` and return a `ComputedFile`."""
+    """Carry out a `SampleFileOrder` and return a packed `ComputedFile`."""
     order = SampleFileOrder.unpack(packed)
     model = _usable_model(order.found, order.model)
     return sample_file(order.found, model, order.count, order.seed, order.format, order.unit).pack()
@@ -159,7 +159,7 @@ def parse_model(loaded: LoadedModel) -> UsableModel:
 
 
 def size_bytes(model: UsableModel) -> int:
-    """Return the size in bytes of a model's arrays, including those computed from its mixture."""
+    """Return the size in bytes of a model's arrays, including arrays that are computed from its mixture."""
     primitive = model.primitive
     parts = (primitive.spatial, primitive.temporal)
     arrays = [array for part in parts for array in (part.mean, part.directions, part.projections)]
@@ -167,7 +167,7 @@ def size_bytes(model: UsableModel) -> int:
 
 
 _MODELS: LruCache[str, UsableModel] = LruCache(max_bytes=MODEL_CACHE_BYTES, size_of=size_bytes)
-"""Cache of a child: parsed models by the digest of their document."""
+"""Cache of a child process: parsed models by the digest of their document."""
 
 
 def sample_document(found: FoundModel, model: UsableModel, count: int, seed: int) -> dict[str, Any]:
@@ -191,7 +191,10 @@ def sample_document(found: FoundModel, model: UsableModel, count: int, seed: int
 def sample_file(
     found: FoundModel, model: UsableModel, count: int, seed: int, file_format: MotionFormat, unit: str
 ) -> ComputedFile:
-    """Return one sample as a file, or several as a ZIP archive of files. Raises `InvalidProblem`."""
+    """Return one sample as a file, or several as a ZIP archive of files.
+
+    Raises `InvalidProblem` if the samples are too large, or if the format cannot represent them.
+    """
     from marey_motion.errors import MotionError
     from marey_motion.exporting import write_clip_file
 

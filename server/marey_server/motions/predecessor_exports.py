@@ -48,8 +48,9 @@ class PredecessorOptions:
 
 
 def unchanged_original(kind: Kind, parts: Parts, options: PredecessorOptions) -> StoredOriginal | None:
-    """Return the file that a model, a tree or a graph was imported from, if the requested part is unchanged.
+    """Return the file that a model, a tree or a graph was imported from, or None if the requested part was changed.
 
+    Also return None for other kinds, and if `options` names a layout, because the file may have another layout.
     The documents in `parts` may contain references to stored arrays in place of the arrays.
     """
     if options.layout is not None:
@@ -76,7 +77,8 @@ def write_predecessor(
 ) -> tuple[str, bytes]:
     """Return the name and the bytes of a file in a format of Marey's predecessor.
 
-    Raises `InvalidProblem` if the item has no such file, and `NotFoundProblem` for a model without a tree.
+    Raises `InvalidProblem` if the item cannot be written in such a format, and `NotFoundProblem` if the tree of a model
+    without a tree is requested.
     """
     from marey_motion.errors import MotionError
 
@@ -101,7 +103,7 @@ def _written(
             return "_mm.json", _model(parts["model"], hierarchy, options.layout or "3")
         if "tree" not in parts:
             raise NotFoundProblem(
-                "The model has no tree of samples to export; build it first, by `marey tree`.", code="no-part"
+                "The model has no tree of samples to export; build it first, with `marey tree`.", code="no-part"
             )
         return "_cluster_tree.json", _tree(parts["model"], parts["tree"])
     raise InvalidProblem(f"An item of the kind {kind} can only be exported as json.", code="no-such-export")

@@ -77,9 +77,10 @@ class PreviewOrder(Message):
 
 
 def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, request: EditPreviewRequest) -> PreviewSource:
-    """Read the inputs of a preview.
+    """Return the inputs of a preview.
 
-    Raises `NotFoundProblem`, and `TooLargeProblem` if the edit is so large that only a job may compute it.
+    Raises `NotFoundProblem` if an input does not exist, `InvalidProblem` if the stored edit is not valid, and
+    `TooLargeProblem` if the motions are so large that only a job may edit them.
     """
     if kind is not Kind.CLIP:
         raise NotFoundProblem(f"Only clips can be edited, not an item of the kind {kind}.", code="not-a-clip")
@@ -141,7 +142,8 @@ def preview_order(source: PreviewSource, request: EditPreviewRequest, encoding: 
 def make_preview(packed: bytes) -> bytes:
     """Carry out a `PreviewOrder` and return the document of the preview.
 
-    Raises `InvalidProblem` if the commands cannot be applied or the result does not have the requested frames.
+    Raises `InvalidProblem` if the commands cannot be applied or the result does not have the requested frames, and
+    `TooLargeProblem` if the edit or the requested range is too large.
     """
     from marey_motion.documents import clip_to_document
     from marey_motion.kinematics import global_positions
@@ -151,7 +153,7 @@ def make_preview(packed: bytes) -> bytes:
     made = _edited(source, order.most_work)
     if request.piece >= len(made):
         raise _invalid(
-            "/piece", "no-piece", f"The edit creates only {counted(len(made), 'clip')}; `piece` counts them from 0."
+            "/piece", "no-piece", f"The edit creates only {counted(len(made), 'clip')}; `piece` counts clips from 0."
         )
     wanted = made[request.piece]
     start, stop = request.frames

@@ -1,4 +1,4 @@
-"""Reading of uploaded files in a child process: the messages that ask for it, and the documents that are returned."""
+"""Reading of uploaded files in a child process: messages to the child process, and the documents that it returns."""
 
 from __future__ import annotations
 
@@ -73,9 +73,9 @@ class ReadDocument(Message):
 
 
 _READ_SKELETONS: LruCache[bytes, ReadDocument] = LruCache(max_entries=_SKELETONS_KEPT)
-"""Cache of a child: encoded hierarchies by their JSON; many files of an upload have the same one."""
+"""Cache of a child process: encoded hierarchies by their JSON; many files of an upload have the same hierarchy."""
 _SKELETONS: LruCache[bytes, PreparedDocument] = LruCache(max_entries=_SKELETONS_KEPT)
-"""Cache of the server: hierarchies by the JSON that a child sent."""
+"""Cache of the server process: hierarchies by the JSON that a child process has sent."""
 
 
 class ReadDraft(Message):
@@ -99,7 +99,7 @@ class ReadDraft(Message):
 class ReadGraph(Message):
     """Graph of models, read from a file of Marey's predecessor.
 
-    Each node is the tuple of its action, name, model id, type and transitions.
+    Each node is a tuple: action, name, id of the model, type, and transitions as pairs of action and name.
     """
 
     name: str
@@ -139,7 +139,7 @@ class ReadFile(Message):
 class MappingOrder(Message):
     """Message that asks a child process to find the joint mapping and axes of a skeleton.
 
-    The message contains the motion of a clip that uses the skeleton.
+    `motion` is the motion of a clip that uses the skeleton, or None if the file contains no clip.
     """
 
     hierarchy: ReadDocument
@@ -158,7 +158,7 @@ def load() -> None:
 
 
 def read_file(order: bytes) -> bytes:
-    """Carry out a `FileOrder` and return a `ReadFile`. Raises `InvalidProblem` for documents that cannot be stored."""
+    """Carry out a `FileOrder`; return a packed `ReadFile`. Raises `InvalidProblem` if a document cannot be stored."""
     found = import_file(FileOrder.unpack(order).file())
     return ReadFile(
         items=tuple(map(_read_item, found.items)),
@@ -170,7 +170,7 @@ def read_file(order: bytes) -> bytes:
 
 
 def find_mapping(order: bytes) -> bytes:
-    """Carry out a `MappingOrder` and return the part `mapping` as a `ReadDocument`."""
+    """Carry out a `MappingOrder` and return the part `mapping` as a packed `ReadDocument`."""
     wanted = MappingOrder.unpack(order)
     skeleton = ImportedItem("", Kind.SKELETON, "", "", {"hierarchy": decoded_tree(wanted.hierarchy.document())})
     items = [skeleton]

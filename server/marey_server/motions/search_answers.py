@@ -33,7 +33,7 @@ ANSWER_SEARCH = "marey_server.motions.search_answers:answer_search"
 WRITE_SEARCH = "marey_server.motions.search_answers:write_search"
 """Functions that child processes run."""
 FAR_CM = 5.0
-"""Error of a position constraint above which the model cannot reach it; inverse kinematics would hide the error."""
+"""Error of a position constraint above which it is out of reach of the model, measured before inverse kinematics."""
 
 MOST_WORK = 3e9
 """Greatest cost of a search, in nanoseconds of one thread (estimated)."""
@@ -67,7 +67,7 @@ class SearchOrder(Message):
     limits: SearchLimits
 
     def search(self) -> tuple[SearchResult, list[Searchable]]:
-        """Return what the search finds, and the model of each step."""
+        """Return the result of the search, and the model of each step."""
         usable = usable_searchables(self.models, self.request.seed, self.limits.drawing_work)
         return search(usable, self.request, self.limits.work), usable
 
@@ -96,7 +96,7 @@ class SearchResult:
 
     @property
     def clip(self) -> Clip:
-        """The motions of all steps, joined to one clip."""
+        """The motions of all steps, joined into one clip, after inverse kinematics if the request asks for it."""
         last = self.found if self.finished is None else self.finished.found
         return last.motion.as_clip(last.skeleton, last.frame_rate_hz)
 
@@ -117,7 +117,7 @@ def answer_search(packed: bytes) -> bytes:
 
 
 def write_search(packed: bytes) -> bytes:
-    """Carry out a `SearchFileOrder` and return a `ComputedFile`."""
+    """Carry out a `SearchFileOrder` and return a packed `ComputedFile`."""
     order = SearchFileOrder.unpack(packed)
     return file_of(order.search()[0], order.models.found, order.format, order.unit).pack()
 

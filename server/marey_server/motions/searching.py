@@ -73,7 +73,8 @@ class Searchable:
 
     `stored` is true if the tree is stored with the model, and false if it was built for the search from random samples.
     `drawing_work` is the estimated computing time for drawing these samples, in nanoseconds. `log_likelihoods` are the
-    log-likelihoods of the examples in ascending order.
+    log-likelihoods of the examples in ascending order. `standard_joints` maps standard names of joints to indices in
+    the skeleton.
     """
 
     usable: UsableModel
@@ -184,9 +185,8 @@ def require_drawable(work: float, most_work: float) -> None:
     """Raise `TooLargeProblem` if drawing samples for the missing trees of a request costs more than `most_work`."""
     if work > most_work:
         raise TooLargeProblem(
-            "Without trees, drawing samples from models with so many keyframes, joints or steps takes too "
-            "long for a search; create a tree for each model first, with a job of the kind `tree` or with "
-            "`marey tree`.",
+            "Some models of the search have no tree, and drawing samples to build the trees takes too long; create a "
+            "tree for each model first, with a job of the kind `tree` or with `marey tree`.",
             code="tree-missing",
         )
 
@@ -199,4 +199,4 @@ def size_bytes(made: Searchable) -> int:
 _SEARCHABLES: LruCache[tuple[SearchableKey, int | None], Searchable] = LruCache(
     max_bytes=models.MODEL_CACHE_BYTES, size_of=size_bytes
 )
-"""Cache of a child: parsed models. The key is the digests of a model's documents, and the seed of a drawn tree."""
+"""Cache of a child process: parsed models, by the digests of a model's documents and the seed of a drawn tree."""

@@ -91,7 +91,7 @@ def write_walk_graph(source: WalkSource, trial: str | None, form: WalkGraphForma
         clips, records = clips_from_tree(source.evaluation), records_from_tree(source.records)
         _require_rows(clips, records.values())
     except (MotionError, AttributeError, KeyError, TypeError, ValueError) as error:
-        detail = f"The documents of this evaluation give no walk graph: {error}."
+        detail = f"The walk graph of this evaluation cannot be computed: {error}."
         raise InvalidProblem(detail, code="not-a-walk") from error
     if trial is not None and trial not in records:
         known = ", ".join([*list(records)[:NAMES_SHOWN], *(["..."] if len(records) > NAMES_SHOWN else [])])
@@ -104,7 +104,7 @@ def write_walk_graph(source: WalkSource, trial: str | None, form: WalkGraphForma
 
 
 def _require_rows(clips: Sequence[DatabaseClip], records: Iterable[TrialRecord]) -> None:
-    """Raise `ValueError` if the rows of clips have gaps, or if trials displayed rows outside the clips.
+    """Raise `ValueError` if there are gaps between the rows of clips, or if a trial displayed a row outside them.
 
     A row is a frame in the database of all clips.
     """
@@ -118,4 +118,4 @@ def _require_rows(clips: Sequence[DatabaseClip], records: Iterable[TrialRecord])
         rows = clip.stop
     for record in records:
         if len(record.rows) and not 0 <= record.rows.min() <= record.rows.max() < rows:
-            raise ValueError(f"a trial displays a row that no clip has; the clips have {rows} rows")
+            raise ValueError(f"a trial displays a row outside the {rows} rows of the clips")
