@@ -138,7 +138,8 @@ class Running:
 async def listening(app: Application) -> AsyncIterator[Running]:
     """Accept requests while the `async with` block runs.
 
-    At its end, new requests are refused, those in progress are finished, and everything is closed.
+    At its end, new requests are refused, and everything is closed after the running requests have ended, at the latest
+    after `drain_s` seconds. Raises `CannotListen`.
     """
     settings = app.services.settings
     try:
@@ -167,7 +168,7 @@ async def listening(app: Application) -> AsyncIterator[Running]:
 
 
 def accept_connections(app: Application, server: HTTPServer, sockets: list[socket.socket]) -> Connections:
-    """Begin to accept connections, as many as the settings allow; return these connections."""
+    """Accept as many connections as the settings allow; return the object that manages them."""
     settings, in_flight = app.services.settings, app.services.in_flight
     most = settings.max_connections or default_connections()
     connections = Connections(
@@ -204,7 +205,7 @@ async def _drain(services: Services, server: HTTPServer, connections: Connection
 def open_database(settings: Settings) -> Database:
     """Open the database of a server; create its folder, tables and first administrator if they are missing.
 
-    Raises `DatabaseUnusable`.
+    Raises `DatabaseUnusable` if the database cannot be opened or upgraded.
     """
     with opening(settings.resolved_database_url):
         prepare_data_folder(settings)
@@ -287,7 +288,8 @@ async def serving(settings: Settings) -> AsyncIterator[Running]:
 def make_worker_token(database: Database, settings: Settings) -> str:
     """Create a token for the workers that this process starts; a worker can claim jobs with it and do nothing else.
 
-    Tokens of earlier starts at this address are revoked; servers at other addresses with the same database keep theirs.
+    Tokens of earlier starts at this address are revoked; servers at other addresses with the same database keep
+    their tokens.
     """
     address = f"{settings.host}:{settings.port} on {socket.gethostname()}"
     return database.write(SYSTEM, _replace_worker_token, f"workers beside the server at {address}"[:MAX_NAME_LENGTH])

@@ -51,7 +51,7 @@ def serve(**settings: Any) -> None:
 
 
 def _new_event_loop() -> asyncio.AbstractEventLoop:
-    """Make an event loop of uvloop, or of asyncio if uvloop is not installed or not available, as on Windows."""
+    """Return a new event loop of uvloop, or of asyncio if uvloop is not installed (it is not available on Windows)."""
     try:
         uvloop = import_module("uvloop")
     except ModuleNotFoundError:
@@ -99,7 +99,7 @@ def backup(*, target: Path, **settings: Any) -> None:
 
 
 def restore(*, source: Path, **settings: Any) -> None:
-    """Restore a database from a backup; fail if a database exists already at the place in the settings."""
+    """Restore a database from a backup. Raises `CommandFailed` if the database in the settings exists already."""
     chosen = read_settings(**settings)
     target = _sqlite_file(chosen, must_exist=False)
     # A log that stays behind would be played into the backup.
@@ -119,7 +119,10 @@ def restore(*, source: Path, **settings: Any) -> None:
 
 
 def fsck(*, repair: bool = False, as_json: bool = False, **settings: Any) -> None:
-    """Verify every digest, reference and counter; fail if there are defects. `repair` corrects counters."""
+    """Verify every digest, reference and counter; with `repair`, correct the counters.
+
+    Raises `CommandFailed` if there are faults.
+    """
     from marey_server.app import connect_database
     from marey_server.store.fsck import check_store
 
@@ -138,7 +141,7 @@ def fsck(*, repair: bool = False, as_json: bool = False, **settings: Any) -> Non
             _say(str(finding))
         _say(f"checked {', '.join(f'{count:,} {what}' for what, count in checked.items()) or 'nothing'}")
     if findings:
-        raise CommandFailed(f"{len(findings)} faults were found and are listed above")
+        raise CommandFailed(f"the database has faults ({len(findings)}), which are listed above")
 
 
 def clock(*, set_now: bool = False, **settings: Any) -> None:
@@ -177,14 +180,14 @@ def purge(**settings: Any) -> None:
 
 
 def _shrink(file: Path) -> None:
-    """Shrink the file of an SQLite database by its free pages, unless a server is running."""
+    """Shrink the file of an SQLite database by its free pages. Raises `CommandFailed` if a server is running."""
     from marey_server.store.database.opening import DatabaseUnusable, vacuum
 
     before = file.stat().st_size
     try:
         vacuum(file)
     except DatabaseUnusable as error:
-        raise CommandFailed(f"the database could not be compacted: {error}") from None
+        raise CommandFailed(f"the file of the database could not be shrunk: {error}") from None
     _say(f"the database takes {file.stat().st_size:,} bytes; it took {before:,}")
 
 
@@ -243,10 +246,10 @@ def _copy_database(source: Path, target: Path) -> None:
             (state,) = writing.execute("PRAGMA quick_check").fetchone()
     except sqlite3.DatabaseError as error:
         target.unlink()
-        raise CommandFailed(f"the backup {source} cannot be read as a database: {error}") from None
+        raise CommandFailed(f"{source} cannot be read as an SQLite database: {error}") from None
     if state != "ok":
         target.unlink()
-        raise CommandFailed(f"the backup {source} is damaged: {state}")
+        raise CommandFailed(f"the database {source} is damaged: {state}")
     with open(target, "rb") as file:
         os.fsync(file.fileno())
 

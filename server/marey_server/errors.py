@@ -102,7 +102,7 @@ class NotAcceptableProblem(ApiProblem):
 
 
 class UnsupportedMediaTypeProblem(ApiProblem):
-    """The body's media type is not understood."""
+    """The media type or the encoding of the body is not supported."""
 
     status = 415
     code = "unsupported-media-type"
@@ -139,7 +139,7 @@ class LeaseLostProblem(ConflictProblem):
 
 
 class QuotaExceededProblem(ConflictProblem):
-    """The request would exceed a quota of the user; nothing was changed."""
+    """The request would exceed a quota of the user or of the project; nothing was changed."""
 
     code = "quota-exceeded"
 

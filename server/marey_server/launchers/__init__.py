@@ -1,1 +1,1 @@
-"""Launchers of workers: beside the server, or on a cluster."""
+"""Launchers, which start worker processes for a server."""

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 PAUSES = Backoff(first_s=0.5, longest_s=30.0, jitter=0.25)
 HEALTHY_AFTER_S = 30.0
-"""Run time in seconds after which a worker counts as started, so that its replacement starts without a long pause."""
+"""Run time in seconds after which a worker counts as healthy, so that it is restarted after a short pause."""
 
 STOP_S = 20.0
 
@@ -33,7 +33,7 @@ STOP_S = 20.0
 async def local_workers(
     count: int, *, url: str, token: str, cache: Path, log_form: LogForm, log_level: str
 ) -> AsyncIterator[None]:
-    """Keep `count` workers running while the `async with` block runs; at its end, ask them to stop.
+    """Keep `count` workers running while the `async with` block runs; at its end, stop them.
 
     Parameters
     ----------

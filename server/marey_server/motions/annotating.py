@@ -17,7 +17,7 @@ from marey_server.store.items.annotating import AnnotatedClip, ChangedAnnotation
 from marey_server.store.revs import ExpectedRev, is_expected, moved_on
 
 MOST_WORK = 30_000_000
-"""Greatest sum, over the commands of a request, of the numbers of segments and keyframes; it takes some seconds."""
+"""Greatest sum, over the commands of a request, of the numbers of segments and keyframes (some seconds of work)."""
 
 
 def apply_commands(

@@ -23,8 +23,8 @@ def give_token(tx: Transaction, administrator: str | None, token_file: Path, *, 
     """Create an administrator's token with every scope and no expiry, and write it to a private file.
 
     The token belongs to the named administrator, or without a name to the administrator who was created first. The file
-    is written before the transaction commits: if the process dies in between, the next start creates a new token and
-    file. Raises `NotFoundProblem` if no active administrator has that name.
+    is written before the transaction commits, so that no valid token is lost if the process dies in between. Raises
+    `NotFoundProblem` if no active administrator has that name.
     """
     tx.principal = users.administrator_principal(tx, administrator)
     wanted = TokenCreate(name=name, scopes=tx.principal.scopes, expires_in_s=None)

@@ -14,7 +14,7 @@ from marey_server.motions.child import FORK_SERVER, SINGLE
 
 CHILD_MODULE = "marey_server.motions.child"
 LOADED_FIRST = ("marey_server.motions.reading:load",)
-"""Functions that load what children need, so that their first orders do not wait for it."""
+"""Functions that load modules and kernels in advance, so that the first orders of children do not wait for this."""
 
 Loading = TypeVar("Loading", ChildProcess, ForkServer)
 
@@ -56,7 +56,7 @@ class ChildStarter:
                 self._fork_server.close()
 
     def _loaded(self, process: Loading) -> Loading:
-        """Wait until a process has loaded its modules, and return it. Raises `ChildBroken`."""
+        """Wait until a process has loaded its modules, and return it. Raises `ChildBroken` or `OSError`."""
         with self._changed:
             self._loading.add(process)
             if self._closed:

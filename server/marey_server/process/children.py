@@ -27,12 +27,12 @@ from marey_server.process.child_starting import LOADED_FIRST, ChildStarter
 T = TypeVar("T")
 
 ORDERS_PER_CHILD = 1000
-"""Number of orders after which a child is replaced, so that memory that a library loses does not add up."""
+"""Number of orders after which a child is replaced, so that memory that a library leaks does not add up."""
 ABANDONED_S = 1.0
-"""Time in seconds in which an order may end by itself after its client has gone; a new child takes longer to start."""
+"""Seconds that an order has to end after its client has disconnected; to start a new child would take longer."""
 CLOSING_S = 10.0
 ASK_AGAIN_S = 5
-"""Time in seconds after which a refused client is asked to try again."""
+"""Time in seconds after which a refused client may try again."""
 JOB_ADVICE = "split the request, or submit a job, which has higher limits"
 _PROBLEMS = {one.status: one for one in (InvalidProblem, NotFoundProblem, TooLargeProblem)}
 
@@ -101,7 +101,7 @@ class ChildTask(Generic[T]):
             _after(ABANDONED_S, self.stop, "client-gone")
 
     def succeed(self, payload: bytes) -> None:
-        """End the task with the result that `read` makes of the bytes, or with the error that `read` raises."""
+        """End the task with the result that `read` returns for the bytes, or with the error that `read` raises."""
         try:
             result = self.read(payload)
         except Exception as error:  # noqa: BLE001 - whoever waits for the task gets it
@@ -174,7 +174,8 @@ class Children:
     ) -> ChildTask[T]:
         """Call `function` (`module:name`) in a child process.
 
-        `make` returns the argument as bytes; `read` converts the answer to the result of the task.
+        `make` returns the argument as bytes; `read` converts the answer to the result of the task. Raises
+        `UnavailableProblem` if the server is stopping.
         """
         task = ChildTask(caller, function, make, read, count_stop)
         with self._changed:
@@ -310,7 +311,7 @@ class Children:
             task.fail(_as_error(outcome.refusal))
         elif outcome.traceback:
             log.error("%s failed in a child process:\n%s", task.function, outcome.traceback)
-            task.fail(ApiProblem("The server failed to read or to compute this; its log says why."))
+            task.fail(ApiProblem("The server failed to carry out this request; its log says why."))
         else:
             task.succeed(outcome.payload)
 
@@ -320,7 +321,7 @@ class Children:
             return _stopping()
         if status == LOST:
             task.count_end("died")
-            return UnavailableProblem("The process that worked on this was lost; try again.")
+            return UnavailableProblem("The child process of this request ended unexpectedly; try again.")
         out_of_time = status == -signal.SIGXCPU
         task.count_end(task.stopped or ("time" if out_of_time else "died"))
         if task.stopped == "time":
@@ -329,13 +330,13 @@ class Children:
             return _too_long(f"{self.limits.processor_s:g} s of processor time", "child_processor_s")
         ended = f"was ended by {_signal_name(-status)}" if status < 0 else f"ended with status {status}"
         return InvalidProblem(
-            f"The process that worked on this {ended}; the data may be damaged, or need more memory than there is.",
+            f"The child process of this request {ended}; the data may be damaged, or need too much memory.",
             code="child-died",
         )
 
     def _too_much_memory(self) -> ApiProblem:
         return TooLargeProblem(
-            f"This needs more than the {self.limits.memory_mb} MiB of memory that the server uses to answer at once "
+            f"This request needs more than the limit of {self.limits.memory_mb} MiB of memory for one request "
             f"(child_memory_mb); {JOB_ADVICE}.",
             code="memory-limit",
         )
@@ -355,7 +356,7 @@ def _discard(child: ConnectedChild | None) -> None:
 
 def _busy(which: str) -> UnavailableProblem:
     return UnavailableProblem(
-        f"{which} use the processes that read files and compute, or wait for one; try again in a few seconds.",
+        f"{which} already use the child processes of the server or wait for one; try again in a few seconds.",
         code="children-busy",
         headers={"Retry-After": str(ASK_AGAIN_S)},
     )
@@ -367,7 +368,7 @@ def _stopping() -> UnavailableProblem:
 
 def _too_long(limit: str, setting: str) -> TooLargeProblem:
     return TooLargeProblem(
-        f"This takes longer than the {limit} that the server uses to answer at once ({setting}); {JOB_ADVICE}.",
+        f"This request takes longer than the limit of {limit} for one request ({setting}); {JOB_ADVICE}.",
         code="time-limit",
     )
 

@@ -1,6 +1,6 @@
-"""Threads for what the server computes itself: decoding and checking of documents, packing, files, and rendering.
+"""Threads in which the server process decodes, checks, packs and renders documents, and reads and writes files.
 
-Long computations and those that need numeric modules run in child processes.
+Long computations, and computations that need numeric modules, run in child processes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 THREAD_NAME = "marey-compute"
 RENDERING_THREADS = 3
-"""Number of threads that render documents; one client, and all strangers together, may use all but one."""
+"""Number of threads that render documents; one client, or all clients without a known token, may use all but one."""
 BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -49,7 +49,7 @@ class ComputeThreads:
         return self._lane.submit(client, function, *args, **kwargs)
 
     def close(self) -> None:
-        """Start no more computations; running ones are not awaited, because their clients are gone."""
+        """Start no more computations, and do not wait for running ones, because their clients have disconnected."""
         self._lane.close(wait=False)
         self.rendering.close(wait=False)
 
@@ -64,7 +64,7 @@ def compute_on_one_thread_each() -> None:
 
 
 def leave() -> None:
-    """End this process without waiting for computations that are still running."""
+    """End this process at once if computations are still running; otherwise do nothing."""
     if not any(thread.name.startswith(THREAD_NAME) for thread in threading.enumerate()):
         return
     logging.shutdown()

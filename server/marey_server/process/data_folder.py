@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 def prepare_data_folder(settings: Settings) -> None:
-    """Create the data folder, and remove the rights of other users to the server's files and folders in it.
+    """Create the data folder, and remove the rights of other users to the server's files and folders in this folder.
 
     Rights to the folder itself are removed as well, unless it contains files that do not belong to the server. An
     SQLite file is created here, because SQLite would let everybody read it; SQLite gives its log files the rights of

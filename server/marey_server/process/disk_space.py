@@ -1,7 +1,7 @@
 """Free space of the disk with the data folder: a minimum below which nothing is stored, and a reserve for starting.
 
-On a disk without any space, a server can neither start nor delete, because SQLite needs some for its log. So a file
-keeps space in reserve. It is removed when space runs out, and made again at the next start with enough space.
+On a full disk, a server can neither start nor delete data, because SQLite needs space for its log. So a reserve file
+occupies some space. It is removed when the disk is full, and created again at the next start with enough free space.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class DiskSpace:
         self._looked_s = -LOOK_AGAIN_S
 
     def fault(self) -> str | None:
-        """Return the reason why nothing can be stored, as a text for operators, or None."""
+        """Return the reason why nothing can be stored, as a text for operators, or None if there is enough space."""
         if not self._is_low():
             return None
         floor = self._floor_bytes // MIB
@@ -54,7 +54,7 @@ class DiskSpace:
 
 
 def free_bytes(folder: Path) -> int:
-    """Return the free space of a folder's disk; if hardly any is left, remove the reserve file first."""
+    """Return the free bytes of a folder's disk; if fewer than `RESERVE_BYTES` are free, first delete the reserve."""
     free, file = shutil.disk_usage(folder).free, folder / RESERVE_FILE
     if free >= RESERVE_BYTES or not file.exists():
         return free
@@ -64,7 +64,7 @@ def free_bytes(folder: Path) -> int:
 
 
 def make_reserve(folder: Path) -> None:
-    """Write the reserve file if its disk has ample space; remove it if there is hardly any."""
+    """Write the reserve file if the disk has 8 times its size free; remove it if the disk is full."""
     file = folder / RESERVE_FILE
     free = free_bytes(folder)
     if file.exists() or free < 8 * RESERVE_BYTES:

@@ -1,7 +1,7 @@
 """Wake-ups of waiting requests from the feed of events, which shows the changes of every server process.
 
 One task per process reads the feed after each commit, after each notification of Postgres, and also periodically, in
-case a notification was lost. So requests that wait cost nothing while nothing happens, however many they are.
+case a notification was lost. So even many waiting requests cause no work while nothing changes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LOOK_EVERY_S = 2.0
 """Interval in seconds at which the feed is read even without a notification, because one may be lost."""
 
 PAUSE_S = 0.05
-"""Least time in seconds between two reads of the feed; under load, one read serves many commits."""
+"""Least time in seconds between two reads of the feed; under load, one read covers many commits."""
 
 RECONNECT = Backoff(first_s=0.5, longest_s=30.0)
 
@@ -50,7 +50,7 @@ async def following_feed(services: Services) -> AsyncIterator[None]:
 
 
 async def _follow(services: Services) -> None:
-    """Read the feed again and again; a failure is logged, and the next reading continues where the last one ended."""
+    """Read the feed repeatedly; a failure is logged, and the next read continues where the last one ended."""
     position = _FeedPosition(services)
     with wakeups.listen([COMMITTED_EVENTS]) as listener:
         while True:

@@ -27,7 +27,7 @@ from marey_server.store.transaction import Transaction
 P = ParamSpec("P")
 T = TypeVar("T")
 Chore = Callable[[Services, str], Awaitable[None]]
-"""Chore; its arguments are the services and this process's name in the leader election."""
+"""Function that does one kind of work; its arguments are the services and this process's name as leader."""
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ LONGEST_TICK_S = 5.0
 GARBAGE_EVERY_S = 3600.0
 FORGET_TRIES_EVERY_S = 60.0
 FIRST_GARBAGE_S = 60.0
-"""Delay of the first collection after the start; short, so that servers that run an hour a day collect, too."""
+"""Delay of the first collection after the start; short, so that servers that run for only an hour also collect."""
 
 
 @asynccontextmanager
@@ -145,7 +145,7 @@ async def _in_thread(services: Services, function: Callable[P, T], *args: P.args
 async def _forget_tries(services: Services, holder: str) -> None:
     """Delete the expired rows of the limits on sign-ins.
 
-    Each sign-in adds three rows, and passwords are hashed one by one, so few rows are added per minute.
+    Few rows are added per minute, because each sign-in adds three rows, and passwords are hashed one by one.
     """
     if await _write(services, _leads, holder):
         while await _write(services, rate_limits.forget_ended) == rate_limits.FORGOTTEN_AT_ONCE:

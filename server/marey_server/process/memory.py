@@ -11,9 +11,9 @@ from marey_server.store.database.lanes import RETRY_AFTER_S, Client
 CLIENT_SHARE = 0.75
 """Largest part of the memory that one client may hold."""
 STRANGERS_SHARE = 0.25
-"""Largest part of the memory that all strangers together may hold."""
+"""Largest part of the memory that all clients without a known token together may hold."""
 RESERVED_SHARE = 0.125
-"""Part of the memory that is added for reserved operations, such as heartbeats."""
+"""Additional memory for reserved operations, such as heartbeats, as a part of the memory for other requests."""
 STRANGERS = "strangers"
 
 

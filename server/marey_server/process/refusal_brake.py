@@ -1,9 +1,10 @@
 """Clients whose requests are refused often: their refusals are delayed while the event loop is late.
 
-Every request costs a few milliseconds of the event loop, also a refused one. Two hundred connections that send nothing
-but such requests keep everybody else waiting for seconds. So if the event loop is late, a client that was refused
-several times must wait before it is refused again, and the event loop has time for others. A client that was refused
-that often also takes its turns among the strangers, so that its requests begin after those of well-behaved clients.
+Every request, even a refused one, takes a few milliseconds of the event loop. If two hundred connections send only
+refused requests, all other clients wait for seconds. So if the event loop is late, a client that was refused several
+times must wait before it is refused again, and the event loop has time for other clients. A client that was refused
+that often is also treated as a client without a known token, so that its requests begin after the requests of other
+clients.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ EVERY_S = 0.05
 KEPT_SHARE = 0.9
 """Share of the lateness that is kept from one measurement to the next."""
 TOLERATED_S = 0.1
-"""Lateness in seconds up to which nobody waits."""
+"""Lateness in seconds up to which no refusal is delayed."""
 DELAY_PER_LATENESS = 10.0
 LONGEST_S = 5.0
 FREE_REFUSALS = 10
@@ -28,7 +29,7 @@ CLIENTS_REMEMBERED = 10_000
 
 
 class RefusalBrake:
-    """Measures how late the event loop is, as long as there are refusals, and says how long a refused client waits."""
+    """Measurement of how late the event loop is, which runs while there are refusals, and delay of refused clients."""
 
     def __init__(self) -> None:
         self.late_s = 0.0
@@ -52,7 +53,7 @@ class RefusalBrake:
         return min(LONGEST_S, DELAY_PER_LATENESS * self.late_s)
 
     def is_often_refused(self, client: str) -> bool:
-        """Return whether a client was refused more than `FREE_REFUSALS` times within the last window."""
+        """Return whether a client was refused more than `FREE_REFUSALS` times within `WINDOW_S`."""
         since_s, count = self._refusals.get(client) or (0.0, 0)
         return count > FREE_REFUSALS and time.monotonic() - since_s <= WINDOW_S
 

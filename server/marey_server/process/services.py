@@ -36,11 +36,11 @@ from marey_server.store.jobs.reaper import StartGrace
 log = logging.getLogger(__name__)
 
 LARGEST_ANSWER_SHARE = 8
-"""Largest part of the cache of answers that one body may take; larger bodies would displace all others."""
+"""Size of the cache of answers divided by the largest body in it; larger bodies would displace all others."""
 ANSWER_ENTRY_BYTES = 512
 """Memory in bytes of an entry in the cache of answers, in addition to its body."""
 MODEL_CACHE_BYTES = 64 << 20
-"""Greatest size of the cache of models' documents."""
+"""Greatest size of the cache of models' documents, in bytes."""
 TOKENS_REMEMBERED = 10_000
 ADMISSIONS_REMEMBERED = 10_000
 
@@ -111,7 +111,7 @@ class Services:
         self.metrics.database_connections.set_function(lambda: self.database.connections_in_use)
 
     def note_faults(self, faults: Sequence[str]) -> None:
-        """Log the reasons why the server is not ready, each time that they change, and log when it is ready again."""
+        """Log the reasons why the server is not ready whenever these reasons change, and log when it is ready again."""
         if list(faults) != self._faults:
             self._faults = list(faults)
             if faults:
@@ -148,7 +148,7 @@ class Services:
             self.database.submit_write(SYSTEM, end_for_lost_author, lost.job_id, lost.fence)
 
     def close(self) -> None:
-        """Wait for running transactions, then close everything."""
+        """Stop child processes and threads, wait for running transactions, and close the database."""
         self.children.close()
         self.compute_threads.close()
         self.password_lane.close()

@@ -32,16 +32,18 @@ class Settings(BaseSettings):
     data: Path = Field(
         Path("marey-data"), description="Folder of the database file, the administrator's token, and blobs."
     )
-    host: str = Field(DEFAULT_HOST, description="Address to listen on; 0.0.0.0 for every network.")
-    port: int = Field(DEFAULT_PORT, ge=0, le=65535, description="Port to listen on; 0 for any free one.")
+    host: str = Field(DEFAULT_HOST, description="Address to listen on; 0.0.0.0: all networks.")
+    port: int = Field(DEFAULT_PORT, ge=0, le=65535, description="Port to listen on; 0: any free port.")
     database_url: str | None = Field(
-        None, description="SQLAlchemy URL; absent: the file marey.db in the data folder. postgresql://... for Postgres."
+        None,
+        description="SQLAlchemy URL of the database, such as postgresql://...; absent: the SQLite file marey.db in the "
+        "data folder.",
     )
     database_threads: int | None = Field(
         None,
         ge=1,
         le=128,
-        description="Reading transactions that run at the same time. Absent: 2 on SQLite, 8 on Postgres.",
+        description="Greatest number of reading transactions at the same time. Absent: 2 on SQLite, 8 on Postgres.",
     )
     blobs: Literal["database", "directory"] = Field(
         "database", description="Storage of blobs: in the database, or in the folder `blobs` of the data folder."
@@ -50,8 +52,7 @@ class Settings(BaseSettings):
     trust_proxy: bool = Field(
         False,
         description="Read the addresses of clients from the header proxy_header. Safe only if all clients reach the "
-        "server "
-        "through a proxy that sets this header.",
+        "server through a proxy that sets this header.",
     )
     proxy_header: Literal["X-Forwarded-For", "X-Real-IP"] = Field(
         "X-Forwarded-For", description="Header in which the proxy names the client's address, if trust_proxy is set."
@@ -68,7 +69,7 @@ class Settings(BaseSettings):
     )
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     drain_s: float = Field(
-        25.0, ge=0, le=600, description="Seconds that running requests have to finish after SIGTERM."
+        25.0, ge=0, le=600, description="Seconds that running requests have to finish after SIGTERM or SIGINT."
     )
     header_timeout_s: float = Field(
         75.0,
@@ -180,7 +181,7 @@ class Settings(BaseSettings):
         description="Greatest total size, in bytes, of the unfinished uploads of a user.",
     )
     user_tokens: int = Field(
-        Quotas.user_tokens, ge=0, description="Greatest number of valid tokens of a user, apart from sign-ins."
+        Quotas.user_tokens, ge=0, description="Greatest number of valid tokens of a user, not counting sign-ins."
     )
     user_projects: int = Field(
         Quotas.user_projects,
@@ -197,9 +198,7 @@ class Settings(BaseSettings):
         ge=0,
         description="Greatest number of open connections over which a user follows events.",
     )
-    user_items: int = Field(
-        Quotas.user_items, ge=0, description="Greatest number of items of a user, who is the user that created them."
-    )
+    user_items: int = Field(Quotas.user_items, ge=0, description="Greatest number of items that a user has created.")
     user_stored_bytes: int = Field(
         Quotas.user_stored_bytes,
         ge=0,

@@ -2,7 +2,7 @@
 
 The event loop handles everything that has arrived before it looks at the network again, and a request passes through it
 several times. If two hundred connections send requests without a pause, and all of them begin at once, each round takes
-two hundred times as long as a request, and everybody waits for several rounds. If a few begin in each round, a round
+two hundred times as long as a request, and all clients wait for several rounds. If a few begin in each round, a round
 takes some milliseconds, and a client waits for one request of every other client.
 """
 
@@ -15,13 +15,13 @@ from marey_server.store.database.lanes import Client, FairLine
 BEGUN_PER_ROUND = 4
 """Number of requests that begin in one round of the event loop if more are waiting."""
 RESERVED_PER_ROUND = 2
-"""Number of these that are reserved operations, if so many are waiting and others wait as well."""
+"""Number of requests in a round that are reserved operations, if enough of them and other requests are waiting."""
 _ENDLESS = 2**62
-"""Limit of a line that the number of connections limits already."""
+"""Limit of a line that is never reached, because the number of connections is limited already."""
 
 
 class Turns:
-    """Requests that wait for their turn, and the number of those that may still begin in this round."""
+    """Requests that wait for their turn, and the number of requests that may still begin in this round."""
 
     def __init__(self) -> None:
         self._reserved: FairLine[asyncio.Future[None]] = FairLine(_ENDLESS, _ENDLESS)

@@ -13,7 +13,7 @@ from marey_server.store import uploads
 from marey_server.store.database.connections import Database
 
 MOST_UPLOADS = 1024
-"""Number of uploads whose hashes are in memory; others are hashed again, once, when their last byte has arrived."""
+"""Number of uploads whose hashes are in memory; other uploads are hashed again after their last byte has arrived."""
 STEP_BYTES = 32 * 2**20
 """Number of bytes that are read and hashed at a time."""
 READ_BYTES = 4 * 2**20
@@ -52,8 +52,8 @@ class UploadHashes:
     If the database stores blobs as files, each upload is also copied to a file, which becomes the blob when the upload
     is complete.
 
-    After a restart, or if another server received some of the pieces, the hash is computed again from the stored
-    pieces.
+    After a restart, or if another server process received some of the pieces, the hash is computed again from the
+    stored pieces.
     """
 
     def __init__(self, database: Database) -> None:
