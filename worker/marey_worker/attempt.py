@@ -1,5 +1,6 @@
-"""Execution of one attempt of a job: a child process computes, and this process supervises the child and answers its
-requests.
+"""Execution of one attempt of a job: a child process computes, and this process supervises it.
+
+This process also answers the requests of the child.
 """
 
 from __future__ import annotations
@@ -127,7 +128,10 @@ class Watch:
     weighed: float = 0.0
 
     def verdict(self, child: ChildProcess | None) -> Stop | None:
-        """Return the reason to stop the attempt now, or None. `child` is None after it has computed all results."""
+        """Return the reason to stop the attempt now, or None if there is none.
+
+        `child` is None after the child process has computed all results.
+        """
         if self.keeper.lost.is_set():
             return Stop.LEASE_LOST
         if self.keeper.cancelled.is_set():
@@ -184,7 +188,10 @@ class RunningAttempt:
         self._staging: list[Future[ChildReply | None]] = []
 
     def run(self, child: ChildProcess) -> Done | Failed | Stop:
-        """Run the job in `child`, which is idle or dead afterwards. The caller then calls `finish`."""
+        """Run the job in `child`, and return its end. Afterwards, the child is idle or has ended.
+
+        The caller must then call `finish`.
+        """
         try:
             child.send(pack(self._order()))
             end = self._attend(child)
@@ -198,8 +205,8 @@ class RunningAttempt:
     def finish(self, end: Done | Failed | Stop) -> Done | Failed | Stop:
         """Wait until all results are stored, report the end to the server, and return it.
 
-        The child may run the next job meanwhile. If results cannot be stored, a failure or a stop is reported instead
-        of a success.
+        The child may run the next job in the meantime. If results cannot be stored, a failure or a stop is reported
+        instead of a success.
         """
         try:
             if isinstance(end, Done):
@@ -249,7 +256,7 @@ class RunningAttempt:
                 return stop
 
     def _check(self, child: ChildProcess | None) -> Stop | None:
-        """Start to send the new part of the log if that is due; return the reason to stop the attempt now, or None."""
+        """Send new output in a separate thread every `LOG_EVERY_S` seconds; return the reason to stop now, or None."""
         if time.monotonic() > self._log_due:
             self._transfers.submit(self._try_to_send_log)
             self._log_due = time.monotonic() + LOG_EVERY_S
@@ -371,7 +378,7 @@ class RunningAttempt:
         )  # fmt: skip
 
     def _try_to_send_log(self) -> None:
-        """Send new output; a failure is only logged, so that no result is lost because of it."""
+        """Send new output; if this fails, log the failure only, so that no result is lost because of it."""
         try:
             self._job_log.send()
         except LeaseLost:
@@ -387,11 +394,11 @@ def _not_stored(staging: Future[ChildReply | None]) -> bool:
 
 
 def send_reply(child: ChildProcess, carried_out: Future[ChildReply | None]) -> None:
-    """Send the child the reply to a request that was carried out, or the reason why it cannot be sent."""
+    """Send the child the reply to a request that was carried out, or a refusal if the reply cannot be encoded."""
     if carried_out.cancelled() or (reply := carried_out.result()) is None:
         return
     try:
         data = pack(reply)
     except (TypeError, ValueError, OverflowError) as error:  # the child waits for an answer, whatever happened
-        data = pack(ChildReply(reply.request, refusal=f"the answer cannot be passed on: {error}"))
+        data = pack(ChildReply(reply.request, refusal=f"the answer cannot be sent to the child process: {error}"))
     child.send(data)

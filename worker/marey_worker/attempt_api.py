@@ -30,7 +30,7 @@ from marey_schemas.queue.worker_protocol import (
 )
 
 PATIENT = Retries(tries=100, longest_s=10.0, total_s=600.0)
-"""Retries of the final request of an attempt, which go on for long, so that computed results are not lost."""
+"""Retries, for up to 10 minutes, of requests without which computed results would be lost."""
 
 PLAIN_TEXT = "text/plain; charset=utf-8"
 
@@ -61,7 +61,7 @@ class AttemptApi:
         return read_model(HeartbeatAnswer, self._post("heartbeat", as_json(Heartbeat(progress=progress)), sender))
 
     def append_log(self, offset: int, piece: bytes) -> LogAnswer:
-        """Append to the attempt's log if its length is `offset`; in any case return the length of the log."""
+        """Append to the attempt's log if the log has `offset` bytes; in both cases, return its length afterwards."""
         headers = {"Upload-Offset": str(offset)}
         try:
             return read_model(LogAnswer, self._post("log", piece, media_type=PLAIN_TEXT, headers=headers))
@@ -117,7 +117,7 @@ class AttemptApi:
             return Blobs(self._transport).fetch(digest)
 
     def put_file(self, path: Path) -> str:
-        """Send a file to the server, and return its digest."""
+        """Send a file to the server, which stores it as a blob, and return its digest."""
         with _dead_token_is_lost_lease():
             return Blobs(self._patient).put_file(path)
 

@@ -1,5 +1,6 @@
-"""Child process that computes. It runs one job after another, so that modules and compiled kernels are loaded only
-once.
+"""Child process of a worker, which computes.
+
+It runs one job after another, so that modules and compiled kernels are loaded only once.
 """
 
 from __future__ import annotations
@@ -27,7 +28,10 @@ DETAIL_CHARACTERS = 1000
 
 
 def main() -> None:
-    """Run the jobs that arrive on a pipe, whose file descriptor is the first argument, until the pipe closes."""
+    """Run the jobs that arrive on a pipe until the pipe closes.
+
+    The first argument is the file descriptor of the pipe; the others are kinds of jobs whose modules are loaded first.
+    """
     pipe = connect_to_parent()
     process = os.getpid()
     load(sys.argv[2:])
@@ -82,7 +86,7 @@ def load(kinds: list[str]) -> None:
 
 
 def run_job(run: Run, pipe: Connection) -> End:
-    """Run one job and return its end, successful or not, as a message."""
+    """Run one job; return the message `Done` with its result, or `Failed` with the reason."""
     context = Context(run, pipe)
     allow_memory(run.memory_limit_bytes)
     try:

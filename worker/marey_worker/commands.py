@@ -40,8 +40,9 @@ def work(
 ) -> None:
     """Run a worker until SIGTERM or SIGINT, then exit; the exit status is not 0 if a job was running at that time.
 
-    Without `log_form`, log lines are text if standard error is a terminal, else JSON, as for the server. With
-    `attached`, the worker stops also when standard input closes, because the process that started it has ended.
+    Without `log_form`, the variable MAREY_LOG_FORM sets the form of the log; without both, log lines are text if
+    standard error is a terminal, otherwise JSON. With `attached`, the worker also stops when standard input closes,
+    because then the process that started it has ended. Raises `NoCredential` if there is no token.
     """
     if credential.token is None:
         raise NoCredential(
@@ -69,7 +70,7 @@ def work(
 def main() -> None:
     """Run the command line of `python -m marey_worker`; `marey serve` starts workers with it."""
     parser = argparse.ArgumentParser(prog="python -m marey_worker", description="Run jobs of a Marey server.")
-    parser.add_argument("--server", help="address of the server; default: that of MAREY_URL or of the stored login")
+    parser.add_argument("--server", help="address of the server; default: from MAREY_URL or the stored login")
     parser.add_argument("--slots", type=int, default=1, help="number of jobs that run at the same time; default: 1")
     parser.add_argument("--name", help="name of the worker, shown to people; default: host name and process id")
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""Context of a job: the interface that the function of a kind uses for its inputs and results."""
+"""Context of a job: the interface through which the functions of a job kind read inputs and store results."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class RequestRefused(Exception):
 
 
 class NoSuchThing(RequestRefused):
-    """A requested object does not exist, or the job may not read it; `code` names the object, as in `no-skeleton`."""
+    """A requested object does not exist, or the job may not read it; `code` names its kind, as in `no-skeleton`."""
 
     def __init__(self, detail: str, code: str = "not-found") -> None:
         super().__init__(detail)
@@ -140,7 +140,7 @@ class Context:
         return results
 
     def blob(self, digest: str) -> bytes:
-        """Return a blob's bytes by its digest."""
+        """Return the bytes of a blob. Raises `NoSuchThing` if the blob does not exist."""
         data: bytes = self._value(self._send(lambda request: ReadBlob(request, digest)), "no-blob")
         return data
 
@@ -158,15 +158,15 @@ class Context:
         self._staging.append(self._send(lambda request: Stage(request, body)))
 
     def put_file(self, path: Path) -> str:
-        """Send a file and return its digest, for a reference in the result."""
+        """Send a file to the server; return its digest, with which a result can refer to the file."""
         digest: str = self._ask(lambda request: PutFile(request, path))
         return digest
 
     def progress(self, done: float, total: float | None = None, note: str = "") -> None:
         """Report that `done` of `total` units of work are finished, for example clips; may be called often.
 
-        `total` is greater than 0, or None if it is unknown: no share is shown then. `note`, at most 500 characters,
-        names the present step.
+        `total` is greater than 0, or None if it is unknown; then users see no percentage. `note` names the current
+        step in at most 500 characters.
         """
         self._pipe.send_bytes(pack(Made(Progress(done=done, total=total, note=note))))
 
@@ -177,7 +177,10 @@ class Context:
     # -- the pipe --
 
     def _read_ahead(self, wanted: Iterable[tuple[T, PartPlace]]) -> Iterator[tuple[T, Any]]:
-        """Yield each object with its document, or None; several requests are sent before the first answer."""
+        """Yield each object with its document, or None if the document does not exist.
+
+        Several requests are sent before the first answer arrives.
+        """
         rest = iter(wanted)
         waiting: deque[tuple[int, list[tuple[T, PartPlace]]]] = deque()
         while True:
@@ -205,7 +208,11 @@ class Context:
         return request
 
     def _value(self, request: int, missing: str = "not-found") -> Any:
-        """Return the value of an answer. Raises `NoSuchThing` with the code `missing`, and `RequestRefused`."""
+        """Wait for the answer to a request, and return its value.
+
+        If the requested object does not exist, raises `NoSuchThing` with the code `missing`; if the request failed for
+        another reason, raises `RequestRefused`.
+        """
         while request not in self._replies:
             reply: ChildReply = unpack(self._pipe.recv_bytes())
             self._replies[reply.request] = reply
@@ -216,7 +223,7 @@ class Context:
 
 
 def encode_outputs(outputs: Sequence[StagedOutput]) -> bytes:
-    """Return a `StageRequest` in MessagePack; arrays that are already encoded are copied into it."""
+    """Return a `StageRequest` for the outputs in MessagePack; arrays that are already encoded are copied unchanged."""
     request = StageRequest(outputs=tuple(outputs))
     fields = request.model_dump(by_alias=True, exclude={"outputs": {"__all__": {"parts"}}})["outputs"]
     whole = [{**each, "parts": output.parts} for each, output in zip(fields, outputs, strict=True)]

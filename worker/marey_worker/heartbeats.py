@@ -15,7 +15,7 @@ from marey_worker.attempt_api import AttemptApi
 log = logging.getLogger(__name__)
 
 CONFIRM_AFTER = 2 / 3
-"""Share of a lease's duration. If no heartbeat has succeeded for that long, one must succeed before publication."""
+"""Part of a lease's duration. If no heartbeat has succeeded for longer, one must succeed before the final request."""
 
 PROGRESS_EVERY_S = 2.0
 RETRY_S = 1.0
@@ -27,7 +27,7 @@ Jobs that end sooner send no heartbeat.
 
 TICK_S = 0.25
 JITTER = 0.2
-"""Largest share of an interval that is subtracted at random, so that attempts do not send at the same time."""
+"""Largest part of an interval that is subtracted at random, so that attempts do not send at the same time."""
 
 
 class LeaseKeeper:
@@ -63,9 +63,10 @@ class LeaseKeeper:
         self._stopped.set()
 
     def confirm(self, *, patiently: bool) -> None:
-        """Check that the lease is still valid before the final request. With `patiently`, retry for longer.
+        """Send a heartbeat before the final request, unless a recent heartbeat shows that the lease is still valid.
 
-        Raises `LeaseLost`, or the client's error if the server does not answer.
+        With `patiently`, the heartbeat is retried for up to 10 minutes. Raises `LeaseLost` if the lease is lost, or the
+        client's error if the server does not answer.
         """
         self._saying_last_word = True
         if self.lost.is_set() or time.monotonic() - self._heard > CONFIRM_AFTER * self._ttl_s:

@@ -45,7 +45,10 @@ class Run:
 
 @dataclass(frozen=True)
 class ChildReply:
-    """Answer to a request: bytes, a digest, documents or nothing; or the reason why it failed."""
+    """Answer to a request: the requested value, or the reason why the request failed.
+
+    `missing` is true if the reason is that the requested object does not exist.
+    """
 
     request: int
     value: Any = None
@@ -78,7 +81,7 @@ class ReadItem:
 
 @dataclass(frozen=True)
 class FindItems:
-    """Request for items by name, directly in a collection or anywhere in the project."""
+    """Request for items by name, directly in a collection, or anywhere in the project if `collection` is None."""
 
     request: int
     kind: Kind
@@ -103,7 +106,7 @@ class ReadResults:
 
 @dataclass(frozen=True)
 class PutFile:
-    """Request to send a file; the answer is its digest."""
+    """Request to send a file to the server; the answer is the digest of the file."""
 
     request: int
     path: Path
@@ -174,4 +177,4 @@ def unpack(data: bytes) -> Any:
         name, fields = msgpack.unpackb(data, strict_map_key=True)
         return _FORMS[name].validate_python(fields)
     except (ValueError, TypeError, KeyError, msgpack.UnpackException, RecursionError, ValidationError) as error:
-        raise BadMessage(f"a child process sent {len(data)} bytes that cannot be read as a message: {error}") from error
+        raise BadMessage(f"{len(data)} bytes from another process cannot be read as a message: {error}") from error

@@ -1,5 +1,6 @@
-"""Signatures of failures, by which equal failures are recognised: after two attempts with the same signature, a job is
-not retried.
+"""Signatures of failures, by which equal failures are recognised.
+
+After two attempts with the same signature, a job is not retried.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ import signal
 import traceback
 
 STAGING = "staging"
-"""Signature of results that the server did not store."""
+"""Signature of the failure that the server did not store results."""
 
 
 def of_exception(error: BaseException) -> str:
@@ -26,11 +27,11 @@ def of_exit(status: int) -> str:
 
 
 def told_exit(status: int) -> str:
-    """Return a sentence about a process that ended unexpectedly."""
+    """Return a text that states how a process ended unexpectedly."""
     if status == -signal.SIGKILL:
         return "the process that ran the job was killed (SIGKILL); most likely the machine ran out of memory"
     if status < 0:
-        return f"the process that ran the job died of {_signal_name(-status)}"
+        return f"the process that ran the job was ended by {_signal_name(-status)}"
     return f"the process that ran the job exited with status {status}"
 
 

@@ -42,7 +42,7 @@ class WorkerOptions:
     """Options of a worker.
 
     `kinds` and `labels` select the jobs of the worker; `slots` is the number of concurrent jobs; `threads` is the total
-    number of threads of all slots.
+    number of threads of all slots. `cache` is the folder of cached inputs, and `cache_bytes` is its greatest size.
     """
 
     name: str = field(default_factory=lambda: f"{socket.gethostname()}:{os.getpid()}")
@@ -65,9 +65,9 @@ def default_cache(environment: Mapping[str, str]) -> Path:
 
 
 class Supervisor:
-    """Supervisor process of a worker, which communicates with the server for its children.
+    """Supervisor process of a worker, which communicates with the server on behalf of its child processes.
 
-    It continues if a child crashes.
+    The supervisor continues if a child process crashes.
     """
 
     def __init__(self, transport: Transport, options: WorkerOptions) -> None:
@@ -85,7 +85,7 @@ class Supervisor:
         self._stopping.set()
 
     def run(self) -> int:
-        """Work until stopped, and return the exit status.
+        """Run jobs until the worker is stopped, and return the exit status.
 
         The status is not 0 if a job was running at that time, if the worker failed, or if the server refused it.
         """
@@ -105,7 +105,7 @@ class Supervisor:
     # -- one slot --
 
     def _work(self) -> None:
-        """Claim and run jobs in one slot until stopped. An unexpected error stops the whole worker."""
+        """Claim and run jobs in one slot until the worker is stopped. An unexpected error stops the whole worker."""
         try:
             self._claim_and_run()
         except Exception:
@@ -165,7 +165,10 @@ class Supervisor:
         return claim(opened.transport, wanted)
 
     def _attempt(self, lease: Lease, child: ChildProcess, finisher: Executor) -> Future[None]:
-        """Run a job; its last results are stored, and its success is reported, while the child runs the next one."""
+        """Run a job; return a future that ends when its results are stored and its end is reported.
+
+        If the job was successful, the child can run the next job before that.
+        """
         place = (lease.job, lease.fence)  # a lost job may run again before its former attempt has ended
         self._running.add(place)
         try:
@@ -195,8 +198,8 @@ class Supervisor:
 class _OpenClaim:
     """Claim that is repeated with the same token and the same id until it is answered.
 
-    The same token is used even if it is rotated meanwhile, because the server repeats an answer only for the token that
-    sent the claim first.
+    The same token is used even if it is rotated in the meantime, because the server repeats an answer only for the
+    token with which the claim was sent first.
     """
 
     transport: Transport

@@ -24,7 +24,7 @@ from marey_worker.job_io.skeleton_cache import Rig, read_rigged
 
 
 class Unusable(NamedTuple):
-    """Folder whose clips cannot be used for matching, with the reason."""
+    """Folder whose clips cannot be used for motion matching, with the number of clips and the reason."""
 
     folder: str
     clips: int
@@ -49,7 +49,7 @@ class _Group(NamedTuple):
 
 
 def read_candidates(context: Context, evaluated: EvaluatedSet) -> Candidates:
-    """Return the matching databases of the job's input `candidates`, without clips that the set already contains."""
+    """Return the matching databases of the job's input `candidates`, without clips of the evaluated set."""
     database = evaluated.clips.database
     known = {source_of(clip) for clip in database.clips}
     pins = [pin for pin in context.inputs.get("candidates", ()) if uid_of(pin) not in known]
@@ -69,14 +69,17 @@ def read_candidates(context: Context, evaluated: EvaluatedSet) -> Candidates:
 
 
 def _named(context: Context, groups: dict[tuple[str, str], _Group]) -> Iterator[tuple[str, _Group]]:
-    """Yield each group with its name: the folder, and the skeleton if the folder has clips of several skeletons."""
+    """Yield the name of each group, and the group.
+
+    The name is the folder, with the name of the skeleton if the folder has clips of several skeletons.
+    """
     for (folder, skeleton), group in groups.items():
         alone = sum(other == folder for other, _ in groups) == 1
         yield folder if alone else f"{folder} ({context.item(Kind.SKELETON, skeleton).name})", group
 
 
 def _build(context: Context, group: _Group, database: MatchingDatabase) -> MatchingDatabase:
-    """Return the matching database of a group; if the skeletons are equal, it uses the body of `database`."""
+    """Return the matching database of a group; if its skeleton equals that of `database`, use the same body."""
     newest = max(map(_skeleton_of, group.motions), key=lambda ref: ref.revision)
     rigged = read_rigged(context, Rig.as_stored(newest))
     body = database.body

@@ -19,7 +19,7 @@ from marey_worker.job_io.matching_clips import MatchingClips, read_evaluated_cli
 
 @dataclass(frozen=True)
 class EvaluatedSet:
-    """Evaluation with the records of its trials, and the matching database of its clips, with the same scaling."""
+    """Evaluation with the records of its trials, and the matching database of its clips in the same scaling."""
 
     result: EvaluationResult
     clips: MatchingClips
@@ -39,7 +39,7 @@ def read_result(context: Context, pin: PinnedInput) -> tuple[EvaluationResult, M
 
 
 def read_evaluated_set(context: Context) -> EvaluatedSet:
-    """Return the job's input `evaluation` with its clips. Raises `JobRefused`."""
+    """Return the job's input `evaluation` with its clips. Raises `JobRefused` if the clips cannot be used."""
     (pin,) = context.inputs["evaluation"]
     result, document = read_result(context, pin)
     return EvaluatedSet(result, read_evaluated_clips(context, pin, document, result.options.database))
@@ -51,7 +51,7 @@ def store_document(context: Context, tree: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def store_file(context: Context, data: bytes) -> dict[str, Any]:
-    """Send a file; return the entry for the job's result, which also protects the file from garbage collection."""
+    """Send a file; return the entry for the job's result, which also prevents garbage collection of the file."""
     file = context.scratch / "document"
     file.write_bytes(data)
     return StoredFile(blob=context.put_file(file), size_bytes=len(data)).model_dump(mode="json")

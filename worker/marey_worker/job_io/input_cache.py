@@ -1,4 +1,4 @@
-"""Cache of downloaded inputs: files with a checksum; the least recently used are removed first."""
+"""Cache of downloaded inputs: files with a checksum; the least recently used files are removed first."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class InputCache:
         self._bytes = sum(size for _, size, _ in self._files())
 
     def get(self, key: str, fetch: Callable[[], bytes]) -> bytes:
-        """Return the bytes of `key` from the folder, or else from `fetch`, and store them."""
+        """Return the bytes of `key` from the folder; if they are not there, call `fetch` and store its result."""
         (data,) = self.get_many([key], lambda _missing: [fetch()])
         assert data is not None
         return data
 
     def get_many(self, keys: Sequence[str], fetch: Callable[[list[int]], Sequence[bytes | None]]) -> list[bytes | None]:
-        """Return the bytes of `keys`; those that are not cached come from `fetch`, which gets their indices.
+        """Return the bytes of `keys`; call `fetch` with the indices of keys that are not cached, and store the result.
 
         `fetch` may leave out values at the end; the result then ends before the first key without a value. A value of
         None is returned, but not stored.
@@ -54,7 +54,7 @@ class InputCache:
         return held if len(fetched) == len(missing) else held[: missing[len(fetched)]]
 
     def _read(self, path: Path) -> bytes | None:
-        """Return the stored bytes, or None; another worker may remove them at any moment."""
+        """Return the stored bytes; return None if they are damaged, or missing because another worker removed them."""
         try:
             sealed = path.read_bytes()
             os.utime(path)

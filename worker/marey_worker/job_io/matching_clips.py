@@ -32,7 +32,7 @@ from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.skeleton_cache import Rig, read_rigged
 
 MOST_KEPT = 1
-"""Greatest number of cached databases; an hour of motion takes a few hundred megabytes."""
+"""Greatest number of cached databases; the database of an hour of motion takes a few hundred megabytes."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,9 @@ _cache: LruCache[bytes, MatchingClips] = LruCache(max_entries=MOST_KEPT)
 class ClipSet:
     """Clips of a matching database, with their trims and loops.
 
-    Together with the options and the normaliser, they determine the database."""
+    Together with the options and the normaliser, they determine the database. `trims` maps items to half-open ranges of
+    frames; `loops` lists the items that are loops; `rig` is the skeleton revision whose joint mapping is used.
+    """
 
     clips: tuple[PinnedInput, ...]
     rig: PinnedInput | None = None
@@ -89,10 +91,10 @@ def wanted_clips(context: Context, params: EvaluateParams) -> ClipSet:
 
 
 def read_clips(context: Context, params: EvaluateParams, options: DatabaseOptions) -> MatchingClips:
-    """Return the job's clips, prepared for matching.
+    """Return the matching database of the job's clips, from the cache if possible.
 
-    Raises `JobRefused` for clips of several skeletons, trims that do not fit, a skeleton that lacks joints, or too few
-    frames.
+    Raises `JobRefused` if the clips have several skeletons, a skeleton lacks joints, a trim is outside its clip, or
+    there are too few frames.
     """
     pins = {name: [(pin.item, pin.revision) for pin in many] for name, many in context.inputs.items()}
     chosen = params.model_dump(mode="json", include={"database", "loops", "trims"})
@@ -107,15 +109,15 @@ def read_clips(context: Context, params: EvaluateParams, options: DatabaseOption
 def read_evaluated_clips(
     context: Context, evaluation: PinnedInput, document: Mapping[str, Any], options: DatabaseOptions
 ) -> MatchingClips:
-    """Return the clips of an evaluation at the revisions that it used, with features scaled by its normaliser.
+    """Return the clips of an evaluation at the revisions that it used, scaled by the normaliser of the evaluation.
 
     Raises `JobRefused` if the evaluation does not list its clips.
     """
     if "clip_set" not in document:
         raise JobRefused(
             "clips-unknown",
-            f"the evaluation {evaluation.path} does not list its clips, because an old version "
-            "created it; evaluate the clips again",
+            f"the evaluation {evaluation.path} does not list its clips, because an old version of "
+            "Marey created it; evaluate the clips again",
         )
     wanted = ClipSet.from_tree(document["clip_set"])
     normaliser = Normaliser.from_tree(document["normaliser"])
@@ -140,7 +142,11 @@ def refusing_motion_errors() -> Iterator[None]:
 def build_set(
     context: Context, wanted: ClipSet, options: DatabaseOptions, normaliser: Normaliser | None
 ) -> MatchingDatabase:
-    """Return the database of clips of one skeleton. Raises `JobRefused`, `MotionError`."""
+    """Return the matching database of a set of clips.
+
+    Raises `JobRefused` if the clips have several skeletons or a trim is outside its clip, and `MotionError` if the
+    clips cannot be used for motion matching.
+    """
     motions = list(read_motions(context, wanted.clips))
     rigged = read_rigged(context, _common_rig(context, wanted, motions))
     body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
@@ -155,7 +161,7 @@ def build_clips(
     options: DatabaseOptions,
     normaliser: Normaliser | None,
 ) -> MatchingDatabase:
-    """Return the database of clips from their motions, each given with its digest."""
+    """Return the matching database of clips; `motions` contains the digest and the motion of each clip."""
     infos = context.documents(wanted.clips, "info", required=False)
     clips = [
         SourceClip(
@@ -179,7 +185,7 @@ def uid_of(pin: PinnedInput) -> str:
 
 
 def read_motions(context: Context, pins: Sequence[PinnedInput]) -> Iterator[tuple[str, MotionDocument]]:
-    """Yield the digest and the motion of each clip."""
+    """Yield the digest of the part `motion` of each clip, and the motion."""
     for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
         context.progress(0, None, f"reading clip {done + 1} of {len(pins)}, {pin.name}")
         yield document_digest(tree), MotionDocument.model_validate(tree)
@@ -222,7 +228,7 @@ def _trim(pin: PinnedInput, motion: MotionDocument, trims: Mapping[str, tuple[in
 
 
 def _pinned_normaliser(context: Context) -> Normaliser | None:
-    """Return the normaliser of the evaluation that the job names, if any."""
+    """Return the normaliser of the evaluation in the input `normaliser`, or None if the job has no such input."""
     for pin in context.inputs.get("normaliser", ()):
         evaluation = context.document(Kind.EVALUATION, pin.item, pin.revision, "evaluation")
         return Normaliser.from_tree(evaluation["normaliser"])

@@ -1,4 +1,4 @@
-"""Refusals: inputs that a job could not use, with reasons; the other inputs are processed."""
+"""Refusals: inputs that a job cannot use, with reasons; the job processes its other inputs."""
 
 from __future__ import annotations
 
@@ -11,14 +11,11 @@ from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import Context, NoSuchThing
 
 UNUSABLE = (MotionError, ValidationError, NoSuchThing)
-"""Errors that concern a single input; the other inputs are processed."""
+"""Errors that concern a single input; the job processes its other inputs."""
 
 
 def present(pin: PinnedInput, document: Any) -> Any:
-    """Return a document of an input.
-
-    Raises `NoSuchThing` if it is None because the input was deleted while the job waited.
-    """
+    """Return `document`; if it is None because the input was deleted while the job waited, raise `NoSuchThing`."""
     if document is None:
         raise NoSuchThing(f"revision {pin.revision} of the item {pin.item} no longer exists", f"no-{pin.kind}")
     return document

@@ -1,4 +1,4 @@
-"""Folders and names of a job's results, which must be unique and different from those of its inputs."""
+"""Folders and names of a job's results, which must be unique and differ from the folders and names of its inputs."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class ResultPlaces:
     def take(self, kind: Kind, collection: str, *names: str) -> None:
         """Reserve names in a collection below `into` for results.
 
-        If a name is too long, or taken, or if its result would replace an input, raises `MotionError` and reserves
-        none of the names.
+        Raises `MotionError` if a name is too long or already reserved, or if its result would replace an input; then no
+        name is reserved.
         """
         for name in names:
             self._require_free(kind, collection, name)
@@ -38,7 +38,7 @@ class ResultPlaces:
         self._taken |= {(kind, collection, name) for name in names}
 
     def keep(self, pin: PinnedInput) -> None:
-        """Reserve the folder and name of an input for the result made from it.
+        """Reserve the folder and name of an input for the result that is made from this input.
 
         Raises `MotionError` if they are reserved for another result.
         """
@@ -59,7 +59,7 @@ class ResultPlaces:
 
 
 def require_different(places: Iterable[tuple[str, str]]) -> None:
-    """Raise `JobRefused` if two results have the same folder and name; called before any computation."""
+    """Raise `JobRefused` if two of the places (folder, name) are equal; call this before any computation."""
     counts = Counter(places)
     for (folder, name), count in counts.most_common(1):
         if count > 1:

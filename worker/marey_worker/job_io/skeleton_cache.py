@@ -51,7 +51,10 @@ def read_rigged(context: Context, rig: Rig) -> Rigged:
 
 
 def plan_between(context: Context, source: Rig, target: Rig, scale: float | None) -> RetargetPlan:
-    """Return the plan of retargeting from one skeleton to another. Raises `MotionError`."""
+    """Return the plan for retargeting from one skeleton to another.
+
+    Raises `MotionError` if a joint mapping cannot be used, or if joints or axes that the plan needs are missing.
+    """
 
     def plan() -> RetargetPlan:
         return plan_retarget(*read_rigged(context, source), *read_rigged(context, target), scale=scale)

@@ -22,7 +22,7 @@ _encoder = ThreadPoolExecutor(1, thread_name_prefix="marey-encode")
 
 
 class StagedResults:
-    """Results of one job in the order of staging; `names` are the names of all results so far."""
+    """Results of one job, which are staged in batches; `names` contains the names of all results so far."""
 
     def __init__(self, context: Context) -> None:
         self.names: set[str] = set()
@@ -41,7 +41,7 @@ class StagedResults:
         Raises `JobRefused` for a repeated name, because the second result would replace the first.
         """
         if output.name in self.names:
-            raise JobRefused("same-name", f"two results of the job would have the name {output.name}")
+            raise JobRefused("same-name", f"two results of the job would have the name {output.name}; rename an input")
         self.names.add(output.name)
         self._ready.append(_encoder.submit(_with_encoded_arrays, output))
         self._ready_bytes += _array_bytes(output.parts)

@@ -30,7 +30,7 @@ def store_report(
 def _scripts(page: str) -> tuple[str, ...]:
     """Return the SHA-256 digest of the page's script, or an empty tuple if the page has none.
 
-    The script is the last element that looks like one, because earlier ones can be names of clips.
+    The script is the last `<script>` in the page, because earlier ones can be parts of names of clips.
     """
     _, found, rest = page.rpartition("<script>")
     digest = hashlib.sha256(rest.partition("</script>")[0].encode()).digest()

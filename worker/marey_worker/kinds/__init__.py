@@ -1,1 +1,1 @@
-"""Kinds of jobs: one module each, with `run(context, params)`."""
+"""Kinds of jobs: each module implements one kind with the function `run(context, params)`."""

@@ -52,10 +52,10 @@ class _ClipAnnotation(NamedTuple):
 
 
 def run(context: Context, params: AlignParams) -> dict[str, Any]:
-    """Align the clips of the job; clips that cannot be aligned are listed as refusals in the result, with code and
-    reason.
+    """Align the clips of the job.
 
-    Raises `JobRefused` if fewer than two clips are left, or if two results would have the same name.
+    A clip that cannot be aligned is listed as a refusal in the result, with code and reason. Raises `JobRefused` if
+    fewer than two clips can be aligned, or if two results would have the same name.
     """
     return _Job(context, params).run()
 
@@ -96,7 +96,7 @@ class _Job:
     # -- what is aligned --
 
     def _require_names(self) -> None:
-        """Raise `JobRefused` if names of results would be equal or too long; called before any computation."""
+        """Raise `JobRefused` if names of results would be equal or too long, before anything is computed."""
         twins = ("", MIRRORED_NAME) if self._params.mirroring == "add" else ("",)
         names = [(pin.folder, self._name(pin, twin)) for pin in self._pins.values() for twin in twins]
         require_different(names)
@@ -122,15 +122,15 @@ class _Job:
             yield _Clip(pin, motion, document_digest(tree), RevisionRef.model_validate(motion.skeleton.model_dump()))
 
     def _of_one_skeleton(self, clips: Sequence[_Clip]) -> list[_Clip]:
-        """Return the clips of the most frequent skeleton; the others are refused."""
+        """Return the clips that use the most frequent skeleton; refuse the other clips."""
         counts = Counter(clip.skeleton.item for clip in clips)
         most = min(counts, key=lambda item: (-counts[item], item), default=None)
         others = [clip for clip in clips if clip.skeleton.item != most]
         if others:
             theirs = self._context.item(Kind.SKELETON, str(most)).path
             error = MotionError(
-                f"it has another skeleton than {counts[str(most)]} of {len(clips)} clips, which have {theirs}; "
-                "move all clips to one skeleton with marey retarget, or build-model --to",
+                f"it has another skeleton than {counts[str(most)]} of {len(clips)} clips, which have {theirs}; move "
+                "all clips to one skeleton first, with `marey retarget` or `marey build-model --to`",
                 code="skeleton-mismatch",
             )
             for clip in others:
@@ -181,7 +181,10 @@ class _Job:
     # -- annotations --
 
     def _read_annotations(self) -> dict[str, list[_ClipAnnotation]] | None:
-        """Return the annotations of the requested layer by id of the clip; None if no annotations are given."""
+        """Return the annotations of the requested layer by id of the clip, or None if no annotations are given.
+
+        Raises `JobRefused` if no annotations are given, but a layer or labels.
+        """
         pins = self._context.inputs.get("annotations", ())
         if not pins:
             if self._params.layer is not None or self._params.labels:
@@ -200,9 +203,10 @@ class _Job:
         return found
 
     def _cuts(self, clip: _Clip, annotations: Mapping[str, Sequence[_ClipAnnotation]]) -> tuple[Cut, ...]:
-        """Return the frames at which a clip's annotation cuts it.
+        """Return the frames at which a clip's annotation cuts the clip.
 
-        An annotation of the clip's own revision has precedence over annotations of other revisions of the clip.
+        An annotation of the clip's own revision has precedence over annotations of other revisions of the clip. Raises
+        `MotionError` if no annotation, or more than one, can be used.
         """
         known = annotations.get(clip.pin.item, ())
         known = [one for one in known if one.clip.revision == clip.pin.revision] or known
@@ -320,7 +324,7 @@ class _Job:
 
 
 def _row(one: AlignedClip) -> dict[str, Any]:
-    """Return the row of an aligned clip in the table of examples."""
+    """Return the entry of an aligned clip in the job's result."""
     slopes = np.diff(one.time_function)
     return {
         "name": one.name,

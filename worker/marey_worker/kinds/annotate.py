@@ -1,4 +1,4 @@
-"""Kind `annotate`: proposes segments and keyframes of clips by algorithms."""
+"""Kind `annotate`: creates annotations of clips whose segments and keyframes an algorithm proposes."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _proposal(params: AnnotateParams) -> Propose:
 
 
 def _joints(rigged: Rigged, names: Sequence[str]) -> tuple[int, ...]:
-    """Return the indices of joints, found by their own names or else by standard names. Raises `UnknownJoint`."""
+    """Return the indices of joints that are given by their names or standard names. Raises `UnknownJoint`."""
     found = []
     for name in names:
         own = name if name in rigged.skeleton else rigged.mapping.joints.get(name)

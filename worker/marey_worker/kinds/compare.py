@@ -1,4 +1,4 @@
-"""Kind `compare`: compares two evaluations of the same trials, as a document and as a report."""
+"""Kind `compare`: compares two evaluations of the same trials, and writes a document and a report."""
 
 from __future__ import annotations
 

@@ -29,15 +29,15 @@ from marey_worker.job_io.staged_results import StagedResults
 
 
 def run(context: Context, params: CutParams) -> dict[str, Any]:
-    """Create a clip from every selected segment, and an annotation if the segment contains keyframes.
+    """Create a clip from every selected segment, and an annotation if the clip has keyframes or margins.
 
-    Raises `JobRefused` if no annotation has such a segment, or if two pieces would have the same name.
+    Raises `JobRefused` if no segment is selected, or if two pieces would have the same name.
     """
     return _Cutting(context, params).run()
 
 
 class _AnnotatedClip(NamedTuple):
-    """Annotation, its clip, and each segment to cut out with the name of its piece."""
+    """Annotation, its clip, and the segments to cut out, each with the name of its piece."""
 
     pin: PinnedInput
     annotation: Annotation
@@ -59,7 +59,7 @@ class _Cutting:
         self._refusals = Refusals(context)
 
     def run(self) -> dict[str, Any]:
-        """Cut all clips; return the number of pieces by label and the refused clips."""
+        """Cut all clips; return the number of pieces, their number by label, and the refused annotations."""
         labels: Counter[str] = Counter()
         todo = self._read()
         self._require_pieces(todo)
@@ -99,7 +99,8 @@ class _Cutting:
         """Return the annotated clip with its name and folder.
 
         If clips are inputs of the job, name and folder are those at the time of submission: results are cached for jobs
-        with the same inputs, so later changes must not affect them. Raises `MotionError` or `NoSuchThing`.
+        with the same inputs, so later changes must not affect the results. Raises `MotionError` if the clip is not an
+        input of the job although other clips are, and `NoSuchThing` if it does not exist.
         """
         if not self._clips:
             return self._context.item(Kind.CLIP, clip.item)
@@ -139,7 +140,7 @@ class _Cutting:
             )
 
     def _why_nothing(self, todo: Sequence[_AnnotatedClip]) -> str:
-        """Return the reason why no segment is cut out, apart from refused annotations."""
+        """Return the reason why no segment is cut out, without the refused annotations."""
         if not todo:
             layer = self._params.layer
             return "no annotation can be used" if layer is None else f"no annotation of the layer {layer!r} can be used"
@@ -192,7 +193,7 @@ class _Cutting:
         return max(0, segment.start - before), min(len(motion.poses), segment.end + after)
 
     def _info(self, clip: RevisionRef) -> ClipInfo:
-        """Return the part `info` of the pieces: the facts about the clip that are also true of the pieces."""
+        """Return the part `info` of the clip without its checks, which do not apply to the pieces."""
         try:
             stored = self._context.document(Kind.CLIP, clip.item, clip.revision, "info")
         except NoSuchThing:
@@ -207,7 +208,7 @@ class _Cutting:
 
 
 def _sliced(motion: MotionDocument, frames: tuple[int, int]) -> dict[str, Any]:
-    """Return the part `motion` of the frames [start, end), bit for bit."""
+    """Return the part `motion` for the frames [start, end), whose values are copied unchanged."""
     kept = slice(*frames)
     translations = None if motion.translations is None else np.ascontiguousarray(motion.translations[kept])
     poses = np.ascontiguousarray(motion.poses[kept])

@@ -32,7 +32,7 @@ def run(context: Context, params: EditParams) -> dict[str, Any]:
     """Apply the commands to every clip of the job.
 
     A clip that cannot be edited is listed as a refusal in the result, with code and reason. Raises `JobRefused` if the
-    commands, the clips that they name, or the places of the results are ambiguous.
+    commands or the places of the results are missing or ambiguous, or if a clip that a command names cannot be used.
     """
     return _Editing(context, params).run()
 
@@ -92,7 +92,7 @@ class _Editing:
     def _edited(
         self, pin: PinnedInput, motion: MotionDocument, known: dict[str, Any] | None, sources: Mapping[str, Clip]
     ) -> Iterator[StagedOutput]:
-        """Return the results of one clip. Raises `MotionError`, `NoSuchThing`."""
+        """Yield the results of one clip. Raises `MotionError` or `NoSuchThing` if the clip cannot be edited."""
         if self._params.in_place:
             self._require_newest(pin)
         body = self._body(motion)
@@ -152,7 +152,7 @@ class _Editing:
         return self._bodies[used]
 
     def _info(self, pin: PinnedInput, stored: dict[str, Any] | None) -> ClipInfo:
-        """Return the part `info` of a result: the facts about the clip that are still true, and the applied edit."""
+        """Return the part `info` of a result: the part `info` of the clip without its checks, and the applied edit."""
         edit = None if self._edit_pin is None else self._edit_pin.as_input().model_dump()
         done = {
             "clip": pin.as_input().model_dump(),
@@ -195,7 +195,10 @@ class _Editing:
 
 
 def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | None, EditDocument]:
-    """Return the commands, and the edit item that contains them, if any. Raises `JobRefused`."""
+    """Return the edit item and its commands; the item is None if the parameters of the job contain the commands.
+
+    Raises `JobRefused` if there are no commands, commands in both places, or an item that is not valid.
+    """
     (pin,) = context.inputs.get("edit", ()) or (None,)
     if (pin is None) == (not params.commands):
         raise JobRefused("which-commands", "give either an edit or commands, and not both")
@@ -208,7 +211,7 @@ def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | No
 
 
 def _wanted_sources(context: Context, edit: EditDocument) -> dict[str, PinnedInput]:
-    """Return the clips that commands name, by id. Raises `JobRefused` if one is missing or given twice."""
+    """Return the clips that commands name, by id. Raises `JobRefused` if a clip is missing or given twice."""
     given = [pin for pin in context.inputs.get("sources", ()) if pin.item in edit.sources]
     found = {pin.item: pin for pin in given}
     if len(found) < len(given):

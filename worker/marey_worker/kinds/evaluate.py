@@ -1,4 +1,4 @@
-"""Kind `evaluate`: evaluates a set of locomotion clips by trials, which are split over tasks and then combined."""
+"""Kind `evaluate`: evaluates a set of locomotion clips by trials, which are divided among tasks and then combined."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Headline = dict[str, float | int | None]
 
 
 def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
-    """Simulate this task's share of the trials by motion matching; the result names the file with their records."""
+    """Simulate the trials of this task by motion matching; the result names the file with the records of the trials."""
     options = EvaluationOptions.of(params)
     trials = _trials(params, options)[context.task.position :: context.task.size]
     clips = read_clips(context, params, options.database)
@@ -105,7 +105,7 @@ def _read_records(context: Context, results: Sequence[Mapping[str, Any]]) -> dic
 
 
 def headline_of(result: EvaluationResult) -> Headline:
-    """Return the numbers of `HEADLINE_METRICS`."""
+    """Return the main numbers of an evaluation by name; `HEADLINE_METRICS` lists these names."""
     sources = sum_by_source(result.clips, result.usage)
     rows = recorded_rows(result.clips, result.usage)
     found: Headline = {
@@ -125,7 +125,7 @@ def headline_of(result: EvaluationResult) -> Headline:
 
 
 def write_report(context: Context, result: EvaluationResult, params: EvaluateParams) -> dict[str, Any]:
-    """Draw every figure, write the page, store both as files, and return the document that refers to these files."""
+    """Draw all figures, write the page, and store both as files; return the document that refers to these files."""
     figures = draw_figures(result)
     page = render_report(result, title=params.name, figures=figures)
     drawn = [*((None, figure) for figure in figures.values()), *_trial_figures(result, params)]
@@ -133,7 +133,7 @@ def write_report(context: Context, result: EvaluationResult, params: EvaluatePar
 
 
 def _trial_figures(result: EvaluationResult, params: EvaluateParams) -> Iterator[tuple[str, DrawnFigure]]:
-    """Return the requested figures of single trials."""
+    """Yield the requested figures of single trials, each with the name of its trial."""
     families = {one.trial.name: one.trial.family for one in result.trials}
     for trial in params.trial_figures:
         for name, kind in FIGURES.items():

@@ -31,7 +31,10 @@ class _File(NamedTuple):
 
 
 def run(context: Context, params: ExportParams) -> dict[str, Any]:
-    """Write the archive. The result names the archive, and lists as refusals the clips that cannot be written."""
+    """Write the clips of the job to an archive; the result names it, and lists the clips that cannot be written.
+
+    Raises `JobRefused` if no clip can be written.
+    """
     exporting = _Exporting(context, params)
     archive = context.scratch / "archive.zip"
     refused: list[dict[str, Any]] = []
@@ -70,7 +73,6 @@ class _Exporting:
         """Return a clip as a file in the requested format.
 
         `info` and `tree` are the parts `info` and `motion` of the clip; the format "original" does not need `tree`.
-
         Raises `MotionError` or `NoSuchThing` if the clip has no file in this format.
         """
         if self._params.format == "original":
@@ -102,13 +104,13 @@ class _Exporting:
 
 
 def _place(pin: PinnedInput) -> str:
-    """Return the path of a clip in the archive; it never leads out of the folder where the archive is extracted."""
+    """Return the path of a clip in the archive, which is always below the folder where the archive is extracted."""
     parts = [part for part in (*pin.collection.split("/"), pin.name) if part not in ("", ".", "..")]
     return "/".join(part.replace("\\", "_") for part in parts)
 
 
 def _free_name(pin: PinnedInput, name: str, taken: Collection[str]) -> str:
-    """Return a file name that is not taken, if necessary with the item's id, or with its id and revision."""
+    """Return `name` if it is not taken, otherwise a name with the item's id, or with its id and revision."""
     file = name.rpartition("/")[2]
     candidates = (name, f"{pin.item}-{file}", f"{pin.item}-{pin.revision}-{file}")
     return next(one for one in candidates if one not in taken)

@@ -36,9 +36,9 @@ class _Importing:
         self._skeleton = self._read_skeleton()
         self._results = StagedResults(context)
         self._mappings: dict[bytes, Any] = {}
-        """Parts `mapping` of the skeletons so far, by the digest of the skeleton."""
+        """Parts `mapping` of the skeletons so far, by the canonical JSON of the skeleton's hierarchy."""
         self._models: list[tuple[str, str, NamedModel]] = []
-        """Models of this job: collection, name, and reference for graphs."""
+        """Models that this job imports: collection, name, and the reference that a graph uses."""
 
     def run(self) -> dict[str, Any]:
         """Import all files in order, and return the result of the job."""

@@ -68,7 +68,7 @@ def run(context: Context, params: ModelParams) -> dict[str, Any]:
 
 
 def _read(context: Context, pins: Sequence[PinnedInput]) -> tuple[list[MotionDocument], list[dict[str, Any]]]:
-    """Read the motion and the info of each aligned clip."""
+    """Return the parts `motion` and `info` of each aligned clip. Raises `JobRefused` if an `info` is not valid."""
     motions, infos = [], []
     for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
         context.progress(done, len(pins), f"reading {pin.name}")
@@ -114,7 +114,7 @@ def _aligned(
 def _provenance(
     context: Context, pins: Sequence[PinnedInput], aligned: AlignedSet, infos: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
-    """Return the sources of the examples, for the part `model`."""
+    """Return the field `provenance` of the part `model`: the aligned clips, the reference and the seed."""
     return {
         "aligned": [{"item": pin.item, "revision": pin.revision, "name": pin.path} for pin in pins],
         "set": infos[0].get("set"),

@@ -1,4 +1,4 @@
-"""Kind `optimise`: improves a set of clips step by step, and logs each step."""
+"""Kind `optimise`: removes and adds clips of an evaluated set step by step, and logs each step."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from marey_worker.job_io.matching_clips import refusing_motion_errors
 
 
 def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
-    """Remove and add clips as long as that improves the set; the result names the document with every step."""
+    """Remove and add clips while this improves the set; the result names the document that lists the steps."""
     evaluated = read_evaluated_set(context)
     candidates = read_candidates(context, evaluated)
     with refusing_motion_errors():
@@ -54,14 +54,14 @@ def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
 
 
 def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> MatchingDatabase:
-    """Return the set and its candidates. Raises `JobRefused` if their clips cannot be in one database."""
+    """Return one database with the clips of the set and all candidates. Raises `JobRefused` if that is not possible."""
     unusable = [f"{one.folder} ({one.detail})" for one in candidates.unusable]
     strangers = [name for name, other in candidates.databases.items() if not same_skeleton(database, other)]
     if unusable or strangers:
         raise JobRefused(
             "skeleton-mismatch",
-            f"the clips in {', '.join([*strangers, *unusable])} cannot be combined with those of the evaluation; move "
-            "them to the evaluation's skeleton first, with `marey retarget`, or leave them out",
+            f"the clips in {', '.join([*strangers, *unusable])} cannot be combined with the clips of the evaluation; "
+            "move them to the evaluation's skeleton first, with `marey retarget`, or leave them out",
         )
     for other in candidates.databases.values():
         database = joined(database, other)
@@ -71,7 +71,7 @@ def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> Matc
 def _simulation(context: Context, evaluated: EvaluatedSet, database: MatchingDatabase) -> Resimulation:
     """Return a simulation with the clips of `database`.
 
-    If these are only the clips of the evaluated set, the simulation reuses the records of the evaluation.
+    If `database` contains only the clips of the evaluated set, the simulation reuses the records of the evaluation.
     """
     alone = database is evaluated.clips.database
     return Resimulation(

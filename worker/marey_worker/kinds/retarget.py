@@ -102,7 +102,7 @@ class _Retargeting:
         )
 
     def _info(self, stored: dict[str, Any] | None, plan: RetargetPlan, checks: tuple[Check, ...]) -> ClipInfo:
-        """Return the part `info` of a result: its origin, and the facts about the source that are still true."""
+        """Return the part `info` of a result: the part `info` of the source with another origin and other checks."""
         details = {
             "scale": plan.scale,
             "mapped": len(plan.pairs),

@@ -1,4 +1,4 @@
-"""Kind `sweep`: runs the trials of an evaluation with other weights of the features, one task for each setting."""
+"""Kind `sweep`: runs the trials of an evaluation with other feature weights, one task for each setting."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SWEEP_SCHEMA = "marey/sweep@1"
 
 
 def run(context: Context, params: SweepParams) -> dict[str, Any]:
-    """Evaluate the clips with the settings of the weights that belong to this task."""
+    """Evaluate the clips with the weights of this task; the result contains the weights and the metrics."""
     evaluated = read_evaluated_set(context)
     settings = vary_each_group(evaluated.result.options.database, params.factors)
     with refusing_motion_errors():
@@ -34,7 +34,7 @@ def run(context: Context, params: SweepParams) -> dict[str, Any]:
 
 
 def gather(context: Context, params: SweepParams, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Collect all settings in order, and rank the groups of features by their effect."""
+    """Combine the rows of all tasks in order, rank the groups of features by their effect, and store the document."""
     # Task i of n has made the settings i, i + n, i + 2n and so on.
     longest = max(len(result["rows"]) for result in results)
     found = [result["rows"][turn] for turn in range(longest) for result in results if turn < len(result["rows"])]
