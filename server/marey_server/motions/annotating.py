@@ -23,7 +23,7 @@ MOST_WORK = 30_000_000
 def apply_commands(
     found: FoundAnnotation, change: AnnotationChange, *, expected_rev: ExpectedRev = None
 ) -> ChangedAnnotation:
-    """Apply commands to an annotation in order; return the changed annotation, or the error of the first that fails.
+    """Apply commands to an annotation in order; return a `ChangedAnnotation` with the result or the error.
 
     If a command fails, no command is applied. The function needs no database. An error is returned, not raised.
     `put_changed` raises it later, inside the transaction that stores the answer under the idempotency key. So a
@@ -58,7 +58,7 @@ def _changed(found: FoundAnnotation, change: AnnotationChange) -> PreparedDocume
             layer = COMMANDS[command.command](layer, **command_arguments(command))
         except MotionError as error:
             wrong = FieldError(pointer=f"/commands/{index}", code=error.code, detail=str(error))
-            detail = f"Command {index} ({command.command}) cannot be carried out, so no command was: {error}"
+            detail = f"Command {index} ({command.command}) cannot be carried out, so nothing was changed: {error}"
             raise InvalidProblem(detail, code="command-refused", errors=[wrong]) from error
     changed = documents.layer_to_document(layer, annotation.clip, annotation.layer, annotation.made_by)
     return prepare_part(Kind.ANNOTATION, "annotation", changed.model_dump(mode="json", by_alias=True))

@@ -50,8 +50,8 @@ class PredecessorOptions:
 def unchanged_original(kind: Kind, parts: Parts, options: PredecessorOptions) -> StoredOriginal | None:
     """Return the file that a model, a tree or a graph was imported from, or None if the requested part was changed.
 
-    Also return None for other kinds, and if `options` names a layout, because the file may have another layout.
-    The documents in `parts` may contain references to stored arrays in place of the arrays.
+    Also return None for an item of another kind, and if `options` names a layout, because the file may have another
+    layout. The documents in `parts` may contain references to stored arrays in place of the arrays.
     """
     if options.layout is not None:
         return None

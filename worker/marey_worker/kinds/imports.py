@@ -94,7 +94,7 @@ class _Importing:
         try:
             item = self._context.item(Kind.SKELETON, self._options.skeleton)
         except NoSuchThing as error:
-            raise JobRefused("no-skeleton", f"there is no skeleton {self._options.skeleton}") from error
+            raise JobRefused("no-skeleton", f"the project has no skeleton {self._options.skeleton}") from error
         hierarchy = self._context.document(Kind.SKELETON, item.id, item.revision, "hierarchy")
         return GivenSkeleton(item.id, item.revision, hierarchy)
 

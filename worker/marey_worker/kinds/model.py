@@ -89,7 +89,7 @@ def _common_skeleton(pins: Sequence[PinnedInput], motions: Sequence[MotionDocume
         if ref.item != used[0].item:
             raise JobRefused(
                 "several-skeletons",
-                f"{pin.path} has another skeleton than {pins[0].path}; align clips of one skeleton",
+                f"{pin.path} has another skeleton than {pins[0].path}; train the model on clips of one skeleton",
             )
     return max(used, key=lambda ref: ref.revision)
 
