@@ -332,7 +332,9 @@ def test_anybody_may_list_the_kinds_of_jobs(server: Server) -> None:
         kinds = ok(anybody.get("/job-kinds"))["items"]
         assert {"import", "retarget", "export"} <= {kind["name"] for kind in kinds}
         assert ok(anybody.get("/job-kinds/retarget"))["inputs"]["clips"]["kind"] == "clip"
-        assert anybody.get("/job-kinds/levitate").status_code == 404
+        unknown = anybody.get("/job-kinds/Levitate")
+        assert unknown.status_code == 404
+        assert unknown.json()["detail"].startswith("There is no job kind 'Levitate'")
 
 
 @pytest.mark.slow

@@ -73,6 +73,8 @@ def joint_axes(
         found = require_item(marey, Address.parse(place), [Kind.SKELETON])
         mapping = found.mapping()
         if twist or swing:
+            if joint is None:
+                raise WrongUsage("name the joint whose axes `--twist` or `--swing` changes")
             if joint not in mapping.axes:
                 raise WrongUsage(
                     f"the joint {joint!r} has no axes; `marey skeleton axes {place}` lists the joints with axes"
@@ -112,7 +114,7 @@ def _vector(text: str | None) -> tuple[float, float, float] | None:
         raise WrongUsage(f"{text!r}: an axis is three numbers, x,y,z") from None
     length = (x * x + y * y + z * z) ** 0.5
     if not 0 < length < float("inf"):
-        raise WrongUsage(f"{text!r}: at least one number of an axis must not be zero")
+        raise WrongUsage(f"{text!r}: the numbers of an axis must be finite, and at least one must not be zero")
     return x / length, y / length, z / length
 
 

@@ -192,12 +192,13 @@ def controller_constants(options: ControllerOptions, rate_hz: float) -> Controll
     ------
     MotionError    if searches are less than a tick apart
     """
-    if options.search_every_s * rate_hz < 0.5:
+    period = round(options.search_every_s * rate_hz)
+    if period < 1:
         raise MotionError("the period of searches must be at least one tick", where="search_every_s")
     return ControllerConstants(
         follow=("time", "path", "open_loop").index(options.follow),
         by_distance=options.selection == "pose_distance",
-        period=round(options.search_every_s * rate_hz),
+        period=period,
         window=round(options.reselect_window_s * rate_hz),
         bias=float(options.continuing_bias),
         margin=float(options.switch_margin),

@@ -144,9 +144,11 @@ def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:
     """Return the requested form of a figure. Raises `NotFoundProblem` if the figure does not have the table."""
     if query.format != "csv":
         return {"png": figure.png, "svg": figure.svg, "json": figure.json_}[query.format]
-    table = query.table or next(iter(figure.csv), None)
+    if not figure.csv:
+        raise NotFoundProblem(f"The figure {figure.name!r} has no tables.", code="no-table")
+    table = query.table or next(iter(figure.csv))
     if table not in figure.csv:
-        tables = ", ".join(figure.csv) or "none"
+        tables = ", ".join(figure.csv)
         raise NotFoundProblem(f"The figure has no table {query.table!r}; it has {tables}.", code="no-table")
     return figure.csv[table]
 

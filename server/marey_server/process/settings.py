@@ -67,7 +67,9 @@ class Settings(BaseSettings):
     log_form: Literal["json", "text"] = Field(
         "json", description="Format of the log: one JSON object per line, or text for people."
     )
-    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        "info", description="Lowest level of the messages that the log contains."
+    )
     drain_s: float = Field(
         25.0, ge=0, le=600, description="Seconds that running requests have to finish after SIGTERM or SIGINT."
     )

@@ -398,11 +398,12 @@ def test_options_that_make_no_sense_are_named(options: dict[str, float], where: 
         EXACT.replace(**options)
 
 
-def test_a_search_period_of_less_than_a_tick_is_refused() -> None:
+@pytest.mark.parametrize("period_s", [0.004, 0.5 / 60])
+def test_a_search_period_that_rounds_to_no_tick_is_refused(period_s: float) -> None:
     database = synthetic_database([arc_track(1.0, 0.0, 5.0)])
 
     with pytest.raises(MotionError, match="search_every_s: the period of searches"):
-        play(database, circle(1.0, 0.0), EXACT.replace(search_every_s=0.004))
+        play(database, circle(1.0, 0.0), EXACT.replace(search_every_s=period_s))
 
 
 def test_a_trajectory_of_another_rate_is_refused() -> None:

@@ -65,7 +65,8 @@ class JobKindResource(Resource):
         try:
             return Reply(find_kind(job_kind).document())
         except UnknownKindError as error:
-            raise NotFoundProblem(f"{error}.".capitalize(), code="no-kind") from None
+            detail = str(error)
+            raise NotFoundProblem(f"{detail[0].upper()}{detail[1:]}.", code="no-kind") from None
 
 
 class JobsQuery(CountedPageQuery):
