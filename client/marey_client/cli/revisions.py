@@ -43,9 +43,10 @@ def find_revision(marey: Marey, address: Address, kinds: Sequence[Kind]) -> tupl
 
 
 def find_version(marey: Marey, address: Address) -> DatasetInput | None:
-    """Return the version of a dataset, or the folder in it, at an address; None if it names no version.
+    """Return the version of a dataset, or the folder in a version, that an address names.
 
-    Raises `WrongUsage` if the address has `@`, but names neither a version nor a folder.
+    Returns None if the address has no `@`, or is the path of a folder of the project. Raises `WrongUsage` if any other
+    address with `@` is not that of a version.
     """
     from marey_schemas.queue.jobs import DatasetInput
 

@@ -183,7 +183,7 @@ def _rest_poses(clip: Clip, tracks: Tracks) -> list[CheckWarning]:
 def _rest_pose_frames(clip: Clip, tracks: Tracks) -> tuple[int, int]:
     """Count the frames of a rest pose at the start of a clip, and those at its end.
 
-    In a rest pose, nearly every joint is at rest, or the arms are held out in a T.
+    In a rest pose, nearly every joint has the rotation of the skeleton's rest pose, or the arms are held out in a T.
     """
 
     def resting(frames: slice) -> NDArray[np.bool_]:

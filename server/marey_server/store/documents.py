@@ -155,7 +155,9 @@ def _check_pointers(pointers: list[str]) -> None:
 
 
 def store_document(tx: Transaction, content: Any, *, schema: str | None = None) -> str:
-    """Store a document, given as a tree or prepared, and return its digest. Storing it again adds no rows.
+    """Store a document and return its digest. `content` is a tree, or what `prepare_document` has returned for it.
+
+    Storing the same document again adds no rows.
 
     Raises `ConflictProblem` (`missing-blobs`) if it names blobs that the caller has not sent and may not read.
     """

@@ -57,7 +57,7 @@ def add_protection_to(dataset: typer.Typer) -> None:
 def open_proposal(
     context: typer.Context,
     place: VersionPlace,
-    title: Annotated[str, typer.Option("--title", "-t", help="What the proposal changes.")],
+    title: Annotated[str, typer.Option("--title", "-t", help="Title: what the proposal changes, in a few words.")],
     description: Annotated[str, typer.Option(help="Reasons for the changes, and what reviewers should look at.")] = "",
     into: Into = "main",
     as_json: AsJson = False,

@@ -97,6 +97,6 @@ def check_search(
 
 
 def _most_varied(aligned: AlignedSet, joints: tuple[int, ...]) -> NDArray[np.int64]:
-    """Find the canonical frames (k,) at which each joint's positions are farthest apart."""
+    """Find, for each of k joints, the canonical frame (k,) in which its positions in the examples vary most."""
     places = toe_positions(aligned.skeleton, aligned.poses, joints)
     return np.asarray(places.var(axis=0).sum(axis=-1).argmax(axis=0), dtype=np.int64)

@@ -120,9 +120,9 @@ def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult
     """Find, for each of `candidates`, the job whose result it can share.
 
     A candidate is a row with `id`, `project_id`, `cache_key` and `cache_mode`. Candidates without such a job are
-    omitted. Of several identical candidates, the first computes the result and the others share it. Submissions to one
-    project that use the cache decide one after another. The jobs with the results are locked, so that their end is not
-    missed.
+    omitted. Of several identical candidates, the first computes the result and the others share it. In each
+    project, this function runs for one transaction at a time. It locks the jobs that it finds, so that none of them
+    ends before the transaction has recorded who shares its result.
     """
     asking = [one for one in candidates if one.cache_key is not None and one.cache_mode in ("use", "refresh")]
     if not asking:
