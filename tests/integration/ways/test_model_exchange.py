@@ -129,7 +129,7 @@ def test_another_layout_and_a_changed_model_are_written_anew(lab: ProjectHandle,
     assert written["keyframes"] == {"contact": 12}
     with pytest.raises(RequestFailed, match="no tree"):
         model.export(tmp_path / "none", format="predecessor", part="tree")
-    with pytest.raises(RequestFailed, match="not imported from one"):
+    with pytest.raises(RequestFailed, match="not imported from a file or was changed since"):
         model.export(tmp_path / "none", format="original", part="tree")
     with pytest.raises(RequestFailed, match="model has no file for the part 'alignment'"):
         model.export(tmp_path / "none", format="predecessor", part="alignment")
