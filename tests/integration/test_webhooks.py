@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -331,3 +333,43 @@ def test_deliveries_continue_after_the_server_could_not_renew_its_lead(
     monkeypatch.setattr(delivering.Deliverer, "_send", send_if_leading)
     add_folders(owner, "first")
     receiver.wait_for(lambda found: len(found) == 2)
+
+
+def test_a_delivery_that_is_interrupted_during_a_search_for_work_is_sent(
+    owner: httpx.Client, open_receiver: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The search has read the database before the interruption, so what it found does not name the webhook."""
+    monkeypatch.setattr(delivering, "RENEW_EVERY_S", 0.2)
+    receiver = open_receiver()
+    make_webhook(owner, receiver.url)
+    sending, searched, interrupted = threading.Event(), threading.Event(), threading.Event()
+    send_batch, find_work = delivering.Deliverer._send_batch, outbox.find_work
+
+    async def interrupt_once(self: Any, *args: Any) -> Any:
+        if interrupted.is_set():
+            return await send_one(self, *args)
+        sending.set()
+        await asyncio.to_thread(searched.wait, PATIENCE_S)
+        return None
+
+    async def note_interruption(self: Any, *args: Any) -> bool:
+        try:
+            return await send_batch(self, *args)
+        finally:
+            if sending.is_set():
+                interrupted.set()
+
+    def search(*args: Any) -> outbox.Work:
+        found = find_work(*args)
+        if sending.is_set():
+            searched.set()
+            interrupted.wait(PATIENCE_S)
+        return found
+
+    send_one = delivering.Deliverer._send
+    monkeypatch.setattr(delivering.Deliverer, "_send", interrupt_once)
+    monkeypatch.setattr(delivering.Deliverer, "_send_batch", note_interruption)
+    monkeypatch.setattr(outbox, "find_work", search)
+    add_folders(owner, "first")
+    received = receiver.wait_for(lambda found: len(found) == 2)
+    assert {one.message["kind"] for one in received} == {"collection.created"}

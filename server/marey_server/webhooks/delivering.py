@@ -71,6 +71,8 @@ class Deliverer:
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._again: set[str] = set()
         """Webhooks that may have got something new to send while their task was running."""
+        self._interrupted: set[str] = set()
+        """Webhooks whose task ended before it had sent everything; the next search for work starts them again."""
 
     async def run(self) -> None:
         """Look for work whenever there are new events or a retry is due. A failure is logged and does not stop this."""
@@ -115,7 +117,8 @@ class Deliverer:
         if self._lead != led:
             work = await self._read(outbox.find_work, None)
         self._after = work.newest
-        for webhook_id in work.webhook_ids:
+        interrupted, self._interrupted = self._interrupted, set()
+        for webhook_id in work.webhook_ids | interrupted:
             self._start(webhook_id)
         if work.next_us is None:
             return RENEW_EVERY_S
@@ -154,13 +157,13 @@ class Deliverer:
             if self._leads():
                 self._start(webhook_id)
             else:
-                self._after = None
+                self._interrupted.add(webhook_id)
 
     async def _serve(self, webhook_id: str) -> None:
         """Send everything that a webhook has to send, until an attempt fails.
 
         If this process loses the lead, or if an error of the server interrupts the task, the next search for work
-        considers all webhooks again.
+        starts the webhook again.
         """
         interrupted = True
         try:
@@ -174,7 +177,7 @@ class Deliverer:
             log.exception("deliveries to the webhook %s failed", webhook_id)
         finally:
             if interrupted:
-                self._after = None
+                self._interrupted.add(webhook_id)
 
     async def _send_batch(self, webhook_id: str) -> bool:
         """Send the next deliveries of a webhook; return whether there may be more."""
@@ -187,7 +190,7 @@ class Deliverer:
         for delivery in batch.deliveries:
             outcome = await self._send(batch, delivery, before)
             if outcome is None:
-                self._after = None
+                self._interrupted.add(webhook_id)
                 return False
             if not delivery.requested:
                 if outcome != "delivered":
