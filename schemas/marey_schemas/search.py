@@ -1,4 +1,4 @@
-"""Searches for motions of models that meet constraints: requests and answers."""
+"""Searches in models for motions that meet constraints: requests and answers."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def suggest(
     remove_out: Annotated[
         Path | None,
         typer.Option(
-            help="Write to this file, one per line, the paths of the clips whose removal has no effect on the trials."
+            help="File for the paths, one per line, of the clips whose removal has no effect on the trials."
         ),
     ] = None,
     wait: Wait = True,
@@ -137,7 +137,7 @@ def optimise(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Find removals and additions of clips that make an evaluated set better, step by step. No clip is changed."""
+    """Find, step by step, which clips to remove from or add to an evaluated set to improve it. No clip is changed."""
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
         request = handle.optimise_request(_places(marey, handle, candidates), **params)

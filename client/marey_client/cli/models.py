@@ -75,7 +75,7 @@ def sample(
         Path | None, typer.Option("--out", "--output", "-o", help="Folder of the files; default: the current folder.")
     ] = None,
     into: Annotated[
-        str | None, typer.Option(help="Create clips in this folder of the project instead of files.")
+        str | None, typer.Option(help="Folder of the project in which to create clips; then no files are written.")
     ] = None,
     unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
     as_json: AsJson = False,

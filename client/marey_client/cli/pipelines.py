@@ -155,8 +155,8 @@ def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[st
             raise WrongUsage("the takes must be in one project")
         if options:
             raise WrongUsage(
-                "parameters of the import step apply only to local files; give --project, the "
-                "project that receives these files"
+                "there are parameters for an import, but the takes are clips of a project; leave these parameters "
+                "out, or give local files, and with --project the project that receives them"
             )
         return addresses[0].project, {"takes": [clips_at(marey, address) for address in addresses]}
     from marey_client.imports import find_files, left_out_text

@@ -55,7 +55,8 @@ def find_version(marey: Marey, address: Address) -> DatasetInput | None:
     version = _VERSION.fullmatch(address.path)
     if version is None:
         raise WrongUsage(
-            f"{address} names no item, no revision and no version; write project/folder/name@2 for a revision of an "
-            "item, and project/dataset@v1 or project/dataset@v1/folder for a version of a dataset"
+            f"{address} is not the address of an item, a revision or a version; write project/folder/name for an "
+            "item, project/folder/name@2 for a revision, and project/dataset@v1 or project/dataset@v1/folder for a "
+            "version of a dataset"
         )
     return DatasetInput(dataset=version[1], version=version[2], path=version[3] or "")

@@ -1,4 +1,4 @@
-"""Commands `token`."""
+"""Commands of the group `token`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def create_token(
     name: Annotated[str, typer.Argument(help="Purpose of the token, for your own reference.")],
     scope: Annotated[
         list[str] | None,
-        typer.Option(help="Scope: read, write, jobs, work or admin; !project=NAME limits it to one project."),
+        typer.Option(help="Scope: read, write, jobs, work or admin; for one project only, as in read!project=lab."),
     ] = None,
     days: Annotated[
         int | None,

@@ -26,14 +26,14 @@ class VersionReader(Protocol):
 
 @dataclass(frozen=True)
 class VersionRange:
-    """Versions among which the first bad one is searched for.
+    """Versions among which the search looks for the first bad one.
 
     Parameters
     ----------
     good, bad : the ends of the range
-    commits : the versions that can be the first bad one, by digest: `bad` and those of its ancestors that are neither
-        `good` nor ancestors of it
-    parents : the parents of each of these versions that the search follows
+    commits : the versions that can be the first bad one, by digest: `bad` and its ancestors, without `good` and the
+        ancestors of `good`
+    parents : for each of these versions, those of its parents that can lead to the first bad one
     """
 
     good: Commit

@@ -57,7 +57,7 @@ def constrain(take: Take, command: Constrain) -> Take:
 
     Raises
     ------
-    UnknownJoint    naming a joint that does not exist
+    UnknownJoint    if a joint does not exist; the error names it
     MappingError    if joint limits or a look-at constraint need axes that cannot be determined
     EditError    naming the constraint that is invalid
     """

@@ -27,7 +27,7 @@ def paste(take: Take, command: Paste) -> Take:
     """Replace the motion of joints with a range of another clip (Herrmann et al. 2019, section 4.1.4).
 
     The range is resampled with cubic splines to the frames it fills; equal lengths are copied exactly. Within the
-    borders rotations are blended along the shorter arc, translations along straight lines.
+    borders, rotations are blended along the shorter arc, and translations along straight lines.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def paste(take: Take, command: Paste) -> Take:
 
     Raises
     ------
-    UnknownJoint    naming a joint that does not exist
+    UnknownJoint    if a joint does not exist; the error names it
     EditError    if the source or the frames do not exist, or if the axes of a joint differ in the two skeletons
     """
     clip = take.source(command.source)
@@ -119,7 +119,7 @@ def rotate_joint(take: Take, command: RotateJoint) -> Take:
 
     Raises
     ------
-    UnknownJoint    naming a joint that does not exist
+    UnknownJoint    if a joint does not exist; the error names it
     EditError    if the frames do not exist
     """
     index = take.joint(command.joint)

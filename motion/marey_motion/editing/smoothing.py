@@ -44,7 +44,7 @@ def smooth(take: Take, command: Smooth) -> Take:
 
     Raises
     ------
-    UnknownJoint    naming a joint that does not exist
+    UnknownJoint    if a joint does not exist; the error names it
     EditError    if the frames do not exist, if the window is too short for the polynomials, or if a joint
         spins so fast that its rotations have no mean
     """

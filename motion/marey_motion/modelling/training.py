@@ -244,7 +244,8 @@ def _sampled_range(aligned: AlignedSet) -> tuple[float, float]:
 def _log_slope_range(aligned: AlignedSet, temporal: PrincipalExamples) -> tuple[float, float]:
     """Compute the range of the logarithms of the examples' time steps, extended by `LOG_SLOPE_MARGIN` at both ends.
 
-    Examples rebuilt from the kept components count as well, so that the limits change no rebuilt example.
+    The range also covers the time steps of the examples as rebuilt from the kept components. So no rebuilt example is
+    changed when samples are clipped to the range.
     """
     functions = temporal.functions
     rebuilt = functions.basis.at_frames @ functions.coefficients(_kept_scores(temporal))[..., 0].T

@@ -24,7 +24,10 @@ Cell = Number | Content
 
 
 def number(value: float | None, digits: int = 2, *, signed: bool = False, look: str = "") -> Number:
-    """Format a number with the given number of decimals; None, NaN and infinite numbers give a dash."""
+    """Format a number with the given number of decimals; None, NaN and infinite numbers give a dash.
+
+    `look` is the CSS class of the table cell.
+    """
     if value is None or not math.isfinite(value):
         return Number(None, "–")
     written = round(value, digits) + 0.0  # not -0.00

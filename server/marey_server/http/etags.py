@@ -73,8 +73,8 @@ def matches(if_none_match: str | None, tag: str) -> bool:
 def write_precondition(if_match: str | None, if_none_match: str | None, *, may_create: bool = False) -> Precondition:
     """Return the precondition of a write.
 
-    Raises `PreconditionRequiredProblem` if the request has none, `PreconditionFailedProblem` if no tag can match, and
-    `BadRequestProblem` if the tags are malformed.
+    Raises `PreconditionRequiredProblem` if the request has none, `PreconditionFailedProblem` if no tag has the form of
+    the tags of resources, which begin with a number, and `BadRequestProblem` if the tags are malformed or too many.
     """
     if if_none_match is not None and may_create:
         if if_none_match.strip() != "*":

@@ -1,4 +1,7 @@
-"""Models in which requests search for motions, and their trees: read in a transaction, parsed and cached in a child."""
+"""Models in which requests search for motions, and their search trees.
+
+They are read in a transaction, and parsed and cached in a child process.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +45,7 @@ class FoundSearchable:
 
     @property
     def key(self) -> SearchableKey:
-        """The digests of the model, its tree and its mapping; an empty string if there is no tree or no mapping."""
+        """The digests of the model, its tree and its mapping; a tree or mapping that does not exist has the digest ""."""
         tree, mapping = ("" if part is None else part.digest for part in (self.tree, self.mapping))
         return self.model.part.digest, tree, mapping
 

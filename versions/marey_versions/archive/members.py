@@ -41,7 +41,7 @@ class MemberKind(StrEnum):
 
     @property
     def ending(self) -> str:
-        """The file ending in the names of members of this kind."""
+        """The file name extension of members of this kind."""
         return _ENDINGS.get(self, ".json")
 
 

@@ -220,7 +220,7 @@ def check(
         ),
     ] = None,
     link: Annotated[str | None, typer.Option(help="Address of a page about the check.")] = None,
-    text: Annotated[str, typer.Option("--message", "-m", help="Explanation of the result.")] = "",
+    text: Annotated[str, typer.Option("--message", "-m", help="Explanation of the result of the check.")] = "",
     commit: CommitSeen = None,
     as_json: AsJson = False,
 ) -> None:
@@ -303,7 +303,7 @@ def protect(
     ] = 0,
     checks: Annotated[
         list[str] | None,
-        typer.Option("--check", metavar="NAME", help="Check that must succeed before a merge; may be repeated."),
+        typer.Option("--check", metavar="NAME", help="Name of a check that must succeed before a merge; repeat the option for several."),
     ] = None,
     up_to_date: Annotated[
         bool, typer.Option("--up-to-date", help="Merge a proposal only if it contains the newest commit of the branch.")

@@ -135,7 +135,7 @@ def sweep_weights(
 
 
 def reweighted(database: MatchingDatabase, weights: FeatureWeights) -> MatchingDatabase:
-    """Change the weights of a database.
+    """Return a database with the features of another one, and other weights.
 
     Parameters
     ----------
@@ -144,11 +144,11 @@ def reweighted(database: MatchingDatabase, weights: FeatureWeights) -> MatchingD
 
     Returns
     -------
-    MatchingDatabase    the same rows
+    MatchingDatabase    with the same rows, scaled by the new weights
 
     Raises
     ------
-    MotionError    if the weight of a group was 0, so that its scale is not known
+    MotionError    if a group has another weight than before, and its weight was 0, because a weight of 0 loses its scale
     """
     options = database.options.model_copy(update={"weights": weights})
     scale = database.normaliser.scale.copy()

@@ -150,8 +150,7 @@ def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
         raise ForbiddenProblem(
-            "A token can have only scopes of the token that creates it, and yours does not have "
-            f"the scope {beyond[0]!r}.",
+            f"Your token does not have the scope {beyond[0]!r}, so it cannot create a token that has it.",
             code="insufficient-scope",
         )
     labels, ends_us = _labels_of(tx, request), _end_of(tx, request)
@@ -198,8 +197,7 @@ def _labels_of(tx: Transaction, request: TokenCreate) -> Mapping[str, str] | Non
     labels_key(request.labels)  # raises InvalidProblem for labels that no worker can announce
     if (beyond := first_outside(request.labels, tx.principal.labels)) is not None:
         raise ForbiddenProblem(
-            "A token can allow only labels that the token that creates it allows, and yours does not allow "
-            f"the label {beyond!r}.",
+            f"Your token does not allow the label {beyond!r}, so it cannot create a token that allows it.",
             code="label-not-allowed",
             context={"label": beyond},
         )

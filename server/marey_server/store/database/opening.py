@@ -39,8 +39,8 @@ def opening(url: str) -> Iterator[None]:
         raise DatabaseUnusable(str(error)) from None
     except CommandError as error:
         raise DatabaseUnusable(
-            f"the tables of the database {_shown(url)} belong to another, perhaps newer, version of Marey; "
-            f"update Marey, or use another database: {error}"
+            f"the tables of the database {_shown(url)} belong to another, perhaps newer, version of Marey "
+            f"({error}); update Marey, or use another database"
         ) from error
 
 

@@ -117,7 +117,7 @@ class AnnotationMerger:
 
 
 def _contents_of(one: ChangedPart) -> tuple[str, ...]:
-    """Return the content digests of the revisions that contain the base, our version and their version of a part.
+    """Return the content digests of three revisions: those with the base, our version and their version of a part.
 
     If there is no base, the result is empty.
     """

@@ -175,9 +175,9 @@ def _merged(
     entries: Mapping[str, DatasetEntry | None],
     annotations: AnnotationMerger,
 ) -> MergedEntries:
-    """Merge the entries of a job, part by part, with changes of others.
+    """Merge the entries of a job, part by part, with the changes of other commits.
 
-    The changes of others are those from the tree `base` to the tree `head`, at the paths of these entries only.
+    Other commits have changed the tree `base` to the tree `head`. Only changes at the paths of these entries count.
     """
     before = {key: entry_of(key, value) for key, value in Tree(reader, base).get_several(entries).items()}
     if base == head:

@@ -68,7 +68,7 @@ _DEPENDENCIES = Prepared(
 
 
 def _after(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, tuple[str, ...]]:
-    """Return, for each job, the ids of the jobs that it depends on, but not of the job whose result it shares."""
+    """Return, for each job, the ids of the jobs that it depends on, without the job whose result it shares."""
     shared = {row.id: row.cached_from for row in rows}
     found: dict[str, tuple[str, ...]] = {}
     for row in tx.run(_DEPENDENCIES, {"ids": list(shared)}):
