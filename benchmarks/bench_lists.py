@@ -17,7 +17,7 @@ PAGES = {
     "first page of 50": "",
     "… by name": "sort=name",
     "… below a folder": "collection=day%205",
-    "… whose name holds a text": "q=0777",
+    "… whose name contains a text": "q=0777",
 }
 REQUESTS = 200
 GOAL_MS = 5.0

@@ -20,7 +20,7 @@ Rows = NDArray[np.int64]
 
 TRIALS, SEARCHES = 40, 25
 SEARCH_EVERY_ROWS = 6
-NEW_WISH_EVERY = 10
+NEW_GOAL_EVERY = 10
 POSE_DIMENSIONS = 15
 CLIPS_PER_HELD_OUT = 10
 LEAST_AHEAD = 20
@@ -47,12 +47,12 @@ def run() -> list[Row]:
 
 
 def _race(row_count: int, peer_queries: int, repeats: int, goal_us: int, hard: bool) -> Row:
-    rows, starts, wishes = _database(row_count)
+    rows, starts, desired = _database(row_count)
     selectable = np.ones(row_count, np.bool_)
     for stop in starts[1:]:
         selectable[max(0, stop - LEAST_AHEAD) : stop] = False
     index = build_index(rows, starts, selectable)
-    play = _play(index, starts, wishes, hard)
+    play = _play(index, starts, desired, hard)
     some = np.linspace(0, len(play.queries) - 1, peer_queries).astype(int)
     found, costs = find_nearest(index, play.queries, warm_rows=play.shown)
     peers = _peers(rows, selectable)
@@ -71,7 +71,7 @@ def _race(row_count: int, peer_queries: int, repeats: int, goal_us: int, hard: b
     us = ours.median_s * 1e6 / len(play.queries)
     quickest = min(timing.median_s for timing in peer_times) * 1e6 / peer_queries
     return Row(
-        f"nearest row, {'another wish' if hard else 'a wish halfway there'}",
+        f"nearest row, {'another desired trajectory' if hard else 'a trajectory half way to the desired one'}",
         f"{row_count:,} rows",
         ours.shown(1e6 / len(play.queries), "µs"),
         ", ".join(_shown(name, timing, peer_queries) for name, timing in zip(peers, peer_times, strict=True)),
@@ -112,8 +112,8 @@ def _database(row_count: int) -> tuple[Floats, Rows, Floats]:
     rng = np.random.default_rng(row_count)
     order = rng.permutation(len(clips))
     held_out = -(-len(clips) // CLIPS_PER_HELD_OUT)
-    wishes = np.concatenate([clips[number] for number in order[:held_out]])[:, POSE_DIMENSIONS:]
-    dimensions = wishes.shape[1] + POSE_DIMENSIONS
+    desired = np.concatenate([clips[number] for number in order[:held_out]])[:, POSE_DIMENSIONS:]
+    dimensions = desired.shape[1] + POSE_DIMENSIONS
     parts: list[Floats] = []
     starts = [0]
     while starts[-1] < row_count:
@@ -125,10 +125,10 @@ def _database(row_count: int) -> tuple[Floats, Rows, Floats]:
             starts.append(starts[-1] + len(part))
             if starts[-1] == row_count:
                 break
-    return np.concatenate(parts), np.array(starts), wishes
+    return np.concatenate(parts), np.array(starts), desired
 
 
-def _play(index: SearchIndex, starts: Rows, wishes: Floats, hard: bool) -> _Play:
+def _play(index: SearchIndex, starts: Rows, desired: Floats, hard: bool) -> _Play:
     """Return the queries of trials. In each, a character searches for a row that continues its pose towards a goal.
 
     The next query starts from a row shortly after the row that was found.
@@ -138,15 +138,15 @@ def _play(index: SearchIndex, starts: Rows, wishes: Floats, hard: bool) -> _Play
     shown = rng.choice(np.flatnonzero(index.selectable), TRIALS)
     queries, rows = [], []
     for search in range(SEARCHES):
-        if search % NEW_WISH_EVERY == 0:
-            wish = rng.integers(0, len(wishes), TRIALS)
+        if search % NEW_GOAL_EVERY == 0:
+            at = rng.integers(0, len(desired), TRIALS)
         query = index.rows[shown]
         share = 1.0 if hard else 0.5
-        query[:, POSE_DIMENSIONS:] += share * (wishes[wish] - query[:, POSE_DIMENSIONS:])
+        query[:, POSE_DIMENSIONS:] += share * (desired[at] - query[:, POSE_DIMENSIONS:])
         queries.append(query)
         rows.append(shown)
         found, _ = find_nearest(index, query, warm_rows=shown)
         shown = np.minimum(found + SEARCH_EVERY_ROWS, stops[found] - 1)
-        wish = np.minimum(wish + SEARCH_EVERY_ROWS, len(wishes) - 1)
+        at = np.minimum(at + SEARCH_EVERY_ROWS, len(desired) - 1)
     # One trial after the other, as they are played.
     return _Play(np.stack(queries, axis=1).reshape(-1, index.rows.shape[1]), np.stack(rows, axis=1).reshape(-1))
