@@ -27,7 +27,8 @@ Kinds = Annotated[
     typer.Option(
         "--kind",
         metavar="KIND",
-        help="Kind of events to send, such as job.failed; may be repeated. The page on webhooks lists all kinds.",
+        help="Kind of events to send, such as job.failed; repeat the option for several. The error for an unknown "
+        "kind lists all kinds.",
     ),
 ]
 Description = Annotated[str | None, typer.Option(help="Purpose of the webhook.")]

@@ -61,8 +61,8 @@ class AlignOptions(CostOptions):
         3,
         ge=0,
         le=60,
-        description="Greatest number of consecutive frames of one clip that are matched with one frame of "
-        "the other; null: no limit.",
+        description="Greatest number of consecutive steps that advance only one of the clips; so one frame is matched "
+        "with at most this number of frames plus one. null: no limit.",
     )
     weights: dict[JointName, _Weight] = Field(
         default_factory=dict,
