@@ -22,7 +22,7 @@ from marey_schemas.access import ProjectChange, Visibility
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 from marey_server.motions import previewing
-from marey_server.process.memory import STRANGERS
+from marey_server.process.memory import UNKNOWN_CLIENTS
 
 pytestmark = pytest.mark.slow  # each test ends a child, and the next one takes seconds to start
 
@@ -92,14 +92,14 @@ def test_the_child_of_a_client_that_leaves_is_stopped(
     until(lambda: not server.app.services.in_flight)
 
 
-def test_all_strangers_together_have_the_share_of_one_user(
+def test_all_clients_without_a_user_together_have_the_share_of_one_user(
     server: Server, owner: httpx.Client, preview: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     public = ProjectChange(visibility=Visibility.PUBLIC).model_dump(mode="json", exclude_unset=True)
     assert owner.patch("/projects/lab", json=public, headers={"If-Match": "*"}).status_code == 200
     children = server.app.services.children
     monkeypatch.setattr(children, "limits", replace(children.limits, requests=2))
-    with children.request(STRANGERS):
+    with children.request(UNKNOWN_CLIENTS):
         refused = server.client().post(preview, json=TRIM)
         assert (refused.status_code, refused.json()["code"]) == (503, "children-busy")
         assert int(refused.headers["Retry-After"]) > 0

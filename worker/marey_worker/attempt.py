@@ -249,7 +249,7 @@ class RunningAttempt:
             if isinstance(message, Done | Failed):
                 return message
             if isinstance(message, Made):
-                self._keeper.tell(message.progress)
+                self._keeper.set_progress(message.progress)
             elif message is not None:
                 self._serve(message, child)
             if (stop := self._check(child)) is not None:
@@ -317,7 +317,7 @@ class RunningAttempt:
 
     def _death(self, child: ChildProcess) -> Failed:
         status = child.wait()
-        return Failed("worker-process-died", signatures.told_exit(status), signatures.of_exit(status), retryable=True)
+        return Failed("worker-process-died", signatures.describe_exit(status), signatures.of_exit(status), retryable=True)
 
     # -- at the end --
 

@@ -45,16 +45,16 @@ class LeaseKeeper:
         self._job = lease.job
         self._interval_s = lease.heartbeat_s
         self._ttl_s = lease.lease_ttl_s
-        self._heard = self._tried = time.monotonic()
+        self._answered = self._tried = time.monotonic()
         self._progress: Progress | None = None
-        self._told: Progress | None = None
-        self._saying_last_word = False
+        self._reported: Progress | None = None
+        self._confirming = False
         self._stopped = threading.Event()
         self._beating = threading.Lock()
         self._thread = threading.Thread(target=self._run, name=f"heartbeat-{lease.job}", daemon=True)
         self._thread.start()
 
-    def tell(self, progress: Progress) -> None:
+    def set_progress(self, progress: Progress) -> None:
         """Set the progress that the next heartbeat reports."""
         self._progress = progress
 
@@ -68,23 +68,23 @@ class LeaseKeeper:
         With `patiently`, the heartbeat is retried for up to 10 minutes. Raises `LeaseLost` if the lease is lost, or the
         client's error if the server does not answer.
         """
-        self._saying_last_word = True
-        if self.lost.is_set() or time.monotonic() - self._heard > CONFIRM_AFTER * self._ttl_s:
+        self._confirming = True
+        if self.lost.is_set() or time.monotonic() - self._answered > CONFIRM_AFTER * self._ttl_s:
             self._beat(patiently=patiently)
 
     def _run(self) -> None:
         wait_s = spread(min(FIRST_S, self._interval_s), JITTER)
         while not self._stopped.wait(TICK_S):
             silent_s = time.monotonic() - self._tried
-            news = self._progress is not self._told and silent_s >= PROGRESS_EVERY_S
-            if news or silent_s >= wait_s:
+            unreported = self._progress is not self._reported and silent_s >= PROGRESS_EVERY_S
+            if unreported or silent_s >= wait_s:
                 wait_s = spread(self._interval_s if self._try_beat() else RETRY_S, JITTER)
 
     def _try_beat(self) -> bool:
         try:
             self._beat()
         except LeaseLost as error:
-            if not self._saying_last_word:  # a heartbeat may well come after it
+            if not self._confirming:  # the final request ends the lease, and a heartbeat may follow it
                 log.warning("%s: %s", self._job, error)
             self.lost.set()
             self._stopped.set()
@@ -98,8 +98,8 @@ class LeaseKeeper:
             progress = self._progress
             self._tried = time.monotonic()
             answer: HeartbeatAnswer = self._api.heartbeat(progress, patiently=patiently)
-            self._heard = time.monotonic()
-            self._told = progress
+            self._answered = time.monotonic()
+            self._reported = progress
             self._ttl_s = answer.lease_ttl_s
             if answer.cancel_requested:
                 self.cancelled.set()

@@ -26,7 +26,7 @@ def of_exit(status: int) -> str:
     return f"exit:{_signal_name(-status) if status < 0 else status}"
 
 
-def told_exit(status: int) -> str:
+def describe_exit(status: int) -> str:
     """Return a text that states how a process ended unexpectedly."""
     if status == -signal.SIGKILL:
         return "the process that ran the job was killed (SIGKILL); most likely the machine ran out of memory"

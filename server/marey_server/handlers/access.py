@@ -100,7 +100,7 @@ class PasswordResource(Resource):
         attempt = SignInTry(name, address, services.settings.login_tries_per_minute)
         services.refused_tries.check(attempt)
         known = await self.look_up(sign_ins.is_known, attempt)
-        lane = services.password_lane if known else services.stranger_lane
+        lane = services.password_lane if known else services.unknown_lane
         with lane.place(address):
             try:
                 stored = await self.change(count_try, attempt)

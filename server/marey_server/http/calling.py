@@ -15,7 +15,7 @@ from marey_server.http.calls import Caller, run_plain
 from marey_server.http.declarations import Operation
 from marey_server.http.exchange import Exchange
 from marey_server.process.children import ChildTask
-from marey_server.process.memory import STRANGERS, Holding
+from marey_server.process.memory import UNKNOWN_CLIENTS, Holding
 from marey_server.process.password_lanes import limited_address
 from marey_server.store.database.lanes import Client
 from marey_server.store.transaction import Transaction
@@ -125,7 +125,7 @@ class CallingExchange(Exchange):
     def _child_user(self) -> str:
         """User whose share of child processes this request uses; callers without a user have one share together."""
         user = self.principal.user_id if self.principal is not None else None
-        return user or STRANGERS
+        return user or UNKNOWN_CLIENTS
 
     def on_connection_close(self) -> None:
         """Stop child processes, because the client has closed the connection."""

@@ -10,11 +10,12 @@ from marey_server.store.database.lanes import RETRY_AFTER_S, Client
 
 CLIENT_SHARE = 0.75
 """Largest part of the memory that one client may hold."""
-STRANGERS_SHARE = 0.25
+UNKNOWN_SHARE = 0.25
 """Largest part of the memory that all clients without a known token together may hold."""
 RESERVED_SHARE = 0.125
 """Additional memory for reserved operations, such as heartbeats, as a part of the memory for other requests."""
-STRANGERS = "strangers"
+UNKNOWN_CLIENTS = "unknown-clients"
+"""Owner of the memory that all clients without a known token hold together."""
 
 
 class RequestMemory:
@@ -37,7 +38,7 @@ class RequestMemory:
         """
         with self._lock:
             others = self.held_bytes > bytes_now
-            share = STRANGERS_SHARE if owner == STRANGERS else CLIENT_SHARE
+            share = UNKNOWN_SHARE if owner == UNKNOWN_CLIENTS else CLIENT_SHARE
             exceeds_share = not reserved and self._by_owner[owner] + more > share * self.total_bytes
             total = self.total_bytes * (1 + RESERVED_SHARE * reserved)
             if others and (exceeds_share or self.held_bytes + more > total):
@@ -65,7 +66,7 @@ class Holding:
 
     def __init__(self, memory: RequestMemory, client: Client, *, reserved: bool) -> None:
         self._memory = memory
-        self._owner = client.key if client.known else STRANGERS
+        self._owner = client.key if client.known else UNKNOWN_CLIENTS
         self._reserved = reserved
         self._bytes = 0
 

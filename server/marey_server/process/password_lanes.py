@@ -1,8 +1,8 @@
 """Threads that hash passwords, and the part of a client's address for which sign-ins are limited.
 
 A hash takes 0.1 s and 32 MiB, so few run at once, and none in the threads of the database or of other computations.
-There is one thread for users at addresses from which they have signed in before, and one for all others (strangers).
-So sign-ins of strangers do not delay these users, and use at most one processor.
+There is one thread for users at addresses from which they have signed in before, and one for all others.
+So other sign-ins do not delay these users, and use at most one processor.
 """
 
 from __future__ import annotations

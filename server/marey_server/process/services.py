@@ -83,7 +83,7 @@ class Services:
         self.in_flight: set[Any] = set()
         self.password_lane = PasswordLane("known")
         """Lane for signed-in users, and for sign-ins from addresses from which the user has signed in before."""
-        self.stranger_lane = PasswordLane("stranger")
+        self.unknown_lane = PasswordLane("unknown")
         """Lane for all other sign-ins."""
         self.refused_tries = RefusedTries()
         self.refusal_brake = RefusalBrake()
@@ -102,7 +102,7 @@ class Services:
 
     def _watch(self) -> None:
         """Show the sizes of queues and pools in the metrics."""
-        passwords = {"passwords": self.password_lane, "passwords-of-strangers": self.stranger_lane}
+        passwords = {"passwords": self.password_lane, "passwords-unknown": self.unknown_lane}
         self.metrics.watch({**self.database.lanes, **self.compute_threads.lanes, **passwords})
         self.metrics.children.set_function(lambda: self.children.sizes[0])
         self.metrics.waiting.labels("children").set_function(lambda: self.children.sizes[1])
@@ -152,5 +152,5 @@ class Services:
         self.children.close()
         self.compute_threads.close()
         self.password_lane.close()
-        self.stranger_lane.close()
+        self.unknown_lane.close()
         self.database.close()

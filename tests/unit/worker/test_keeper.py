@@ -80,11 +80,11 @@ def test_heartbeats_go_on_until_stopped(api: Api, keep: Callable[..., LeaseKeepe
     assert has_ended(one)
 
 
-def test_progress_is_told_before_the_next_heartbeat_is_due(
+def test_progress_is_reported_before_the_next_heartbeat_is_due(
     api: Api, keep: Callable[..., LeaseKeeper], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(heartbeats, "PROGRESS_EVERY_S", 0.02)
-    keep(heartbeat_s=1000).tell(Progress(done=1, total=2))
+    keep(heartbeat_s=1000).set_progress(Progress(done=1, total=2))
     assert api.beat.wait(60)
     assert api.heard[0].done == 1
 

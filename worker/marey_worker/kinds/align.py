@@ -97,8 +97,8 @@ class _Job:
 
     def _require_names(self) -> None:
         """Raise `JobRefused` if names of results would be equal or too long, before anything is computed."""
-        twins = ("", MIRRORED_NAME) if self._params.mirroring == "add" else ("",)
-        names = [(pin.folder, self._name(pin, twin)) for pin in self._pins.values() for twin in twins]
+        endings = ("", MIRRORED_NAME) if self._params.mirroring == "add" else ("",)
+        names = [(pin.folder, self._name(pin, ending)) for pin in self._pins.values() for ending in endings]
         require_different(names)
         long = [name for _, name in names if len(name) > MAX_NAME_LENGTH]
         if long:
@@ -107,8 +107,8 @@ class _Job:
                 f"the name {long[0]!r} has {len(long[0])} characters; at most {MAX_NAME_LENGTH} are allowed",
             )
 
-    def _name(self, pin: PinnedInput, twin: str) -> str:
-        return f"{pin.name}{self._params.suffix}{twin}"
+    def _name(self, pin: PinnedInput, ending: str) -> str:
+        return f"{pin.name}{self._params.suffix}{ending}"
 
     def _read(self) -> Iterator[_Clip]:
         pins = self._context.inputs["clips"]
@@ -288,7 +288,7 @@ class _Job:
     ) -> StagedOutput:
         pin = self._pin_of(one.uid)
         reference = self._pin_of(aligned.reference)
-        twin = MIRRORED_NAME if one.uid.endswith(MIRRORED) else ""
+        ending = MIRRORED_NAME if one.uid.endswith(MIRRORED) else ""
         motion = documents.clip_to_document(one.motion.as_clip(aligned.skeleton, aligned.frame_rate_hz), skeleton)
         sources = {"clips": tuple(used.as_input() for used in dict.fromkeys((pin, reference)))}
         if _uid(pin) in self._annotations:
@@ -296,9 +296,9 @@ class _Job:
         if rig := self._context.inputs.get("rig"):
             sources["rig"] = tuple(used.as_input() for used in rig)
         return StagedOutput(
-            name=f"{pin.collection}/{self._name(pin, twin)}",
+            name=f"{pin.collection}/{self._name(pin, ending)}",
             kind=Kind.PROCESSED,
-            item_name=self._name(pin, twin),
+            item_name=self._name(pin, ending),
             collection=pin.folder,
             tags=self._params.tags,
             parts={

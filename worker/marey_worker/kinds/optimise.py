@@ -29,7 +29,7 @@ def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
 
         def made(step: OptimisationStep) -> None:
             steps.append(step)
-            context.log(_told(step, names))
+            context.log(_describe(step, names))
 
         found = optimise(
             simulation,
@@ -56,11 +56,11 @@ def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
 def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> MatchingDatabase:
     """Return one database with the clips of the set and all candidates. Raises `JobRefused` if that is not possible."""
     unusable = [f"{one.folder} ({one.detail})" for one in candidates.unusable]
-    strangers = [name for name, other in candidates.databases.items() if not same_skeleton(database, other)]
-    if unusable or strangers:
+    mismatched = [name for name, other in candidates.databases.items() if not same_skeleton(database, other)]
+    if unusable or mismatched:
         raise JobRefused(
             "skeleton-mismatch",
-            f"the clips in {', '.join([*strangers, *unusable])} cannot be combined with the clips of the evaluation; "
+            f"the clips in {', '.join([*mismatched, *unusable])} cannot be combined with the clips of the evaluation; "
             "move them to the evaluation's skeleton first, with `marey retarget`, or leave them out",
         )
     for other in candidates.databases.values():
@@ -83,8 +83,8 @@ def _simulation(context: Context, evaluated: EvaluatedSet, database: MatchingDat
     )
 
 
-def _told(step: OptimisationStep, names: dict[str, str]) -> str:
+def _describe(step: OptimisationStep, names: dict[str, str]) -> str:
     did = {"start": "the unchanged set", "remove": "without", "add": "with"}[step.action]
     clips = ", ".join(names.get(source, source) for source in step.sources)
-    told = f"objective {step.objective:.4f} m, offset {step.metrics['offset_mean']:.4f} m, {step.data_s:.1f} s of data"
-    return f"step {step.number}: {did} {clips}".rstrip() + f": {told}, {step.changed_trials} trials changed"
+    figures = f"objective {step.objective:.4f} m, offset {step.metrics['offset_mean']:.4f} m, {step.data_s:.1f} s of data"
+    return f"step {step.number}: {did} {clips}".rstrip() + f": {figures}, {step.changed_trials} trials changed"

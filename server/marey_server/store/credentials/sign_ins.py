@@ -1,4 +1,4 @@
-"""Limits on wrong passwords, shared by all servers; a stranger cannot use them to lock out the owner of an account.
+"""Limits on wrong passwords, shared by all servers; nobody can use them to lock out the owner of an account.
 
 Every try with a wrong password counts towards two limits: that of this account from this address, and that of this
 address for all accounts. If the address is unknown, which means that nobody has signed in to the account from it, the

@@ -1,7 +1,7 @@
 """Lanes: groups of threads with a limited queue, in which clients take turns.
 
-A client that sends many requests delays only its own requests: the queue alternates between known clients and
-strangers, and between the clients within each group. A client is known if the server has accepted its token before. A
+A client that sends many requests delays only its own requests: the queue alternates between known and unknown
+clients, and between the clients within each group. A client is known if the server has accepted its token before. A
 queue is limited in total and for each client.
 """
 
@@ -21,7 +21,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 MOST_WAITING = 512
-"""Greatest number of calls that wait in a line for known clients, and the same for strangers."""
+"""Greatest number of calls that wait in a line for known clients, and the same for unknown clients."""
 MOST_WAITING_EACH = 256
 """Greatest number of calls that wait in a line for one client."""
 RETRY_AFTER_S = 2
@@ -29,7 +29,7 @@ RETRY_AFTER_S = 2
 
 @dataclass(frozen=True, slots=True)
 class Client:
-    """Owner of a call: a token that the server has accepted before, or the address of a stranger."""
+    """Owner of a call: a token that the server has accepted before, or the address of an unknown client."""
 
     key: str
     known: bool = True
@@ -129,7 +129,7 @@ class FairLine(Generic[T]):
 class Lane:
     """Threads that run the calls of a `FairLine`.
 
-    `most_each` limits how many calls run at the same time for one client, and for all strangers together.
+    `most_each` limits how many calls run at the same time for one client, and for all unknown clients together.
     """
 
     def __init__(self, name: str, threads: int, *, most_each: int | None = None) -> None:
@@ -138,7 +138,7 @@ class Lane:
         self._idle = threads
         self._line: FairLine[_QueuedCall] = FairLine()
         self._running: Counter[str] = Counter()
-        self._strangers = 0
+        self._running_unknown = 0
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -175,16 +175,16 @@ class Lane:
                 self._running[ended.key] -= 1
                 if not self._running[ended.key]:
                     del self._running[ended.key]
-                self._strangers -= not ended.known
+                self._running_unknown -= not ended.known
             call = self._line.take(self._may_run)
             if call is None:
                 self._idle += 1
                 return None
             self._running[call.client.key] += 1
-            self._strangers += not call.client.known
+            self._running_unknown += not call.client.known
             return call
 
     def _may_run(self, client: Client) -> bool:
-        if not client.known and self._strangers >= self._most_each:
+        if not client.known and self._running_unknown >= self._most_each:
             return False
         return self._running[client.key] < self._most_each

@@ -106,13 +106,13 @@ def _progress_of_tasks(
     for row in tx.execute(statement):
         if row.progress is not None:
             running.setdefault(row.parent_id, []).append(Progress.model_validate(row.progress))
-    told: dict[str, Progress] = {}
+    progress: dict[str, Progress] = {}
     for head in heads:
         ended = sum(count for state, count in children.get(head.id, {}).items() if JobState(state).terminal)
         at_work = running.get(head.id, [])
         shares = sum(min(1.0, one.done / one.total) for one in at_work if one.total)
-        told[head.id] = Progress(done=ended + shares, total=head.size, note=at_work[0].note if at_work else "")
-    return told
+        progress[head.id] = Progress(done=ended + shares, total=head.size, note=at_work[0].note if at_work else "")
+    return progress
 
 
 def _document(row: Any, after: tuple[str, ...], children: dict[str, int], at_work: Progress | None) -> Job:

@@ -227,7 +227,7 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     """
     try:
         with tx.connection.begin_nested():
-            ended = _publish_anew(tx, job_id)
+            ended = _publish_shared(tx, job_id)
     except ApiProblem:
         ended = []
     if not ended:
@@ -235,7 +235,7 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     return ended
 
 
-def _publish_anew(tx: Transaction, job_id: str) -> list[Ended]:
+def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     """Publish the shared result as the result of a waiting job; return the jobs that ended as a result.
 
     No job ends if the shared result is no longer stored. Raises the errors of `publish`.

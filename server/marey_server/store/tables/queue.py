@@ -78,7 +78,7 @@ job = Table(
     Column("rev", Integer, nullable=False, default=1),
     Index("ix_job_listing", "project_id", "id"),
     Index(
-        "ix_job_claim",  # in the order of claims; the columns after the id tell whether this worker can run the job
+        "ix_job_claim",  # in the order of claims; the columns after the id show whether this worker can run the job
         text("priority DESC"),
         "run_at_us",
         "id",
