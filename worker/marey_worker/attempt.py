@@ -317,7 +317,8 @@ class RunningAttempt:
 
     def _death(self, child: ChildProcess) -> Failed:
         status = child.wait()
-        return Failed("worker-process-died", signatures.describe_exit(status), signatures.of_exit(status), retryable=True)
+        detail = signatures.describe_exit(status)
+        return Failed("worker-process-died", detail, signatures.of_exit(status), retryable=True)
 
     # -- at the end --
 
