@@ -50,7 +50,8 @@ def login(
         me = marey.me()
     path = logins_path(os.environ)
     store_login(path, url, secret)
-    print_message(f"logged in to {url} as {me.user.name if me.user else 'nobody'}; the token is in {path}")
+    owner = f"as {me.user.name}" if me.user else "with a token of no user"
+    print_message(f"logged in to {url} {owner}; the token is in {path}")
 
 
 def logout(context: typer.Context) -> None:
@@ -60,7 +61,7 @@ def logout(context: typer.Context) -> None:
     with connect(context, anonymous=True) as marey:
         url = marey.transport.url
     known = forget_login(logins_path(os.environ), url)
-    print_message(f"forgot the token for {url}" if known else f"no token is stored for {url}")
+    print_message(f"the stored token for {url} is deleted" if known else f"no token is stored for {url}")
 
 
 # -- users --
@@ -93,7 +94,7 @@ def create_user(
         made = marey.users.create(wanted)
     if as_json:
         return print_json(made)
-    return print_message(f"user {made.name} exists now")
+    return print_message(f"user {made.name} is created")
 
 
 @user.command("ls")

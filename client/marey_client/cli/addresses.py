@@ -240,7 +240,7 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
         if not deleted:
             raise _missing(marey, address, "no item or folder")
         raise WrongUsage(
-            f"there is no deleted item at {address}; `marey ls --deleted {address.project}` lists the deleted items"
+            f"there is no deleted item or folder at {address}; `marey ls --deleted {address.project}` lists them"
         )
     return found[0]
 

@@ -205,7 +205,7 @@ def _print_evaluation(found: EvaluationHandle, as_json: bool) -> None:
             for row in worst]  # fmt: skip
     columns = ("worst trials", "offset m", "speed error m/s", "turn error deg/s")
     print_table(columns, rows, right=columns[1:])
-    return print_message(f"{found.path}: marey report {found.project}/{found.path} --out report.html")
+    return print_message(f"to write the report, run marey report {found.project}/{found.path} --out report.html")
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -44,7 +44,8 @@ Evaluation = Annotated[str, typer.Argument(help="An evaluation: project/folder/n
 From = Annotated[
     list[str] | None,
     typer.Option(
-        "--from", help="A clip that may be added, or a folder of clips, in the same project; may be repeated."
+        "--from",
+        help="Clip or folder of clips that can be added to the set, in the project of the evaluation; may be repeated.",
     ),
 ]
 
@@ -160,7 +161,7 @@ def sweep(
             _print_found(found, found.document(), as_json, _print_sweep)
 
 
-# -- asking -----------------------------------------------------------------------------------------------------------
+# -- requests ---------------------------------------------------------------------------------------------------------
 
 
 def _found(
@@ -190,18 +191,18 @@ def _print_found(
         show(document)
 
 
-# -- telling ----------------------------------------------------------------------------------------------------------
+# -- output -----------------------------------------------------------------------------------------------------------
 
 
 def _print_comparison(document: Mapping[str, Any]) -> None:
     changed = document["changed"]
     moved = [one for one in changed if not one["same_motion"]]
     if not changed:
-        typer.echo(f"No trial changed: all {document['trials']} are the same to the last bit.")
+        typer.echo(f"No trial changed: the results of all {document['trials']} trials are identical, bit for bit.")
     elif not moved:
         typer.echo(
-            f"The character moves the same way in every trial; {len(changed)} of {document['trials']} use other "
-            "clips for it."
+            f"The character moves in the same way in every trial; {len(changed)} of {document['trials']} trials use "
+            "other clips."
         )
     else:
         typer.echo(f"{len(moved)} of {document['trials']} trials changed.")
@@ -236,17 +237,17 @@ def _metres(value: float | None) -> str:
 def _print_suggestions(document: Mapping[str, Any]) -> None:
     unused, redundant = document["unused"], document["redundant"]
     sections = (
-        (f"Can be removed without any change: {counted(len(unused['clips']), 'clip')}, "
-         f"{_seconds(unused['clips'])}", unused["clips"]),
-        (f"Can be cut with hardly any change: {counted(len(unused['ranges']), 'range')} of clips, "
-         f"{_seconds(unused['ranges'])}", unused["ranges"]),
-        (f"Can be removed with little harm{' after those clips' if unused['clips'] else ''}, one after another: "
-         f"{len(redundant['plan'])} planned; "
-         f"{redundant['tried']} of {redundant['needed']} used clips tried", redundant["plan"]),
-        (f"Are nearly the same: {counted(len(document['near_duplicates']['pairs']), 'pair')} within "
+        (f"{counted(len(unused['clips']), 'clip')} ({_seconds(unused['clips'])}) can be removed without changing any "
+         "trial", unused["clips"]),
+        (f"{counted(len(unused['ranges']), 'range')} of clips ({_seconds(unused['ranges'])}) can be cut off with "
+         "hardly any change", unused["ranges"]),
+        (f"{counted(len(redundant['plan']), 'clip')} can {'then ' if unused['clips'] else ''}be removed one after "
+         f"another with little effect; {redundant['tried']} of {redundant['needed']} used clips were tried",
+         redundant["plan"]),
+        (f"{counted(len(document['near_duplicates']['pairs']), 'pair')} of clips with nearly the same motion, within "
          f"{document['near_duplicates']['threshold_cm']:g} cm", document["near_duplicates"]["spared"]),
-        (f"Would fill holes: {counted(len(document['fillings']), 'clip')}", document["fillings"]),
-        ("In this order", document["additions"]),
+        (f"{counted(len(document['fillings']), 'clip')} would fill holes", document["fillings"]),
+        ("Order in which to add clips", document["additions"]),
     )  # fmt: skip
     for heading, entries in sections:
         if entries:
@@ -261,7 +262,7 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
             f"{one['folder']}: {counted(one['clips'], 'clip')} cannot be matched: {one['detail']} ({one['code']})"
         )
     if not any(entries for _, entries in sections):
-        typer.echo("Every clip is needed, and nothing was found that would fill a hole.")
+        typer.echo("No clip was found that can be removed or that would fill a hole.")
 
 
 def _seconds(entries: Sequence[Mapping[str, Any]]) -> str:
@@ -278,8 +279,12 @@ def _print_steps(document: Mapping[str, Any]) -> None:
     ]  # fmt: skip
     columns = ("step", "action", "clips", "objective m", "offset m", "data s", "trials changed")
     print_table(columns, rows, right=columns[3:])
-    typer.echo({"no gain": "No further step gains enough.", "steps": "Ended at the greatest number of steps.",
-                "evaluations": "Ended at the greatest number of sets to try."}[document["ended"]])  # fmt: skip
+    reasons = {
+        "no gain": "Ended because no further step gains enough.",
+        "steps": "Ended at the greatest number of steps.",
+        "evaluations": "Ended at the greatest number of sets to try.",
+    }
+    typer.echo(reasons[document["ended"]])
 
 
 def _print_sweep(document: Mapping[str, Any]) -> None:
@@ -294,7 +299,7 @@ def _print_sweep(document: Mapping[str, Any]) -> None:
         )
         for one in document["influences"]
     ]
-    columns = ("features", "weight", "best", "gain m", "spread m")
+    columns = ("features", "weight", "best weight", "gain m", "spread m")
     print_table(columns, rows, right=columns[1:])
     typer.echo(f"The objective is {document['settings'][0]['objective']:.4f} m with the weights of the evaluation.")
 

@@ -66,7 +66,7 @@ def model(
 def sample(
     context: typer.Context,
     place: Annotated[str, typer.Argument(help="A model: project/folder/name, or project/id.")],
-    n: Annotated[int, typer.Option("-n", min=1, max=1000, help="Number of motions.")] = 1,
+    n: Annotated[int, typer.Option("-n", min=1, max=1000, help="Number of motions to draw.")] = 1,
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of the random numbers; the same seed gives the same motions.")
     ] = 0,
@@ -124,4 +124,5 @@ def _print_model(found: ModelHandle, as_json: bool) -> None:
         print_table(columns, rows, right=columns)
     for warning in training["warnings"]:
         print_message(f"{warning['code']}: {warning['message']}")
-    return print_message(f"{found.path}: marey sample {found.project}/{found.path} -n 10 --out samples")
+    place = f"{found.project}/{found.path}"
+    return print_message(f"to draw motions from the model, run marey sample {place} -n 10 --out samples")

@@ -82,7 +82,7 @@ def mv(
     to = Address.parse(target)
     for source in sources:
         if Address.parse(source).project != to.project:
-            raise WrongUsage(f"{source} cannot move to another project; download it, and upload it to {to.project}")
+            raise WrongUsage(f"{source} cannot be moved to another project; download it, and upload it to {to.project}")
     with connect(context) as marey:
         into_folder = target.endswith("/") or not to.path or len(sources) > 1 or _is_folder(marey, to)
         things = [the_thing(marey, source, kind) for source in sources]
@@ -92,7 +92,7 @@ def mv(
         def move(thing: Thing) -> Any:
             was = thing.place
             moved = thing.move(folder, name or was.rpartition("/")[2])
-            print_message(f"{was} is {to.project}/{moved.path} now")
+            print_message(f"{was} is moved to {to.project}/{moved.path}")
             return moved
 
         _do_each(things, move, "moved", as_json)
@@ -143,7 +143,7 @@ def restore(context: typer.Context, places: Places, kind: KindOf = None, as_json
             except Conflict as error:
                 error.add_note("first move or rename the item that has this address now, with marey mv")
                 raise
-            print_message(f"{thing.place} is back")
+            print_message(f"{thing.place} is restored")
             return restored
 
         _do_each(things, bring_back, "restored", as_json)
@@ -208,7 +208,7 @@ def tag(
                 print_message(f"{len(things) - len(items):,} of {counted(len(things), 'item')} need no change")
         if preview:
             rows = [(one.place, " ".join(one.handle.item.tags), " ".join(wanted[one.id].tags or ())) for one in items]
-            return _preview(("name", "tags", "tags then"), rows, items, "tagged", as_json)
+            return _preview(("name", "tags", "new tags"), rows, items, "changed", as_json)
 
         def put_tags(item: SingleItem) -> Any:
             changed = item.handle.change(wanted[item.id])
@@ -291,7 +291,7 @@ def _ask(question: str) -> None:
             f"{question} This needs a confirmation, but standard input is not a terminal; confirm with --yes"
         )
     if not typer.confirm(question, err=True):
-        print_message("nothing is removed")
+        print_message("nothing was removed")
         raise Refused
 
 

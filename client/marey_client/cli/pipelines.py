@@ -17,6 +17,7 @@ from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_refused, print_table, progress
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_client.cli.terminal.typed_values import json_or_text, read_json
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_client.handles.pipelines import PipelineRun
@@ -63,7 +64,7 @@ def build_model(
         list[str],
         typer.Argument(help="Clips or folders of clips, as project/folder[/name]; with --project, local files."),
     ],
-    name: Annotated[str, typer.Option(help="Name of the model and of the action.")],
+    name: Annotated[str, typer.Option(help="Name of the model.")],
     propose: Chosen,
     job: Chosen,
     project: Annotated[str | None, typer.Option(help="Project to which local files are uploaded.")] = None,
@@ -215,7 +216,7 @@ def _print_shortfalls(run: PipelineRun) -> None:
     """Print for each step the inputs that it refused or in which it found nothing, the notes, and the commit."""
     for step, job in run.steps.items():
         if refused := _refused(job):
-            print_message(f"{step} refused {len(refused)}:")
+            print_message(f"{step} refused {counted(len(refused), 'input')}:")
             print_refused(refused, most=REFUSED_SHOWN)
         result = job.result or {}
         if empty := result.get("empty"):
@@ -263,7 +264,7 @@ def _row(step: tuple[str, Job]) -> tuple[str, ...]:
 
 
 def _state(job: Job) -> str:
-    return f"{job.state}, as before" if job.cached_from and job.state.terminal else str(job.state)
+    return f"{job.state} (reused)" if job.cached_from and job.state.terminal else str(job.state)
 
 
 def _done(job: Job) -> str:

@@ -55,7 +55,7 @@ def create_project(
         made = marey.create_project(wanted).read()
     if as_json:
         return print_json(made)
-    return print_message(f"project {made.name} exists now")
+    return print_message(f"project {made.name} is created")
 
 
 @project.command("ls")
@@ -183,4 +183,4 @@ def remove_member(context: typer.Context, project_name: ProjectName, user: UserN
     """Remove a user from a project."""
     with connect(context) as marey:
         marey.project(project_name).members.remove(user)
-    print_message(f"{user} is no member of {project_name} any more")
+    print_message(f"{user} is no longer a member of {project_name}")

@@ -216,7 +216,7 @@ def _start(text: str) -> dict[str, float | None]:
     return {"x": x, "z": z, "heading_deg": heading}
 
 
-# -- telling -----------------------------------------------------------------------------------------------------------
+# -- output ------------------------------------------------------------------------------------------------------------
 
 
 def _print(answer: SearchAnswer) -> None:
@@ -230,13 +230,13 @@ def _print(answer: SearchAnswer) -> None:
         left = error if one.finished_error is None else one.finished_error
         what = f"{one.type} {one.joint}" if one.joint else one.type
         rows.append((one.step, what, f"{one.searched_error:.3f}", f"{left:.3f}", unit, "yes" if one.reached else "no"))
-    columns = ("step", "constraint", "searched", "at the end", "unit", "reached")
+    columns = ("step", "constraint", "after search", "final error", "unit", "reached")
     print_table(columns, rows, right=columns[2:4])
     for number, step in enumerate(answer.steps):
         likely = step.likelihood_percentile
         likelihood = "" if likely is None else f", likelier than {likely:.0f} % of the examples"
         typer.echo(f"step {number}: {step.duration_s:.2f} s{likelihood}")
         if step.tree == "drawn":
-            print_message("The model has no tree of its own; samples were drawn for this search. marey tree makes one.")
+            print_message("The model has no tree, so samples were drawn for this search; `marey tree` builds one.")
     for place in answer.out_of_reach:
-        print_message(f"constraint {place}: out of the model's reach: the model was not trained on such motions.")
+        print_message(f"constraint {place} is out of the model's reach: the model was not trained on such motions.")

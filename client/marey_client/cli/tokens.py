@@ -146,7 +146,7 @@ def _end_of(token: Token) -> str:
     left = token.expires_at - datetime.now(UTC)
     shown = f"{token.expires_at:%Y-%m-%d}"
     if left.total_seconds() <= 0:
-        return f"{shown} (ended)"
+        return f"{shown} (expired)"
     return f"{shown} (in {counted(left.days, 'day')})" if left.days < SOON_DAYS else shown
 
 

@@ -89,7 +89,7 @@ def clips(lab: ProjectHandle) -> list[str]:
 
 def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, lab: ProjectHandle) -> None:
     ids = {clip.name: clip.id for clip in lab.clips.list()}
-    assert "lab/raw/a is lab/raw/walk now" in run("mv", "lab/raw/a", "lab/raw/walk").stderr
+    assert "lab/raw/a is moved to lab/raw/walk" in run("mv", "lab/raw/a", "lab/raw/walk").stderr
     assert lab.clips.get(ids["a"]).path == "raw/walk"
     run("mv", "lab/raw/b", f"lab/{ids['c']}", "lab/takes/day-1/")  # made, as it is not there
     assert clips(lab) == ["raw/walk", "takes/day-1/b", "takes/day-1/c"]
@@ -104,7 +104,7 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, la
     ("arguments", "status", "told"),
     [
         (["mv", "lab/raw/a", "lab/raw/b"], 1, "lab/raw/a: There is already a clip with this name in the collection."),
-        (["mv", "lab/raw/a", "studio/a"], 2, "lab/raw/a cannot move to another project"),
+        (["mv", "lab/raw/a", "studio/a"], 2, "lab/raw/a cannot be moved to another project"),
         (["mv", "lab/raw/nobody", "lab/raw/b"], 2, "there is no item or folder at lab/raw/nobody"),
         (["mv", "lab/raw/a"], 2, "give the items to move and the destination"),
         (["mv", "lab", "lab/b"], 2, "'lab' is a project"),
@@ -114,7 +114,7 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, la
         (["rm", "lab/raw/a", "lab/raw", "--yes"], 2, "lab/raw/a is inside lab/raw, and the command names both"),
         (["rm", "lab/raw/a", "lab/raw/a", "--yes"], 2, "lab/raw/a is named twice"),
         (["rm", "lab/raw/a/", "--yes"], 2, "there is no item or folder at lab/raw/a"),
-        (["restore", "lab/raw/a"], 2, "there is no deleted item at lab/raw/a; `marey ls --deleted lab` lists"),
+        (["restore", "lab/raw/a"], 2, "there is no deleted item or folder at lab/raw/a; `marey ls --deleted lab` lists"),
         (["tag", "lab/raw/a"], 2, "give them with --add"),
         (["tag", "lab/raw", "--add", "x"], 2, "lab/raw is a folder, and folders have no tags"),
         (["rm", "lab/raw/a", "--kind", "stone"], 2, "'stone' is not a kind of item"),
@@ -278,8 +278,8 @@ def test_a_query_is_explained_by_what_each_condition_hides(run: Command) -> None
     ("rows", "told"),
     [
         ("clip,select\na,perfect\nnobody,best\n", ["row 2, select", "'perfect'", "row 3: there is no clip 'nobody'"]),
-        ("clip,select\na,best\nraw/a,good\n", ["row 3: 'raw/a' is also in row 2"]),
-        ("clip,select\na,best,more\n", ["row 2: there are more cells than columns"]),
+        ("clip,select\na,best\nraw/a,good\n", ["row 3: the clip 'raw/a' is also in row 2"]),
+        ("clip,select\na,best,more\n", ["row 2: the row has more cells than the table has columns"]),
         ("name,select\na,best\n", ["needs a column `clip` or `file`"]),
         ("clip,select\n", ["has no rows"]),
         ("clip,shoot_day\na,yesterday\n", ["row 2, shoot_day"]),

@@ -85,7 +85,7 @@ def test_the_commands_of_the_page_work_in_their_order(run: CommandLine, project:
     assert (walker.clip("walk").item.tags, walker.clip("walk").info().comment) == (("slow",), "on trial")
     walker.commit("Theirs", "trial", "theirs")
     walker.commit("Ours", "main", "ours")
-    assert "nothing is recorded" in run("dataset", "merge", "lab/gaits@trial", status=1).stderr
+    assert "nothing was recorded" in run("dataset", "merge", "lab/gaits@trial", status=1).stderr
     walker.follow()
     exported, _ = walker.follow()
     assert json.loads(exported)["clips"] == 2

@@ -41,7 +41,7 @@ def test_without_all_that_can_go_no_trial_changes(lab: ProjectHandle, run: Comma
     evaluated(lab, kept, name="second", normaliser=first.id)
 
     told = run("compare", "lab/first", "lab/second", "--out", "compared.html").stdout
-    assert "No trial changed: all 6 are the same to the last bit." in told
+    assert "No trial changed: the results of all 6 trials are identical, bit for bit." in told
     assert f"removed: {len(names)} clips" in told
     page = (tmp_path / "compared.html").read_text(encoding="utf-8")
     assert page.startswith("<!DOCTYPE html>")
@@ -90,7 +90,7 @@ def test_clips_of_another_folder_fill_the_holes_of_a_set(lab: ProjectHandle, mar
     assert all("60" in name for name in names)
     assert not any(one["needs_retarget"] for one in found["fillings"])
     told = run("suggest", "lab/straight", "--from", "lab/walks", "--removals", 0, "--consider", 0).stdout
-    assert f"Would fill holes: {len(found['fillings'])} clips." in told
+    assert f"{len(found['fillings'])} clips would fill holes." in told
     assert "can be blended with the set" in told
 
     run("optimise", "lab/straight", "--from", "lab/walks", "--max-steps", 2, "--consider", 3)

@@ -64,7 +64,7 @@ def test_suggestions_are_asked_for_by_the_revision_that_was_read_and_with_what_w
 def test_a_comparison_in_which_nothing_changed_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     lists: dict[str, list[str]] = {name: [] for name in ("changed", "metrics", "removed", "added", "newly_unused")}
     _print_comparison({**lists, "trials": 162})
-    assert "No trial changed: all 162 are the same to the last bit." in capsys.readouterr().out
+    assert "No trial changed: the results of all 162 trials are identical, bit for bit." in capsys.readouterr().out
 
 
 def test_weights_of_the_objective_are_read_by_name() -> None:

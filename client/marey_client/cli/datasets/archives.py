@@ -62,7 +62,7 @@ def create_archive(
         return print_json({"file": str(file), "commit": made.digest, "bytes": file.stat().st_size})
     size_mb = file.stat().st_size / 1e6
     return print_message(
-        f"{file} has the version {short(made.digest)} of {at.project}/{at.dataset} ({size_mb:,.1f} MB)"
+        f"{file} contains the version {short(made.digest)} of {at.project}/{at.dataset} ({size_mb:,.1f} MB)"
     )
 
 

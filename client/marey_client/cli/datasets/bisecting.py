@@ -152,14 +152,14 @@ def _print_plan(among: VersionRange, as_json: bool) -> None:
         document = {"good": among.good, "bad": among.bad, "versions": len(among.commits), "first": among.first}
         return print_json({**document, "expected": 2 + among.expected_tests})
     if among.first is not None:
-        print_pairs([("first between the ends", f"{short(among.first.digest)} {among.first.message}")])
+        print_pairs([("first after the ends", f"{short(among.first.digest)} {among.first.message}")])
     return print_message(_plan(among))
 
 
 def _print_test(test: VersionTest, found: Measurement, left: int) -> None:
     verdict = {True: "bad", False: "good", None: "skipped"}[test.bad]
     value = found.reason if found.value is None else f"{found.value:.6g}" + (" (reused)" if found.reused else "")
-    more = f"; about {left} more" if left else ""
+    more = f"; about {left} more to evaluate" if left else ""
     print_message(f"{short(test.commit.digest)} is {verdict}: {value}{more}")
 
 
@@ -196,15 +196,15 @@ def _change(found: Crossing, one: ParentChange) -> str:
 def _print_doubts(found: Crossing, one: ParentChange) -> None:
     name = short(one.parent.commit.digest)
     if one.may_be_noise:
-        print_message(f"the interval of the change from {name} contains 0: the crossing may be noise")
+        print_message(f"the interval of the change from {name} contains 0, so the crossing may be noise")
     if one.parent.value is not None and found.limit.exceeded_by(one.parent.value):
-        print_message(f"{name} was taken as good, since a later version is good, but its value is {found.limit}, too")
+        print_message(f"{name} counts as good because a later version is good, but its value is {found.limit}, too")
 
 
 def _print_suspects(found: Crossing) -> None:
     reasons = {one.commit.digest: one.reason for one in found.measurements}
     rows = [(short(one.digest), one.at, one.author, one.message, reasons[one.digest]) for one in found.search.suspects]
-    print_table(("first bad version is one of", "time", "author", "message", "not evaluated because"), rows)
+    print_table(("first bad version is one of", "time", "author", "message", "reason"), rows)
 
 
 def _document(found: Crossing) -> dict[str, Any]:

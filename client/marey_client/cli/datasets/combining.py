@@ -192,7 +192,7 @@ def _print_result(found: MergeAnswer, into: str) -> None:
         for one in found.conflicts:
             _print_reason(one)
         print_message(
-            f"{counted(found.conflict_count, 'conflict')}; nothing is recorded. Decide each by --ours, "
+            f"{counted(found.conflict_count, 'conflict')}; nothing was recorded. Decide each conflict by --ours, "
             "--theirs or --base"
         )
     elif found.commit is None:
@@ -200,7 +200,7 @@ def _print_result(found: MergeAnswer, into: str) -> None:
     else:
         print_message(
             f"{into} is at {short(found.commit.digest)} now; {counted(found.changes, 'entry')} changed. "
-            "marey dataset checkout gives the folder its entries"
+            "To update the folder, run `marey dataset checkout`"
         )
 
 

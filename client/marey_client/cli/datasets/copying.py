@@ -61,7 +61,7 @@ def push(
     versions that your dataset lacks, the branch does not move; pull it, merge, and push again.
     """
     with connect(context) as here, connect_other(to, token_file, here) as there:
-        _copy(here, there, place, target, branch, as_json)
+        _copy(here, there, place, target, branch, as_json, server=to)
 
 
 def pull(
@@ -86,7 +86,17 @@ def pull(
         _copy(there, here, place, target, branch, as_json)
 
 
-def _copy(source: Marey, target: Marey, place: str, into: str | None, branch: str | None, as_json: bool) -> None:
+def _copy(
+    source: Marey,
+    target: Marey,
+    place: str,
+    into: str | None,
+    branch: str | None,
+    as_json: bool,
+    *,
+    server: str | None = None,
+) -> None:
+    """Copy a version and print the result; `server` is the address of the target if another server was named."""
     at = parse(place, version=True)
     to = at if into is None else parse(into)
     if source is target and (at.project, at.dataset) == (to.project, to.dataset):
@@ -96,7 +106,7 @@ def _copy(source: Marey, target: Marey, place: str, into: str | None, branch: st
         made = datasets.pull(at.on(source), to.dataset, at.version, into=branch, on_progress=advance)
     if as_json:
         return print_json({"commit": made.commit.digest, "branch": made.branch, "moved": made.moved, "tag": made.tag})
-    print_message(imported(to, made))
+    print_message(imported(to, made, server=server))
     if made.tag is not None:
-        print_message(f"the tag {made.tag} is at this version, too")
+        print_message(f"the tag {made.tag} was copied, too")
     return None

@@ -52,19 +52,23 @@ def parse(text: str, *, version: bool = False) -> NamedVersion:
     return NamedVersion(project, name, named or "main")
 
 
-def imported(at: NamedVersion, made: ImportedVersion) -> str:
+def imported(at: NamedVersion, made: ImportedVersion, *, server: str | None = None) -> str:
     """Return a sentence for the user after an import, with the next command.
 
     If the branch moved to the imported version, the command checks out the branch; otherwise, it merges the version
-    into the branch.
+    into the branch. `server` is the address of the server with the dataset, if it is not the server of the command.
     """
     name, digits = f"{at.project}/{at.dataset}", short(made.commit.digest)
+    there = f" --server {server}" if server else ""
     if not made.moved:
         return (
-            f"{name} has the version {digits}; {made.branch} has other versions and did not move: marey dataset merge "
-            f"{name}@{digits} --into {made.branch}"
+            f"{name} contains the version {digits} now, but the branch {made.branch} has other versions and was not "
+            f"moved; to merge them, run marey dataset merge {name}@{digits} --into {made.branch}{there}"
         )
-    return f"{made.branch} of {name} is at {digits}; marey dataset checkout {name}@{made.branch}"
+    return (
+        f"{made.branch} of {name} is at {digits} now; to update the folder, run marey dataset checkout "
+        f"{name}@{made.branch}{there}"
+    )
 
 
 def short(digest: str | None) -> str | None:

@@ -133,7 +133,7 @@ def _pairs(found: ProposalDetail) -> list[tuple[str, object]]:
         ("target", f"{found.target} at {short(found.target_commit)}"),
         ("merged", short(found.merged)),
         ("ended by", found.ended_by),
-        ("merged for", found.when_green),
+        ("merge requested by", found.when_green),
         ("changes", None if computed is None else computed.changes),
         ("conflicts", None if computed is None else computed.conflict_count),
         ("missing", "" if computed is None else " ".join(one.detail for one in computed.missing)),
@@ -203,7 +203,7 @@ def review(
         made = at.on(marey).proposals.at(number).review(verdict, text, commit=commit)
     if as_json:
         return print_json(made)
-    return print_message(f"recorded {made.verdict} for {short(made.commit)}")
+    return print_message(f"recorded the verdict {made.verdict} for {short(made.commit)}")
 
 
 @proposal.command("check")
@@ -273,8 +273,8 @@ def _outcome(found: Proposal) -> str:
     if found.state is ProposalState.MERGED:
         return f"merged; {found.target} is at {short(found.merged)} now"
     if found.when_green is not None:
-        return f"the proposal {found.number} will be merged for {found.when_green} as soon as nothing is missing"
-    return f"the proposal {found.number} waits for a merge"
+        return f"the proposal {found.number} will be merged for {found.when_green} when nothing is missing any more"
+    return f"the proposal {found.number} is open; no merge is requested"
 
 
 @proposal.command("close")

@@ -101,7 +101,9 @@ def _exported_at(marey: Marey, address: Address) -> list[_Exported]:
     if single is not None:
         return [_Exported(*single, "", single[0].name)]
     if not below:
-        raise WrongUsage(f"there is no clip and no item at {address}; `marey ls {address.project}` lists the project")
+        raise WrongUsage(
+            f"there is no item and no folder with clips at {address}; `marey ls {address.project}` lists the project"
+        )
     return [_Exported(one, None, one.item.collection.removeprefix(address.path).strip("/"), one.name) for one in below]
 
 

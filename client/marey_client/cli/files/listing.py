@@ -173,7 +173,7 @@ def _show_deleted(
     rows += [(one.path, one.item.kind, one.item.deleted_at, one.id) for one in items]
     print_table(("name", "kind", "deleted", "id"), rows)
     return print_message(
-        f"marey restore {address.project}/NAME restores an item; if several items have this name, give an id"
+        f"`marey restore {address.project}/NAME` restores an item or a folder; if several have this name, give the id"
     )
 
 

@@ -149,13 +149,14 @@ def _from_table(
         try:
             change = _of_row(row, fields, key, known, place)
             if change.clip.id in changes:
-                raise WrongUsage(f"{place}: {row[key]!r} is also in {changes[change.clip.id].place}")
+                raise WrongUsage(f"{place}: the clip {row[key]!r} is also in {changes[change.clip.id].place}")
             changes[change.clip.id] = change
         except WrongUsage as error:
             wrong.append(str(error))
     if wrong:
         more = [f"and {len(wrong) - ERRORS_SHOWN} more"] if len(wrong) > ERRORS_SHOWN else []
-        raise WrongUsage(f"{table}: nothing was changed\n  " + "\n  ".join([*wrong[:ERRORS_SHOWN], *more]))
+        heading = f"{table}: {counted(len(wrong), 'row')} must be corrected first, so no record was changed"
+        raise WrongUsage("\n  ".join([heading, *wrong[:ERRORS_SHOWN], *more]))
     return iter(changes.values())
 
 
@@ -182,7 +183,7 @@ def _of_row(
     place: str,
 ) -> _RecordChange:
     if None in row:
-        raise WrongUsage(f"{place}: there are more cells than columns")
+        raise WrongUsage(f"{place}: the row has more cells than the table has columns")
     named = (row[key] or "").strip()
     found = known.get(named, [])
     if len(found) != 1:

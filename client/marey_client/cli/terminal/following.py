@@ -165,10 +165,11 @@ def commit_text(ended: Job) -> str:
     name = f"{commit.dataset}@{commit.branch}"
     if conflict is not None:
         place = f"{ended.project}/{commit.dataset}@{conflict.branch}"
-        advice = "" if conflict.branch is None else f" marey dataset merge {place} --into {commit.branch}"
-        return f"{name} did not move. {conflict.detail}{advice}"
+        merge = f" To merge it, run marey dataset merge {place} --into {commit.branch}"
+        advice = "" if conflict.branch is None else merge
+        return f"{name} does not contain the results: {conflict.detail}{advice}"
     if commit.digest is None:
-        return f"{name} has these results already, so there is no new commit"
+        return f"{name} already contains these results, so there is no new commit"
     return f"{name} is at {short(commit.digest)} now"
 
 

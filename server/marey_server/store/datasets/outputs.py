@@ -242,13 +242,16 @@ def _on_own_branch(
     changed = f"{counted(len(paths), 'path')} of the outputs changed on {wanted.branch!r} while the job ran"
     conflict = CommitConflict(
         code="paths-changed",
-        detail=f"{changed}, the first {paths[0]!r}. The outputs are on a branch of their own; merge it.",
+        detail=f"{changed}, the first {paths[0]!r}. The outputs are on a new branch, which can be merged.",
         paths=tuple(paths[:MOST_LISTED]),
         count=len(paths),
     )
     of_dataset = dataset_ref.c.dataset_id == wanted.dataset_id
     if tx.execute(select(func.count()).select_from(dataset_ref).where(of_dataset)).scalar_one() >= MOST_REFS:
-        detail = f"{changed}, and the dataset has the greatest number of branches and tags."
+        detail = (
+            f"{changed}, and the outputs were not committed to a new branch, because the dataset already has {MOST_REFS:,} "
+            "branches and tags, which is the limit. Delete some of them, and submit the job again."
+        )
         return CommittedOutputs(conflict=conflict.model_copy(update={"code": "too-many-refs", "detail": detail}))
     digest = _record(tx, wanted, mover, store, tree, () if wanted.base is None else (wanted.base,))
     name = _create_branch(tx, wanted, digest)
