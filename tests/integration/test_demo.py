@@ -28,7 +28,7 @@ def test_the_demonstration_tells_how_good_the_motion_is_and_does_nothing_twice(t
     assert f"ls demo --token-file {tmp_path}/data/admin.token" in done.stderr
     sentence = told.splitlines()[0]
     assert "trajectories" in sentence
-    assert "retargeted clips: those whose root gets 0.5 m away within 1 s" in told
+    assert "retargeted clips: those whose root moves at least 0.5 m within 1 s" in told
 
     again = json.loads(demo(tmp_path, "--json").stdout)
     assert again["evaluation"]["verdict"] == sentence

@@ -129,7 +129,7 @@ def test_skeletons_and_mappings_name_their_joints() -> None:
         "2 joints added: Tail, Tip",
         "1 joint removed: Prop",
         "1 joint renamed: LeftArm → ArmL",
-        "rest pose of Head: parent Neck1 → Neck, offset by 2 cm, rest rotation by 5°",
+        "rest pose of Head: parent Neck1 → Neck, offset changed by 2 cm, rest rotation changed by 5°",
         "the end sites of the joints differ",
         "mapping of head: Head → no joint",
         "axes of 1 joint changed: Head",

@@ -39,15 +39,15 @@ class DemoEvaluation:
     def sentence(self) -> str:
         """The quality of the clips, in a sentence."""
         if self.summary is None:
-            return f"None of {self.clips} retargeted clips is locomotion, so there was nothing to evaluate."
+            return f"None of {self.clips} retargeted clips is locomotion, so nothing was evaluated."
         return str(self.summary["verdict"])
 
     @property
     def selection(self) -> str:
         """The evaluated clips, and the reason for the choice."""
         return (
-            f"of {self.clips} retargeted clips: those whose root gets {TRAVEL_M:g} m away within "
-            f"{TRAVEL_WINDOW_S:g} s, in most frames"
+            f"of {self.clips} retargeted clips: those whose root moves at least {TRAVEL_M:g} m within "
+            f"{TRAVEL_WINDOW_S:g} s from at least half of the frames"
         )
 
 

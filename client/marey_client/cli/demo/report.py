@@ -100,7 +100,7 @@ def print_report(report: DemoReport) -> None:
     typer.echo(f"{report.evaluation.sentence}\n")
     print_rows(_rows(report))
     for step, reason in report.refused[:REASONS_SHOWN]:
-        print_message(f"refused at {step}: {reason}")
+        print_message(f"refused in the step {step}: {reason}")
     if len(report.refused) > REASONS_SHOWN:
         print_message(f"... and {len(report.refused) - REASONS_SHOWN} more")
     print_message(f"\nserver data       {report.data.absolute()}")
@@ -114,7 +114,7 @@ def print_report(report: DemoReport) -> None:
         print_message(f"evaluation        {report.evaluation.report.absolute()}")
     marey, data = _command(), shlex.quote(str(report.data))
     token = shlex.quote(str(report.data / ADMIN_TOKEN))
-    print_message(f"look around       {marey} serve --data {data}   and then   {marey} ls demo --token-file {token}")
+    print_message(f"to browse, run    {marey} serve --data {data}   and   {marey} ls demo --token-file {token}")
 
 
 def _command() -> str:
@@ -129,20 +129,20 @@ def _rows(report: DemoReport) -> Iterator[tuple[str, str, str]]:
     refusals = Counter(step for step, _ in report.refused)
     yield "files", f"{figures['files']}", _counted(taken)
     if report.left_out:
-        yield "left out", f"{report.left_out}", "no motion files"
+        yield "left out", f"{report.left_out}", "not motion files"
     yield "warnings", f"{sum(report.warnings.values())}", _counted(dict(report.warnings.most_common()))
-    yield "refused", f"{len(report.refused)}", _counted({f"at {step}": count for step, count in refusals.items()})
-    yield "frames in", f"{figures['frames']:,}", "sent, read, checked, stored"
+    yield "refused", f"{len(report.refused)}", _counted({f"in {step}": count for step, count in refusals.items()})
+    yield "imported", f"{figures['frames']:,}", "frames, uploaded, read, checked and stored"
     yield "", f"{seconds['import']:.2f}", "seconds"
     yield "", f"{rates['import']:,.0f}", "poses per second"
     yield "", f"{sizes['takes']:.0f}", "bytes per pose"
     yield (
-        "frames out",
+        "retargeted",
         f"{figures['retargeted_frames']:,}",
-        f"in {figures['retargeted_clips']} clips on another skeleton",
+        f"frames in {figures['retargeted_clips']} clips on another skeleton",
     )
     shared = (
-        f"; {report.shared_tasks} of {report.tasks} tasks share results of earlier ones" if report.shared_tasks else ""
+        f"; {report.shared_tasks} of {report.tasks} tasks reuse results of earlier ones" if report.shared_tasks else ""
     )
     yield "", f"{seconds['retarget']:.2f}", f"seconds, through queue and worker{shared}"
     yield "", f"{rates['retarget']:,.0f}", "poses per second"

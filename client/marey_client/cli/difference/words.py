@@ -123,7 +123,7 @@ def _run(run: FrameRun, motion: MotionDifference) -> str:
     if stop == motion.frames[side]:
         return f"{name}: last {frames} {verb} ({seconds:.2f} s)"
     where = _time(start, stop, motion.frame_rate_hz[side])
-    return f"{frames} {verb} {where}{' of the revision before' if removed else ''}"
+    return f"{frames} {verb} {where}{' of the earlier revision' if removed else ''}"
 
 
 def _unmatched(motion: MotionDifference) -> Iterator[str]:
@@ -214,9 +214,9 @@ def _skeleton(skeleton: SkeletonDifference) -> Iterator[str]:
         if one.parent is not None:
             changes.append(f"parent {one.parent[0] or 'none'} → {one.parent[1] or 'none'}")
         if one.offset_cm:
-            changes.append(f"offset by {one.offset_cm:.3g} cm")
+            changes.append(f"offset changed by {one.offset_cm:.3g} cm")
         if one.rotation_deg:
-            changes.append(f"rest rotation by {one.rotation_deg:.3g}°")
+            changes.append(f"rest rotation changed by {one.rotation_deg:.3g}°")
         lines.append(f"rest pose of {one.joint}: {', '.join(changes)}")
     yield from _limited(lines, "joint")
     if skeleton.reordered:

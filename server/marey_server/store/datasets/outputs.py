@@ -249,8 +249,8 @@ def _on_own_branch(
     of_dataset = dataset_ref.c.dataset_id == wanted.dataset_id
     if tx.execute(select(func.count()).select_from(dataset_ref).where(of_dataset)).scalar_one() >= MOST_REFS:
         detail = (
-            f"{changed}, and the outputs were not committed to a new branch, because the dataset already has {MOST_REFS:,} "
-            "branches and tags, which is the limit. Delete some of them, and submit the job again."
+            f"{changed}, and the outputs were not committed to a new branch, because the dataset already has "
+            f"{MOST_REFS:,} branches and tags, which is the limit. Delete some of them, and submit the job again."
         )
         return CommittedOutputs(conflict=conflict.model_copy(update={"code": "too-many-refs", "detail": detail}))
     digest = _record(tx, wanted, mover, store, tree, () if wanted.base is None else (wanted.base,))
