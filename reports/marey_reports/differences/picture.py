@@ -62,8 +62,8 @@ _WIDTH, _LEFT, _TIMES, _PATHS = 12.8, 1.7, 6.2, 2.5
 _ROW, _HIGHEST_ROW, _LEAST_ROWS, _ABOVE, _BELOW = 0.21, 0.36, 2.0, 2.35, 0.6
 _UPPER, _LOWER = (0.74, 0.74, 1.0, 1.0), (0.0, 0.0, 0.26, 0.26)
 """Heights of the corners of the upper bar and of the lower bar."""
-_THINNEST, _NAME_ROOM = 0.004, 0.16
-"""Least width of a bar, and room for a number of frames in words, as shares of the longest duration."""
+_THINNEST, _NAME_WIDTH = 0.004, 0.16
+"""Least width of a bar, and width of a number of frames in words, as shares of the longest duration."""
 
 
 def draw_difference(difference: Difference, file_type: FileType) -> bytes:
@@ -80,12 +80,14 @@ def draw_difference(difference: Difference, file_type: FileType) -> bytes:
 
     Raises
     ------
-    ValueError    if the difference has nothing to draw
+    ValueError    if the difference is not between two motions or annotations, or has a `motion` without `plot`
     """
     if difference.motion is not None and difference.plot is not None:
         figure = _draw_motions(difference, difference.motion, difference.plot)
     elif difference.annotations is not None:
         figure = _draw_annotations(difference, *difference.annotations)
+    elif difference.motion is not None:
+        raise ValueError("the difference lacks the values to draw; request it again with plot=True")
     else:
         raise ValueError("only differences between two motions or between two annotations can be drawn")
     return to_png(figure) if file_type == "png" else to_svg(figure, _title(difference)).encode()
@@ -108,11 +110,11 @@ def _draw_motions(difference: Difference, motion: MotionDifference, plot: Differ
     figure.text(0.25 / _WIDTH, 1.0 - 0.3 / (top + _ABOVE), plain(_title(difference)), fontsize=HEADING + 1.5, color=INK,
                 va="center", fontweight="bold", parse_math=False)  # fmt: skip
     bars = add_panel(figure, Place(_LEFT, top + 0.8, _TIMES, 0.7), grid=False)
-    bars.set_title("frames that correspond", fontsize=HEADING, color=INK, loc="left", fontweight="bold", pad=21)
+    bars.set_title("corresponding frames", fontsize=HEADING, color=INK, loc="left", fontweight="bold", pad=21)
     _draw_runs(bars, motion)
     height = min(rows, _HIGHEST_ROW * max(len(shown), 1))
     place = Place(_LEFT, top - height, _TIMES, height)
-    heat = add_panel(figure, place, title="change of rotations", x="time after (s)", grid=False)
+    heat = add_panel(figure, place, title="change of rotations", x="time in the later revision (s)", grid=False)
     _draw_changes(figure, heat, plot, shown, top)
     place = Place(_LEFT + _TIMES + 1.9, top + 1.45 - _PATHS, _PATHS, _PATHS)
     name = f"path of {motion.path.joint}" if motion.path is not None else "path"
@@ -146,22 +148,22 @@ def _draw_runs(panel: Axes, motion: MotionDifference) -> None:
 
 
 def _name_runs(panel: Axes, motion: MotionDifference) -> None:
-    """Write the numbers of removed and inserted frames above and below the bars, as far as there is room."""
-    room = _NAME_ROOM * max(motion.duration_s)
+    """Write the numbers of removed and inserted frames above and below the bars, where they do not overlap."""
+    width = _NAME_WIDTH * max(motion.duration_s)
     free = {"removed": 0.0, "inserted": 0.0}
     for run in motion.runs:
         if run.change == "matched":
             continue
         removed = run.change == "removed"
         start, stop = (one / motion.frame_rate_hz[not removed] for one in (run.before if removed else run.after))
-        left = min(max((start + stop - room) / 2.0, 0.0), max(motion.duration_s) - room)
+        left = min(max((start + stop - width) / 2.0, 0.0), max(motion.duration_s) - width)
         if left < free[run.change]:
             continue
-        free[run.change] = left + room
+        free[run.change] = left + width
         count = (run.before[1] - run.before[0]) or (run.after[1] - run.after[0])
         place, side = (1.06, "bottom") if removed else (-0.06, "top")
         look = {"color": REMOVED if removed else INSERTED, "ha": "center", "va": side}
-        write(panel, (left + room / 2.0, place), f"{count:,} {run.change}", **look)
+        write(panel, (left + width / 2.0, place), f"{count:,} {run.change}", **look)
 
 
 def _draw_changes(figure: Figure, panel: Axes, plot: DifferencePlot, shown: NDArray[np.intp], top: float) -> None:
@@ -217,10 +219,10 @@ def _draw_annotations(difference: Difference, before: Annotation, after: Annotat
         for one in layer.segments:
             panel.broken_barh([(one.start, one.end - one.start)], (bottom + 0.16, 0.6), facecolor=colours[one.label],
                               alpha=0.85 if one in edited else 0.3, edgecolor="white", lw=0.8)  # fmt: skip
-            room = int((one.end - one.start) / end * 150)
-            if room > 2 and len(layer.segments) <= MOST_LABELS:
+            longest = int((one.end - one.start) / end * 150)
+            if longest > 2 and len(layer.segments) <= MOST_LABELS:
                 middle = (one.start + one.end) / 2.0
-                write(panel, (middle, bottom + 0.46), shortened(one.label, room), ha="center", fontsize=SMALL)
+                write(panel, (middle, bottom + 0.46), shortened(one.label, longest), ha="center", fontsize=SMALL)
         for mark in layer.keyframes:
             panel.plot([mark.frame + 0.5], [bottom + 0.84], marker="v", ms=5, color=INK)
             if len(layer.keyframes) <= MOST_LABELS:

@@ -146,7 +146,7 @@ def without_shared_folder(names: Sequence[str]) -> list[str]:
     return ["/".join(place[shared:]) for place in places]
 
 
-def told_apart(names: Sequence[str]) -> list[str]:
+def differing_parts(names: Sequence[str]) -> list[str]:
     """Shorten names to the parts that differ: drop the folders and the first words that all names share.
 
     The words are kept if one of the names would be empty without them.
@@ -166,7 +166,7 @@ def labels_of(names: Sequence[str], longest: int = LONGEST_NAME) -> list[str]:
     takes = [name.rpartition("/")[2] for name in names]
     apart = takes if len(set(takes)) == len(set(names)) else without_shared_folder(names)
     if any(len(name) > longest for name in apart):
-        apart = told_apart(apart)
+        apart = differing_parts(apart)
     labels = [shortened(name, longest) for name in apart]
     for label in [label for label, count in Counter(labels).items() if count > 1]:
         places = [place for place, other in enumerate(labels) if other == label]

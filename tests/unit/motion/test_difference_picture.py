@@ -100,6 +100,12 @@ def test_only_differences_with_values_to_draw_have_a_picture() -> None:
         draw_difference(difference_of(), "png")
 
 
+def test_a_difference_without_values_to_draw_is_refused_with_the_remedy() -> None:
+    without = DIFFERENCES["trimmed"].model_copy(update={"plot": None})
+    with pytest.raises(ValueError, match="request it again with plot=True"):
+        draw_difference(without, "svg")
+
+
 def test_keyframes_and_segments_of_both_annotations_are_named() -> None:
     text = draw_difference(DIFFERENCES["annotations"], "svg").decode()
     assert all(name in text for name in ("idle", "walk", "contact", "before", "after"))

@@ -20,9 +20,9 @@ from marey_reports.drawing.paper import (
     Place,
     add_colour_bar,
     add_panel,
+    differing_parts,
     new_figure,
     shortened,
-    told_apart,
 )
 from marey_reports.models.figures.subjects import evenly
 from marey_schemas.options.alignment import CostOptions
@@ -65,7 +65,7 @@ def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None
     names = dict(
         zip(
             (clip.uid for clip in aligned.clips),
-            told_apart([clip.name for clip in aligned.clips]),
+            differing_parts([clip.name for clip in aligned.clips]),
             strict=True,
         )
     )

@@ -21,7 +21,7 @@ from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search.check import SearchCheck
 from marey_motion.modelling.training_report import TrainingReport
 from marey_motion.skeleton import Skeleton
-from marey_reports.drawing.paper import shortened, told_apart
+from marey_reports.drawing.paper import differing_parts, shortened
 from marey_reports.drawing.stick_figures import StickFigure, body_of
 from marey_reports.drawing.strips import StripMoments
 
@@ -62,7 +62,7 @@ class ModelSubject:
     @cached_property
     def names(self) -> list[str]:
         """Names of the examples, without the folders and the first words that all share."""
-        return told_apart([clip.name for clip in self.examples.clips])
+        return differing_parts([clip.name for clip in self.examples.clips])
 
     @cached_property
     def poses(self) -> Floats:

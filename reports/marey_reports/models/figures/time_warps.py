@@ -17,9 +17,9 @@ from marey_reports.drawing.paper import (
     Place,
     add_keys,
     add_panel,
+    differing_parts,
     new_figure,
     shortened,
-    told_apart,
 )
 from marey_reports.models.figures.canonical_time import CANONICAL_TIME, mark_keyframes, percents
 from marey_schemas.wording import counted
@@ -41,7 +41,7 @@ def draw_time_warps(aligned: AlignedSet) -> Sketch:
     speeds = 1.0 / np.diff(aligned.time_functions, axis=1)
     reference = [clip.uid for clip in aligned.clips].index(aligned.reference)
     odd = _most_unlike(aligned, reference)
-    names = [shortened(name, 26) for name in told_apart([clip.name for clip in aligned.clips])]
+    names = [shortened(name, 26) for name in differing_parts([clip.name for clip in aligned.clips])]
     figure = new_figure(10.4, 4.1)
     left = add_panel(figure, Place(0.7, 0.65, 3.4, 2.9), x=CANONICAL_TIME, y="time in the clip (s)", title="when")
     right = add_panel(figure, Place(4.85, 0.65, 3.4, 2.9), x=CANONICAL_TIME, y="speed (2: twice as the reference)",
