@@ -30,8 +30,8 @@ Figures = Mapping[str, DrawnFigure]
 HOLES = "holes"
 WORST_TRIALS = 10
 WALK_GRAPH = (
-    "The graph of single frames, with the order of every walk, is written as GraphML or JSON by "
-    "marey report project/name --walk-graph walks.graphml."
+    "marey report project/name --walk-graph walks.graphml writes the graph of single frames, with the order of every "
+    "walk, as GraphML or JSON."
 )
 LOAD_CLIPS = 15
 MOST_HOLES = 15
@@ -43,7 +43,7 @@ def headline(result: EvaluationResult) -> Html:
     sources = sum_by_source(result.clips, result.usage)
     used = sum(1 for source in sources if source.ticks)
     base = result.baseline
-    beside = "" if base is None else f"{_written(base, 'offset_mean')} with generated clips that cover everything"
+    beside = "" if base is None else f"{_written(base, 'offset_mean')} with generated clips (baseline)"
     held = recorded_rows(result.clips, result.usage) / result.options.database.rate_hz
     covered = int(np.count_nonzero(coverage.deficit_s <= 0.0))
     return facts(
@@ -52,7 +52,7 @@ def headline(result: EvaluationResult) -> Html:
             ("distance from the path", _written(result, "offset_mean"), beside),
             ("speeds and turns covered", f"{covered} of {coverage.deficit_s.size}", f"{duration(held)} of clips"),
             ("clips used", f"{used} of {len(sources)}", _mirroring(result)),
-            ("left-right symmetry", f"{coverage.symmetry:.2f}", "of the data: 1 is alike, 0 one-sided"),
+            ("left-right symmetry", f"{coverage.symmetry:.2f}", "of the data; 1: both sides equal, 0: one side only"),
         )
     )
 
@@ -63,13 +63,13 @@ def coverage_chapter(result: EvaluationResult, figures: Figures) -> Section:
     short = [result.clips[index].name for index in coverage.too_short]
     text = element(
         "p",
-        f"The clips hold {duration(len(coverage.clip) / result.options.database.rate_hz)} of motion in windows of one "
-        f"second. {100 * coverage.index:.0f} % of the speeds and turn rates that the trials ask for have at least "
-        f"{result.options.coverage_least_s:g} s of it.",
+        f"The clips contain {duration(len(coverage.clip) / result.options.database.rate_hz)} of motion, measured in "
+        f"windows of one second. At least {result.options.coverage_least_s:g} s of it are available for "
+        f"{100 * coverage.index:.0f} % of the speeds and turn rates that the trials request.",
     )
-    too_short = element("p", f"Shorter than a second, and so no part of this: {_listed(short)}.") if short else None
+    too_short = element("p", f"Clips shorter than one second are not counted: {_listed(short)}.") if short else None
     pictures = shown(figures, *(name for name in COVERAGE_FIGURES if name != HOLES))  # it has a chapter of its own
-    return Section("coverage", "What is covered", (text, too_short, pictures))
+    return Section("coverage", "Coverage", (text, too_short, pictures))
 
 
 def error_chapter(result: EvaluationResult, figures: Figures) -> Section:
@@ -77,19 +77,19 @@ def error_chapter(result: EvaluationResult, figures: Figures) -> Section:
     worst = sorted(result.trials, key=lambda each: (-strain(each).worst, each.trial.name))[:WORST_TRIALS]
     lost = sum(not is_followed(each) for each in result.trials)
     text = (
-        "Every trajectory is followed."
+        "The character follows every trajectory."
         if not lost
-        else f"{counted(lost, 'trajectory')} of {len(result.trials)} {'is' if lost == 1 else 'are'} not followed."
+        else f"The character does not follow {lost:,} of {counted(len(result.trials), 'trajectory')}."
     )
     rows = [_trial_row(each) for each in worst]
-    listing = table("The worst trials; what is beyond its limit is marked", TRIAL_HEADS, rows, numbers=range(1, 8))
+    listing = table("The worst trials; values beyond their limits are marked", TRIAL_HEADS, rows, numbers=range(1, 8))
     pictures = (
         shown(figures, "offsets"),
         listing,
         element("div", shown(figures, *SCENARIO_FIGURES), class_="pair"),
         shown(figures, *TRIAL_FIGURES),
     )
-    return Section("errors", "Where the errors are", (element("p", text), pictures))
+    return Section("errors", "Errors", (element("p", text), pictures))
 
 
 def load_chapter(result: EvaluationResult, figures: Figures) -> Section:
@@ -100,15 +100,16 @@ def load_chapter(result: EvaluationResult, figures: Figures) -> Section:
         total += used[half].share
         half += 1
     text = (
-        f"{counted(half, 'clip')} of {len(used)} used {'makes' if half == 1 else 'make'} up half of what was displayed."
+        f"{half:,} of {counted(len(used), 'used clip')} {'provides' if half == 1 else 'provide'} at least half of the "
+        "displayed frames."
         if used
         else "No clip was displayed."
     )
     rows = [_use_row(source, result) for source in used[:LOAD_CLIPS]]
-    listing = table("The clips displayed most", USE_HEADS, rows, numbers=range(1, 5)) if rows else None
+    listing = table("The most used clips", USE_HEADS, rows, numbers=range(1, 5)) if rows else None
     return Section(
         "load",
-        "Which clips carry the load",
+        "Most used clips",
         (element("p", text), listing, shown(figures, *USE_FIGURES), element("p", WALK_GRAPH)),
     )
 
@@ -118,40 +119,42 @@ def unused_chapter(result: EvaluationResult) -> Section:
     sources = sum_by_source(result.clips, result.usage)
     unused = [source for source in sources if not source.ticks]
     if not unused:
-        return Section("unused", "Which clips are never used", element("p", "Every clip was used at least once."))
+        return Section("unused", "Unused clips", element("p", "Every clip was used at least once."))
     seconds = sum(len(source.popularity) for source in unused) / result.options.database.rate_hz
     text = element(
         "p",
         f"{counted(len(unused), 'clip')} of {len(sources)}, {duration(seconds)} of motion, "
         f"{'was' if len(unused) == 1 else 'were'} displayed in no trial. Without "
-        f"{'it' if len(unused) == 1 else 'them'} these trials stay the same to the bit, when the normaliser is kept; "
-        "trials of other kinds may need them.",
+        f"{'it' if len(unused) == 1 else 'them'}, the results of these trials stay the same, if the normaliser is kept. "
+        f"Other trials may need {'it' if len(unused) == 1 else 'them'}.",
     )
     names = element("ul", [element("li", source.name) for source in unused], class_="names")
     content: Content = names if len(unused) <= MOST_NAMES else folded(f"All {len(unused)} names", names)
-    return Section("unused", "Which clips are never used", (text, content))
+    return Section("unused", "Unused clips", (text, content))
 
 
 def recording_chapter(result: EvaluationResult, figures: Figures) -> Section:
     """Write the chapter on the data to record next."""
     holes = find_holes(result.coverage)
     if not holes:
-        text = element("p", "Nothing: every speed and turn rate that the trials ask for has enough data.")
-        return Section("record", "What to record next", (text, shown(figures, HOLES)))
+        text = element("p", "There is enough data for every speed and turn rate that the trials request.")
+        return Section("record", "Data to record next", (text, shown(figures, HOLES)))
     missing = float(result.coverage.deficit_s.sum())
     rest = sum(hole.missing_s for hole in holes[MOST_HOLES:])
     items = [element("li", hole.words, ": ", element("b", f"{duration(hole.missing_s)} missing")) for hole in holes]
     more = (
-        element("p", f"and {duration(rest)} in {counted(len(holes) - MOST_HOLES, 'smaller hole')}.") if rest else None
+        element("p", f"The other {counted(len(holes) - MOST_HOLES, 'hole')}: {duration(rest)} missing.")
+        if rest
+        else None
     )
     return Section(
         "record",
-        "What to record next",
+        "Data to record next",
         (
             element(
                 "p",
-                f"At least {duration(missing)} of motion, so that each of {result.coverage.deficit_s.size} cells has "
-                f"{result.options.coverage_least_s:g} s. The largest holes first:",
+                f"At least {duration(missing)} of motion are missing: each of {result.coverage.deficit_s.size} cells of "
+                f"speed and turn rate needs {result.options.coverage_least_s:g} s. The largest holes first:",
             ),
             element("ol", items[:MOST_HOLES]),
             more,
@@ -176,13 +179,13 @@ def baseline_chapter(result: EvaluationResult) -> Section:
             row.append(number(base.suite.get(name), metric.digits))
         rows.append([*row, metric.unit])
     about = (
-        f"{HOW_POOLED} The baseline is the same suite over generated clips, one for each speed and turn rate: "
-        "it shows what the same motion matching reaches when no data is missing."
+        f"{HOW_POOLED} The baseline is the same suite with generated clips, one for each speed and turn rate. It shows "
+        "the results of the same motion matching if no data is missing."
         if base is not None
-        else f"{HOW_POOLED} No baseline was evaluated beside them."
+        else f"{HOW_POOLED} No baseline was evaluated."
     )
-    listing = table("The suite in numbers", heads, rows, numbers=range(1, len(heads) - 1), sortable=False)
-    return Section("numbers", "In numbers", (element("p", about), listing))
+    listing = table("Metrics of the suite", heads, rows, numbers=range(1, len(heads) - 1), sortable=False)
+    return Section("numbers", "Metrics", (element("p", about), listing))
 
 
 def appendix_chapter(result: EvaluationResult) -> Section:
@@ -198,14 +201,17 @@ def appendix_chapter(result: EvaluationResult) -> Section:
         "all",
         "All trials and clips",
         (
-            element("p", "A click on the head of a column sorts by it."),
+            element("p", "Click on the heading of a column to sort by this column."),
             folded(f"All {len(result.trials)} trials", trials),
             folded(f"All {len(sum_by_source(result.clips, result.usage))} clips", clips),
         ),
     )
 
 
-HOW_POOLED = "Means over all trials; of largest distances the largest, of counts the sum."
+HOW_POOLED = (
+    "The values are means over all trials, with these exceptions: the maximum for the largest distance, the root mean "
+    "square for “ahead or behind” and “beside the path”, and the sum for counts."
+)
 BEYOND = "bad"
 TRIAL_HEADS = (
     "trial",
@@ -216,7 +222,7 @@ TRIAL_HEADS = (
     "transitions (1/s)",
     "response (s)",
 )
-USE_HEADS = ("clip", "share of frames", "length (s)", "frames shown at all", "times entered")
+USE_HEADS = ("clip", "share of display", "length (s)", "own frames displayed", "times entered")
 
 
 def _trial_row(outcome: TrialResult) -> list[Cell]:

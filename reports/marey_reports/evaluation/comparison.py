@@ -35,7 +35,7 @@ def compared(before: EvaluationResult, after: EvaluationResult) -> str:
     gained = sum(is_followed(new) and not is_followed(old) for old, new in pairs)
     lost = sum(is_followed(old) and not is_followed(new) for old, new in pairs)
     if second.followed == first.followed:
-        start, parts = "Neither better nor worse", [f"the character follows {_share(second)} trajectories as before"]
+        start, parts = "Neither better nor worse", [f"the character follows {_share(second)} trajectories, as before"]
     else:
         start = "Better" if second.followed > first.followed else "Worse"
         parts = [f"the character follows {_share(second)} trajectories, {first.followed} before"]
@@ -67,7 +67,7 @@ def headline_of_two(before: EvaluationResult, after: EvaluationResult, labels: t
             (
                 "speeds and turns covered",
                 _arrow(*(f"{100 * each.index:.0f} %" for each in cells)),
-                "" if enough[0] == enough[1] else f"where {enough[0]} and {enough[1]} are enough: not comparable",
+                "" if enough[0] == enough[1] else f"not comparable: {enough[0]} and {enough[1]} are required",
             ),
             ("clips used", _arrow(str(used[0]), str(used[1])), f"of {len(sources[0])} and {len(sources[1])}"),
         )
@@ -79,7 +79,7 @@ def metric_chapter(
 ) -> Section:
     """Write the chapter on the changes of the suite's numbers, with intervals where they were computed."""
     changes = {change.metric: change for change in comparison.metrics} if comparison is not None else {}
-    heads = ["measure", *labels, "change", *(["between", "verdict"] if comparison else []), "unit"]
+    heads = ["measure", *labels, "change", *(["95 % interval", "verdict"] if comparison else []), "unit"]
     rows: list[Sequence[Cell]] = []
     for name, metric in METRICS.items():
         known = changes.get(name)
@@ -93,17 +93,17 @@ def metric_chapter(
         if comparison is not None:
             row += [_interval(known, digits), known.verdict if known else ""]
         rows.append([*row, metric.unit])
-    text = "Of the whole suite."
+    text = "Values of the whole suite."
     if comparison is not None:
         text = (
-            "Means over the trials that both define, also of what each trial has as its largest distance or counts; "
-            "the report of one evaluation has the largest and the sum of all trials there. The mean change lies "
-            "between the two bounds with 95 % confidence, by resampling the trials."
+            "Each value is the mean over the trials for which both evaluations define it, also for largest distances "
+            "and counts, for which the report of one evaluation shows the maximum and the sum. The 95 % confidence "
+            "intervals of the mean changes were computed by resampling the trials."
         )
     listing = table(
-        "The suite in numbers", heads, rows, numbers=(1, 2, 3, 4) if comparison else (1, 2, 3), sortable=False
+        "Metrics of the suite", heads, rows, numbers=(1, 2, 3, 4) if comparison else (1, 2, 3), sortable=False
     )
-    return Section("numbers", "What changed", (element("p", text), listing))
+    return Section("numbers", "Changes of the metrics", (element("p", text), listing))
 
 
 def trial_chapter(
@@ -113,9 +113,9 @@ def trial_chapter(
     pairs = [(old, new) for old, new in paired(before, after) if old.metrics != new.metrics]
     pairs.sort(key=lambda pair: (-abs(_shift(*pair)), pair[0].trial.name))
     changed = sum(not each.same_motion for each in comparison.changed) if comparison is not None else len(pairs)
-    text = f"{counted(changed, 'trial')} of {len(before.trials)} went another way."
+    text = f"The motion of the character changed in {changed:,} of {counted(len(before.trials), 'trial')}."
     if comparison is not None and (others := len(comparison.changed) - changed):
-        text += f" {others} more went the same way with other clips."
+        text += f" In {counted(others, 'other trial')}, it is the same, but from other clips."
     heads = ("trial", "distance before (m)", "after (m)", "change (m)", "followed before", "after")
     listing: Content = None
     if pairs:
@@ -125,7 +125,7 @@ def trial_chapter(
             everything = table("All changed trials", heads, rows, numbers=(1, 2, 3))
             listing = (listing, folded(f"All {len(rows)} changed trials", everything))
     pictures = shown(figures, "offsets", *SCENARIO_FIGURES, *TRIAL_FIGURES)
-    return Section("trials", "Where it changed", (element("p", text), listing, pictures))
+    return Section("trials", "Changed trials", (element("p", text), listing, pictures))
 
 
 def clip_chapter(before: EvaluationResult, after: EvaluationResult, figures: Figures) -> Section:
@@ -134,14 +134,14 @@ def clip_chapter(before: EvaluationResult, after: EvaluationResult, figures: Fig
     held = [{clip.uid for clip in result.clips} for result in (before, after)]
     used = [{result.clips[usage.clip].uid for usage in result.usage if usage.ticks} for result in (before, after)]
     lists = (
-        ("Clips that came", held[1] - held[0]),
-        ("Clips that went", held[0] - held[1]),
+        ("Added clips", held[1] - held[0]),
+        ("Removed clips", held[0] - held[1]),
         ("Clips no longer used", (used[0] - used[1]) & held[1]),
-        ("Clips used now", (used[1] - used[0]) & held[0]),
+        ("Clips newly used", (used[1] - used[0]) & held[0]),
     )
     content = [_names(title, sorted(uids), names) for title, uids in lists if uids]
     if not content:
-        content = [element("p", "Both have the same clips and use the same ones.")]
+        content = [element("p", "Both evaluations have the same clips and use the same clips.")]
     return Section("clips", "Clips", (content, shown(figures, *USE_FIGURES)))
 
 
@@ -178,7 +178,7 @@ def _interval(change: MetricChange | None, digits: int) -> Number:
     if change is None:
         return Number(None, "–")
     low, high = (number(bound, digits, signed=True).written for bound in (change.low, change.high))
-    return Number(change.low, f"{low} and {high}")
+    return Number(change.low, f"{low} to {high}")
 
 
 def _look(change: MetricChange | None) -> str:

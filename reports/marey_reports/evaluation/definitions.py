@@ -20,76 +20,93 @@ class Metric(NamedTuple):
 
 METRICS = {
     "offset_mean": Metric(
-        "distance from the path", "m", 2, "mean distance of the character from where it should be at the same moment"
+        "distance from the path", "m", 2, "mean distance of the character from the desired position at the same moment"
     ),
-    "offset_max": Metric("largest distance", "m", 2, "the largest such distance in any trial"),
-    "offset_final": Metric("distance at the end", "m", 2, "the distance at the last moment of a trial"),
-    "along_track_rms": Metric("ahead or behind", "m", 2, "the part of the distance along the path: lag or lead"),
-    "cross_track_rms": Metric("beside the path", "m", 2, "the part of the distance across the path: drift"),
-    "abs_se_v": Metric("speed error", "m/s", 2, "how much too fast or too slow a trial is on average"),
-    "abs_se_omega_deg": Metric("turn rate error", "deg/s", 1, "how much too much or too little it turns on average"),
+    "offset_max": Metric("largest distance", "m", 2, "largest such distance in a trial"),
+    "offset_final": Metric("distance at the end", "m", 2, "distance from the desired position at the end of a trial"),
+    "along_track_rms": Metric(
+        "ahead or behind", "m", 2, "root mean square of the part of the distance along the path: lag or lead"
+    ),
+    "cross_track_rms": Metric(
+        "beside the path", "m", 2, "root mean square of the part of the distance across the path: drift"
+    ),
+    "abs_se_v": Metric("speed error", "m/s", 2, "absolute error of the mean speed of a trial"),
+    "abs_se_omega_deg": Metric("turn rate error", "deg/s", 1, "absolute error of the mean turn rate of a trial"),
     "dse_v": Metric("spread of the speed", "m/s", 2, "standard deviation of the speed about its own mean"),
-    "dse_omega_deg": Metric("spread of the turn rate", "deg/s", 1, "the same of the turn rate; every step sways"),
-    "response_s": Metric(
-        "response to a new speed", "s", 2, "time until the speed is within 10 % of the new one for half a second"
+    "dse_omega_deg": Metric(
+        "spread of the turn rate",
+        "deg/s",
+        1,
+        "standard deviation of the turn rate about its own mean; the sway of each step contributes to it",
     ),
-    "response_missed": Metric("speeds never reached", "", 0, "switches of speed that were never answered"),
+    "response_s": Metric(
+        "response to a new speed",
+        "s",
+        2,
+        "mean time from a switch until the speed is within 10 % of the new one, and stays there for half a second",
+    ),
+    "response_missed": Metric(
+        "speeds never reached", "", 0, "number of switches to which the character did not respond before the next one"
+    ),
     "pose_cost_mean": Metric(
         "transition cost", "m", 3, "distance over hips, spine, head, hands and feet from one displayed pose to the next"
     ),
     "pose_cost_p95": Metric("transition cost, 95 %", "m", 3, "95 % of the transition costs are below"),
     "transitions_per_s": Metric(
-        "transitions", "1/s", 2, "how often the character switches to another place in the clips"
+        "transitions", "1/s", 2, "number of jumps per second that a search chose although the clip could have continued"
     ),
     "treading_share": Metric(
-        "treading", "", 2, "share of the transitions that go back to nearly the same frame, for want of another"
+        "treading", "", 2, "share of the transitions that lead to a frame of the same clip at most 1/3 s away"
     ),
-    "clip_ends": Metric("clip ends met", "", 0, "how often a clip ended before the search chose to leave it"),
+    "clip_ends": Metric("clip ends met", "", 0, "number of jumps at the end of a clip and of restarts of a loop"),
     "offset_asymmetry": Metric(
-        "left-right difference", "m", 2, "mean difference of the distance between a left turn and the same right turn"
+        "left-right difference",
+        "m",
+        2,
+        "mean difference of the distance from the path between a left turn and the same right turn",
     ),
 }
 """Metrics in the order of the report; metrics that a result does not have are left out."""
 
-# What the published text leaves open, as printed there and as it is read here.
+# Ambiguous parts of the published text: the subject, the printed text, and the computation here.
 _READINGS = (
     (
         "static errors (equations 1 and 2)",
         "1/m · Σ v_r − v_ref over m + 1 terms, brackets missing",
-        "signed bias: the mean of recorded minus wished over the steps of the circle. Too fast and too far to the left "
-        "are positive.",
+        "signed bias: the mean of recorded minus desired values over the steps of the circle. Too fast and too far to "
+        "the left are positive.",
     ),
     (
         "dynamic errors (equations 3 and 4)",
         "root of Σ (v_r − SE + v_ref)² over the number of reference values",
         "population standard deviation about the trial's own mean, in switching trials about the mean of each regime; "
-        "over a suite the root of the mean square of the trials'.",
+        "over a suite the mean, and in dse_…_pooled the root mean square, of the trials.",
     ),
     (
         "offset (equation 5)",
         "Σ ‖p − p_ref‖ in metres, growing with time and frame rate",
-        "the mean of the distances at equal moments; the sum and the integral over time are kept beside it.",
+        "the mean of the distances at equal moments; the sum and the integral over time are also stored.",
     ),
     (
         "sign of errors (figure 8)",
         "a peak at +1.5 m/s for a speed that is not reached",
-        "recorded minus wished everywhere; figures can be drawn the other way round.",
+        "recorded minus desired everywhere; the option negate_errors of figures reverses the sign.",
     ),
     (
         "window of evaluation",
         "the whole duration",
-        "after the approach, from the beginning of the circle, unless the options say otherwise.",
+        "after the approach, from the beginning of the circle, unless the options set another window.",
     ),
     (
         "transition cost (figure 7)",
         "cumulative distance over selected joints, to the candidate pose",
         "the distance from each displayed pose to the next displayed one, in metres, summed over the joints named "
-        "above; the normalised cost that the search compares is recorded apart.",
+        "above; the normalised cost that the search compares is stored separately.",
     ),
     (
         "duration of trials",
         "not given",
-        "the same for every trial; see the options.",
+        "the same for every trial, as set in the options.",
     ),
 )
 
@@ -101,38 +118,44 @@ def definitions() -> Html:
         for name, metric in METRICS.items()
     ]
     rules = (
-        f"on average no farther from the wished place than it goes in {LONGEST_LAG_S:g} s",
-        f"on average no more than {100 * LARGEST_SPEED_SHARE:g} % faster or slower than wished",
-        f"on average turning no more than {LARGEST_TURN_DEG_S:g} degrees a second too much or too little",
+        f"its distance from the desired position is at most the distance that it travels in {LONGEST_LAG_S:g} s at the "
+        "desired speed",
+        f"its speed differs from the desired speed by at most {100 * LARGEST_SPEED_SHARE:g} %",
+        f"its turn rate differs from the desired turn rate by at most {LARGEST_TURN_DEG_S:g} degrees per second",
     )
     grades = ", ".join(f"from {100 * share:g} % {name}" for share, name in GRADES[:-1])
     return joined(
         (
-            element("h3", "When a trajectory counts as followed"),
-            element("p", "The character is"),
+            element("h3", "Followed trajectories"),
+            element("p", "The character follows a trajectory if, on average over the trial:"),
             element("ul", [element("li", rule) for rule in rules]),
             element(
                 "p",
-                f"The share of trajectories that are followed gives the grade: {grades}, below that {GRADES[-1][1]}.",
+                f"The share of followed trajectories determines the grade: {grades}, below that {GRADES[-1][1]}.",
             ),
             element("h3", "Coverage"),
             element(
                 "p",
-                "Every second of every clip, one window per frame, has a mean speed and turn rate. A cell around each "
-                "trial counts the seconds of data within it; it has enough from the least that the options ask for. "
-                "Symmetry is 1 where left and right turns are covered alike and 0 where only one side is.",
+                "The data is measured in windows of one second, one for each frame, by their mean speed and turn rate. "
+                "Each trial has a cell around its speed and turn rate. A cell has enough data if its windows sum up to "
+                "the number of seconds that the options require. Symmetry is 1 if left and right turns are covered "
+                "equally, and 0 if only one side is covered.",
             ),
             element("h3", "Metrics"),
             table(
-                "What the numbers mean", ("name", "unit", "meaning", "in the data"), metrics, numbers=(), sortable=False
+                "Definitions of the metrics",
+                ("name", "unit", "meaning", "name in the data"),
+                metrics,
+                numbers=(),
+                sortable=False,
             ),
-            element("h3", "How ambiguous formulas are read"),
+            element("h3", "Interpretation of the published formulas"),
             element(
                 "p",
                 "The method is that of Abichequer Sangalli, Hoyet, Christie and Pettré, A new framework for the "
-                "evaluation of locomotive motion datasets through motion matching techniques (MIG 2022). Where its "
-                "text is open:",
+                "evaluation of locomotive motion datasets through motion matching techniques (MIG 2022). Its text "
+                "leaves open the following:",
             ),
-            table("Readings", ("what", "as printed", "as read here"), _READINGS, numbers=(), sortable=False),
+            table("Interpretations", ("subject", "printed", "computed here"), _READINGS, numbers=(), sortable=False),
         )
     )

@@ -58,8 +58,8 @@ def render_report(result: EvaluationResult, *, title: str, figures: Mapping[str,
         recording_chapter(result, drawn),
         baseline_chapter(result),
         appendix_chapter(result),
-        Section("definitions", "What the numbers mean", definitions()),
-        Section("provenance", "Where this comes from", (provenance([result], ["value"]), notes(result))),
+        Section("definitions", "Definitions", definitions()),
+        Section("provenance", "Provenance", (provenance([result], ["value"]), notes(result))),
     ]
     lead = element("p", verdict(result), class_="verdict"), headline(result)
     return page(title, lead, sections, f"Written by Marey {result.provenance.code_version}.")
@@ -88,8 +88,8 @@ def render_comparison(
         trial_chapter(before, after, comparison, drawn),
         clip_chapter(before, after, drawn),
         coverage_of_two_chapter(drawn),
-        Section("definitions", "What the numbers mean", definitions()),
-        Section("provenance", "Where this comes from", provenance([before, after], labels)),
+        Section("definitions", "Definitions", definitions()),
+        Section("provenance", "Provenance", provenance([before, after], labels)),
     ]
     lead = element("p", compared(before, after), class_="verdict"), headline_of_two(before, after, labels)
     return page(title, lead, sections, f"Written by Marey {after.provenance.code_version}.")

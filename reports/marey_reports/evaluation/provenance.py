@@ -14,7 +14,7 @@ DIGESTS = ("dataset", "normaliser", "options", "scenarios")
 
 def provenance(results: Sequence[EvaluationResult], labels: Sequence[str]) -> Html:
     """Write digests, versions and options of one result, or of two side by side with their differences marked."""
-    heads = ("what", *labels)
+    heads = ("name", *labels)
     digests = [_row(name, [getattr(result.provenance, name) for result in results], code=True) for name in DIGESTS]
     versions = _row("version of the code", [result.provenance.code_version for result in results], code=True)
     options = [dict(_flat("", result.options)) for result in results]
@@ -32,7 +32,7 @@ def provenance(results: Sequence[EvaluationResult], labels: Sequence[str]) -> Ht
     ]  # fmt: skip
     return joined(
         (
-            element("p", "The same clips, options and code give the same numbers to the bit."),
+            element("p", "The same clips, options and version of the code give the same numbers, bit for bit."),
             table("Digests", heads, [*digests, versions], numbers=(), sortable=False),
             folded("All options", table("Options", heads, rows, numbers=(), sortable=False)),
             folded("Digest of every clip", digests_of_clips),

@@ -68,7 +68,7 @@ def page(result: EvaluationResult, figures: dict[str, DrawnFigure]) -> Page:
 def test_a_report_is_one_sound_file_that_shows_every_figure(page: Page, figures: dict[str, DrawnFigure]) -> None:
     assert page.tags["svg"] == page.tags["figcaption"] == len(FIGURES)
     assert page.tags["h1"] == 1
-    assert page.text.count("What to record next") == 2  # the link and the heading
+    assert page.text.count("Data to record next") == 2  # the link and the heading
     for figure in figures.values():
         assert figure.caption in page.text
 
@@ -154,14 +154,14 @@ def test_the_suite_s_numbers_are_called_means_largest_and_sums_as_they_are(
     result: EvaluationResult, page: Page
 ) -> None:
     largest = max(each.metrics["offset_max"] for each in result.trials)
-    assert "of largest distances the largest, of counts the sum" in page.text
+    assert "the maximum for the largest distance" in page.text
     assert f"largest distance {largest:.2f}" in page.text
 
 
 def test_clips_that_were_never_used_are_named(page: Page, result: EvaluationResult) -> None:
     unused = [result.clips[usage.clip].name for usage in result.usage if not usage.ticks]
     start = page.text.index("were displayed in no trial")
-    told = page.text[start : page.text.index("What to record next", start)]
+    told = page.text[start : page.text.index("Data to record next", start)]
 
     assert len(unused) == 2
     assert all(name in told for name in unused)
@@ -316,13 +316,13 @@ def test_the_verdict_is_one_sentence_with_the_worst_trial_and_its_reason(result:
 
 
 def test_the_definitions_name_the_limits_and_shares_of_the_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "no more than 15 % faster or slower" in definitions.definitions()
+    assert "differs from the desired speed by at most 15 %" in definitions.definitions()
     monkeypatch.setattr(definitions, "LARGEST_SPEED_SHARE", 0.2)
     monkeypatch.setattr(definitions, "LARGEST_TURN_DEG_S", 12.0)
     monkeypatch.setattr(definitions, "LONGEST_LAG_S", 0.7)
     monkeypatch.setattr(definitions, "GRADES", ((0.8, "fine"), (0.0, "bad")))
     told = definitions.definitions()
-    for part in ("20 % faster", "no more than 12 degrees", "in 0.7 s", "from 80 % fine, below that bad"):
+    for part in ("by at most 20 %", "by at most 12 degrees", "in 0.7 s", "from 80 % fine, below that bad"):
         assert part in told
 
 
@@ -343,8 +343,8 @@ def test_a_comparison_shows_what_came_went_and_changed(result: EvaluationResult)
     page = is_sound(render_comparison(result, after, title="Change", labels=("old", "new"), figures=drawn_both()))
 
     assert page.tags["figure"] == len(FIGURES)
-    assert "Clips that came (1) newcomer" in page.text
-    assert "Clips that went (3)" in page.text
+    assert "Added clips (1) newcomer" in page.text
+    assert "Removed clips (3)" in page.text
     assert f"{after.suite['offset_mean'] - result.suite['offset_mean']:+.2f}" in page.text
     assert "old → new" in page.text
 
@@ -357,8 +357,8 @@ def test_a_comparison_with_intervals_shows_them_and_the_trials_that_changed(resu
         render_comparison(comparison.before, comparison.after, title="Change", comparison=comparison, figures={})
     )
 
-    assert "1 trial of 30 went another way." in page.text
-    assert "+0.00 and +0.00" in page.text
+    assert "The motion of the character changed in 1 of 30 trials." in page.text
+    assert "+0.00 to +0.00" in page.text
 
 
 def test_a_comparison_writes_means_of_counts_with_decimals_and_no_minus_before_nothing(
@@ -376,7 +376,7 @@ def test_a_comparison_writes_means_of_counts_with_decimals_and_no_minus_before_n
     (ends,) = (one for one in comparison.metrics if one.metric == "clip_ends")
     assert f"clip ends met {ends.before:.1f} {ends.after:.1f} {ends.change:+.1f}" in page.text
     assert "-0.0 " not in page.text
-    assert "also of what each trial has as its largest distance" in page.text
+    assert "also for largest distances and counts" in page.text
 
 
 def test_trials_that_only_show_other_clips_went_the_same_way(result: EvaluationResult) -> None:
@@ -385,7 +385,7 @@ def test_trials_that_only_show_other_clips_went_the_same_way(result: EvaluationR
     page = is_sound(
         render_comparison(comparison.before, comparison.after, title="Change", comparison=comparison, figures={})
     )
-    assert "0 trials of 30 went another way. 30 more went the same way with other clips." in page.text
+    assert "changed in 0 of 30 trials. In 30 other trials, it is the same, but from other clips." in page.text
 
 
 def test_a_comparison_counts_mirrored_twins_once_and_says_when_coverage_is_asked_for_otherwise(
@@ -398,7 +398,7 @@ def test_a_comparison_counts_mirrored_twins_once_and_says_when_coverage_is_asked
     after = replace(result, clips=(first, twin, *rest), usage=usage, options=options)
     page = is_sound(render_comparison(result, after, title="Change", figures={}))
     assert f"of {len(result.clips)} and {len(result.clips) - 1}" in page.text
-    assert "where 1 s and 0.25 s are enough: not comparable" in page.text
+    assert "not comparable: 1 s and 0.25 s are required" in page.text
 
 
 def test_what_the_script_sorts_by_is_a_number(result: EvaluationResult, figures: dict[str, DrawnFigure]) -> None:

@@ -86,5 +86,6 @@ def _simulation(context: Context, evaluated: EvaluatedSet, database: MatchingDat
 def _describe(step: OptimisationStep, names: dict[str, str]) -> str:
     did = {"start": "the unchanged set", "remove": "without", "add": "with"}[step.action]
     clips = ", ".join(names.get(source, source) for source in step.sources)
-    values = f"objective {step.objective:.4f} m, offset {step.metrics['offset_mean']:.4f} m, {step.data_s:.1f} s of data"
+    offset = step.metrics["offset_mean"]
+    values = f"objective {step.objective:.4f} m, offset {offset:.4f} m, {step.data_s:.1f} s of data"
     return f"step {step.number}: {did} {clips}".rstrip() + f": {values}, {step.changed_trials} trials changed"
