@@ -125,8 +125,8 @@ def unused_chapter(result: EvaluationResult) -> Section:
         "p",
         f"{counted(len(unused), 'clip')} of {len(sources)}, {duration(seconds)} of motion, "
         f"{'was' if len(unused) == 1 else 'were'} displayed in no trial. Without "
-        f"{'it' if len(unused) == 1 else 'them'}, the results of these trials stay the same, if the normaliser is kept. "
-        f"Other trials may need {'it' if len(unused) == 1 else 'them'}.",
+        f"{'it' if len(unused) == 1 else 'them'}, but with the same normaliser, the results of these trials stay the "
+        f"same. Other trials may need {'it' if len(unused) == 1 else 'them'}.",
     )
     names = element("ul", [element("li", source.name) for source in unused], class_="names")
     content: Content = names if len(unused) <= MOST_NAMES else folded(f"All {len(unused)} names", names)
@@ -153,8 +153,8 @@ def recording_chapter(result: EvaluationResult, figures: Figures) -> Section:
         (
             element(
                 "p",
-                f"At least {duration(missing)} of motion are missing: each of {result.coverage.deficit_s.size} cells of "
-                f"speed and turn rate needs {result.options.coverage_least_s:g} s. The largest holes first:",
+                f"At least {duration(missing)} of motion are missing: each of {result.coverage.deficit_s.size} cells "
+                f"of speed and turn rate needs {result.options.coverage_least_s:g} s. The largest holes first:",
             ),
             element("ol", items[:MOST_HOLES]),
             more,

@@ -61,14 +61,14 @@ FIGURES = {
     "scenario-circle": FigureKind("4a", "A trial at constant speed", "one", draw_circle, ("circle",)),
     "scenario-switching": FigureKind("4b", "A trial whose speed switches", "one", draw_switching, ("switching",)),
     "offsets": FigureKind("5", "Distance from the path", "none", draw_offsets),
-    "density": FigureKind("6", "Where the data is", "none", draw_density),
+    "density": FigureKind("6", "Density of the data", "none", draw_density),
     "transition-cost": FigureKind("7", "Cost of transitions over a trial", "one", draw_transition_costs),
     "errors": FigureKind("8", "Errors of speed and turn rate", "one", draw_errors),
     "usage": FigureKind("9", "Usage of the clips", "any", draw_usage),
     "clip-graph": FigureKind("10", "Frames and transitions", "any", draw_clip_graph),
     "directions": FigureKind("", "Forward, backward and sideways", "none", draw_directions),
-    "holes": FigureKind("", "What is missing", "none", draw_holes),
-    "frame-use": FigureKind("", "Which parts of the clips are used", "any", draw_frame_use),
+    "holes": FigureKind("", "Missing data", "none", draw_holes),
+    "frame-use": FigureKind("", "Use of the parts of the clips", "any", draw_frame_use),
 }
 """Every figure by its name."""
 

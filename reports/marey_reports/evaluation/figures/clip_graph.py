@@ -35,9 +35,9 @@ MOST_CLIPS = 24
 MOST_LINES = 400
 BOW = 0.45  # how far a line is drawn towards the middle of the ring
 SIZES, LARGEST_DOT = 8, 90.0  # number of sizes of dots; area in square points
-LONGEST_NAMES, LETTER_IN = (18, 13), 0.066  # signs of a name with one panel and with two, and how wide one is
+LONGEST_NAMES, LETTER_IN = (18, 13), 0.066  # characters of a name with one panel and with two; width of a character
 ABSENT = "(absent)"
-RADIAL_NAMES = 8  # more names than this run outwards, lest they meet
+RADIAL_NAMES = 8  # more names than this are written radially, so that they do not overlap
 
 
 class _Line(NamedTuple):
@@ -261,6 +261,6 @@ def _caption(
         jumps = f"{sum(line.times for line in drawn):,} of {int(each[:, 2].sum()):,} jumps"
         parts.append(f"{subject.prefix}{shown} of {len(used)} used clips and {jumps} between frames drawn.")
     return (
-        "Each circle is a clip that runs clockwise from the gap above; a dot is larger the more its frames were shown. "
-        f"A line is a jump to another place, in the colour of the clip it leaves. {' '.join(parts)}"
+        "Each circle is a clip, which runs clockwise from the gap at the top; dots are larger for frames that were "
+        f"displayed more often. Each line is a jump, in the colour of the clip where it starts. {' '.join(parts)}"
     )

@@ -48,7 +48,7 @@ def draw_usage(subjects: Sequence[Subject], trial: str | None, options: FigureOp
     height = ROW * rows * (1.0 if len(subjects) == 1 else 1.35)
     figure = new_figure(8.6, height + (1.05 if trial or len(subjects) > 1 else 0.65))
     place = Place(2.55, 0.55, 5.2, height)
-    panel = add_panel(figure, place, title=trial or "", x="frames displayed, or times switched")
+    panel = add_panel(figure, place, title=trial or "", x="displayed frames, or transitions")
     panel.grid(visible=False, axis="y")
     thick, largest = 0.8 / len(subjects), 1
     for number, use in enumerate(uses):
@@ -132,7 +132,7 @@ def _caption(subjects: Sequence[Subject], uses: Sequence[_Use]) -> str:
     for subject, use in zip(subjects, uses, strict=True):
         used = sum(1 for ticks in use.ticks.values() if ticks)
         parts.append(
-            f"{subject.prefix}{used} of {len(use.ticks)} clips used over {sum(use.ticks.values()):,} displayed frames, "
-            f"{counted(use.transitions, 'transition')} between them."
+            f"{subject.prefix}{used} of {len(use.ticks)} clips were used; {sum(use.ticks.values()):,} displayed frames, "
+            f"{counted(use.transitions, 'transition')}."
         )
-    return "How often frames of each clip were displayed. " + " ".join(parts)
+    return "Number of displayed frames of each clip. " + " ".join(parts)

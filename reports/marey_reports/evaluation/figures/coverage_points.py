@@ -127,7 +127,7 @@ def _draw_keys(panel: Axes, subjects: Sequence[Subject], chosen: Sequence[_Point
         keys.append(Line2D([], [], ls="", color=REFERENCE, marker="o", markersize=3.5, markeredgewidth=0))
         labels.append(counted(rest, "other clip"))
     if not keys:
-        panel.text(0.5, 0.5, "no clip of a second or longer", transform=panel.transAxes, ha="center", color=QUIET)
+        panel.text(0.5, 0.5, "no clip of one second or more", transform=panel.transAxes, ha="center", color=QUIET)
         return
     add_keys(panel, handles=keys, labels=labels, loc="upper left", bbox_to_anchor=(1.01, 1.03), handletextpad=0.2)
 
@@ -160,6 +160,6 @@ def _caption(
         drawn = "all of them" if len(points.windows) == total else f"{len(points.windows):,} of them, evenly spaced"
         turn, speed = np.degrees(subject.result.coverage.turn_rate_rad_s), subject.result.coverage.speed_m_s
         beyond = int(np.count_nonzero((np.abs(turn) > limits[0][1]) | (speed > limits[1][1])))
-        outside = f"; {beyond:,} lie beyond the axes" if beyond else ""
+        outside = f"; {beyond:,} are outside the axes" if beyond else ""
         parts.append(f"{subject.prefix}{total:,} windows from {counted(held, 'clip')}, {drawn} drawn{outside}.")
-    return "Each point is the mean speed and turn rate of one second of a clip. " + " ".join(parts)
+    return "Each point shows the mean speed and turn rate of a window of one second. " + " ".join(parts)

@@ -62,7 +62,7 @@ SPEEDS = _Plane(
     names=("turn_rate_deg_s", "speed_m_s"),
     cell=_grid_cell,
     cell_label="seconds of data around one trial",
-    about="Brighter is where the clips hold more seconds. The frame is the grid of trials.",
+    about="Brighter areas contain more seconds of data. The frame is the outline of the grid of trials.",
 )
 DIRECTIONS = _Plane(
     x=lambda coverage: coverage.strafe_m_s,
@@ -71,7 +71,7 @@ DIRECTIONS = _Plane(
     names=("strafe_m_s", "forward_m_s"),
     cell=lambda _: (DIRECTION_CELL_M_S, DIRECTION_CELL_M_S),
     cell_label="seconds of data per 0.25 x 0.25 m/s",
-    about="Which way the body moves as seen from where it faces; a speed alone hides backward and sideways motion.",
+    about="Velocity relative to the facing direction of the body, which distinguishes backward and sideways motion.",
 )
 
 
@@ -105,7 +105,7 @@ def _draw(subjects: Sequence[Subject], plane: _Plane) -> Sketch:
         _frame(panel, subject.result.coverage, plane)
         if not each.any():
             write(
-                panel, (0.5, 0.5), "no clip of a second or longer", transform=panel.transAxes, ha="center", color=LIGHT
+                panel, (0.5, 0.5), "no clip of one second or more", transform=panel.transAxes, ha="center", color=LIGHT
             )
     if two:
         add_colour_bar(
@@ -188,7 +188,7 @@ def _draw_change(
     panel.tick_params(labelleft=False)
     norm = SymLogNorm(linthresh=0.1 * largest, linscale=1.0, vmin=-largest, vmax=largest)
     drawn = panel.pcolormesh(*edges, change, cmap="PuOr", norm=norm, rasterized=True, shading="flat")
-    bar = add_colour_bar(figure, drawn, Place(place.left, 0.52, place.width, 0.12), "seconds more (violet) or less")
+    bar = add_colour_bar(figure, drawn, Place(place.left, 0.52, place.width, 0.12), "seconds more (violet) or fewer")
     bar.set_xticks([-largest, -0.1 * largest, 0.1 * largest, largest])
     bar.set_xticklabels([f"{value:+g}" for value in (-largest, -0.1 * largest, 0.1 * largest, largest)])
     bar.minorticks_off()

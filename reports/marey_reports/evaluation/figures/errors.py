@@ -37,7 +37,7 @@ def draw_errors(subjects: Sequence[Subject], trial: str | None, options: FigureO
     chosen = choose_trial(subjects, trial, ("switching", "circle"))
     views = [view_trial(subject, chosen) for subject in subjects]
     errors = [_errors(view, options.negate_errors) for view in views]
-    meaning = "wished minus recorded" if options.negate_errors else "recorded minus wished"
+    meaning = "desired minus recorded" if options.negate_errors else "recorded minus desired"
     quantities = (
         (f"speed error (m/s), {meaning}", "m/s"),
         (f"turn rate error (deg/s, left positive), {meaning}", "deg/s"),
@@ -151,5 +151,5 @@ def _caption(trial: str, views: Sequence[TrialView], errors: Sequence[tuple[_Err
             f"{view.subject.prefix}speed {speed.one.means[0]:+z.2f} ± {speed.one.deviations[0]:.2f} m/s, "
             f"turn rate {turn.one.means[0]:+z.1f} ± {turn.one.deviations[0]:.1f} deg/s"
         )
-    text = f"Errors at every step of a {trial}: the place of a peak is the static error, its width the dynamic one: "
+    text = f"Errors at every step of a {trial}. The mean is the static error, the width the dynamic error: "
     return f"{text}{'; '.join(parts)}."

@@ -68,7 +68,7 @@ def draw_frame_use(subjects: Sequence[Subject], trial: str | None, options: Figu
         panel.set(xlim=(0.0, 100.0), ylim=(rows - 0.4, -0.6))
     if drawn is not None:
         place = Place(2.45, 0.5, len(subjects) * (width + between) - between, 0.12)
-        add_colour_bar(figure, drawn, place, "times each frame was displayed", square_root_ticks(ceiling))
+        add_colour_bar(figure, drawn, place, "times that a frame was displayed", square_root_ticks(ceiling))
     return Sketch(figure, {"stretches": _table(subjects, strips)}, _caption(subjects, strips))
 
 
@@ -112,7 +112,7 @@ def _draw(panel: Axes, uids: Sequence[str], strips: dict[str, _Strip], ceiling: 
         drawn = panel.pcolormesh(
             edges, [row - 0.42, row + 0.42], values, cmap=warm_colours(), norm=norm, rasterized=True
         )
-        about = f"{strip.duration_s:.1f} s, {100 * strip.shown:.0f} % shown"
+        about = f"{strip.duration_s:.1f} s, {100 * strip.shown:.0f} % used"
         look: dict[str, Any] = {"va": "center", "textcoords": "offset points", "fontsize": SMALL, "color": QUIET}
         panel.annotate(about, (100.0, row), (4, 0), annotation_clip=False, **look)
     return drawn
@@ -144,4 +144,4 @@ def _caption(subjects: Sequence[Subject], strips: Sequence[dict[str, _Strip]]) -
         parts.append(
             f"{subject.prefix}{share} of all frames were displayed at least once in the suite; {len(each)} clips drawn."
         )
-    return "Darker stretches were displayed more often, blank ones never. " + " ".join(parts)
+    return "Darker parts were displayed more often, and white parts never. " + " ".join(parts)

@@ -97,4 +97,4 @@ def _caption(subjects: Sequence[Subject]) -> str:
             f"{subject.prefix}{np.count_nonzero(missing > 0)} of {missing.size} cells lack data, "
             f"{missing.sum():.1f} s in all."
         )
-    return f"Seconds that each cell lacks; a dot stands where there is enough. {' '.join(parts)}"
+    return f"Seconds of data that each cell lacks; a dot marks a cell with enough data. {' '.join(parts)}"

@@ -115,7 +115,7 @@ def _draw_two(
             figure,
             changed,
             place,
-            "change of the mean offset (m), blue is better",
+            "change of the mean offset (m); blue: better",
             np.concatenate((-upward[:0:-1], upward))[:: max(1, (len(upward) - 1) // 2)],
         )
     return figure
@@ -211,4 +211,4 @@ def _caption(subjects: Sequence[Subject], families: Sequence[str], fields: Seque
                 name = f"{subject.label}, {FAMILY_TITLES[family].lower()}" if subject.label else FAMILY_TITLES[family]
                 low, middle, high = np.nanquantile(field.offset_m, (0.0, 0.5, 1.0))
                 parts.append(f"{name}: {low:.2f} to {high:.2f} m, median {middle:.2f} m")
-    return "Mean distance to the wished place over each trial; dots are trials. " + "; ".join(parts) + "."
+    return "Mean distance from the desired position over each trial; each dot is a trial. " + "; ".join(parts) + "."

@@ -47,7 +47,7 @@ def _draw(subjects: Sequence[Subject], name: str | None, family: Family) -> Sket
         )
         if path is not None:
             panel.plot(*path.T, color=COLOURS[number], lw=1.1, alpha=0.85, zorder=2, label="recorded")
-        panel.plot(*guide.positions.T, color=REFERENCE, lw=1.8, zorder=3, label="asked for")
+        panel.plot(*guide.positions.T, color=REFERENCE, lw=1.8, zorder=3, label="desired")
         panel.plot(0.0, 0.0, "o", color=INK, ms=5, zorder=4)
         _number_sections(panel, guide.positions, sections, limits)
         panel.set(xlim=limits[0][::-1], ylim=limits[1])
@@ -144,8 +144,8 @@ def _paths(guide: Reference, subjects: Sequence[Subject], followed: Sequence[Flo
 def _caption(trial: Trial, sections: Sequence[tuple[int, int, float]], rate_hz: float) -> str:
     turn = np.degrees(trial.turn_rate_rad_s)
     straight = sections[0][1] / rate_hz
-    text = f"Seen from above, from the dot: {straight:g} s straight at {trial.speed_m_s:g} m/s (1), "
-    side = "straight on" if turn == 0 else f"to the {'left' if turn > 0 else 'right'} at {abs(turn):g} deg/s"
+    text = f"Desired path from above, from the dot on: {straight:g} s straight at {trial.speed_m_s:g} m/s (1), "
+    side = "straight ahead" if turn == 0 else f"to the {'left' if turn > 0 else 'right'} at {abs(turn):g} deg/s"
     if trial.family == "switching":
         return (
             f"{text}then {side}, switching between {trial.speed_m_s:g} and {trial.switch_speed_m_s:g} m/s every "

@@ -121,7 +121,8 @@ def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequen
         if candidates:
             return max(candidates, key=lambda each: strain(each).worst).trial
     wanted = f"trial {name!r}" if name is not None else "trial"
+    owner = "the evaluation has" if len(subjects) == 1 else "the two evaluations share"
     raise MotionError(
-        f"the figure cannot be drawn: the evaluation has no {wanted} of the kind {' or '.join(families)}",
+        f"the figure cannot be drawn: {owner} no {wanted} of the kind {' or '.join(families)}",
         code="unknown-trial",
     )

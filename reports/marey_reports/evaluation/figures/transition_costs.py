@@ -24,7 +24,7 @@ def draw_transition_costs(subjects: Sequence[Subject], trial: str | None, _optio
     figure = new_figure(9.0, 4.6)
     above = add_panel(figure, Place(0.7, 3.05, 8.1, 1.2), title=demand(chosen), y="speed (m/s)")
     below = add_panel(figure, Place(0.7, 0.55, 8.1, 2.2), x="time (s)", y="transition cost (m)")
-    above.step(first.times_s, first.wanted_speeds_m_s, where="post", color=REFERENCE, lw=1.8, label="wished")
+    above.step(first.times_s, first.wanted_speeds_m_s, where="post", color=REFERENCE, lw=1.8, label="desired")
     costs = [view.record.pose_cost[1:] for view in views]
     top = max([LEAST_TOP_M, *(float(np.nanmax(cost, initial=0.0)) for cost in costs)])
     for number, (view, cost) in enumerate(zip(views, costs, strict=True)):
@@ -34,7 +34,7 @@ def draw_transition_costs(subjects: Sequence[Subject], trial: str | None, _optio
         switches = view.series.times_s[view.switched]
         level = np.full(len(switches), -(0.045 + 0.05 * number) * top)
         below.plot(switches, level, "|", color=COLOURS[number], ms=5, mew=0.8)
-    write(below, (0.0, 1.02), "ticks below: switches to another place", transform=below.transAxes, va="bottom")
+    write(below, (0.0, 1.02), "marks below: transitions to another frame", transform=below.transAxes, va="bottom")
     changes = first.times_s[1:][(np.diff(first.wanted_speeds_m_s) != 0) | (np.diff(first.wanted_turn_rates_rad_s) != 0)]
     for panel in (above, below):
         panel.set_xlim(0.0, float(first.times_s[-1]) if len(first.times_s) else 1.0)
@@ -66,8 +66,6 @@ def _caption(views: Sequence[TrialView]) -> str:
         switches = int(np.count_nonzero(view.switched))
         if len(costs):
             spread = f"mean {costs.mean():.3f} m, 95 % below {np.quantile(costs, 0.95):.3f} m"
-            parts.append(f"{view.subject.prefix}{spread}, {switches} switches")
-    text = (
-        "Distance over the joints from each displayed pose to the next; peaks are switches between poses that differ: "
-    )
+            parts.append(f"{view.subject.prefix}{spread}, {switches} transitions")
+    text = "Distance of each displayed pose from the previous one, summed over joints; peaks are jumps to other poses: "
     return f"{text}{'; '.join(parts)}."
