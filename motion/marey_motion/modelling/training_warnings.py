@@ -46,13 +46,15 @@ def warnings_of(primitive: MotionPrimitive, report: TrainingReport, options: Mod
 def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: ModelOptions) -> list[Warned]:
     count, found = len(report.examples), []
     if primitive.dimensions == 0:
-        found.append(Warned("no-variation", f"the {count} examples are one motion: the model can only repeat it"))
+        found.append(
+            Warned("no-variation", f"all {count} examples are the same motion, so the model can only repeat it")
+        )
     elif count < FEW_EXAMPLES_PER_DIMENSION * primitive.dimensions:
         found.append(
             Warned(
                 "too-few-examples",
-                f"{count} examples for {primitive.dimensions} dimensions: their likelihoods say little, and the "
-                "mixture has one component; add examples, or keep less than "
+                f"there are only {count} examples for {primitive.dimensions} dimensions, so their likelihoods are not "
+                "meaningful, and the mixture has one normal distribution; add examples, or keep less than "
                 f"{options.spatial_share:.0%} of the variance",
             )
         )
@@ -64,14 +66,19 @@ def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: Mo
                 Warned(
                     "does-not-generalise",
                     f"the mean reconstruction error is {left_out:.1f} cm for an example left out of the training, but "
-                    f"{training:.1f} cm for training examples: they do not cover how this action varies",
+                    f"{training:.1f} cm for training examples, which do not show all variations of the action; add examples",
                 )
             )
     outliers = sorted((one for one in report.examples if one.outlier), key=_likelihood)
     if outliers:
         names = ", ".join(one.name for one in outliers[:NAMES_SHOWN])
         more = f" and {len(outliers) - NAMES_SHOWN} more" if len(outliers) > NAMES_SHOWN else ""
-        found.append(Warned("outliers", f"unlike the other examples: {names}{more}; look at them"))
+        found.append(
+            Warned(
+                "outliers",
+                f"these examples are unlike the others: {names}{more}; check whether they show the same action",
+            )
+        )
     return found
 
 
@@ -85,7 +92,10 @@ def _of_mixture(report: TrainingReport) -> list[Warned]:
     slow = [candidate.components for candidate in report.candidates if not candidate.converged]
     if slow:
         found.append(
-            Warned("not-converged", f"the fit of a mixture of {', '.join(map(str, slow))} components did not converge")
+            Warned(
+                "not-converged",
+                f"the fit of a mixture of {', '.join(map(str, slow))} normal distributions did not converge",
+            )
         )
     return found
 
@@ -99,7 +109,7 @@ def _of_samples(report: TrainingReport) -> list[Warned]:
         found.append(
             Warned(
                 "odd-durations",
-                f"{durations.outside_share:.0%} of the samples last over 5% longer or shorter than any example",
+                f"{durations.outside_share:.0%} of the samples are more than 5% longer or shorter than all examples",
             )
         )
     return found
@@ -120,8 +130,8 @@ def _of_feet(feet: FootQuality, trained: FootQuality) -> list[Warned]:
         found.append(
             Warned(
                 "feet-slide",
-                f"where the examples' feet stand, those of samples slide at {feet.slide_m_s:.2f} m/s on average "
-                f"(examples: {trained.slide_m_s:.2f} m/s); finish samples with planted feet",
+                f"where the examples plant their feet, those of samples slide at {feet.slide_m_s:.2f} m/s on average "
+                f"(examples: {trained.slide_m_s:.2f} m/s); plant the feet of samples (edit command `plant_feet`)",
             )
         )
     return found

@@ -23,17 +23,19 @@ def verdict_of(trained: TrainedPrimitive) -> str:
     count = len(report.examples)
     parts = [f"{counted(count, 'example')} in {primitive.dimensions} dimensions"]
     kinds = len(primitive.mixture.weights)
-    parts.append(f"{counted(kinds, 'kind')} of motion")
+    parts.append(f"{counted(kinds, 'normal distribution')}")
     error = _left_out_cm(trained)
     if error is not None:
-        parts.append(f"an unseen example is reconstructed {error:.1f} cm off on average")
+        parts.append(f"the mean error of a left-out example is {error:.1f} cm")
     feet = report.sample_feet
     if feet is not None:
         below = f"{feet.below_floor_mean_cm:.1f} cm below the floor in {feet.below_floor_share:.0%} of the frames"
-        parts.append(f"samples' feet are {below}" if feet.below_floor_share else "samples' feet stay above the floor")
+        parts.append(
+            f"feet of samples are {below}" if feet.below_floor_share else "feet of samples stay above the floor"
+        )
     sentence = "; ".join(parts) + "."
     noted = [warning.code for warning in trained.warnings]
-    return f"{sentence} To look at: {', '.join(noted)}." if noted else sentence
+    return f"{sentence} Warnings: {', '.join(noted)}." if noted else sentence
 
 
 def headline_of(trained: TrainedPrimitive) -> Headline:

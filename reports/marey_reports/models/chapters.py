@@ -28,15 +28,15 @@ def headline(trained: TrainedPrimitive) -> Html:
     durations, drawn = report.training_durations, report.sample_durations
     lasting = "" if drawn is None else f"samples {drawn.least_s:.1f}–{drawn.most_s:.1f} s"
     odd = sum(example.outlier for example in report.examples)
-    kinds = counted(len(primitive.mixture.weights), "kind")
+    normals = counted(len(primitive.mixture.weights), "normal distribution")
     return facts(
         (
-            ("examples", str(len(report.examples)), f"{odd} odd" if odd else "none of them odd"),
-            ("an unseen example is off by", *_unseen(trained)),
-            ("how long it lasts", f"{durations.least_s:.1f}–{durations.most_s:.1f} s", lasting),
-            ("numbers that make a motion", str(primitive.dimensions),
-             f"{primitive.spatial.count} of poses, {primitive.temporal.count} of time; {kinds}"),
-            ("feet of samples slide at", *_sliding(report.sample_feet, report.training_feet)),
+            ("examples", str(len(report.examples)), f"{odd} unusual" if odd else "none of them unusual"),
+            ("error of a left-out example", *_unseen(trained)),
+            ("duration of the examples", f"{durations.least_s:.1f}–{durations.most_s:.1f} s", lasting),
+            ("dimensions", str(primitive.dimensions),
+             f"{primitive.spatial.count} of poses, {primitive.temporal.count} of time; {normals}"),
+            ("sliding of feet in samples", *_sliding(report.sample_feet, report.training_feet)),
         )
     )  # fmt: skip
 
@@ -46,7 +46,7 @@ def _unseen(trained: TrainedPrimitive) -> tuple[str, str]:
     if errors is None or len(trained.report.examples) < 2:
         return "–", "not measured"
     at = min(kept, len(errors.components) - 1)
-    return f"{errors.left_out_cm[at]:.1f} cm", f"one that it was made of by {errors.training_cm[at]:.1f} cm"
+    return f"{errors.left_out_cm[at]:.1f} cm", f"of a training example: {errors.training_cm[at]:.1f} cm"
 
 
 def _sliding(samples: FootQuality | None, examples: FootQuality | None) -> tuple[str, str]:
@@ -54,28 +54,28 @@ def _sliding(samples: FootQuality | None, examples: FootQuality | None) -> tuple
         return "–", "not measured"
     return (
         f"{CM_PER_M * samples.slide_m_s:.0f} cm/s",
-        f"those of the examples at {CM_PER_M * examples.slide_m_s:.0f} cm/s",
+        f"in examples: {CM_PER_M * examples.slide_m_s:.0f} cm/s",
     )
 
 
 def warning_chapter(trained: TrainedPrimitive) -> Section:
     """Write the chapter on the warnings about the model."""
     if not trained.warnings:
-        text = element("p", "Nothing stands out.")
-        return Section("look", "What to look at", text)
+        text = element("p", "There are no warnings.")
+        return Section("look", "Warnings", text)
     items = [
         element("li", f"{warning.message[:1].upper()}{warning.message[1:]}. ", element("code", warning.code))
         for warning in trained.warnings
     ]
-    return Section("look", "What to look at", element("ul", items))
+    return Section("look", "Warnings", element("ul", items))
 
 
 def motion_chapter(subject: ModelSubject, figures: Figures) -> Section:
     """Write the chapter on the samples of the model and the space that they reach."""
     text = element(
         "p",
-        "Left and right are those of the body: blue is its left side, orange its right. All motions begin where the "
-        "axes cross and face forward.",
+        "Left and right are the sides of the body: the left side is blue, the right side orange. All motions begin at the "
+        "origin and face forward.",
     )
     reaches = reach_of(subject)
     heads = (
@@ -84,14 +84,16 @@ def motion_chapter(subject: ModelSubject, figures: Figures) -> Section:
     )
     rows = [_reach_row(reach) for reach in reaches]
     listing = table(
-        "Where hands and feet are in 98 of 100 moments; left, up and forward are positive",
+        "Range of hands and feet (1 % to 99 % quantiles); left, up and forward are positive",
         heads,
         rows,
         numbers=range(1, len(heads)),
         sortable=False,
     )
     pictures = shown(figures, "samples", "mean", "paths")
-    return Section("motions", "What it makes", (text, pictures, listing, shown(figures, "search-errors", "durations")))
+    return Section(
+        "motions", "Generated motions", (text, pictures, listing, shown(figures, "search-errors", "durations"))
+    )
 
 
 def _reach_row(reach: Reach) -> list[Cell]:
@@ -106,16 +108,14 @@ def variation_chapter(subject: ModelSubject, figures: Figures) -> Section:
     """Write the chapter on the effect of each of the first components."""
     spatial, temporal = subject.primitive.spatial.count, subject.primitive.temporal.count
     if not spatial + temporal:
-        text = "Nothing: all examples are the same motion, and so are all samples."
-        return Section("variation", "What it can vary", element("p", text))
+        text = "The model has no components: all examples are the same motion, and so are all samples."
+        return Section("variation", "Components", element("p", text))
     text = (
         f"A motion of this model is {counted(spatial, 'number')} for its poses and {counted(temporal, 'number')} for "
-        "its time. Each number turns one of the knobs below; the first ones turn most."
+        "its time, one for each component. The figures show the effects of the first components, which vary most."
     )
     components = [name for name in figures if name.startswith("component-")]
-    return Section(
-        "variation", "What it can vary", (element("p", text), shown(figures, *components, "time-components"))
-    )
+    return Section("variation", "Components", (element("p", text), shown(figures, *components, "time-components")))
 
 
 def example_chapter(subject: ModelSubject, figures: Figures) -> Section:
@@ -123,16 +123,16 @@ def example_chapter(subject: ModelSubject, figures: Figures) -> Section:
     examples = subject.report.examples
     order = sorted(range(len(examples)), key=lambda place: (-_oddness(examples[place]), examples[place].uid))
     rows = [_example_row(examples[place], subject.names[place]) for place in order]
-    heads = ("example", "odd", "likelihood", "unseen error (cm)", "alignment (cm)", "duration (s)")
+    heads = ("example", "unusual", "log-likelihood", "left-out error (cm)", "alignment (cm)", "duration (s)")
     listing: Content = table("The examples, the least likely first", heads, rows[:MOST_ROWS], numbers=range(2, 6))
     if len(rows) > MOST_ROWS:
         everything = table("All examples", heads, rows, numbers=range(2, 6))
         listing = (listing, folded(f"All {len(rows)} examples", everything))
     text = (
-        "An example that is unlike the others may show another action, a mistake of the recording or of the "
-        "alignment, or just something rare. Look at it, and leave it out if it does not belong here."
+        "An unusual example may show another action, an error of the recording or of the alignment, or a rare "
+        "variation. Check it, and remove it if it does not show this action."
     )
-    return Section("examples", "Which examples are odd", (element("p", text), shown(figures, "likelihood"), listing))
+    return Section("examples", "Unusual examples", (element("p", text), shown(figures, "likelihood"), listing))
 
 
 def _oddness(example: ExampleReport) -> float:
@@ -143,7 +143,7 @@ def _oddness(example: ExampleReport) -> float:
 def _example_row(example: ExampleReport, name: str) -> list[Cell]:
     return [
         element("span", name, title=example.uid),
-        element("b", "odd", class_="bad") if example.outlier else "",
+        element("b", "unusual", class_="bad") if example.outlier else "",
         number(-_oddness(example), 1, look="bad" if example.outlier else ""),
         number(example.left_out_error_cm, 1),
         number(CM_PER_M * float(np.sqrt(max(example.alignment_cost, 0.0))), 1),
@@ -156,7 +156,7 @@ def making_chapter(subject: ModelSubject, figures: Figures) -> Section:
     aligned = subject.examples
     reference = next(clip.name for clip in aligned.clips if clip.uid == aligned.reference)
     text = (
-        f"{counted(len(aligned.clips), 'clip')}, brought to one place, one direction and the time of {reference}: "
+        f"{counted(len(aligned.clips), 'clip')}, aligned in place, direction and time with {reference}: "
         f"{aligned.frame_count} canonical frames at {aligned.frame_rate_hz:g} Hz."
     )
     keys = sorted(aligned.keyframes.items(), key=lambda each: (each[1], each[0]))
@@ -166,10 +166,10 @@ def making_chapter(subject: ModelSubject, figures: Figures) -> Section:
         heads = ("keyframe", "canonical frame", "in the reference (s)")
         listing = table("Keyframes that all examples share", heads, rows, numbers=(1, 2), sortable=False)
     pictures = shown(figures, "time-warps", "alignment-costs")
-    return Section("making", "How the examples were aligned", (element("p", text), listing, pictures))
+    return Section("making", "Alignment of the examples", (element("p", text), listing, pictures))
 
 
 def numbers_chapter(figures: Figures) -> Section:
     """Write the chapter on the size of the model: variance, errors of reconstruction, latent space and mixture."""
     pictures = shown(figures, "variance", "reconstruction", "latent-space", "mixture")
-    return Section("numbers", "How much it keeps", pictures)
+    return Section("numbers", "Size and accuracy", pictures)

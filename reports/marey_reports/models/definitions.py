@@ -7,39 +7,45 @@ from marey_reports.drawing.markup import Html, element, joined
 from marey_reports.drawing.tables import table
 
 _WORDS = (
-    ("example", "a clip that the model was made of, after it was aligned with the others"),
+    ("example", "a clip on which the model was trained, after its alignment with the others"),
     ("sample", "a synthetic motion, drawn from the model"),
     (
         "canonical frame and time",
-        "the common place and time of all examples: the root begins where the axes cross, the body faces forward, and "
-        "the same moment of the action is at the same percentage of canonical time",
+        "the common place and time of all examples: the root begins at the origin, the body faces forward, and the "
+        "same moment of the action is at the same percentage of canonical time",
     ),
     ("reference", "the example whose time is the canonical time"),
     ("keyframe", "a moment of the action that was labelled in every example"),
-    ("component", "a way in which the examples differ, found so that the first few hold most of their variance"),
-    ("sd", "standard deviation: two of three examples lie within one of the mean, 19 of 20 within two"),
-    ("latent space", "the numbers, one for each component, from which the model makes a motion"),
-    ("mixture", "the normal distributions of these numbers in the examples, from which samples are drawn"),
+    (
+        "component",
+        "principal component: a way in which the examples differ; the first few explain most of their variance",
+    ),
+    ("sd", "standard deviation; in a normal distribution, 68 % are within one of the mean, and 95 % within two"),
+    ("latent space", "the space of the numbers, one for each component, from which the model generates a motion"),
+    (
+        "mixture",
+        "the weighted normal distributions, fitted to these numbers of the examples, from which samples are drawn",
+    ),
 )
 
 _NUMBERS = (
     (
-        "unseen error",
+        "left-out error",
         "cm",
-        "each example in turn is left out, and rebuilt from the mean and the components of all others: mean distance "
-        "of its joints from where they were",
+        "mean distance of the joints of an example from their positions after a reconstruction from the mean and the "
+        "components of all other examples",
     ),
     (
         "log-likelihood",
         "",
-        "natural logarithm of the density of an example's numbers; more is likelier. By a mixture that was fitted "
-        "without the example, where that was measured",
+        "natural logarithm of the probability density of an example in latent space; higher is likelier. The mixture "
+        "was fitted without the example, if this was computed",
     ),
     (
-        "odd",
+        "unusual",
         "",
-        f"its log-likelihood is more than {OUTLIER_DEVIATIONS:g} robust standard deviations (1.4826 times the median "
-        "distance from the median) below that of the middle example",
+        f"an example whose log-likelihood is more than {OUTLIER_DEVIATIONS:g} robust standard deviations (1.4826 times the median "
+        "distance from the median) below the median of all examples",
     ),
     (
         "alignment",
@@ -50,10 +56,14 @@ _NUMBERS = (
     (
         "sliding feet",
         "cm/s",
-        "mean speed over the ground of what touches it, in the steps of canonical time in which most examples stand "
-        "still",
+        "mean speed over the ground of the feet that touch it, at the canonical frames at which most examples have them "
+        "planted",
     ),
-    ("BIC, AIC", "", "criteria that weigh how well a mixture fits against how many numbers it needs; less is better"),
+    (
+        "BIC, AIC",
+        "",
+        "information criteria, which weigh the fit of a mixture against its number of parameters; lower is better",
+    ),
 )
 
 
@@ -61,9 +71,9 @@ def definitions() -> Html:
     """Write the definitions of terms and numbers, and the references of the method."""
     return joined(
         (
-            table("Words", ("word", "meaning"), _WORDS, numbers=(), sortable=False),
+            table("Terms", ("term", "meaning"), _WORDS, numbers=(), sortable=False),
             element("h3", "Numbers"),
-            table("What the numbers mean", ("name", "unit", "meaning"), _NUMBERS, numbers=(), sortable=False),
+            table("Definitions of the numbers", ("name", "unit", "meaning"), _NUMBERS, numbers=(), sortable=False),
             element(
                 "p",
                 "The method is that of Min and Chai, Motion Graphs++ (ACM Transactions on Graphics 31, 2012), in the "

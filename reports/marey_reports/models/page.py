@@ -53,8 +53,8 @@ def render_model_report(
         example_chapter(subject, figures),
         making_chapter(subject, figures),
         numbers_chapter(figures),
-        Section("definitions", "What the words and numbers mean", definitions()),
-        Section("provenance", "Where this comes from", provenance(trained, origin)),
+        Section("definitions", "Definitions", definitions()),
+        Section("provenance", "Provenance", provenance(trained, origin)),
     ]
     lead = element("p", verdict_of(trained), class_="verdict"), headline(trained)
     return page(title, lead, sections, f"Written by Marey {code_version()}.")
@@ -72,8 +72,8 @@ def provenance(trained: TrainedPrimitive, origin: Mapping[str, Any]) -> Html:
     ]
     return joined(
         (
-            element("p", "The same examples, options, seed and code give the same model to the bit."),
-            table("Origin", ("what", "value"), known, numbers=(), sortable=False),
+            element("p", "The same examples, options, seed and version of the code give the same model, bit for bit."),
+            table("Origin", ("name", "value"), known, numbers=(), sortable=False),
             folded("All options", table("Options", ("option", "value"), options, numbers=(), sortable=False)),
             folded("Every example", table("Aligned clips", ("clip", "name"), clips, numbers=())) if clips else None,
         )
@@ -81,4 +81,4 @@ def provenance(trained: TrainedPrimitive, origin: Mapping[str, Any]) -> Html:
 
 
 def _written(value: object) -> str:
-    return "chosen by the data" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+    return "chosen automatically" if value is None else f"{value:g}" if isinstance(value, float) else str(value)

@@ -366,4 +366,4 @@ def test_the_check_of_searches_is_drawn_where_there_is_one(subject: ModelSubject
     found = SearchCheck(("walk001", "walk001"), ("left_wrist", "right_wrist"), (5, 9), np.array([2.0, 3.0]), np.ones(2))
     figure = drawn_of(replace(subject, check=found), "search-errors")
     assert [row["joint"] for row in rows_of(figure, "errors")] == ["left_wrist", "right_wrist"]
-    assert "hands and feet of 1 example were" in figure.caption
+    assert "hands and feet of 1 example, for a model" in figure.caption

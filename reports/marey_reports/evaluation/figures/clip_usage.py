@@ -132,7 +132,7 @@ def _caption(subjects: Sequence[Subject], uses: Sequence[_Use]) -> str:
     for subject, use in zip(subjects, uses, strict=True):
         used = sum(1 for ticks in use.ticks.values() if ticks)
         parts.append(
-            f"{subject.prefix}{used} of {len(use.ticks)} clips were used; {sum(use.ticks.values()):,} displayed frames, "
+            f"{subject.prefix}{used} of {len(use.ticks)} clips used; {sum(use.ticks.values()):,} displayed frames, "
             f"{counted(use.transitions, 'transition')}."
         )
     return "Number of displayed frames of each clip. " + " ".join(parts)

@@ -25,21 +25,21 @@ __all__ = ["DrawnFigure", "ModelSubject", "draw_alignment_figures", "draw_model_
 SWEPT_COMPONENTS = 3
 
 ALIGNMENT_FIGURES: dict[str, tuple[str, Callable[[AlignedSet], Sketch | None]]] = {
-    "time-warps": ("How the clips were aligned in time", draw_time_warps),
-    "alignment-costs": ("What the alignment weighed", draw_alignment_costs),
+    "time-warps": ("Alignment in time", draw_time_warps),
+    "alignment-costs": ("Costs of the alignment", draw_alignment_costs),
 }
 MODEL_FIGURES: dict[str, tuple[str, Callable[[ModelSubject], Sketch | None]]] = {
-    "mean": ("The mean motion", draw_mean),
+    "mean": ("Mean motion", draw_mean),
     "samples": ("Examples and samples", draw_samples),
-    "paths": ("Where hands and feet go", draw_paths),
-    "search-errors": ("How near it comes to what is asked", draw_search_check),
-    "durations": ("How long motions last", draw_durations),
-    "time-components": ("What varies in time", draw_time_components),
-    "variance": ("What the components hold", draw_variance),
-    "reconstruction": ("What the components rebuild", draw_reconstruction),
-    "latent-space": ("The latent space", draw_latent_space),
-    "mixture": ("The choice of the mixture", draw_criterion),
-    "likelihood": ("Which examples fit, and which are odd", draw_likelihood),
+    "paths": ("Trajectories of hands and feet", draw_paths),
+    "search-errors": ("Errors at search targets", draw_search_check),
+    "durations": ("Durations", draw_durations),
+    "time-components": ("Time components", draw_time_components),
+    "variance": ("Variance of the components", draw_variance),
+    "reconstruction": ("Reconstruction error", draw_reconstruction),
+    "latent-space": ("Latent space", draw_latent_space),
+    "mixture": ("Choice of the mixture", draw_criterion),
+    "likelihood": ("Likelihood of the examples", draw_likelihood),
 }
 """Title and drawing function of each figure, by its name. Figures whose function returns None are left out."""
 

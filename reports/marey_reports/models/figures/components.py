@@ -24,8 +24,8 @@ def draw_mean(subject: ModelSubject) -> Sketch:
     row = StripRow("mean", f"{duration_s:.2f} s", points[None], _ways(subject, subject.mean_poses[None]))
     figure = draw_strips(subject.body, [row], moments, subject.seen_from_rad, cell_in=(CELL_IN[0], 1.9))
     caption = (
-        f"What the model makes when nothing varies: {duration_s:.2f} s, at {len(frames)} moments of canonical time, "
-        "seen from its front right. The line on the floor is where the root goes."
+        f"The mean motion of the model: {duration_s:.2f} s, at {len(frames)} moments of canonical time, seen from the "
+        "front right. The line on the floor is the path of the root."
     )
     return Sketch(figure, {"positions": position_table(subject, frames, [("mean", points)])}, caption)
 
@@ -47,9 +47,8 @@ def draw_component(subject: ModelSubject, component: int) -> Sketch:
     share = float(np.diff(subject.primitive.spatial.energy, prepend=0.0)[component])
     joint, moved_cm = most_moved(subject, points)
     caption = (
-        f"What it changes ({100 * share:.0f} % of the variance): from two standard "
-        f"deviations of the examples below the mean to two above it. Most of all it moves {joint}, by up to "
-        f"{moved_cm:.0f} cm from end to end."
+        f"Effect of this component ({100 * share:.0f} % of the variance): from two standard deviations of the examples "
+        f"below the mean to two above it. {joint} differs most between the two ends, by up to {moved_cm:.0f} cm."
     )
     named = [(written(deviation), points[place]) for place, deviation in enumerate(DEVIATIONS)]
     return Sketch(figure, {"positions": position_table(subject, frames, named)}, caption)

@@ -55,8 +55,8 @@ def draw_latent_space(subject: ModelSubject) -> Sketch | None:
     components = len(primitive.mixture.weights)
     odd = [example.name for example in subject.report.examples if example.outlier]
     caption = (
-        f"Each example as a point in the latent space of the model, with {SCATTERED_SAMPLES} samples; "
-        f"{_mixture(components)} (outlines hold two standard deviations). {_odd_ones(len(odd))}"
+        f"The examples and {SCATTERED_SAMPLES} samples in the latent space of the model; {_mixture(components)} "
+        f"(outlines at two standard deviations). {_odd_ones(len(odd))}"
     )
     tables: Tables = {
         "examples": {
@@ -73,18 +73,16 @@ def draw_latent_space(subject: ModelSubject) -> Sketch | None:
 
 def _mixture(components: int) -> str:
     return (
-        "the model draws them from one normal distribution"
+        "samples are drawn from one normal distribution"
         if components == 1
-        else f"the model draws them from {components} normal distributions"
+        else f"samples are drawn from {components} normal distributions"
     )
 
 
 def _odd_ones(count: int) -> str:
     if not count:
-        return "No example stands apart from the others."
-    return (
-        f"{counted(count, 'example')} {'stands' if count == 1 else 'stand'} apart from the others, marked by a cross."
-    )
+        return "No example is unusual."
+    return f"Crosses mark {counted(count, 'unusual example')}."
 
 
 def _pairs(spatial: int, temporal: int) -> list[tuple[int, int]]:
@@ -116,7 +114,7 @@ def _draw_pair(panel: Axes, subject: ModelSubject, samples: Floats, pair: tuple[
         outline = ellipse(mean[[x, y]], covariance[np.ix_(pair, pair)])
         panel.plot(outline[:, 0], outline[:, 1], color=COLOURS[1], lw=1.2, label=None if number else "mixture")
     odd = np.array([example.outlier for example in subject.report.examples], dtype=bool)
-    for chosen, marker, label in ((~odd, "o", "examples"), (odd, "X", "odd examples")):
+    for chosen, marker, label in ((~odd, "o", "examples"), (odd, "X", "unusual examples")):
         if chosen.any():
             size = 5.0 if marker == "o" else 8.0
             panel.plot(latents[chosen, x], latents[chosen, y], ls="", marker=marker, ms=size, mfc=COLOURS[0],
@@ -139,7 +137,7 @@ def draw_likelihood(subject: ModelSubject) -> Sketch:
     below = _deviations(np.array([_judged(example) for example in examples]))
     shown = order[:MOST_ROWS]
     figure = new_figure(8.8, ROW * len(shown) + 0.95)
-    label = "how much likelier or less likely than the middle example (robust deviations)"
+    label = "log-likelihood, as deviation from the median (robust standard deviations)"
     panel = add_panel(figure, Place(3.0, 0.65, 5.6, ROW * len(shown)), x=label)
     values, rows = below[shown], np.arange(len(shown))
     drawn = np.maximum(values, -FARTHEST)
@@ -185,11 +183,11 @@ def _judged(example: ExampleReport) -> float:
 
 def _likelihood_caption(subject: ModelSubject, odd: list[int], hidden: int) -> str:
     start = (
-        "How well each example fits what the others let expect, the worst at the top. Left of the dashed line an "
-        f"example is odd{f'; the {hidden} likeliest are not shown' if hidden else ''}."
+        "Log-likelihood of each example, the lowest at the top. Examples to the left of the dashed line are unusual"
+        f"{f'; the {hidden} likeliest are not shown' if hidden else ''}."
     )
     if not odd:
-        return f"{start} None is."
+        return f"{start} There are none."
     named = ", ".join(subject.names[place] for place in odd[:NAMED])
     more = f" and {len(odd) - NAMED} more" if len(odd) > NAMED else ""
-    return f"{start} Look whether the action of the others is what these show: {named}{more}."
+    return f"{start} Check whether these show the same action as the others: {named}{more}."

@@ -24,7 +24,7 @@ def draw_search_check(subject: ModelSubject) -> Sketch | None:
     if check is None:
         return None
     examples = counted(len(set(check.examples)), "example")
-    about = f"where hands and feet of {examples} were, by a model made without them"
+    about = f"positions of hands and feet of {examples}, for a model trained without them"
     sketch = draw_search_errors(check.searched_cm, check.refined_cm, about=about)
     whose = {"example": check.examples, "joint": check.joints, "canonical_frame": check.frames}
     return sketch._replace(tables={"errors": {**whose, **sketch.tables["errors"]}})
@@ -60,6 +60,6 @@ def _caption(searched_cm: Floats, refined_cm: Floats, about: str) -> str:
         return "No target was searched for."
     found = [f"{np.median(values):.1f} cm (worst {values.max():.1f} cm)" for values in (searched_cm, refined_cm)]
     return (
-        f"How near the model comes to {counted(len(searched_cm), 'target')}{f', {about}' if about else ''}: half of "
-        f"them within {found[0]} by the search of its tree alone, and within {found[1]} after refinement."
+        f"Distance from {counted(len(searched_cm), 'target')}{f' ({about})' if about else ''}: the median is "
+        f"{found[0]} after the search of the tree, and {found[1]} after refinement."
     )

@@ -39,7 +39,7 @@ def draw_variance(subject: ModelSubject) -> Sketch:
     figure = new_figure(9.6, 3.5)
     for place, (kind, (energy, kept)) in zip((Place(0.7, 0.65, 5.4, 2.4), Place(6.8, 0.65, 2.6, 2.4)), kinds.items(),
                                              strict=True):  # fmt: skip
-        label = "variance held (%)" if kind == "poses" else ""
+        label = "variance explained (%)" if kind == "poses" else ""
         panel = add_panel(figure, place, title=f"{kind}: {kept} of {len(energy)} kept", x="components", y=label)
         _draw_bars(panel, energy, kept)
     tables: Tables = {
@@ -47,9 +47,8 @@ def draw_variance(subject: ModelSubject) -> Sketch:
         for kind, (energy, kept) in kinds.items()
     }
     held = " ".join(_held(kind, *known) for kind, known in kinds.items())
-    return Sketch(
-        figure, tables, f"How much of what varies the first components hold together; blue ones are kept. {held}"
-    )
+    caption = f"Share of the variance that the first components explain together; the kept ones are blue. {held}"
+    return Sketch(figure, tables, caption)
 
 
 def _draw_bars(panel: Axes, energy: Floats, kept: int) -> None:
@@ -75,7 +74,7 @@ def _held(kind: str, energy: Floats, kept: int) -> str:
     whose = "The poses of the examples" if kind == "poses" else "Their time"
     verb = "vary" if kind == "poses" else "varies"
     return (
-        f"{whose} {verb} in {counted(len(energy), 'independent way')}; the model keeps {kept} of them, and with them "
+        f"{whose} {verb} in {counted(len(energy), 'component')}; the model keeps {kept} of them, which explain "
         f"{100.0 - lost:.1f} % of the variance."
     )
 
@@ -90,11 +89,13 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
     panel = add_panel(figure, Place(0.75, 0.65, 5.2, 2.5), x="spatial components", y="mean distance of joints (cm)")
     low, high = np.quantile(errors.left_out_each_cm, (0.1, 0.9), axis=0)
     if len(errors.left_out_each_cm) > 1:
-        panel.fill_between(errors.components, low, high, color=COLOURS[1], alpha=0.18, lw=0, label="8 of 10 examples")
+        panel.fill_between(
+            errors.components, low, high, color=COLOURS[1], alpha=0.18, lw=0, label="80 % of left-out examples"
+        )
         panel.plot(errors.components, errors.left_out_cm, color=COLOURS[1], marker="s", ms=3.5, lw=1.4,
-                   label="examples it has not seen")  # fmt: skip
+                   label="left-out examples")  # fmt: skip
     panel.plot(errors.components, errors.training_cm, color=COLOURS[0], marker="o", ms=3.5, lw=1.4,
-               label="examples it was made of")  # fmt: skip
+               label="training examples")  # fmt: skip
     panel.axvline(kept, color=QUIET, lw=0.9, ls=(0, (4, 3)))
     top = 1.15 * max(float(curve.max()) for curve in (high, errors.left_out_cm, errors.training_cm)) or 1.0
     panel.set(xlim=(-0.4, max(float(errors.components[-1]), 1.0) + 0.4), ylim=(0.0, top))
@@ -103,14 +104,11 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
     add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
     at = min(kept, len(errors.components) - 1)
     caption = (
-        "How far joints are from where they should be when examples are rebuilt by so many components. With the "
-        f"{kept} that are kept, examples the model was made of are off by {errors.training_cm[at]:.1f} cm on average"
+        "Error of examples that are reconstructed from the first components, by their number. With the "
+        f"{counted(kept, 'kept component')}, the mean error is {errors.training_cm[at]:.1f} cm for training examples"
     )
     if len(errors.left_out_each_cm) > 1:
-        caption += (
-            f", and examples that were left out by {errors.left_out_cm[at]:.1f} cm: so well does it follow motions "
-            "that it does not know"
-        )
+        caption += f", and {errors.left_out_cm[at]:.1f} cm for examples that were left out"
     tables: Tables = {
         "errors": {
             "components": errors.components,
@@ -129,17 +127,17 @@ def draw_criterion(subject: ModelSubject) -> Sketch | None:
     chosen = len(subject.primitive.mixture.weights)
     counts = np.array([each.components for each in candidates])
     figure = new_figure(6.9, 3.3)
-    panel = add_panel(figure, Place(0.95, 0.65, 3.9, 2.3), x="components of the mixture", y="BIC, AIC (less is better)")
+    panel = add_panel(figure, Place(0.95, 0.65, 3.9, 2.3), x="normal distributions", y="BIC, AIC (lower is better)")
     for name, colour, marker in (("bic", COLOURS[0], "o"), ("aic", REFERENCE, "^")):
         values = np.array([getattr(each, name) for each in candidates])
         panel.plot(counts, values, color=colour, marker=marker, ms=4.5, lw=1.3, label=name.upper())
     refused = [each for each in candidates if each.refusal]
     if refused:
         panel.plot([each.components for each in refused], [each.bic for each in refused], ls="", marker="x", ms=9,
-                   color=COLOURS[1], label="too few examples in one")  # fmt: skip
+                   color=COLOURS[1], label="rejected")  # fmt: skip
     taken = next((each for each in candidates if each.components == chosen), None)
     if taken is not None:
-        panel.plot([chosen], [taken.bic], ls="", marker="o", ms=11, mfc="none", mec=INK, label=f"taken: {chosen}")
+        panel.plot([chosen], [taken.bic], ls="", marker="o", ms=11, mfc="none", mec=INK, label=f"used: {chosen}")
     tick_whole_numbers(panel.xaxis)
     panel.set_xlim(counts[0] - 0.5, counts[-1] + 0.5)
     add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
@@ -154,8 +152,8 @@ def draw_criterion(subject: ModelSubject) -> Sketch | None:
         }
     }
     caption = (
-        f"How many normal distributions the examples are best described by: {chosen}. More describe them better and "
-        "need more parameters; BIC weighs one against the other. The number with the lowest BIC is taken, unless one "
-        "of the distributions would have too few examples. AIC is drawn for comparison."
+        f"Information criteria by the number of normal distributions in the mixture; the model uses {chosen}. Both "
+        "weigh the fit against the number of parameters. A number is rejected if a distribution would have too few "
+        "examples, or if it makes held-out examples no likelier than one distribution does."
     )
     return Sketch(figure, tables, caption)

@@ -43,9 +43,9 @@ def draw_time_warps(aligned: AlignedSet) -> Sketch:
     odd = _most_unlike(aligned, reference)
     names = [shortened(name, 26) for name in differing_parts([clip.name for clip in aligned.clips])]
     figure = new_figure(10.4, 4.1)
-    left = add_panel(figure, Place(0.7, 0.65, 3.4, 2.9), x=CANONICAL_TIME, y="time in the clip (s)", title="when")
-    right = add_panel(figure, Place(4.85, 0.65, 3.4, 2.9), x=CANONICAL_TIME, y="speed (2: twice as the reference)",
-                      title="how fast")  # fmt: skip
+    left = add_panel(figure, Place(0.7, 0.65, 3.4, 2.9), x=CANONICAL_TIME, y="time in the clip (s)", title="time")
+    right = add_panel(figure, Place(4.85, 0.65, 3.4, 2.9), x=CANONICAL_TIME, y="speed (2: twice that of the reference)",
+                      title="speed")  # fmt: skip
     share = percents(aligned.frame_count)
     _draw_lines(left, share, times_s, reference, odd, names)
     _draw_lines(right, 0.5 * (share[1:] + share[:-1]), speeds, reference, odd, names)
@@ -114,13 +114,13 @@ def _clips(aligned: AlignedSet) -> dict[str, object]:
 def _caption(aligned: AlignedSet, reference: int) -> str:
     durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
     keyframes = (
-        f" Dotted lines are the {counted(len(aligned.keyframes), 'keyframe')} that all share."
+        f" Dotted lines mark the {counted(len(aligned.keyframes), 'keyframe')} that all share."
         if aligned.keyframes
         else ""
     )
     return (
-        f"How {counted(len(aligned.clips), 'clip')} of {durations.min():.2f} to {durations.max():.2f} s were laid over "
-        f"{aligned.clips[reference].name}, the reference: on the left, which moment of each clip belongs to which "
-        "moment of canonical time; on the right, how fast the clip plays there, compared with the reference. The clips "
-        f"whose timing is least like the reference's are in colour.{keyframes}"
+        f"Alignment of {counted(len(aligned.clips), 'clip')} of {durations.min():.2f} to {durations.max():.2f} s with "
+        f"the reference {aligned.clips[reference].name}. Left: the moment of each clip at each moment of canonical time. "
+        "Right: the speed of the clip there, relative to the reference. The clips whose timing differs most from that of "
+        f"the reference are in colour.{keyframes}"
     )

@@ -40,7 +40,7 @@ def draw_time_components(subject: ModelSubject) -> Sketch | None:
     for component, (passed, rate) in enumerate(zip(swept, rates, strict=True)):
         left, first = 0.75 + component * (WIDTH + 0.35), component == 0
         above = add_panel(figure, Place(left, HEIGHT + 1.15, WIDTH, HEIGHT), title=f"time component {component + 1}",
-                          y="time passed (s)" if first else "")  # fmt: skip
+                          y="elapsed time (s)" if first else "")  # fmt: skip
         below = add_panel(figure, Place(left, 0.7, WIDTH, HEIGHT), x=CANONICAL_TIME,
                           y="speed (2: twice as fast)" if first else "")  # fmt: skip
         for panel, values, places in ((above, passed, shares), (below, rate, 0.5 * (shares[1:] + shares[:-1]))):
@@ -55,8 +55,8 @@ def draw_time_components(subject: ModelSubject) -> Sketch | None:
     spans = [f"component {number + 1} from {passed[0, -1]:.2f} to {passed[-1, -1]:.2f} s" for number, passed in
              enumerate(swept)]  # fmt: skip
     caption = (
-        "How time passes along each time component, from two standard deviations below the mean to two above: above, "
-        "the real time at each canonical moment; below, how fast the motion is played there. Durations: "
+        "Effect of each time component, from two standard deviations below the mean to two above it. Upper row: elapsed "
+        "time at each canonical moment; lower row: speed there, relative to the reference. Durations: "
         f"{', '.join(spans)}."
     )
     table = {
@@ -105,7 +105,7 @@ def draw_durations(subject: ModelSubject) -> Sketch:
     shares = [np.histogram(values, edges)[0] / len(values) for values in (examples, samples)]
     table = {"from_s": edges[:-1], "to_s": edges[1:], "examples_share": shares[0], "samples_share": shares[1]}
     caption = (
-        f"Examples last {examples.min():.2f} to {examples.max():.2f} s, nine of ten samples "
+        f"Examples last {examples.min():.2f} to {examples.max():.2f} s, and 90 % of the samples "
         f"{np.quantile(samples, 0.05):.2f} to {np.quantile(samples, 0.95):.2f} s."
     )
     return Sketch(figure, {"durations": table}, caption)
