@@ -66,7 +66,8 @@ def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: Mo
                 Warned(
                     "does-not-generalise",
                     f"the mean reconstruction error is {left_out:.1f} cm for an example left out of the training, but "
-                    f"{training:.1f} cm for training examples, which do not show all variations of the action; add examples",
+                    f"{training:.1f} cm for training examples, which do not show all variations of the action; add "
+                    "examples",
                 )
             )
     outliers = sorted((one for one in report.examples if one.outlier), key=_likelihood)

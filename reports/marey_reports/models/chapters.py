@@ -74,8 +74,8 @@ def motion_chapter(subject: ModelSubject, figures: Figures) -> Section:
     """Write the chapter on the samples of the model and the space that they reach."""
     text = element(
         "p",
-        "Left and right are the sides of the body: the left side is blue, the right side orange. All motions begin at the "
-        "origin and face forward.",
+        "Left and right are the sides of the body: the left side is blue, the right side orange. All motions begin "
+        "at the origin and face forward.",
     )
     reaches = reach_of(subject)
     heads = (

@@ -44,8 +44,8 @@ _NUMBERS = (
     (
         "unusual",
         "",
-        f"an example whose log-likelihood is more than {OUTLIER_DEVIATIONS:g} robust standard deviations (1.4826 times the median "
-        "distance from the median) below the median of all examples",
+        f"an example whose log-likelihood is more than {OUTLIER_DEVIATIONS:g} robust standard deviations (1.4826 "
+        "times the median distance from the median) below the median of all examples",
     ),
     (
         "alignment",
@@ -56,8 +56,8 @@ _NUMBERS = (
     (
         "sliding feet",
         "cm/s",
-        "mean speed over the ground of the feet that touch it, at the canonical frames at which most examples have them "
-        "planted",
+        "mean speed over the ground of the feet that touch it, at the canonical frames at which most examples have "
+        "them planted",
     ),
     (
         "BIC, AIC",

@@ -66,10 +66,10 @@ def draw_samples(subject: ModelSubject) -> Sketch:
     spread = [_spread_cm(subject, points) for points in (examples, samples)]
     caption = (
         f"{counted(len(chosen), 'training example')} above, {counted(len(samples), 'sample')} of the model below, on "
-        "top of each other at the same moments of canonical time, seen from the same direction. Where bodies are closer "
-        "together in the lower row, samples vary less than the examples; where they are farther apart, more. The mean "
-        f"distance of the joints from their mean position is {spread[0]:.0f} cm for the examples, and {spread[1]:.0f} cm "
-        "for the samples."
+        "top of each other at the same moments of canonical time, seen from the same direction. Where bodies are "
+        "closer together in the lower row, samples vary less than the examples; where they are farther apart, more. "
+        f"The mean distance of the joints from their mean position is {spread[0]:.0f} cm for the examples, and "
+        f"{spread[1]:.0f} cm for the samples."
     )
     named = [(subject.examples.clips[index].uid, points) for index, points in zip(chosen, examples, strict=True)]
     named += [(f"sample {number}", points) for number, points in enumerate(samples)]
@@ -116,9 +116,10 @@ def draw_paths(subject: ModelSubject) -> Sketch:
     names = [*(subject.examples.clips[index].uid for index in chosen), *(f"sample {n}" for n in range(len(chosen)))]
     table = _path_table(names, list(joints), frames, np.concatenate(list(sets.values())))
     caption = (
-        f"Trajectories of {_listed(list(joints))}, in metres from the start of the root, with the body facing forward: "
-        f"{counted(len(chosen), 'training example')} on the left, as many samples on the right; seen from the side in the "
-        "upper row, and from above in the lower row. Samples should fill the region of the examples, and not leave it."
+        f"Trajectories of {_listed(list(joints))}, in metres from the start of the root, with the body facing "
+        f"forward: {counted(len(chosen), 'training example')} on the left, as many samples on the right; seen from "
+        "the side in the upper row, and from above in the lower row. Samples should fill the region of the examples, "
+        "and not leave it."
     )
     return Sketch(figure, {"paths": table}, caption)
 

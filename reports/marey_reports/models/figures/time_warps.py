@@ -120,7 +120,7 @@ def _caption(aligned: AlignedSet, reference: int) -> str:
     )
     return (
         f"Alignment of {counted(len(aligned.clips), 'clip')} of {durations.min():.2f} to {durations.max():.2f} s with "
-        f"the reference {aligned.clips[reference].name}. Left: the moment of each clip at each moment of canonical time. "
-        "Right: the speed of the clip there, relative to the reference. The clips whose timing differs most from that of "
-        f"the reference are in colour.{keyframes}"
+        f"the reference {aligned.clips[reference].name}. Left: the moment of each clip at each moment of canonical "
+        "time. Right: the speed of the clip there, relative to the reference. The clips whose timing differs most "
+        f"from that of the reference are in colour.{keyframes}"
     )

@@ -55,8 +55,8 @@ def draw_time_components(subject: ModelSubject) -> Sketch | None:
     spans = [f"component {number + 1} from {passed[0, -1]:.2f} to {passed[-1, -1]:.2f} s" for number, passed in
              enumerate(swept)]  # fmt: skip
     caption = (
-        "Effect of each time component, from two standard deviations below the mean to two above it. Upper row: elapsed "
-        "time at each canonical moment; lower row: speed there, relative to the reference. Durations: "
+        "Effect of each time component, from two standard deviations below the mean to two above it. Upper row: "
+        "elapsed time at each canonical moment; lower row: speed there, relative to the reference. Durations: "
         f"{', '.join(spans)}."
     )
     table = {
