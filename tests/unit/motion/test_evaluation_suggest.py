@@ -96,25 +96,25 @@ def test_the_document_holds_everything_with_a_reason_and_travels(found: Suggesti
 def test_reasons_name_the_clip_and_what_it_does(found: Suggestions) -> None:
     tree = suggestions_to_tree(found)
     unused = {clip["source"]: clip["reason"] for clip in tree["unused"]["clips"]}
-    assert "“fast_000”: without its 4.0 s every trial stays exactly the same" in unused["fast_000"]
+    assert "“fast_000”: without this clip (4.0 s), all trials stay exactly the same" in unused["fast_000"]
     assert tree["unused"]["ranges"]
-    assert not any("exactly" in part["reason"] for part in tree["unused"]["ranges"])  # it is filtered anew at the cut
+    assert not any("exactly" in part["reason"] for part in tree["unused"]["ranges"])  # it is filtered again at the cut
     (spared,) = tree["near_duplicates"]["spared"]
     assert "nearly the same motion as “clip_000”" in spared["reason"]
-    assert "turns has" in tree["fillings"][0]["reason"]
+    assert "turns contains" in tree["fillings"][0]["reason"]
 
 
 @pytest.mark.parametrize(
     ("change_m", "said"),
     [
-        (0.081, "the mean distance from the path grows by 8.1 cm."),
-        (-0.081, "the mean distance from the path shrinks by 8.1 cm."),
-        (0.0004, "the mean distance from the path stays the same to the millimetre."),
+        (0.081, "the mean distance from the path increases by 8.1 cm."),
+        (-0.081, "the mean distance from the path decreases by 8.1 cm."),
+        (0.0004, "the mean distance from the path changes by less than 0.5 mm."),
     ],
 )
 def test_the_reason_for_a_removal_says_which_way_the_distance_goes_and_how_far(change_m: float, said: str) -> None:
     removal = Removal("walk@1", "walk", 2.0, 3, {"offset_mean": change_m}, 0.0, 0.0)
-    assert why_redundant(removal, 9) == f"Without “walk” (2.0 s, needed in 3 of 9 trials) {said}"
+    assert why_redundant(removal, 9) == f"Without “walk” (2.0 s, used in 3 of 9 trials), {said}"
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_the_reason_for_a_filling_says_where_most_of_it_is_missing(turn_rate_deg
     cells = (FilledCell(1.5, turn_rate_deg_s, 0.9, 1.0), FilledCell(1.0, 0.0, 0.1, 0.5))
     filling = Filling("runs", "a@1", "a", 4.0, cells, 1.0, 0.25, 40, False, 0.25, 0.5)
     assert why_filling(filling) == (
-        f"“a” from runs has 1.0 s of what is missing, most of it at 1.5 m/s {where}; 25 % of it can be blended with "
+        f"“a” from runs contains 1.0 s of the missing data, most of it at 1.5 m/s {where}; 25 % of it can be blended with "
         "the set."
     )
 

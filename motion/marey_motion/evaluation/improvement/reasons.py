@@ -8,7 +8,7 @@ from marey_motion.evaluation.improvement.redundancy import Removal
 from marey_motion.evaluation.improvement.unused import UnusedClip, UnusedRange
 
 NOTICEABLE_M = 0.0005
-"""Change of the mean distance from the path below which the text says that nothing changes."""
+"""Change of the mean distance from the path in metres; smaller changes are not given as a number."""
 
 
 def why_unused_clip(clip: UnusedClip) -> str:
@@ -22,7 +22,7 @@ def why_unused_clip(clip: UnusedClip) -> str:
     -------
     str    a sentence
     """
-    return f"No trial ever needs “{clip.name}”: without its {clip.seconds:.1f} s every trial stays exactly the same."
+    return f"No trial uses “{clip.name}”: without this clip ({clip.seconds:.1f} s), all trials stay exactly the same."
 
 
 def why_unused_range(part: UnusedRange) -> str:
@@ -39,8 +39,8 @@ def why_unused_range(part: UnusedRange) -> str:
     str    a sentence
     """
     return (
-        f"“{part.name}” is never needed from {part.start_s:.2f} s to {part.stop_s:.2f} s: "
-        f"when these {part.seconds:.1f} s are cut off, trials stay nearly the same."
+        f"No trial uses “{part.name}” from {part.start_s:.2f} s to {part.stop_s:.2f} s: "
+        f"without these {part.seconds:.1f} s, all trials stay nearly the same."
     )
 
 
@@ -58,11 +58,12 @@ def why_redundant(removal: Removal, trials: int) -> str:
     """
     change = removal.changes["offset_mean"]
     if abs(change) < NOTICEABLE_M:
-        effect = "the mean distance from the path stays the same to the millimetre"
+        effect = f"the mean distance from the path changes by less than {1000 * NOTICEABLE_M:g} mm"
     else:
-        effect = f"the mean distance from the path {'grows' if change > 0 else 'shrinks'} by {100 * abs(change):.1f} cm"
+        direction = "increases" if change > 0 else "decreases"
+        effect = f"the mean distance from the path {direction} by {100 * abs(change):.1f} cm"
     return (
-        f"Without “{removal.name}” ({removal.seconds:.1f} s, needed in {removal.trials} of {trials} trials) {effect}."
+        f"Without “{removal.name}” ({removal.seconds:.1f} s, used in {removal.trials} of {trials} trials), {effect}."
     )
 
 
@@ -80,9 +81,9 @@ def why_duplicate(source: str, pair: NearDuplicate) -> str:
     """
     gone, stays = (pair.first_name, pair.second_name) if source == pair.first else (pair.second_name, pair.first_name)
     if pair.same_content:
-        return f"“{gone}” is “{stays}” once more: one of them is enough."
-    alike = "the mirror image of the motion of" if pair.mirrored else "nearly the same motion as"
-    return f"“{gone}” shows {alike} “{stays}” ({pair.distance_cm:.1f} cm apart on average): one of them may be enough."
+        return f"“{gone}” has the same content as “{stays}”: one of them is enough."
+    alike = "nearly the mirror image of the motion of" if pair.mirrored else "nearly the same motion as"
+    return f"“{gone}” shows {alike} “{stays}” (mean distance {pair.distance_cm:.1f} cm): one of them may be enough."
 
 
 def why_filling(filling: Filling) -> str:
@@ -96,10 +97,10 @@ def why_filling(filling: Filling) -> str:
     -------
     str    a sentence
     """
-    gain = f"“{filling.name}” from {filling.collection} has {filling.filled_s:.1f} s of what is missing"
+    gain = f"“{filling.name}” from {filling.collection} contains {filling.filled_s:.1f} s of the missing data"
     where = f"most of it at {_cell_in_words(filling.cells[0])}"
     if filling.needs_retarget:
-        return f"{gain}, {where}; it is of another skeleton and has to be retargeted first."
+        return f"{gain}, {where}; it has another skeleton and must be retargeted first."
     return f"{gain}, {where}; {100 * (filling.blendable_share or 0.0):.0f} % of it can be blended with the set."
 
 
@@ -115,8 +116,8 @@ def why_addition(addition: Addition) -> str:
     str    a sentence
     """
     return (
-        f"“{addition.filling.name}” from {addition.filling.collection} then adds {addition.filled_s:.1f} s of what is "
-        f"still missing: {100 * addition.coverage_index:.0f} % of the grid would be covered."
+        f"“{addition.filling.name}” from {addition.filling.collection} then adds {addition.filled_s:.1f} s of the "
+        f"data that is still missing; {100 * addition.coverage_index:.0f} % of the grid are covered then."
     )
 
 
