@@ -119,10 +119,18 @@ def _check_windows(frames: AnyInts, windows: Sequence[Window]) -> None:
         start, stop = window.start + window.smooth_start, window.stop - window.smooth_stop
         held = (frames >= start) & (frames < stop)
         if not held.any():
-            raise EditError(f"the window {window.start}:{window.stop} contains no changed frame", where="windows")
+            raise EditError(
+                f"the window {window.start}:{window.stop} contains no changed frame apart from its smooth ends; remove "
+                "it, or choose a window around a changed frame",
+                where="windows",
+            )
         inside |= held
     if not inside.all():
-        raise EditError(f"the changed frame {int(frames[~inside][0])} is in none of the windows", where="windows")
+        raise EditError(
+            f"the changed frame {int(frames[~inside][0])} is in no window apart from smooth ends; add or extend a "
+            "window",
+            where="windows",
+        )
 
 
 def spread_displacements(frames: AnyInts, values: Floats, window: Window) -> Floats:

@@ -244,12 +244,16 @@ def _fail(
             f"the skeleton has no bone {excerpt(word[0])!r}; use the ASF that belongs to this AMC", code="unknown-bone"
         )
     if stopped == _REPEATED_BONE:
-        raise lines.error(f"the bone has a second line in frame {state[_NUMBER]}; remove one", joint=bone.name)
+        raise lines.error(
+            f"the bone {bone.name!r} has two lines in frame {state[_NUMBER]}; remove one", joint=bone.name
+        )
     if stopped == _WRONG_WIDTH:
         cut = state[_FOUND] < len(bone.channels) and not lines.data[state[_POSITION] :].strip(b"\r\n\t ").count(b"\n")
         raise lines.error(
-            f"the bone has {state[_FOUND]} values for {len(bone.channels)} degrees of freedom"
-            + ("; the file is cut off" if cut else ""),
+            f"the bone {bone.name!r} has {state[_FOUND]} values for {len(bone.channels)} degrees of freedom"
+            + (
+                "; the file is cut off, so copy or export it again" if cut else "; use the ASF that belongs to this AMC"
+            ),
             code="file-truncated" if cut else "frame-width",
             joint=bone.name,
         )
@@ -257,7 +261,8 @@ def _fail(
     missing = skeleton.bones[int(np.argmax(moving & (seen < state[_FRAME])))]
     at_end = not lines.data[state[_POSITION] :].strip()
     raise lines.error(
-        f"frame {state[_NUMBER]} has no line for this bone" + ("; the file is cut off" if at_end else ""),
+        f"frame {state[_NUMBER]} has no line for the bone {missing.name!r}"
+        + ("; the file is cut off, so copy or export it again" if at_end else "; add the line"),
         code="file-truncated" if at_end else "frame-width",
         joint=missing.name,
     )

@@ -116,7 +116,7 @@ class _HierarchyReader:
                 return self._checked()
             for piece in filter(None, map(bytes.strip, _BRACES.split(line))):
                 self._read_piece(piece)
-        raise self.lines.error("the file ends inside its HIERARCHY", code="file-truncated")
+        raise self.lines.error("the file ends inside its HIERARCHY; copy or export it again", code="file-truncated")
 
     def _read_piece(self, piece: bytes) -> None:
         if piece == b"{":
@@ -127,7 +127,8 @@ class _HierarchyReader:
             self.brace_due = False
         elif self.brace_due:
             raise self.lines.error(
-                f"the joint must be followed by {{, not {excerpt(piece)!r}", joint=self._joint_name()
+                f"the line of a joint or End Site must be followed by {{, not {excerpt(piece)!r}; add the brace",
+                joint=self._joint_name(),
             )
         elif piece == b"}":
             if not self.open:
@@ -163,7 +164,9 @@ class _HierarchyReader:
         if not self.open and keyword == b"JOINT":
             raise self.lines.error("this JOINT has no parent; the first joint must be a ROOT")
         if self.open and self.open[-1] == _END_SITE:
-            raise self.lines.error("an End Site must not contain a JOINT", joint=self._joint_name())
+            raise self.lines.error(
+                "an End Site must not contain a JOINT; move the JOINT out of it", joint=self._joint_name()
+            )
         if len(header.names) == MAX_JOINTS:
             raise FormatLimit(
                 f"the file has more than {MAX_JOINTS} joints", file=self.lines.file, line=self.lines.number
@@ -211,7 +214,7 @@ class _HierarchyReader:
                 f"CHANNELS declares {excerpt(words[0])} channels, but lists {len(names)}", joint=joint
             )
         if len(set(names)) != len(names):
-            raise self.lines.error("a channel is named twice", joint=joint)
+            raise self.lines.error("CHANNELS lists a channel twice; remove one", joint=joint)
         self.header.channels[self.open[-1]] = tuple(names)
 
     def _joint_name(self) -> str | None:
@@ -231,7 +234,9 @@ def _read_motion_header(lines: TextLines, header: BvhHeader) -> None:
         position, number = lines.position, lines.number
         line = next(iter(lines), None)
         if line is None:
-            raise lines.error("the file ends before 'Frames:' and 'Frame Time:'", code="file-truncated")
+            raise lines.error(
+                "the file ends before 'Frames:' and 'Frame Time:'; copy or export it again", code="file-truncated"
+            )
         if match := _FRAME_TIME.fullmatch(line):
             frame_time = lines.number_in(match[1], "Frame Time")
         elif match := _FRAMES.fullmatch(line):

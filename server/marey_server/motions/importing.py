@@ -288,8 +288,8 @@ def graph_draft(tx: Transaction, project: str, graph: ImportedGraph) -> Draft:
 def _entry(file: PreparedImport, published: Sequence[Published]) -> ImportEntry:
     made = {one.kind: one for one in published}
     kinds = [kind for kind in (Kind.CLIP, Kind.MODEL, Kind.GRAPH, Kind.SKELETON) if kind in made]
-    if not kinds:  # not a StopIteration: a future does not accept it, so the request would wait for ever
-        raise RuntimeError(f"the import of {file.name} published no clip, model, graph or skeleton")
+    if not kinds:  # a StopIteration of `next` would not be stored in the future, so the request would never end
+        raise RuntimeError(f"no clip, model, graph or skeleton was created from {file.name!r}; this is a server error")
     main = made[kinds[0]]
     skeleton = made.get(Kind.SKELETON)
     return ImportEntry(

@@ -209,7 +209,10 @@ def test_names_of_results_that_would_be_too_long_refuse_the_job(project: Project
     first, *others = project.inputs["clips"]
     project.inputs["clips"] = (first.model_copy(update={"name": 250 * "n"}), *others)
     refused = refusal(project, suffix="-aligned")
-    assert (refused.code, refused.detail[-43:]) == ("name-too-long", "has 258 characters; at most 255 are allowed")
+    assert refused.code == "name-too-long"
+    assert refused.detail.endswith(
+        "of 258 characters, but at most 255 are allowed; rename the clip, or give a shorter suffix"
+    )
 
 
 def test_clips_that_cannot_be_read_refuse_the_job(project: Project) -> None:

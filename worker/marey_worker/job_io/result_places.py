@@ -48,7 +48,8 @@ class ResultPlaces:
     def _require_free(self, kind: Kind, collection: str, name: str) -> None:
         if len(name) > MAX_NAME_LENGTH:
             raise MotionError(
-                f"the name {name!r} has {len(name)} characters; at most {MAX_NAME_LENGTH} are allowed",
+                f"the result would have the name {name!r} of {len(name)} characters, but at most {MAX_NAME_LENGTH} are "
+                "allowed; rename the input, or give a shorter suffix",
                 code="name-too-long",
             )
         if (kind, collection, name) in self._taken:

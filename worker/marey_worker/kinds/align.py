@@ -104,7 +104,8 @@ class _Job:
         if long:
             raise JobRefused(
                 "name-too-long",
-                f"the name {long[0]!r} has {len(long[0])} characters; at most {MAX_NAME_LENGTH} are allowed",
+                f"the result would have the name {long[0]!r} of {len(long[0])} characters, but at most "
+                f"{MAX_NAME_LENGTH} are allowed; rename the clip, or give a shorter suffix",
             )
 
     def _name(self, pin: PinnedInput, ending: str) -> str:

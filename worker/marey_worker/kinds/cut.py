@@ -136,7 +136,8 @@ class _Cutting:
         if long:
             raise JobRefused(
                 "name-too-long",
-                f"the name {long[0]!r} has {len(long[0])} characters; at most {MAX_NAME_LENGTH} are allowed",
+                f"the piece would have the name {long[0]!r} of {len(long[0])} characters, but at most "
+                f"{MAX_NAME_LENGTH} are allowed; rename the clip, or give a shorter label or pattern of names",
             )
 
     def _why_nothing(self, todo: Sequence[_AnnotatedClip]) -> str:

@@ -62,9 +62,7 @@ def why_redundant(removal: Removal, trials: int) -> str:
     else:
         direction = "increases" if change > 0 else "decreases"
         effect = f"the mean distance from the path {direction} by {100 * abs(change):.1f} cm"
-    return (
-        f"Without “{removal.name}” ({removal.seconds:.1f} s, used in {removal.trials} of {trials} trials), {effect}."
-    )
+    return f"Without “{removal.name}” ({removal.seconds:.1f} s, used in {removal.trials} of {trials} trials), {effect}."
 
 
 def why_duplicate(source: str, pair: NearDuplicate) -> str:
