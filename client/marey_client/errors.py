@@ -114,8 +114,11 @@ class RequestFailed(MareyError):
         self.anonymous = anonymous
 
     def __str__(self) -> str:
-        texts = (f"{field.pointer}: {field.detail}" for field in self.errors)
-        return "; ".join([self.detail, *(one for one in texts if one not in self.detail)])
+        whole = self.detail
+        for text in (f"{field.pointer}: {field.detail}" for field in self.errors):
+            if text not in self.detail:
+                whole += f" {text}" if whole.endswith(".") else f"; {text}"
+        return whole
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The other members come back as the instance's dictionary; so do notes.

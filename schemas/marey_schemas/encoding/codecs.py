@@ -216,11 +216,12 @@ def _most_lists(data: bytes) -> int:
 
 
 def _too_many_lists(data: bytes) -> CodecError:
-    return CodecError("too-large", "", f"{len(data)} bytes may contain at most {_most_lists(data)} objects and lists")
+    most = _most_lists(data)
+    return CodecError("too-large", "", f"the document of {len(data)} bytes has more than {most} objects and lists")
 
 
 def _too_many_values(pointer: str) -> CodecError:
-    return CodecError("too-large", pointer, f"more than {MAX_VALUES} values; numbers can be sent as arrays")
+    return CodecError("too-large", pointer, f"the document has more than {MAX_VALUES} values; send numbers as arrays")
 
 
 def _parse_bson(data: bytes) -> Any:

@@ -55,7 +55,8 @@ class Readyz(Resource):
         self.services.note_faults(faults)
         if faults:
             shown = self.principal is not None and self.principal.administrator
-            detail = "; ".join(faults) if shown else "The server is not ready; its log says what is missing."
+            reasons = " ".join(f"{fault[:1].upper()}{fault[1:]}." for fault in faults)
+            detail = f"The server is not ready. {reasons if shown else 'Its log gives the reason.'}"
             raise UnavailableProblem(detail, code="not-ready", headers={"Retry-After": "5"})
         return Reply(Health(status="ready"), headers={"Cache-Control": "no-store"})
 

@@ -256,7 +256,8 @@ def _form_options(form: dict[str, bytearray]) -> ImportOptions:
         return ImportOptions.model_validate(values)
     except ValidationError as error:
         faults = field_errors(error, values)
-        raise InvalidProblem(f"{faults[0].pointer}: {faults[0].detail}", code="invalid-form", errors=faults) from None
+        first = f"{faults[0].pointer or 'the form'}: {faults[0].detail}"
+        raise InvalidProblem(f"The form is not valid: {first}", code="invalid-form", errors=faults) from None
 
 
 def _stored_files(tx: Transaction, request: ImportRequest) -> list[SourceFile]:

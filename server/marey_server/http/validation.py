@@ -59,7 +59,9 @@ def _known_parameters(known: Mapping[str, Any]) -> str:
 
 def _bad_query(faults: list[FieldError]) -> BadRequestProblem:
     names = ", ".join(dict.fromkeys(fault.pointer for fault in faults))
-    return BadRequestProblem(f"Query parameters: {names}.", code="bad-query", errors=faults[:MAX_ERRORS])
+    return BadRequestProblem(
+        f"These query parameters are not valid: {names}.", code="bad-query", errors=faults[:MAX_ERRORS]
+    )
 
 
 def decode_body(
@@ -112,5 +114,7 @@ def survey(tree: Any, steps: tuple[str, ...] = ()) -> bool:
         return sum(survey(item, (*steps, str(index))) for index, item in enumerate(tree)) > 0
     if isinstance(tree, str) and "\0" in tree:
         fault = FieldError(pointer=json_pointer(steps), code="bad-text", detail="A text may not contain NUL.")
-        raise InvalidProblem(f"{fault.pointer}: {fault.detail}", code="bad-text", errors=[fault])
+        raise InvalidProblem(
+            f"The request body is not valid: {fault.pointer}: {fault.detail}", code="bad-text", errors=[fault]
+        )
     return isinstance(tree, np.ndarray | EncodedArray)

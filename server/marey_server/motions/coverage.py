@@ -349,8 +349,9 @@ def refusing(field: str) -> Iterator[None]:
         ) from error
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        detail = ": ".join((*map(str, first["loc"]), without_prefix(first["msg"])))
-        raise InvalidProblem(f"{field}: {detail}", errors=[_fault(f"/{field}", "invalid", detail)]) from error
+        detail = ": ".join(filter(None, (".".join(map(str, first["loc"])), without_prefix(first["msg"]))))
+        fault = _fault(f"/{field}", "invalid", detail)
+        raise InvalidProblem(f"The request is not valid: {fault.pointer}: {detail}", errors=[fault]) from error
 
 
 def _fault(pointer: str, code: str, detail: str) -> FieldError:

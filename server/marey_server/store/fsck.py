@@ -352,7 +352,7 @@ def find_faults(tx: Transaction) -> list[str]:
     """Return descriptions, for the operator, of faults that prevent the server from serving requests."""
     faults = []
     if not schema_at_head(tx.connection):
-        faults.append("the database's tables are not those of this version: run `marey db upgrade`")
+        faults.append("the tables of the database are not those of this version of the server; run `marey db upgrade`")
     try:
         tx.blobs.check_writable()
     except OSError as error:

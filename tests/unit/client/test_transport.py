@@ -188,7 +188,7 @@ def test_errors_survive_the_way_from_one_process_to_another(script: ScriptedServ
     with pytest.raises(errors.Invalid) as refused:
         script.marey().project("lab").read()
     again = pickle.loads(pickle.dumps(refused.value))
-    assert (str(again), again.code, again.anonymous) == ("No.; /name: too long", "invalid", False)
+    assert (str(again), again.code, again.anonymous) == ("No. /name: too long", "invalid", False)
     ended = pickle.loads(pickle.dumps(errors.JobUnsuccessful("it failed", {"id": "job_1"})))
     assert (str(ended), ended.job) == ("it failed", {"id": "job_1"})
 
