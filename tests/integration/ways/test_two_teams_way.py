@@ -151,7 +151,9 @@ def test_a_push_changes_no_branch_that_has_other_versions_and_no_tag(
     head = studio.datasets.at("gaits").at()
     assert answer == {"commit": head.digest, "branch": "main", "moved": False, "tag": None}
     assert [partner.datasets.at("gaits").at(version) for version in ("main", "v1")] == [theirs] * 2
-    assert "was not moved; to merge them, run marey dataset merge lab/gaits@" in told("marey dataset push lab/gaits --to $PARTNER")
+    pushed = told("marey dataset push lab/gaits --to $PARTNER")
+    assert "was not moved; to merge them, run marey dataset merge lab/gaits@" in pushed
+    assert "--into main --server http" in pushed
     told("marey dataset push lab/gaits --to $PARTNER --branch studio")
     assert partner.datasets.at("gaits").at("studio").digest == head.digest
 

@@ -258,7 +258,7 @@ class TestRefusals:
             ),
             (bvh().replace(b"CHANNELS 3 Zrotation", b"CHANNELS 3 Zscale"), 9, "Arm", "Zscale"),
             (bvh().replace(b"JOINT Arm", b"BONE Arm"), 6, "Hips", "BONE"),
-            (bvh().replace(b"JOINT Arm\n  {", b"JOINT Arm\n"), 8, "Arm", "the line of a joint or End Site must be followed by {, not"),
+            (bvh().replace(b"JOINT Arm\n  {", b"JOINT Arm\n"), 8, "Arm", "must be followed by {, not"),
             (bvh().replace(b"JOINT Arm\n  {", b"JOINT Arm\n  {\n{"), 8, "Arm", "this { does not follow"),
             (bvh(hierarchy=ARM + ARM.replace("HIERARCHY\n", "")), 16, None, "second ROOT"),
             (ARM.encode(), 15, None, "ends"),

@@ -99,7 +99,8 @@ def pin_inputs(
             _error(f"{at}/inputs", "too-many", f"The job has {total} inputs; at most {MOST_INPUTS} are allowed.")
         )
     if errors:
-        raise InvalidProblem(f"{errors[0].pointer}: {errors[0].detail}", errors=errors[:100])
+        first = f"{errors[0].pointer}: {errors[0].detail}"
+        raise InvalidProblem(f"The inputs of the job are not valid: {first}", errors=errors[:100])
     return pins
 
 
@@ -108,13 +109,16 @@ def _misnamed(kind: KindDeclaration, request: JobCreate, at: str) -> list[FieldE
         _error(
             f"{at}/inputs/{_escaped(name)}",
             "unknown-input",
-            f"{kind.name} has no input {name!r}; it has {', '.join(map(repr, kind.inputs)) or 'none'}.",
+            f"Jobs of the kind {kind.name} have no input {name!r}; their inputs are "
+            f"{', '.join(map(repr, kind.inputs)) or 'none'}.",
         )
         for name in request.inputs
         if name not in kind.inputs
     ]
     lacking = [
-        _error(f"{at}/inputs", "missing-input", f"{kind.name} needs the input {name!r}: {spec.description}")
+        _error(
+            f"{at}/inputs", "missing-input", f"Jobs of the kind {kind.name} need the input {name!r}: {spec.description}"
+        )
         for name, spec in kind.inputs.items()
         if spec.required and name not in request.inputs
     ]

@@ -161,7 +161,7 @@ def _target(
 def _count_tasks(kind: KindDeclaration, params: Any, at: str) -> int:
     count = 1 if kind.task_count is None else kind.task_count(params)
     if not 1 <= count <= MOST_TASKS:
-        detail = f"These parameters make {count} tasks; {kind.name} takes 1 to {MOST_TASKS}."
+        detail = f"These parameters divide the job into {count} tasks; 1 to {MOST_TASKS} are allowed."
         raise _invalid(f"{at}/params", "too-many-tasks", detail)
     return count
 
