@@ -111,6 +111,14 @@ _READINGS = (
 )
 
 
+_COVERAGE = (
+    "The data is measured in windows of one second, one for each frame, by their mean speed and turn rate. Each "
+    "trial has a cell around its speed and turn rate. A cell has enough data if its windows sum up to the number of "
+    "seconds that the options require. Symmetry is 1 if left and right turns are covered equally, and 0 if only one "
+    "side is covered."
+)
+
+
 def definitions() -> Html:
     """Write the definitions of metrics, the rules of the verdict, and our interpretation of every ambiguous formula."""
     metrics = [
@@ -134,13 +142,7 @@ def definitions() -> Html:
                 f"The share of followed trajectories determines the grade: {grades}, below that {GRADES[-1][1]}.",
             ),
             element("h3", "Coverage"),
-            element(
-                "p",
-                "The data is measured in windows of one second, one for each frame, by their mean speed and turn rate. "
-                "Each trial has a cell around its speed and turn rate. A cell has enough data if its windows sum up to "
-                "the number of seconds that the options require. Symmetry is 1 if left and right turns are covered "
-                "equally, and 0 if only one side is covered.",
-            ),
+            element("p", _COVERAGE),
             element("h3", "Metrics"),
             table(
                 "Definitions of the metrics",

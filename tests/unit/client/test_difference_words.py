@@ -44,7 +44,7 @@ def test_the_heading_names_both_items() -> None:
     [
         ("removed", (0, 12), (0, 0), "trimmed: first 12 frames removed (0.20 s)"),
         ("removed", (239, 240), (239, 239), "trimmed: last 1 frame removed (0.02 s)"),
-        ("removed", (60, 90), (60, 60), "30 frames removed between 1.00 s and 1.50 s of the revision before"),
+        ("removed", (60, 90), (60, 60), "30 frames removed between 1.00 s and 1.50 s of the earlier revision"),
         ("inserted", (0, 0), (0, 6), "extended: first 6 frames inserted (0.10 s)"),
         ("inserted", (240, 240), (180, 240), "extended: last 60 frames inserted (1.00 s)"),
         ("inserted", (60, 60), (60, 90), "30 frames inserted between 1.00 s and 1.50 s"),

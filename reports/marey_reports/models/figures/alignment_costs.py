@@ -86,9 +86,8 @@ def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None
     ]
     caption = (
         "Distance between the poses of a clip and of the reference, after the best turn and shift on the floor, for "
-        f"every pair of moments; the line is the path of the alignment: {'; '.join(parts)}. A path along a light "
-        "valley, without long horizontal or vertical parts, is a good alignment. Clips are reconstructed from their "
-        "aligned form."
+        f"every pair of moments; the line is the path of the alignment: {'; '.join(parts)}. In a good alignment, it "
+        "follows a light valley, without long horizontal or vertical parts. Clips are rebuilt from their aligned form."
     )
     table = {
         "clip": [view.clip.uid for view in views for _ in range(aligned.frame_count)],
