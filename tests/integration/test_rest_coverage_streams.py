@@ -189,7 +189,7 @@ def test_it_goes_on_from_what_an_evaluation_found(owner: httpx.Client) -> None:
         ([[5.0]], 1.0, "1 cells"),
         ([[5.0], [-1.0]], 1.0, "coverage: seconds: the value of each cell"),
         ([[5.0], [1e300]], 1.0, "coverage: seconds: the value of each cell"),
-        ([[5.0], [1.0]], 0.0, "options: coverage_least_s"),
+        ([[5.0], [1.0]], 0.0, "options.coverage_least_s"),
         (None, 1.0, "coverage: Field required"),
     ],
 )

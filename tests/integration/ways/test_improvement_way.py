@@ -36,7 +36,7 @@ def test_without_all_that_can_go_no_trial_changes(lab: ProjectHandle, run: Comma
     unused = {clip["clip"] for clip in first.clips() if clip["ticks"] == 0}
     assert names
     assert set(names) <= unused
-    assert "Can be removed without any change" in told
+    assert "can be removed without changing any trial." in told
     kept = [clip for clip in lab.clips.list() if clip.path not in names]
     evaluated(lab, kept, name="second", normaliser=first.id)
 
