@@ -198,8 +198,8 @@ def _cancel(tx: Transaction, which: ColumnElement[bool], policy: QueuePolicy) ->
         )
         .returning(*ENDED_COLUMNS)
     ).all()
-    running = [row for row in rows if row.state == "running"]
-    emit_job_events(tx, "job.cancel_requested", [(row.project_id, row.id, {}) for row in running])
+    still_running = [row for row in rows if row.state == "running"]
+    emit_job_events(tx, "job.cancel_requested", [(row.project_id, row.id, {}) for row in still_running])
     return rows
 
 
