@@ -102,9 +102,7 @@ def suggest(
     candidates: From = None,
     remove_out: Annotated[
         Path | None,
-        typer.Option(
-            help="File for the paths, one per line, of the clips whose removal has no effect on the trials."
-        ),
+        typer.Option(help="File for the paths, one per line, of the clips whose removal has no effect on the trials."),
     ] = None,
     wait: Wait = True,
     as_json: AsJson = False,

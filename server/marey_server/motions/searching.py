@@ -45,7 +45,7 @@ class FoundSearchable:
 
     @property
     def key(self) -> SearchableKey:
-        """The digests of the model, its tree and its mapping; a tree or mapping that does not exist has the digest ""."""
+        """The digests of the model, its tree and its mapping; "" for a tree or mapping that does not exist."""
         tree, mapping = ("" if part is None else part.digest for part in (self.tree, self.mapping))
         return self.model.part.digest, tree, mapping
 

@@ -303,7 +303,11 @@ def protect(
     ] = 0,
     checks: Annotated[
         list[str] | None,
-        typer.Option("--check", metavar="NAME", help="Name of a check that must succeed before a merge; repeat the option for several."),
+        typer.Option(
+            "--check",
+            metavar="NAME",
+            help="Name of a check that must succeed before a merge; repeat the option for several.",
+        ),
     ] = None,
     up_to_date: Annotated[
         bool, typer.Option("--up-to-date", help="Merge a proposal only if it contains the newest commit of the branch.")

@@ -148,7 +148,7 @@ def reweighted(database: MatchingDatabase, weights: FeatureWeights) -> MatchingD
 
     Raises
     ------
-    MotionError    if a group has another weight than before, and its weight was 0, because a weight of 0 loses its scale
+    MotionError    if the weight of a group changes from 0, because its scale is then unknown
     """
     options = database.options.model_copy(update={"weights": weights})
     scale = database.normaliser.scale.copy()
