@@ -14,7 +14,14 @@ from marey_client.blobs import Blobs
 from marey_client.errors import ArchiveInUse, NothingToArchive, UnexpectedAnswer
 from marey_client.transport import BLOCKS, MAX_ANSWER_BYTES, as_json
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
-from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent
+from marey_schemas.datasets.contents import (
+    MOST_CHECKED,
+    MOST_CONTENTS,
+    ArchiveCheck,
+    ArchivePermission,
+    ContentsRequest,
+    PartOfContent,
+)
 from marey_schemas.documents.blob_references import references_of
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import canonical_json, detach_arrays
@@ -37,6 +44,10 @@ MOST_LISTED = 10_000
 
 OnProgress = Callable[[str, int, int | None], None]
 """Function called with the current activity, the amount done, and the total amount if it is known."""
+
+
+CheckContents = Callable[[Sequence[str]], None]
+"""Function called with content digests of revisions before their documents are read."""
 
 
 class DatasetReader(Protocol):
@@ -68,12 +79,19 @@ class DatasetReader(Protocol):
 
 
 def write_archive(
-    dataset: DatasetReader, version: str, path: Path, on_progress: OnProgress, *, since: Sequence[str] = ()
+    dataset: DatasetReader,
+    version: str,
+    path: Path,
+    on_progress: OnProgress,
+    *,
+    since: Sequence[str] = (),
+    check: CheckContents,
 ) -> Commit:
     """Write an archive of a version and check it; the versions `since` and all versions before them are left out.
 
-    An interrupted call leaves a file whose name ends in `.part`; the next call continues this file. Raises
-    `ArchiveInUse` if another process is writing the file, and `NothingToArchive` if no version is left.
+    Before the documents of revisions are read, `check` is called with the content digests of these revisions, and may
+    raise an error. An interrupted call leaves a file whose name ends in `.part`; the next call continues this file.
+    Raises `ArchiveInUse` if another process is writing the file, and `NothingToArchive` if no version is left.
     """
     head = dataset.at(version)
     bases = [dataset.at(one) for one in since]
@@ -84,7 +102,7 @@ def write_archive(
         tempfile.TemporaryDirectory(dir=part.parent) as folder,
     ):
         _lock(file, part)
-        _Making(dataset, ArchiveWriter(file), Path(folder), on_progress).run(head, bases)
+        _Making(dataset, ArchiveWriter(file), Path(folder), on_progress, check).run(head, bases)
         try:
             check_archive(Archive(file), lambda done, of: on_progress("checking", done, of))
         except BadArchive as error:
@@ -96,6 +114,22 @@ def write_archive(
         os.fsync(file.fileno())
     part.replace(path)
     return head
+
+
+def check_consents(dataset: DatasetReader, reason: str | None, contents: Sequence[str]) -> None:
+    """Check that revisions, given by content digest, may be exported to an archive.
+
+    Raises `Conflict` if the consent for a clip has ended, unless a `reason` to export it nevertheless is given, which
+    the server records.
+    """
+    for start in range(0, len(contents), MOST_CHECKED):
+        request = ArchiveCheck(
+            contents=tuple(contents[start : start + MOST_CHECKED]),
+            allow_expired_consent=reason is not None,
+            consent_reason=reason,
+        )
+        url = f"{dataset.project_url}/datasets/{dataset.name}/archive-checks"
+        dataset.transport.post(ArchivePermission, url, request)
 
 
 def short_name(commits: Iterable[str]) -> str:
@@ -120,6 +154,7 @@ class _Making:
     folder: Path
     """Folder for files on their way from the server into the archive."""
     on_progress: OnProgress
+    check: CheckContents
     known: set[str] = field(default_factory=set)
     """Content digests of the revisions that the archive has, or will have."""
     documents: dict[str, PartOfContent] = field(default_factory=dict)
@@ -137,6 +172,7 @@ class _Making:
         for done, commit in enumerate(commits):
             self.on_progress("reading versions", done, len(commits))
             self._add_commit(commit, unchanged=bool(bases))
+        self.check(sorted(self.known))
         self._add_documents(self.documents)
         parents = {parent for commit in commits for parent in commit.parents}
         self.writer.finish(self.dataset.name, head.digest, sorted(parents & before.keys()))
@@ -250,6 +286,7 @@ class _Making:
         """Add revisions to which documents refer, given by content digest, and the documents of these revisions."""
         waiting = sorted(contents)
         self.known.update(waiting)
+        self.check(waiting)
         for start in range(0, len(waiting), MOST_CONTENTS):
             some = waiting[start : start + MOST_CONTENTS]
             found = self._ask(ContentsRequest(revisions=tuple(some)))["revisions"]

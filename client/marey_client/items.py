@@ -155,12 +155,17 @@ class ItemHandle:
         format: str = "original",  # noqa: A002
         revision: int | None = None,
         beside: TakenPaths | None = None,
+        allow_expired_consent: str | None = None,
         **options: str | None,
     ) -> Path:
         """Write a revision of the item, by default the newest, to `folder` as a file of `format`; return its path.
 
-        If several items are exported with the same `beside`, files of the same name get numbers.
+        If several items are exported with the same `beside`, files of the same name get numbers. If the consent for a
+        clip has ended, raises `Conflict`, unless `allow_expired_consent` gives the reason why the clip is exported
+        nevertheless. The server records the reason; the caller must be a maintainer or owner.
         """
+        if allow_expired_consent is not None:
+            options |= {"allow_expired_consent": "true", "consent_reason": allow_expired_consent}
         return download(
             self.transport,
             f"{self.url}/export",

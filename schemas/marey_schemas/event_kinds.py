@@ -22,6 +22,7 @@ ProjectEventKind = Literal[
     "item.changed",
     "item.deleted",
     "item.restored",
+    "consent.overridden",
     "dataset.created",
     "dataset.deleted",
     "branch.created",

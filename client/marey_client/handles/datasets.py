@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypedDict, Unpack
 
@@ -336,6 +337,7 @@ class DatasetHandle:
         version: str = MAIN,
         *,
         since: str | Sequence[str] | None = None,
+        allow_expired_consent: str | None = None,
         on_progress: OnProgress = _silent,
     ) -> Commit:
         """Write a version, all versions before it, and everything that they contain to one file.
@@ -343,11 +345,15 @@ class DatasetHandle:
         Return the commit of the version. The file exists only when it is complete and checked; the next call continues
         an interrupted one. The versions `since` and all before them are left out; the archive can then be imported only
         into datasets that have the versions `since`. Raises `NothingToArchive` if no version is left.
+
+        If the consent for a clip has ended, raises `Conflict`, unless `allow_expired_consent` gives the reason why the
+        clip is exported nevertheless. The server records the reason; the caller must be a maintainer or owner.
         """
-        from marey_client.archives import write_archive
+        from marey_client.archives import check_consents, write_archive
 
         bases = () if since is None else (since,) if isinstance(since, str) else since
-        return write_archive(self, version, Path(path), on_progress, since=bases)
+        check = partial(check_consents, self, allow_expired_consent)
+        return write_archive(self, version, Path(path), on_progress, since=bases, check=check)
 
     def receive(self, archive: Archive, *, into: str = MAIN, on_progress: OnProgress = _silent) -> ImportedVersion:
         """Record the versions of an archive without checking it, and move the branch `into` to the newest of them.

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, StringConstraints
 
 from marey_schemas.base import Answer, Request
+from marey_schemas.consents import ConsentOverride
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, EntryPath
 from marey_schemas.datasets.naming import RefName
 from marey_schemas.kinds import Kind
@@ -15,6 +16,8 @@ from marey_schemas.names import Digest, Message, Tag
 
 MOST_CONTENTS = 256
 """Greatest number of revisions, and of documents, in one request."""
+MOST_CHECKED = 500
+"""Greatest number of revisions in one request that checks whether they may be written to an archive."""
 MOST_RECEIVED_CHANGES = 200_000
 """Greatest number of entries that a commit from elsewhere may change."""
 
@@ -40,6 +43,22 @@ class ContentsRequest(Request):
 
     revisions: tuple[Digest, ...] = Field((), max_length=MOST_CONTENTS)
     documents: tuple[PartOfContent, ...] = Field((), max_length=MOST_CONTENTS)
+
+
+class ArchiveCheck(ConsentOverride):
+    """Question whether the clips of an archive may be exported; a large archive is checked by several requests."""
+
+    contents: tuple[Digest, ...] = Field(
+        min_length=1, max_length=MOST_CHECKED, description="Content digests of revisions that the archive will contain."
+    )
+
+
+class ArchivePermission(Answer):
+    """Permission to write revisions to an archive."""
+
+    consent_ended: int = Field(
+        description="Number of items whose consent has ended, and whose export the request allows."
+    )
 
 
 class ReceivedRevision(Request):

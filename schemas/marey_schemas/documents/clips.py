@@ -6,12 +6,14 @@ Lengths are metres, times seconds, quaternions w,x,y,z; axes are right-handed wi
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from datetime import date
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, StringConstraints, model_validator
+from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from marey_schemas.base import Request
 from marey_schemas.documents.references import OutputRef as OutputRef
@@ -90,17 +92,37 @@ class ClipSource(Request):
     )
 
 
+_DAY = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
+
+
+def _require_day(value: object) -> object:
+    """Return the value; raise ValueError unless it is a date or has the form of one.
+
+    Documents are stored as they were sent, and days are compared as texts.
+    """
+    is_day = _DAY.fullmatch(value) if isinstance(value, str) else type(value) is date
+    if is_day:
+        return value
+    raise ValueError("write the day as in 2026-11-23")
+
+
+Day = Annotated[date, BeforeValidator(_require_day)]
+"""Day as in 2026-11-23."""
+
+
 class TakeRecord(Request):
     """Facts about the recording that a clip comes from; lists of clips show them, and queries can filter by them."""
 
     subject: str | None = Field(None, description="Performer, under a pseudonym.")
     action: str | None = Field(None, description="What the performer does.")
     take: str | None = Field(None, max_length=64, description="Take, as the studio numbers it.")
-    shoot_day: date | None = Field(None, description="Day of the recording.")
+    shoot_day: Day | None = Field(None, description="Day of the recording.")
     select: Literal["best", "good", "no good"] | None = Field(None, description="Rating of the take by the director.")
     licence: str | None = Field(None, description="Licence of the recording.")
     capture_system: str | None = Field(None, description="System that recorded the motion.")
-    consent_until: date | None = Field(None, description="Last day of the performer's consent.")
+    consent_until: Day | None = Field(
+        None, description="Last day of the performer's consent; clips are not exported after this day, in UTC."
+    )
 
 
 class ClipInfo(TakeRecord):
@@ -114,3 +136,15 @@ class ClipInfo(TakeRecord):
     comment: str | None = None
     source: ClipSource | None = None
     checks: tuple[Check, ...] = ()
+
+    def with_consent_of(self, others: Iterable[ClipInfo]) -> Self:
+        """Return this description with the strictest consent of it and `others`, whose motion the clip also contains.
+
+        The last day is the earliest one of all. The purposes are those that all clips which record purposes have in
+        common.
+        """
+        infos = (self, *others)
+        days = [one.consent_until for one in infos if one.consent_until is not None]
+        purposes = [one.consent_for for one in infos if one.consent_for is not None]
+        common = tuple(one for one in purposes[0] if all(one in each for each in purposes)) if purposes else None
+        return self.model_copy(update={"consent_until": min(days, default=None), "consent_for": common})

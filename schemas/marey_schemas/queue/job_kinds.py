@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from marey_schemas.base import Request
+from marey_schemas.consents import ConsentOverride
 from marey_schemas.formats import IMPORTED
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.queue import job_params
@@ -55,6 +56,11 @@ class KindDeclaration:
     `named_after` is the input whose items determine the names and relative collections of the results; the parameter
     `suffix` is appended to the names. `unclear_place` is a function of the parameters and a collection; it returns why
     these do not determine the place of the results, or None if they do.
+
+    `exports` is the input whose clips the job writes to files. Its parameters then extend `ConsentOverride`. The job
+    must refuse the clips of this input that have `consent_ended`, unless `allow_expired_consent` is true, and list the
+    ids of all of them as `consent_ended` in its result. The results of an identical job are reused only if the consent
+    has ended for the same clips.
     """
 
     name: str
@@ -76,18 +82,21 @@ class KindDeclaration:
     never_cached_for: Callable[[Mapping[str, Any]], bool] | None = None
     named_after: str | None = None
     unclear_place: Callable[[Any, str], str | None] | None = None
+    exports: str | None = None
 
     def __post_init__(self) -> None:
         if self.fan_out is not None and not (self.fan_out in self.inputs and self.inputs[self.fan_out].many):
             raise ValueError(
                 f"job kind {self.name}: fan_out names {self.fan_out!r}, which must be an input that takes many items"
             )
-        for name in (*self.never_cached_without, *filter(None, [self.named_after])):
+        for name in (*self.never_cached_without, *filter(None, [self.named_after, self.exports])):
             if name not in self.inputs:
                 raise ValueError(
-                    f"job kind {self.name}: never_cached_without and named_after must name inputs of the kind, "
-                    f"and {name!r} is none of them"
+                    f"job kind {self.name}: never_cached_without, named_after and exports must name inputs of the "
+                    f"kind, and {name!r} is none of them"
                 )
+        if self.exports is not None and not issubclass(self.params, ConsentOverride):
+            raise ValueError(f"job kind {self.name}: the parameters of a kind with exports must extend ConsentOverride")
         for name in (*self.newest_of, *filter(None, [self.in_place])):
             if name not in self.params.model_fields:
                 raise ValueError(
@@ -190,9 +199,10 @@ EXPORT = KindDeclaration(
     description="Exports clips as files of one format in one archive.",
     params=job_params.ExportParams,
     implementation="marey_worker.kinds.export:run",
-    version=3,
+    version=4,
     inputs={"clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to export.")},
     outputs={"archive": "file"},
+    exports="clips",
 )
 
 EVALUATE = KindDeclaration(
@@ -278,7 +288,7 @@ EDIT = KindDeclaration(
     description="Applies the commands of an edit to clips: trims, joins, smooths, places and repairs them.",
     params=job_params.EditParams,
     implementation="marey_worker.kinds.edit:run",
-    version=2,
+    version=3,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to edit."),
         "edit": InputSpec(

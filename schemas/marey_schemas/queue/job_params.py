@@ -8,6 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from marey_schemas.base import Request
+from marey_schemas.consents import ConsentOverride
 from marey_schemas.editing.edits import MOST_COMMANDS, EditCommand
 from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, ExportFormat, WrittenUnit
 from marey_schemas.imports import ImportFile
@@ -282,7 +283,7 @@ class RetargetParams(SuffixedResults):
     )
 
 
-class ExportParams(Request):
+class ExportParams(ConsentOverride):
     """Parameters of jobs of the kind `export`: one archive of files."""
 
     format: ExportFormat = Field(DEFAULT_FORMAT, description="Format of the files.")

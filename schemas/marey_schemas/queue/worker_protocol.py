@@ -53,6 +53,11 @@ class PinnedInput(Answer):
     )
 
     commit: str | None = Field(None, description="Commit of a dataset from which the input was taken.")
+    consent_ended: str | None = Field(
+        None,
+        description="Last day of the performer's consent, if the job would write the input to a file and this day has "
+        "passed, by the clock of the server in UTC.",
+    )
 
     @property
     def folder(self) -> str:

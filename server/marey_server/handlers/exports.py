@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from marey_schemas.base import Request
+from marey_schemas.consents import ConsentOverride
 from marey_schemas.formats import (
     DEFAULT_END_INDEX,
     DEFAULT_FORM,
@@ -28,9 +28,10 @@ from marey_server.motions import exporting
 from marey_server.motions.child import ComputedFile
 from marey_server.motions.exporting import ExportTime
 from marey_server.motions.predecessor_exports import PredecessorOptions
+from marey_server.store import items
 
 
-class ExportQuery(Request):
+class ExportQuery(ConsentOverride):
     """Query parameters of an export: the format and the options of the file."""
 
     format: ExportFormat = Field("original", description="File format; original: the file exactly as it was imported.")
@@ -82,18 +83,25 @@ class Export(BlobSender):
         and graphs can be returned as predecessor and json; items of other kinds only as json. The formats called
         predecessor are those of Marey's predecessor: an unchanged item that was imported from such a file is returned
         as that file.
+
+        If the consent for a clip has ended, the export is refused (409, `consent-expired`). The take record of the
+        newest revision counts; for an aligned clip, that of its source clip. Maintainers can allow the export with
+        `allow_expired_consent` and a reason.
         """
         place = (project, kind_of(kind), item, query.revision)
         options = PredecessorOptions(query.end_index, query.form, query.part, query.layout)
         options.require_part_of(place[1])
+        permitted = query.allow_expired_consent
+        if permitted:
+            await self.change(items.permit_export, *place[:3], query)
         if query.format == "original":
-            original = await self.look_up(exporting.find_original, *place, options)
+            original = await self.look_up(exporting.find_original, *place, options, permitted=permitted)
             return await self.send_blob(original.digest, disposition=attachment(original.name))
         if query.format == "predecessor":
             unchanged = await self.look_up(exporting.find_unchanged_original, *place, options)
             if unchanged is not None:
                 return await self.send_blob(unchanged.digest, disposition=attachment(unchanged.name))
-        source = await self.look_up(exporting.read_source, *place)
+        source = await self.look_up(exporting.read_source, *place, permitted=permitted)
         order = partial(exporting.export_order, source, query.format, query.unit, query.time, options)
         file = await self.compute_apart(exporting.EXPORT_ITEM, order, ComputedFile.unpack)
         headers = {"Content-Disposition": attachment(file.name), "Cache-Control": "private, no-cache"}

@@ -48,9 +48,17 @@ class ExportOrder(Message):
         )  # fmt: skip
 
 
-def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ItemToExport:
-    """Return an item with all documents that a file format may need. Raises `NotFoundProblem`."""
+def read_source(
+    tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None, *, permitted: bool
+) -> ItemToExport:
+    """Return an item with all documents that a file format may need.
+
+    `permitted` says that the export is allowed even if the consent for the clip has ended. Raises `NotFoundProblem`,
+    and `ConflictProblem` if the consent has ended.
+    """
     found = items.read_item(tx, project, kind, item_id)
+    if kind in WITH_MOTION and not permitted:
+        items.require_consent(items.find_ended_consents(tx, [item_id]).values())
     number = found.revision if revision is None else revision
     held = items.read_revision(tx, project, kind, item_id, number).parts
     parts = {part: items.read_part(tx, project, kind, item_id, part, revision=number).tree for part in sorted(held)}
@@ -82,11 +90,19 @@ def find_unchanged_original(
 
 
 def find_original(
-    tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None, options: PredecessorOptions
+    tx: Transaction,
+    project: str,
+    kind: Kind,
+    item_id: str,
+    revision: int | None,
+    options: PredecessorOptions,
+    *,
+    permitted: bool,
 ) -> OriginalFile:
     """Return the file that a clip, a model, a model's tree or a graph was imported from.
 
-    Raises `NotFoundProblem` if the item was not imported from a file, or if a model, tree or graph was changed since.
+    `permitted` is as for `read_source`. Raises `NotFoundProblem` if the item was not imported from a file, or if a
+    model, tree or graph was changed since, and `ConflictProblem` if the consent for the clip has ended.
     """
     if kind in (Kind.MODEL, Kind.GRAPH):
         asked = PredecessorOptions(part=options.part)  # in whatever layout it came
@@ -95,6 +111,8 @@ def find_original(
             return unchanged
     if kind is Kind.CLIP:
         info = items.read_part(tx, project, kind, item_id, "info", revision=revision, arrays="none").tree
+        if not permitted:
+            items.require_consent(items.find_ended_consents(tx, [item_id]).values())
         if (original := original_of_clip(item_id, info)) is not None:
             return original
     raise NotFoundProblem(

@@ -50,6 +50,7 @@ class _Editing:
         self._refusals = Refusals(context)
         self._places = ResultPlaces(context)
         self._findings: list[dict[str, Any]] = []
+        self._source_infos: list[ClipInfo] = []
         if (unclear := params.unclear_place(context.into)) is not None:
             raise JobRefused("ambiguous-place", unclear)
         self._edit_pin, self._edit = _wanted_edit(context, params)
@@ -81,8 +82,9 @@ class _Editing:
     def _read_sources(self) -> dict[str, Clip]:
         pins = tuple(self._source_pins.values())
         sources = {}
-        for pin, tree in self._context.documents(pins, "motion"):
-            motion = MotionDocument.model_validate(tree)
+        for pin, (tree, info) in self._context.documents_of_each(pins, "motion", "info"):
+            motion = MotionDocument.model_validate(present(pin, tree))
+            self._source_infos += [] if info is None else [ClipInfo.model_validate(info)]
             try:
                 sources[pin.item] = documents.clip_from_document(motion, self._body(motion).skeleton)
             except MotionError as error:
@@ -152,16 +154,17 @@ class _Editing:
         return self._bodies[used]
 
     def _info(self, pin: PinnedInput, stored: dict[str, Any] | None) -> ClipInfo:
-        """Return the part `info` of a result: the part `info` of the clip without its checks, and the applied edit."""
+        """Return the part `info` of a result: the part `info` of the clip without its checks, and the applied edit.
+
+        The consent is the strictest one of the clip and of the clips that the commands name.
+        """
         edit = None if self._edit_pin is None else self._edit_pin.as_input().model_dump()
         done = {
             "clip": pin.as_input().model_dump(),
             "edit": edit,
             "commands": [command.command for command in self._edit.commands],
         }
-        if stored is None:
-            return ClipInfo(source=ClipSource(format="edited", details=done))
-        known = ClipInfo.model_validate(stored)
+        known = (ClipInfo() if stored is None else ClipInfo.model_validate(stored)).with_consent_of(self._source_infos)
         source = ClipSource(format="edited", details=done)
         if self._params.in_place and known.source is not None:
             # It is still the clip of that file; only its motion is another.

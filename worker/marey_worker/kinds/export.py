@@ -10,6 +10,7 @@ from marey_motion import documents
 from marey_motion.errors import MotionError
 from marey_motion.exporting import write_motion_file
 from marey_motion.skeleton import Skeleton
+from marey_schemas.consents import CONSENT_EXPIRED, CONSENT_REMEDY
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.reports import StoredFile
 from marey_schemas.documents.skeletons import SkeletonHierarchy
@@ -33,13 +34,17 @@ class _File(NamedTuple):
 def run(context: Context, params: ExportParams) -> dict[str, Any]:
     """Write the clips of the job to an archive; the result names it, and lists the clips that cannot be written.
 
-    Raises `JobRefused` if no clip can be written.
+    The result also lists the clips whose consent has ended: these are written only if the parameters of the job allow
+    it. Raises `JobRefused` if no clip can be written.
     """
     exporting = _Exporting(context, params)
     archive = context.scratch / "archive.zip"
-    refused: list[dict[str, Any]] = []
     written: set[str] = set()
-    pins = sorted(context.inputs["clips"], key=lambda pin: (pin.collection, pin.name, pin.item))
+    given = sorted(context.inputs["clips"], key=lambda pin: (pin.collection, pin.name, pin.item))
+    ended = [pin for pin in given if pin.consent_ended is not None]
+    barred = set() if params.allow_expired_consent else {pin.item for pin in ended}
+    pins = [pin for pin in given if pin.item not in barred]
+    refused = [_refusal(pin, CONSENT_EXPIRED, _end_of_consent(pin)) for pin in ended if pin.item in barred]
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as target:
         parts = ("info",) if params.format == "original" else ("info", "motion")
         for done, (pin, (info, *motion)) in enumerate(context.documents_of_each(pins, *parts)):
@@ -47,18 +52,22 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
             try:
                 file = exporting.file_of(pin, info or {}, *motion)
             except (MotionError, NoSuchThing) as error:
-                refused.append({"name": _place(pin), "item": pin.item, "code": error.code, "detail": str(error)})
+                refused.append(_refusal(pin, error.code, str(error)))
                 continue
             name = _free_name(pin, file.name, written)
             written.add(name)
             target.writestr(_entry(name), file.data)
     if not written:
-        raise JobRefused(
-            "nothing-to-export", f"none of {counted(len(pins), 'clip')} can be exported in the format {params.format}"
-        )
+        what = f"none of {counted(len(given), 'clip')} can be exported in the format {params.format}"
+        raise JobRefused("nothing-to-export", f"{what}; {refused[0]['name']}: {refused[0]['detail']}")
     size = archive.stat().st_size
     stored = StoredFile(blob=context.put_file(archive), size_bytes=size)
-    return {"archive": stored.model_dump(mode="json"), "clips": len(written), "refused": refused}
+    return {
+        "archive": stored.model_dump(mode="json"),
+        "clips": len(written),
+        "refused": refused,
+        "consent_ended": sorted({pin.item for pin in ended}),
+    }
 
 
 class _Exporting:
@@ -101,6 +110,14 @@ class _Exporting:
             skeleton = documents.skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
             self._skeletons[ref] = skeleton, hierarchy
         return self._skeletons[ref]
+
+
+def _refusal(pin: PinnedInput, code: str, detail: str) -> dict[str, Any]:
+    return {"name": _place(pin), "item": pin.item, "code": code, "detail": detail}
+
+
+def _end_of_consent(pin: PinnedInput) -> str:
+    return f"the consent for the clip ended on {pin.consent_ended}. {CONSENT_REMEDY}"
 
 
 def _place(pin: PinnedInput) -> str:

@@ -10,7 +10,7 @@ import typer
 
 from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, imported, parse, short
 from marey_client.cli.terminal.failures import Refused
-from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.invocation import AllowExpiredConsent, AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, progress
 from marey_schemas.wording import counted
 
@@ -49,6 +49,7 @@ def create_archive(
             "that have this version. May be repeated.",
         ),
     ] = None,
+    allow_expired_consent: AllowExpiredConsent = None,
     as_json: AsJson = False,
 ) -> None:
     """Write a version, all versions before it, and everything that they contain to one file, and check it.
@@ -57,7 +58,9 @@ def create_archive(
     """
     at = parse(place, version=True)
     with connect(context) as marey, progress() as advance:
-        made = at.on(marey).archive(file, at.version, since=since, on_progress=advance)
+        made = at.on(marey).archive(
+            file, at.version, since=since, allow_expired_consent=allow_expired_consent, on_progress=advance
+        )
     if as_json:
         return print_json({"file": str(file), "commit": made.digest, "bytes": file.stat().st_size})
     size_mb = file.stat().st_size / 1e6

@@ -11,7 +11,7 @@ import typer
 from marey_client.cli.addresses import Address
 from marey_client.cli.revisions import find_revision, find_version
 from marey_client.cli.terminal.failures import Refused, WrongUsage
-from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.invocation import AllowExpiredConsent, AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, progress
 from marey_schemas.formats import EXPORT_FORMATS
 from marey_schemas.wording import counted, one_of
@@ -48,6 +48,7 @@ def download(
     restored: Annotated[
         bool, typer.Option(help="Export aligned clips with the time and place of their source clips.")
     ] = False,
+    allow_expired_consent: AllowExpiredConsent = None,
     as_json: AsJson = False,
 ) -> None:
     """Write clips to files: one clip, or all clips in a folder and below.
@@ -62,7 +63,8 @@ def download(
         raise WrongUsage(f"{format!r} is not a format; the formats are {', '.join(EXPORT_FORMATS)}")
     address = Address.parse(place)
     with connect(context) as marey:
-        options = {"format": format, "unit": unit} | ({"time": "source"} if restored else {})
+        options = {"format": format, "unit": unit, "allow_expired_consent": allow_expired_consent}
+        options |= {"time": "source"} if restored else {}
         written, refused = _download_all(_exported_at(marey, address), output, options)
     if as_json:
         print_json({"files": [str(path) for path in written], "refused": refused})

@@ -28,6 +28,14 @@ QueryText = Annotated[
         "the reference of queries lists the fields.",
     ),
 ]
+AllowExpiredConsent = Annotated[
+    str | None,
+    typer.Option(
+        metavar="REASON",
+        help="Export clips although the consent of the performer has ended. The server records the reason; requires "
+        "the role maintainer.",
+    ),
+]
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 from marey_schemas.datasets.commits import Commit
-from marey_schemas.datasets.contents import ContentsRequest, ReceivedCommit, ReceivedRevisions, StoredRevisions
+from marey_schemas.datasets.contents import (
+    ArchiveCheck,
+    ArchivePermission,
+    ContentsRequest,
+    ReceivedCommit,
+    ReceivedRevisions,
+    StoredRevisions,
+)
 from marey_schemas.sizes import MIB
 from marey_server.handlers.items import MAX_DOCUMENT_BYTES
 from marey_server.http.declarations import Access, Document, RequestBody, reads, writes
@@ -32,6 +39,25 @@ class ProjectContents(Resource):
         """
         found = await self.look_up(datasets.load_contents, project, body)
         return await self.render_document(Reply(found))
+
+
+class ArchiveChecks(Resource):
+    """Checks before revisions are written to an archive."""
+
+    path = "/projects/{project}/datasets/{dataset}/archive-checks"
+    tag = "ProjectDatasets"
+
+    @reads(access=Access.READER, body=ArchiveCheck, answer=ArchivePermission)
+    async def post(self, project: str, dataset: str, body: ArchiveCheck) -> Reply:
+        """Check that the consent for the clips of an archive has not ended.
+
+        A program that writes an archive sends this request before it reads the documents with `POST
+        /projects/{project}/contents`. Aligned clips are checked, too. If the consent for an item has ended, the answer
+        is an error (409, `consent-expired`) that names such items. Maintainers can allow the export with
+        `allow_expired_consent` and a reason; an event then names the items.
+        """
+        run = self.change if body.allow_expired_consent else self.look_up
+        return Reply(await run(datasets.check_archive, project, dataset, body))
 
 
 class ReceivedContents(Resource):
@@ -81,4 +107,4 @@ class ReceivedCommits(Resource):
         return await self.answer(datasets.record_receipt, project, dataset, body, prepared)
 
 
-RESOURCES: tuple[type[Resource], ...] = (ProjectContents, ReceivedContents, ReceivedCommits)
+RESOURCES: tuple[type[Resource], ...] = (ProjectContents, ArchiveChecks, ReceivedContents, ReceivedCommits)

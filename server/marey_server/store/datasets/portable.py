@@ -1,4 +1,4 @@
-"""Content of versions in a form that is the same on every server: documents contain no ids of this server."""
+"""Content of versions for archives and other servers: documents contain no ids of this server."""
 
 from __future__ import annotations
 
@@ -7,15 +7,36 @@ from typing import Any
 
 from sqlalchemy import select
 
-from marey_schemas.datasets.contents import ContentsRequest
+from marey_schemas.access import Role
+from marey_schemas.datasets.contents import ArchiveCheck, ArchivePermission, ContentsRequest
 from marey_server.store import documents, projects
 from marey_server.store.datasets.contents import Contents, find_contents_of
 from marey_server.store.datasets.history import revisions_with
+from marey_server.store.datasets.naming import find_dataset
+from marey_server.store.items.consents import find_ended_with, record_override, require_consent
 from marey_server.store.items.reading import MOST_BYTES_AT_ONCE
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.tables import document, item
 from marey_server.store.transaction import Transaction
 from marey_versions.records import RevisionKey, portable_document, references_in
+
+
+def check_archive(tx: Transaction, project: str, name: str, request: ArchiveCheck) -> ArchivePermission:
+    """Check that revisions may be written to an archive of a dataset.
+
+    Clips whose consent has ended may be, if the request allows it; an event then names them. Raises `ConflictProblem`
+    if the consent has ended and the request does not allow the export, and `ForbiddenProblem` if it allows the export,
+    but the caller is not a maintainer or an owner.
+    """
+    role = Role.MAINTAINER if request.allow_expired_consent else Role.READER
+    project_row = projects.require(tx, project, at_least=role)
+    found = find_dataset(tx, project_row, name)
+    ended = find_ended_with(tx, project_row.id, request.contents)
+    if not request.allow_expired_consent:
+        require_consent(ended)
+    elif ended:
+        record_override(tx, project_row.id, found.id, request, ended)
+    return ArchivePermission(consent_ended=len(ended))
 
 
 def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> dict[str, Any]:

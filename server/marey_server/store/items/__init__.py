@@ -16,6 +16,7 @@ from marey_server.store.items.changing import (
     revert_item,
     set_parts,
 )
+from marey_server.store.items.consents import find_ended_consents, permit_export, require_consent
 from marey_server.store.items.drafts import Draft, Published, StoredDocument
 from marey_server.store.items.history import list_revisions, read_lineage, read_revision, read_staleness
 from marey_server.store.items.lineage_graphs import read_lineage_graph
@@ -48,11 +49,13 @@ __all__ = [
     "find_annotated_clip",
     "find_annotation",
     "find_contents",
+    "find_ended_consents",
     "find_part",
     "list_items",
     "list_revisions",
     "load_part",
     "load_parts",
+    "permit_export",
     "prepare_part",
     "prepare_parts",
     "publish",
@@ -64,6 +67,7 @@ __all__ = [
     "read_part",
     "read_revision",
     "read_staleness",
+    "require_consent",
     "restore_item",
     "revert_item",
     "set_parts",

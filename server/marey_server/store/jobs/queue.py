@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -41,6 +41,7 @@ from marey_server.access.secret_tokens import IssuedToken, derive_attempt_token,
 from marey_server.errors import ForbiddenProblem, InvalidProblem, LeaseLostProblem
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs.events import emit_job_events
+from marey_server.store.jobs.exports import lease_inputs
 from marey_server.store.jobs.fencing import (
     COUNT_ATTEMPT,
     HELD,
@@ -328,7 +329,8 @@ def _leases(
 ) -> list[Lease]:
     sizes = _sizes(tx, rows)
     return [
-        _lease(row, sizes.get(row.parent_id, row.size), token, policy) for row, token in zip(rows, tokens, strict=True)
+        _lease(row, lease_inputs(tx, row.kind, row.inputs), sizes.get(row.parent_id, row.size), token, policy)
+        for row, token in zip(rows, tokens, strict=True)
     ]
 
 
@@ -340,13 +342,15 @@ def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
     return {one.id: one.size for one in tx.execute(select(job.c.id, job.c.size).where(job.c.id.in_(parents)))}
 
 
-def _lease(row: Row[Any], size: int | None, token: IssuedToken, policy: QueuePolicy) -> Lease:
+def _lease(
+    row: Row[Any], inputs: Mapping[str, Any], size: int | None, token: IssuedToken, policy: QueuePolicy
+) -> Lease:
     return Lease(
         job=row.id,
         project=row.project_name,
         kind=row.kind,
         params=row.params,
-        inputs={name: tuple(PinnedInput(**pin) for pin in pins) for name, pins in row.inputs.items()},
+        inputs={name: tuple(PinnedInput(**pin) for pin in pins) for name, pins in inputs.items()},
         into=row.into_path,
         seed=row.seed,
         position=row.position,

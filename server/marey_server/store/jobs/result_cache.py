@@ -4,7 +4,8 @@ Jobs are identical if kind, version of the kind, parameters, seed and inputs are
 its name, its path, and the content of the documents that the kind reads are equal, because results are named after
 inputs and refer to them. A kind can require more to be equal: the collection of the results, or the newest revision of
 an item that the parameters name. Jobs whose result depends on data that is read while they run have no cache key. For
-each job, shared results are published again, into the job's own collection. The cache is limited to one project.
+each job, shared results are published again, into the job's own collection. The cache is limited to one project. An
+exported archive is not shared after the consent for one of its clips has ended.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_server.errors import ApiProblem
 from marey_server.store import blobs
-from marey_server.store.jobs import commits, staging
+from marey_server.store.jobs import commits, exports, staging
 from marey_server.store.jobs.endings import Ended, end_jobs
 from marey_server.store.jobs.events import wake_workers
 from marey_server.store.jobs.fencing import QUEUED, RUNNING, WAITING
@@ -238,7 +239,8 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
 def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     """Publish the shared result as the result of a waiting job; return the jobs that ended as a result.
 
-    No job ends if the shared result is no longer stored. Raises the errors of `publish`.
+    No job ends if the shared result is no longer stored, or if it is an export for which other consents had ended.
+    Raises the errors of `publish`.
     """
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")
@@ -255,6 +257,8 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
         .join(source, source.c.id == job.c.cached_from)
         .where(waits)
     ).one()
+    if not exports.may_share(tx, row.kind, row.inputs, row.result):
+        return []
     place = (row.source_id, row.fence)
     drafts = staging.staged_drafts(tx, [place]).get(place, {})
     tx.shared_outputs += len(drafts)

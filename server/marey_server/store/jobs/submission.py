@@ -30,6 +30,7 @@ from marey_server.store.jobs import commits, result_cache, staging
 from marey_server.store.jobs.documents import document_of_new, job_documents
 from marey_server.store.jobs.endings import dependency_failure
 from marey_server.store.jobs.events import emit_job_events, wake_workers
+from marey_server.store.jobs.exports import record_permission
 from marey_server.store.jobs.inputs import FoundItem, find_items, late_inputs, pin_inputs
 from marey_server.store.jobs.labels import labels_key
 from marey_server.store.jobs.late_inputs import pin_late_inputs
@@ -89,8 +90,10 @@ def submit_checked(
     """Insert the rows of checked jobs and queue those without unfinished dependencies.
 
     `upstream` maps the jobs that they depend on to their states; these jobs must be locked. A dependency among the
-    submissions counts as waiting.
+    submissions counts as waiting. Raises `ForbiddenProblem` for an export that requires a higher role of the caller.
     """
+    for one in submissions:
+        record_permission(tx, project, one.id, one.kind, one.params, one.pins)
     heads = [_head(project, one, upstream) for one in submissions]
     tasks, sources = lay_out(tx, [one for one in heads if not one.unbound])
     everything = [*heads, *tasks]

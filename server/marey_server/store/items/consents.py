@@ -1,0 +1,113 @@
+"""Consent of performers: clips whose consent has ended, and permissions to export them nevertheless.
+
+The take record of the newest revision counts for every revision of a clip, because a consent concerns the recording. An
+aligned clip has no take record of its own; that of its source clip counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any, NamedTuple
+
+from sqlalchemy import Select, and_, case, select
+
+from marey_schemas.access import Role
+from marey_schemas.consents import CONSENT_EXPIRED, CONSENT_REMEDY, ConsentOverride
+from marey_schemas.kinds import Kind
+from marey_schemas.wording import counted
+from marey_server.errors import ConflictProblem
+from marey_server.store import projects
+from marey_server.store.database.clock import datetime_of
+from marey_server.store.items.reading import find_item
+from marey_server.store.tables import collection, item, revision
+from marey_server.store.transaction import IN_LIST, Transaction
+
+MOST_NAMED = 100
+"""Greatest number of clips that an error or an event names; both also contain the number of all clips."""
+
+
+class EndedConsent(NamedTuple):
+    """Item whose consent has ended, the path of the clip with its take record, and the last day of the consent."""
+
+    item: str
+    path: str
+    until: str
+
+
+def find_ended_consents(tx: Transaction, item_ids: Iterable[str]) -> dict[str, EndedConsent]:
+    """Return, by id, those of the items whose consent has ended: whose last day is before the present day, in UTC."""
+    wanted = sorted(set(item_ids))
+    found: dict[str, EndedConsent] = {}
+    for start in range(0, len(wanted), IN_LIST):
+        rows = tx.execute(_ended(tx).where(item.c.id.in_(wanted[start : start + IN_LIST])))
+        found.update((row.id, _shown(row)) for row in rows)
+    return found
+
+
+def find_ended_with(tx: Transaction, project_id: str, contents: Sequence[str]) -> list[EndedConsent]:
+    """Return the items of a project whose consent has ended, and of which a revision has one of the content digests."""
+    holders = select(revision.c.item_id).where(revision.c.content.in_(contents))
+    rows = tx.execute(_ended(tx).where(item.c.project_id == project_id, item.c.id.in_(holders)).order_by(item.c.id))
+    return [_shown(row) for row in rows]
+
+
+def _ended(tx: Transaction) -> Select[Any]:
+    recorded, place = item.alias("recorded"), collection.alias("place")
+    holder = case((item.c.kind == Kind.PROCESSED.value, item.c.summary["clip"].as_string()), else_=item.c.id)
+    until = recorded.c.summary["consent_until"].as_string()
+    today = datetime_of(tx.now_us).date().isoformat()
+    same_project = recorded.c.project_id == item.c.project_id  # a document may name any clip as its source
+    return (
+        select(item.c.id, place.c.path.label("folder"), recorded.c.name, until.label("until"))
+        .join(recorded, and_(recorded.c.id == holder, same_project))
+        .join(place, place.c.id == recorded.c.collection_id)
+        .where(
+            item.c.kind.in_((Kind.CLIP.value, Kind.PROCESSED.value)),
+            recorded.c.kind == Kind.CLIP.value,
+            until < today,
+        )
+    )
+
+
+def _shown(row: Any) -> EndedConsent:
+    return EndedConsent(row.id, f"{row.folder}/{row.name}".lstrip("/"), row.until)
+
+
+# -- refusing and allowing ---------------------------------------------------------------------------------------------
+
+
+def require_consent(ended: Collection[EndedConsent]) -> None:
+    """Raise `ConflictProblem` if the consent for any clips has ended; it names the first of them, and the remedies."""
+    if not ended:
+        return
+    first = next(iter(ended))
+    what = f"The consent for the clip {first.path!r} ended on {first.until}"
+    if len(ended) > 1:
+        what = f"The consent for {counted(len(ended), 'clip')} has ended, for {first.path!r} on {first.until}"
+    raise ConflictProblem(f"{what}. {CONSENT_REMEDY}", code=CONSENT_EXPIRED, context=_named(ended))
+
+
+def permit_export(tx: Transaction, project: str, kind: Kind, item_id: str, override: ConsentOverride) -> None:
+    """Allow the export of an item although its consent may have ended; if it has ended, record this as an event.
+
+    Raises `ForbiddenProblem` unless the caller is a maintainer or an owner, and `NotFoundProblem`.
+    """
+    project_row = projects.require(tx, project, at_least=Role.MAINTAINER)
+    find_item(tx, project_row, kind, item_id)
+    if ended := find_ended_consents(tx, [item_id]):
+        record_override(tx, project_row.id, item_id, override, list(ended.values()))
+
+
+def record_override(
+    tx: Transaction, project_id: str, subject: str, override: ConsentOverride, ended: Collection[EndedConsent]
+) -> None:
+    """Record as an event that the caller allows the export of clips whose consent has `ended`.
+
+    `subject` is the id of what exports them: a job, a dataset, or the item itself.
+    """
+    tx.emit("consent.overridden", subject, project_id=project_id, reason=override.consent_reason, **_named(ended))
+
+
+def _named(ended: Collection[EndedConsent]) -> dict[str, Any]:
+    clips = [{"item": one.item, "path": one.path, "consent_until": one.until} for one in list(ended)[:MOST_NAMED]]
+    return {"clips": clips, "count": len(ended)}

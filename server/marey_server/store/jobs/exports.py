@@ -1,0 +1,86 @@
+"""Jobs that write clips to files: clips whose consent has ended, and permissions to export these."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from marey_schemas.access import Role
+from marey_schemas.consents import ConsentOverride
+from marey_schemas.queue.job_kinds import KindDeclaration, UnknownKindError, find_kind
+from marey_server.access import roles
+from marey_server.errors import ForbiddenProblem
+from marey_server.store.items.consents import EndedConsent, find_ended_consents, record_override
+from marey_server.store.projects import ProjectRow
+from marey_server.store.transaction import Transaction
+
+ENDED = "consent_ended"
+"""Member of a job's result that lists the ids of the exported input's clips whose consent had ended."""
+
+
+def ended_inputs(tx: Transaction, kind: KindDeclaration, inputs: Mapping[str, Any]) -> dict[str, EndedConsent]:
+    """Return, by id, the clips that a job of the kind writes to files and whose consent has ended.
+
+    Inputs that are not known yet are left out.
+    """
+    if kind.exports is None:
+        return {}
+    return find_ended_consents(tx, (pin["item"] for pin in inputs.get(kind.exports, ()) if "item" in pin))
+
+
+def lease_inputs(tx: Transaction, kind_name: str, inputs: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """Return the inputs of a job as a worker gets them: of clips that the job exports, with the end of their consent.
+
+    The present day counts, not that of the submission.
+    """
+    try:
+        kind = find_kind(kind_name)
+    except UnknownKindError:
+        return dict(inputs)  # of a worker with job kinds of its own
+    ended = ended_inputs(tx, kind, inputs)
+    if not ended:
+        return dict(inputs)
+    return {
+        name: [
+            pin | {ENDED: ended[pin["item"]].until} if name == kind.exports and pin["item"] in ended else pin
+            for pin in pins
+        ]
+        for name, pins in inputs.items()
+    }
+
+
+def may_share(tx: Transaction, kind_name: str, inputs: Mapping[str, Any], result: Mapping[str, Any] | None) -> bool:
+    """Return whether the result of an identical job has refused, or was allowed to export, the same clips as a new job.
+
+    It has not if a consent has ended since, or if a later day was recorded.
+    """
+    try:
+        kind = find_kind(kind_name)
+    except UnknownKindError:
+        return True
+    return kind.exports is None or ended_inputs(tx, kind, inputs).keys() == set((result or {}).get(ENDED, ()))
+
+
+def record_permission(
+    tx: Transaction,
+    project: ProjectRow,
+    job_id: str,
+    kind: KindDeclaration,
+    params: Mapping[str, Any],
+    inputs: Mapping[str, Any],
+) -> None:
+    """Record an event if a new job may export clips whose consent has ended; the event names these clips.
+
+    Clips that are not known yet, or whose consent ends before the job runs, are not named; the result of the job lists
+    all of them. Raises `ForbiddenProblem` unless the caller is a maintainer or an owner.
+    """
+    if kind.exports is None or not params.get("allow_expired_consent"):
+        return
+    if not roles.includes(project.role, Role.MAINTAINER):
+        raise ForbiddenProblem(
+            f"A job with `allow_expired_consent` requires at least the role {Role.MAINTAINER.value} in the project "
+            f"{project.name!r}; without it, the job leaves out the clips whose consent has ended.",
+            code="insufficient-role",
+        )
+    override = ConsentOverride.model_validate({name: params[name] for name in ConsentOverride.model_fields})
+    record_override(tx, project.id, job_id, override, list(ended_inputs(tx, kind, inputs).values()))
