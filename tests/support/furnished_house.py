@@ -66,6 +66,7 @@ BODIES = {
     "ProposalMerge": {"when_green": True},
     "CheckoutRequest": {"version": "spare", "discard": True},
     "ContentsRequest": {"revisions": [OTHER_DIGEST]},
+    "ArchiveCheck": {"contents": [OTHER_DIGEST]},
     "ReceivedRevisions": {
         "revisions": [
             {
