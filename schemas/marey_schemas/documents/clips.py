@@ -143,7 +143,7 @@ class ClipInfo(TakeRecord):
         The last day is the earliest one of all. The purposes are those that all clips which record purposes have in
         common.
         """
-        infos = (self, *others)
+        infos: tuple[ClipInfo, ...] = (self, *others)
         days = [one.consent_until for one in infos if one.consent_until is not None]
         purposes = [one.consent_for for one in infos if one.consent_for is not None]
         common = tuple(one for one in purposes[0] if all(one in each for each in purposes)) if purposes else None

@@ -27,6 +27,8 @@ def _of_summary(name: str) -> Callable[[Item], object]:
     return lambda item: item.summary.get(name)
 
 
+RECORDED = ("subject", "action", "take", "shoot_day", "select", "licence", "capture_system", "consent_until")
+"""Columns with fields of take records."""
 COLUMNS: dict[str, Callable[[Item], object]] = {
     "kind": lambda item: item.kind,
     "revision": lambda item: item.revision,
@@ -36,7 +38,7 @@ COLUMNS: dict[str, Callable[[Item], object]] = {
     "seconds": lambda item: None if (given := item.summary.get("duration_s")) is None else round(given, 3),
     "warnings": lambda item: " ".join(item.summary.get("warnings", ())),
     "tags": lambda item: " ".join(item.tags),
-    **{name: _of_summary(name) for name in ("subject", "action", "take", "shoot_day", "select", "licence")},
+    **{name: _of_summary(name) for name in RECORDED},
     "created": lambda item: item.created_at,
     "updated": lambda item: item.updated_at,
     "id": lambda item: item.id,

@@ -92,8 +92,8 @@ def submit_checked(
     `upstream` maps the jobs that they depend on to their states; these jobs must be locked. A dependency among the
     submissions counts as waiting. Raises `ForbiddenProblem` for an export that requires a higher role of the caller.
     """
-    for one in submissions:
-        record_permission(tx, project, one.id, one.kind, one.params, one.pins)
+    for submitted in submissions:
+        record_permission(tx, project, submitted.id, submitted.kind, submitted.params, submitted.pins)
     heads = [_head(project, one, upstream) for one in submissions]
     tasks, sources = lay_out(tx, [one for one in heads if not one.unbound])
     everything = [*heads, *tasks]
