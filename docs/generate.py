@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,8 @@ from marey_server.process.settings import Settings
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = Path(__file__).parent / "reference"
+UNKNOWN = "…"
+"""Text in place of a value that is known only at run time."""
 NOTE = "<!-- Written by `make docs` from the code; change it there. -->\n\n"
 
 
@@ -190,21 +192,39 @@ def _subclasses(base: type[errors.ApiProblem]) -> Iterator[type[errors.ApiProble
 def _raised(classes: dict[str, type[errors.ApiProblem]]) -> Iterator[tuple[str, str, str]]:
     """Yield code, class name and message of each error that the server creates with an explicit `code`."""
     for file in sorted((ROOT / "server").rglob("*.py")):
+        texts = _constants_of(file)
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in classes):
                 continue
-            codes = [each.value for each in node.keywords if each.arg == "code"]
-            if codes and isinstance(codes[0], ast.Constant) and node.args:
-                yield str(codes[0].value), node.func.id, _spoken(node.args[0])
+            codes = [_spoken(each.value, texts) for each in node.keywords if each.arg == "code"]
+            if codes and UNKNOWN not in codes[0] and node.args:
+                yield codes[0], node.func.id, _spoken(node.args[0], texts)
 
 
-def _spoken(node: ast.expr) -> str:
-    """Return the message that an expression gives, with … in place of values that are known only at run time."""
+def _constants_of(file: Path) -> dict[str, str]:
+    """Return the constant texts that a loaded module of the server defines or imports, by name."""
+    module = sys.modules.get(".".join(file.relative_to(ROOT / "server").with_suffix("").parts))
+    return {
+        name: text
+        for name, text in ({} if module is None else vars(module)).items()
+        if name.isupper() and isinstance(text, str)
+    }
+
+
+def _spoken(node: ast.expr, texts: Mapping[str, str]) -> str:
+    """Return the text that an expression gives, with … in place of values that are known only at run time.
+
+    `texts` contains constants by name.
+    """
     if isinstance(node, ast.Constant):
         return str(node.value)
+    if isinstance(node, ast.Name):
+        return texts.get(node.id, UNKNOWN)
+    if isinstance(node, ast.FormattedValue):
+        return _spoken(node.value, texts)
     if isinstance(node, ast.JoinedStr):
-        return "".join(str(each.value) if isinstance(each, ast.Constant) else "…" for each in node.values)
-    return "…"
+        return "".join(_spoken(each, texts) for each in node.values)
+    return UNKNOWN
 
 
 def _table(heads: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:

@@ -81,10 +81,12 @@ def require_consent(ended: Collection[EndedConsent]) -> None:
     if not ended:
         return
     first = next(iter(ended))
-    what = f"The consent for the clip {first.path!r} ended on {first.until}"
-    if len(ended) > 1:
-        what = f"The consent for {counted(len(ended), 'clip')} has ended, for {first.path!r} on {first.until}"
-    raise ConflictProblem(f"{what}. {CONSENT_REMEDY}", code=CONSENT_EXPIRED, context=_named(ended))
+    clips = "the clip" if len(ended) == 1 else f"{counted(len(ended), 'clip')}, the first of which is"
+    raise ConflictProblem(
+        f"The consent has ended for {clips} {first.path!r}, whose last day was {first.until}. {CONSENT_REMEDY}",
+        code=CONSENT_EXPIRED,
+        context=_named(ended),
+    )
 
 
 def permit_export(tx: Transaction, project: str, kind: Kind, item_id: str, override: ConsentOverride) -> None:
