@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
@@ -245,10 +245,14 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
     return found[0]
 
 
-def items_selected(marey: Marey, places: Sequence[str], query: str, kind: str | None) -> list[SingleItem]:
+def items_selected(
+    marey: Marey, places: Sequence[str], query: str, kind: str | None, *, deleted: bool = False
+) -> list[SingleItem]:
     """Return the items of a kind, by default clips, that a query selects in projects or folders and their subfolders.
 
-    The items of each place are sorted by path; an item in several places is returned once.
+    The items of each place are sorted by path; an item in several places is returned once. With `deleted`, deleted
+    items are selected, also in deleted folders; of several with the same path, the one that was deleted last comes
+    first.
 
     Raises `WrongUsage` if a place is not a project or folder, or if the query selects nothing.
     """
@@ -259,16 +263,27 @@ def items_selected(marey: Marey, places: Sequence[str], query: str, kind: str | 
     for place in places:
         address = Address.parse(place)
         project = marey.project(address.project)
-        if address.path and project.collections.at(address.path) is None:
+        if address.path and not _is_folder(project, address.path, deleted=deleted):
             raise WrongUsage(f"there is no folder at {address}; --query selects items in projects and folders")
-        items = project.items(wanted).list(query=query, collection=address.path)
+        items = _last_deleted_first(project.items(wanted).list(query=query, collection=address.path, deleted=deleted))
         found.update((one.id, one) for one in sorted(items, key=lambda one: one.path))
     if not found:
-        raise WrongUsage(
-            f"the query selects no item of the kind {wanted} in {', '.join(places)}; "
-            "`marey ls PLACE --query … --explain` counts the items that each condition hides"
-        )
+        hint = "`marey ls PLACE --query … --explain` counts the items that each condition hides"
+        if deleted:
+            hint = "`marey ls --deleted PLACE` lists the items that can be restored"
+        what = f"deleted item of the kind {wanted}" if deleted else f"item of the kind {wanted}"
+        raise WrongUsage(f"the query selects no {what} in {', '.join(places)}; {hint}")
     return list(map(SingleItem, found.values()))
+
+
+def _is_folder(project: ProjectHandle, path: str, *, deleted: bool) -> bool:
+    """Return whether there is a folder at a path, or, with `deleted`, whether there was one."""
+    folders = project.collections
+    return folders.at(path) is not None or (deleted and folders.at(path, deleted=True) is not None)
+
+
+def _last_deleted_first(items: Iterable[ItemHandle]) -> list[ItemHandle]:
+    return sorted(items, key=lambda one: one.item.deleted_at or one.item.created_at, reverse=True)
 
 
 def require_apart(things: Sequence[Thing]) -> None:
@@ -316,4 +331,4 @@ def _items(project: ProjectHandle, address: Address, kind: Kind, *, deleted: boo
         found += items.list(path=address.path, deleted=deleted)
     elif address.name.startswith(f"{kind.value}_"):
         found += (one for one in items.list(deleted=deleted) if one.id == address.name)
-    return sorted(found, key=lambda one: one.item.deleted_at or one.item.created_at, reverse=True)
+    return _last_deleted_first(found)

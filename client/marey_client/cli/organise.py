@@ -129,13 +129,32 @@ def rm(
         return _do_each(things, remove, "removed", as_json, selected=query is not None)
 
 
-def restore(context: typer.Context, places: Places, kind: KindOf = None, as_json: AsJson = False) -> None:
-    """Restore removed items, and folders with the contents removed along with them; `marey ls --deleted` lists them."""
+def restore(
+    context: typer.Context,
+    places: PlacesOrFolders,
+    kind: KindOrClips = None,
+    query: QueryText = None,
+    preview: Annotated[
+        bool, typer.Option("--preview", help="List what --query would restore, but change nothing.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Restore removed items, and folders with the contents removed along with them; `marey ls --deleted` lists them.
+
+    If several removed items had the same path, the one that was removed last is restored. With --query, each item is
+    restored by a request of its own. If the server refuses to restore one of them, for example because another item has
+    its path now, the others are still restored, and the exit status is 1.
+    """
     from marey_client.errors import Conflict
 
+    if preview and query is None:
+        raise WrongUsage("--preview lists the items that a query selects; add --query, or leave out --preview")
     with connect(context) as marey:
-        things = [the_thing(marey, place, kind, deleted=True) for place in places]
-        require_apart(things)
+        things = _named_or_selected(marey, places, kind, query, deleted=True)
+        if query is not None:
+            things = _last_at_each_path(things)
+        if preview:
+            return _preview(("name", "kind"), [(one.place, one.kind) for one in things], things, "restored", as_json)
 
         def bring_back(thing: Thing) -> Any:
             try:
@@ -143,10 +162,23 @@ def restore(context: typer.Context, places: Places, kind: KindOf = None, as_json
             except Conflict as error:
                 error.add_note("first move or rename the item that has this address now, with marey mv")
                 raise
-            print_message(f"{thing.place} is restored")
+            if query is None:
+                print_message(f"{thing.place} is restored")
             return restored
 
-        _do_each(things, bring_back, "restored", as_json)
+        return _do_each(things, bring_back, "restored", as_json, selected=query is not None)
+
+
+def _last_at_each_path(things: Sequence[Thing]) -> list[Thing]:
+    """Return the first of the things at each path, and report the number of the others."""
+    chosen: dict[str, Thing] = {}
+    for one in things:
+        chosen.setdefault(one.place, one)
+    if others := len(things) - len(chosen):
+        print_message(
+            f"left out {counted(others, 'item')} with the path of one that was removed later; restore them by their ids"
+        )
+    return list(chosen.values())
 
 
 def revert(
@@ -240,11 +272,13 @@ def _with_tags(thing: Thing, added: Sequence[str], removed: Set[str]) -> ItemCha
         ) from None
 
 
-def _named_or_selected(marey: Marey, places: Sequence[str], kind: str | None, query: str | None) -> Sequence[Thing]:
-    """Return the folders and items at addresses, or the items that a query selects there."""
+def _named_or_selected(
+    marey: Marey, places: Sequence[str], kind: str | None, query: str | None, *, deleted: bool = False
+) -> Sequence[Thing]:
+    """Return the folders and items at addresses, or the items that a query selects there, or deleted ones."""
     if query is not None:
-        return items_selected(marey, places, query, kind)
-    things = [the_thing(marey, place, kind) for place in places]
+        return items_selected(marey, places, query, kind, deleted=deleted)
+    things = [the_thing(marey, place, kind, deleted=deleted) for place in places]
     require_apart(things)
     return things
 

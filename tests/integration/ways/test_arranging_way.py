@@ -122,6 +122,9 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, la
         (["rm", "lab/raw/a", "--query", "name = a", "--yes"], 2, "there is no folder at lab/raw/a; --query selects"),
         (["rm", "lab", "--query", "name = a", "--kind", "collection", "--yes"], 2, "items, not folders"),
         (["rm", "lab", "--query", "name =", "--yes"], 1, "the query ends too early"),
+        (["restore", "lab", "--query", "name = a"], 2, "the query selects no deleted item of the kind clip in lab;"),
+        (["restore", "lab/nowhere", "--query", "name = a"], 2, "there is no folder at lab/nowhere"),
+        (["restore", "lab/raw/a", "--preview"], 2, "--preview lists the items that a query selects; add --query"),
     ],
 )
 def test_what_cannot_be_is_told_and_changes_nothing(
@@ -227,6 +230,38 @@ def test_what_a_query_selects_is_previewed_removed_after_a_yes_and_counted(run: 
     assert done.stderr == "2 items removed\n"
     assert clips(lab) == ["raw/b"]
     assert [one.name for one in lab.skeletons.list()] != []  # they have no action, but a query selects clips
+
+
+def test_what_a_query_selects_is_restored_from_removed_folders_too(run: Command, lab: ProjectHandle) -> None:
+    run("record", "lab/raw/b", "--set", "action=run")
+    run("mv", "lab/raw/c", "lab/day/c")
+    run("rm", "lab/raw/a", "lab/raw/b", "lab/day/", "--yes")
+    rule = ("--query", "not action = run")
+    previewed = run("restore", "lab", *rule, "--preview")
+    assert [f"lab/{place}" in previewed.stdout for place in ("raw/a", "raw/b", "day/c")] == [True, False, True]
+    assert previewed.stderr == "2 items would be restored; nothing was changed\n"
+    assert clips(lab) == []
+    done = run("restore", "lab/day", *rule, "--json")
+    assert [one["name"] for one in json.loads(done.stdout)["restored"]] == ["c"]
+    assert run("restore", "lab", *rule).stderr == "1 item restored\n"
+    assert clips(lab) == ["day/c", "raw/a"]
+
+
+def test_of_several_removed_items_of_one_path_a_query_restores_the_last(
+    run: Command, lab: ProjectHandle, takes: Path
+) -> None:
+    first = next(lab.clips.list(path="raw/a")).id
+    run("rm", "lab/raw/a")
+    run("mv", "lab/raw/b", "lab/raw/a")
+    last = next(lab.clips.list(path="raw/a")).id
+    run("rm", "lab/raw/a")
+    done = run("restore", "lab", "--query", "name = a")
+    assert done.stderr.splitlines()[-1] == "1 item restored"
+    assert "left out 1 item with the path of one that was removed later" in done.stderr
+    assert next(lab.clips.list(path="raw/a")).id == last
+    refused = run("restore", "lab", "--query", "name = a", status=1)
+    assert "first move or rename the item that has this address now" in refused.stderr
+    assert {one.id for one in lab.clips.list(deleted=True)} == {first}
 
 
 def test_what_a_query_selects_is_tagged_from_several_pages(
