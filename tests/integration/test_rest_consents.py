@@ -183,6 +183,15 @@ def test_who_is_no_maintainer_cannot_allow_an_export(studio: Studio, export: Exp
     assert studio.overrides() == []
 
 
+def test_guests_of_a_public_project_are_asked_to_sign_in(studio: Studio, export: Export) -> None:
+    walk, guest = studio.clip("walk", day(-1)), studio.server.client()
+    ok(studio.owner.patch(LAB, json={"visibility": "public"}, headers={"If-Match": "*"}))
+    refused(export(walk, guest), 409, "consent-expired")
+    refused(export(walk, guest, **ALLOWED), 401, "unauthenticated")
+    refused(export(walk, studio.client(None), **ALLOWED), 403, "insufficient-role")
+    assert studio.overrides() == []
+
+
 def test_a_maintainer_allows_an_export_with_a_reason_which_an_event_records(studio: Studio, export: Export) -> None:
     walk, maintainer = studio.clip("walk", day(-1)), studio.client(Role.MAINTAINER)
     assert export(walk, maintainer, **ALLOWED).content.startswith(b"HIERARCHY")

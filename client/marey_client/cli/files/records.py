@@ -13,7 +13,7 @@ from marey_client.cli.addresses import REQUESTS_AT_ONCE, Address
 from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
 from marey_client.cli.terminal.invocation import QueryText, connect
 from marey_client.cli.terminal.output import print_message, progress
-from marey_schemas.wording import counted
+from marey_schemas.wording import counted, without_prefix
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -111,7 +111,7 @@ def _checked(given: Mapping[str, str], place: str) -> dict[str, Any]:
     except ValidationError as error:
         first = error.errors()[0]
         raise WrongUsage(
-            f"{place}, {'.'.join(map(str, first['loc']))}: {first['msg']}, not {first['input']!r}"
+            f"{place}, {'.'.join(map(str, first['loc']))}: {without_prefix(first['msg'])}, not {first['input']!r}"
         ) from None
     return {name: getattr(checked, name) for name in given}
 
