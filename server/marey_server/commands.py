@@ -145,7 +145,7 @@ def fsck(*, repair: bool = False, as_json: bool = False, **settings: Any) -> Non
 
 
 def clock(*, set_now: bool = False, **settings: Any) -> None:
-    """Compare the clock that an SQLite database stores with the clock of this machine.
+    """Compare the stored time of an SQLite database with the clock of this machine.
 
     With `set_now`, set the stored clock to the time of this machine.
     """

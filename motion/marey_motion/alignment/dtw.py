@@ -64,8 +64,8 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
         total, length = kernels.align_limited(matrix, max_run, longest)
     if not np.isfinite(total):
         raise MotionError(
-            f"{len(matrix)} frames cannot be aligned with {matrix.shape[1]} frames when at most {max_run} "
-            "consecutive steps may advance only one of the motions; allow more such steps",
+            f"{len(matrix)} frames cannot be aligned with {matrix.shape[1]} frames if one motion may pause for "
+            f"at most {max_run} frames of the other; raise this limit",
             code="alignment-impossible",
             where="max_run",
         )

@@ -252,9 +252,9 @@ def _turn_between(before: Floats, after: Floats) -> Floats:
 
 
 def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], zone: float, blend: int) -> Floats:
-    """Compute how far (F,), in metres, the root must be lowered so that legs reach planted feet with bent knees.
+    """Compute how far (F,), in metres, the root must be lowered so that the legs reach the planted feet undamped.
 
-    `zone` is the angle from the straight leg, in radians, in which knees are damped (see `solve_two_bone`).
+    Knees are damped if the leg is straight up to an angle of `zone` radians (see `solve_two_bone`).
     """
     from marey_motion.editing.inverse_kinematics import two_bone_kernels
 

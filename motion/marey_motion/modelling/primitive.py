@@ -30,7 +30,9 @@ MOST_ATTEMPTS = 100
 
 @dataclass(frozen=True, eq=False)
 class FunctionalComponents:
-    """Functions of canonical time with D channels, as a mean and k principal functions in n spline coefficients.
+    """Functions of canonical time with D channels: the sum of a mean and of k weighted principal functions.
+
+    Each function is stored as n spline coefficients for each channel.
 
     Parameters
     ----------

@@ -128,7 +128,7 @@ def _components_to_tree(components: FunctionalComponents) -> Tree:
 
 
 def _components_from_tree(tree: Mapping[str, Any], columns: NDArray[np.int64] | None) -> FunctionalComponents:
-    """Read components from a document, with the channels `columns` in this order; None keeps the document's order."""
+    """Read components from a document. `columns` selects and orders its channels; None keeps all in their order."""
     arrays = {name: np.asarray(tree[name]) for name in _COMPONENTS}
     if columns is not None:
         for name in ("mean", "directions", "projections"):

@@ -28,5 +28,5 @@ class EditDocument(Request):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Ids of the clips that the commands name."""
+        """Ids of the clips to which the commands refer."""
         return tuple(dict.fromkeys(str(one.source) for one in self.commands if isinstance(one, Concatenate | Paste)))

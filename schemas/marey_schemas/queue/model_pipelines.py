@@ -54,8 +54,7 @@ class ModelPlan(Request):
             raise ValueError("give either files to import or clips, not both")
         if self.annotations and (self.files is not None or self.annotate is not None):
             raise ValueError(
-                "annotations: cannot be combined with `files` or `annotate`; remove `annotations`, or give `clips` "
-                "instead of `files` and leave out `annotate`"
+                "annotations: cannot be combined with `files` or `annotate`; with annotations, give `clips` alone"
             )
         if self.cut is not None and not self.annotations and self.annotate is None:
             raise ValueError("cut: cutting needs annotations; give `annotations`, or `annotate` to have them proposed")

@@ -1,4 +1,7 @@
-"""Models that generate motion for requests: read in one transaction; parsed, cached and sampled in a child process."""
+"""Models from which requests draw samples.
+
+One transaction reads the documents of a model; a child process parses, caches and samples them.
+"""
 
 from __future__ import annotations
 

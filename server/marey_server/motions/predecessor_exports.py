@@ -77,8 +77,8 @@ def write_predecessor(
 ) -> tuple[str, bytes]:
     """Return the name and the bytes of a file in a format of Marey's predecessor.
 
-    Raises `InvalidProblem` if the item cannot be written in such a format, and `NotFoundProblem` if the tree of a model
-    without a tree is requested.
+    Raises `InvalidProblem` if the item cannot be written in such a format, and `NotFoundProblem` if a tree
+    is requested, but the model has none.
     """
     from marey_motion.errors import MotionError
 

@@ -1,6 +1,6 @@
-"""Models in which requests search for motions, and their search trees.
+"""Models, with their search trees, in which motions are searched on request.
 
-They are read in a transaction, and parsed and cached in a child process.
+One transaction reads the documents; a child process parses and caches them.
 """
 
 from __future__ import annotations

@@ -118,4 +118,4 @@ def _require_rows(clips: Sequence[DatabaseClip], records: Iterable[TrialRecord])
         rows = clip.stop
     for record in records:
         if len(record.rows) and not 0 <= record.rows.min() <= record.rows.max() < rows:
-            raise ValueError(f"a trial displays a row outside the {rows} rows of the clips")
+            raise ValueError(f"a trial refers to a row that does not exist; the clips have {rows} rows")

@@ -227,7 +227,7 @@ def meets_hidden(tx: Transaction, name: str, guesses_per_hour: int) -> bool:
 
 
 def count_guess(tx: Transaction, guesses_per_hour: int) -> None:
-    """Count that the caller has tried the name of a hidden project.
+    """Count one attempt of the caller to use the name of a hidden project.
 
     Raises `TooManyRequestsProblem` if the caller has tried too many of these names.
     """

@@ -44,7 +44,7 @@ Parent = Annotated[
         min=1,
         max=2,
         help="For a merge commit: number of the parent with which it is compared to find its changes; 1 is the branch "
-        "that the merge changed, 2 is the merged version.",
+        "before the merge, 2 is the version that was merged into it.",
     ),
 ]
 

@@ -30,7 +30,11 @@ def diff(
     context: typer.Context,
     place: VersionPlace,
     after: Annotated[
-        str | None, typer.Argument(help="Later version; default: the given version is compared with the one before it.")
+        str | None,
+        typer.Argument(
+            help="Later version. Without it, the first argument is the later version, and is compared with the version "
+            "before it."
+        ),
     ] = None,
     path: Annotated[str, typer.Option(help="Entry or folder to compare.")] = "",
     most: Annotated[

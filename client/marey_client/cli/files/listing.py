@@ -157,7 +157,7 @@ def _sorted(items: Sequence[ItemHandle], column: str, *, reverse: bool) -> list[
 
 
 def _stale(items: Sequence[ItemHandle]) -> list[ItemHandle]:
-    """Return the items of which an input has a newer revision."""
+    """Return the outdated items: since they were made, one of their inputs has got a newer revision."""
     with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
         answers = pool.map(lambda one: one.staleness().stale, items)
         return [one for one, stale in zip(items, answers, strict=True) if stale]

@@ -1,4 +1,4 @@
-"""Encodings of the predecessor's documents: JSON, BSON, or BSON compressed with bz2."""
+"""Encodings of the documents of Marey's predecessor: JSON, BSON, or BSON compressed with bz2."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The four layouts of the predecessor's motion primitives, brought to one form.
+"""Conversion of the four layouts of motion primitives of Marey's predecessor to one form.
 
-Layout 3 has the parts `sspm` (space), `tspm` (time) and `gmm`; layouts 1 and 2 are flat, with fields
-`eigen_vectors_spatial` for space and `*_temporal_semantic*` or `*_time*` for time; a static primitive has
-`spatial_coeffs` alone.
+Layouts 1 and 2 are flat: the field `eigen_vectors_spatial` contains space, and fields `*_temporal_semantic*` or
+`*_time*` contain time. Layout 3 has the parts `sspm` (space), `tspm` (time) and `gmm` (mixture). The layout `static`
+has the field `spatial_coeffs` alone.
 """
 
 from __future__ import annotations

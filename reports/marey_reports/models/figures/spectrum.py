@@ -1,4 +1,4 @@
-"""Figure of the size of a model: variance of the components, errors of reconstruction, choice of the mixture."""
+"""Figure about the number of components: their variance, errors of reconstruction, choice of the mixture."""
 
 from __future__ import annotations
 

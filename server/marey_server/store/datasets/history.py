@@ -321,8 +321,8 @@ def compare_versions(
 ) -> DatasetDifference:
     """Return the entries that differ in two versions; at most `limit` of them are listed.
 
-    With `path`, compare only the entries at this path or below it. What was moved from or to another folder then counts
-    as added or removed.
+    With `path`, compare only the entries at this path or below it. An entry that was
+    moved from elsewhere then counts as added, and one that was moved away as removed.
     """
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)

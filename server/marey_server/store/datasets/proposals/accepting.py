@@ -1,4 +1,7 @@
-"""Merges of proposals: a read prepares the merge, and a short write checks what is required and records it."""
+"""Merges of proposals.
+
+A read transaction prepares the merge. A short write transaction checks the requirements, and records the merge.
+"""
 
 from __future__ import annotations
 
