@@ -1,10 +1,13 @@
-"""Kinds of events. The type checker compares each event that the server records with this list."""
+"""Kinds of events. The type checker compares each event that the server records with this list.
+
+Kinds of events that concern access or deletion are kinds of audit entries: the audit log consists of these events.
+"""
 
 from __future__ import annotations
 
 from typing import Literal, get_args
 
-ProjectEventKind = Literal[
+ProjectAuditKind = Literal[
     "project.created",
     "project.changed",
     "project.deleted",
@@ -13,25 +16,46 @@ ProjectEventKind = Literal[
     "member.added",
     "member.changed",
     "member.removed",
-    "collection.created",
-    "collection.moved",
     "collection.deleted",
     "collection.restored",
-    "item.created",
-    "item.revised",
-    "item.changed",
     "item.deleted",
     "item.restored",
     "consent.overridden",
-    "dataset.created",
     "dataset.deleted",
-    "branch.created",
-    "branch.moved",
     "branch.deleted",
+    "branch.reset",
     "branch.protected",
     "branch.unprotected",
-    "tag.created",
     "tag.deleted",
+    "webhook.created",
+    "webhook.changed",
+    "webhook.rotated",
+    "webhook.deleted",
+]
+"""Kinds of audit entries in a project."""
+
+ServerAuditKind = Literal[
+    "user.created",
+    "user.changed",
+    "user.limited",
+    "token.created",
+    "token.rotated",
+    "token.revoked",
+]
+"""Kinds of audit entries that belong to no project."""
+
+AuditKind = Literal[ProjectAuditKind, ServerAuditKind]
+
+OrdinaryEventKind = Literal[
+    "collection.created",
+    "collection.moved",
+    "item.created",
+    "item.revised",
+    "item.changed",
+    "dataset.created",
+    "branch.created",
+    "branch.moved",
+    "tag.created",
     "commit.received",
     "proposal.opened",
     "proposal.commented",
@@ -48,26 +72,14 @@ ProjectEventKind = Literal[
     "job.succeeded",
     "job.failed",
     "job.cancelled",
-    "webhook.created",
-    "webhook.changed",
-    "webhook.rotated",
-    "webhook.deleted",
     "webhook.requested",
 ]
+"""Kinds of events in a project that are not in the audit log."""
+
+ProjectEventKind = Literal[ProjectAuditKind, OrdinaryEventKind]
 """Kinds of events in a project; a webhook can be notified of each of them."""
 
-ServerEventKind = Literal[
-    "user.created",
-    "user.changed",
-    "user.limited",
-    "token.created",
-    "token.rotated",
-    "token.revoked",
-]
-"""Kinds of events that belong to no project."""
-
-EventKind = ProjectEventKind | ServerEventKind
-
+AUDIT_KINDS: tuple[AuditKind, ...] = get_args(AuditKind)
 PROJECT_EVENT_KINDS: tuple[ProjectEventKind, ...] = get_args(ProjectEventKind)
 
 DEFAULT_WEBHOOK_KINDS: tuple[ProjectEventKind, ...] = (

@@ -40,6 +40,13 @@ class Principal:
         """The name of the user, or `job:<id>` for an attempt of a job, as shown for authors and in events."""
         return self.user_name if self.kind != "attempt" else f"job:{self.job_id}"
 
+    @property
+    def owner(self) -> str:
+        """The name of the user to whom the tokens of this principal belong. Raises `TypeError` if it is not a user."""
+        if self.user_name is None:
+            raise TypeError(f"a principal of the kind {self.kind} has no tokens")
+        return self.user_name
+
 
 ANONYMOUS = Principal("anonymous")
 SYSTEM = Principal("system", administrator=True, scopes=tuple(scope.value for scope in Scope))

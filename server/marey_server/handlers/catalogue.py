@@ -3,6 +3,7 @@
 from marey_server.handlers import (
     access,
     annotations,
+    audit,
     blobs,
     collections,
     coverage_streams,
@@ -49,6 +50,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     *blobs.RESOURCES,
     *uploads.RESOURCES,
     *events.RESOURCES,
+    *audit.RESOURCES,
     *webhooks.RESOURCES,
     *documentation.RESOURCES,
     *health.RESOURCES,

@@ -223,6 +223,11 @@ class Settings(BaseSettings):
         5, ge=0, description="Days after which a webhook is paused if all attempts have failed; 0: never."
     )
     events_days: int = Field(Retention.events_days, ge=0, description="Days for which events are kept; 0: for ever.")
+    audit_days: int = Field(
+        Retention.audit_days,
+        ge=0,
+        description="Days for which entries of the audit log are kept, at least events_days; 0: for ever.",
+    )
     logs_days: int = Field(
         Retention.logs_days,
         ge=0,
@@ -254,6 +259,17 @@ class Settings(BaseSettings):
             )
         return heartbeat_s
 
+    @field_validator("audit_days")
+    @classmethod
+    def _check_audit_days(cls, audit_days: int, others: ValidationInfo) -> int:
+        events_days = others.data.get("events_days", 0)
+        if audit_days and not 0 < events_days <= audit_days:
+            kept = f"{events_days} days" if events_days else "for ever"
+            raise ValueError(
+                f"the value must be 0 or at least events_days, because audit entries are events, which are kept {kept}"
+            )
+        return audit_days
+
     @classmethod
     def settings_customise_sources(
         cls,
@@ -274,7 +290,7 @@ class Settings(BaseSettings):
     @property
     def retention(self) -> Retention:
         """Return the numbers of days for which events, logs and jobs are kept."""
-        return Retention(self.events_days, self.logs_days, self.jobs_days)
+        return Retention(self.events_days, self.logs_days, self.jobs_days, self.audit_days)
 
     @property
     def child_limits(self) -> ChildLimits:

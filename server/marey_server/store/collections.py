@@ -211,7 +211,7 @@ def delete_collection(tx: Transaction, project: str, collection_id: str, *, expe
         .returning(item.c.creator_id, item.c.stored_bytes)
     )
     quotas.release(tx, project_row.id, quotas.by_creator(gone))
-    tx.emit("collection.deleted", collection_id, project_id=project_row.id, path=path)
+    tx.audit("collection.deleted", collection_id, about=path, project_id=project_row.id, path=path)
 
 
 def restore_collection(
@@ -241,7 +241,7 @@ def restore_collection(
         .returning(item.c.creator_id, item.c.stored_bytes)
     )
     quotas.hold(tx, project_row.id, quotas.by_creator(back))
-    tx.emit("collection.restored", collection_id, project_id=project_row.id, path=gone.path)
+    tx.audit("collection.restored", collection_id, about=gone.path, project_id=project_row.id, path=gone.path)
     return _shown(row)
 
 

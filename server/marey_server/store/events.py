@@ -5,6 +5,10 @@ transactions overlap, so events get their numbers after the commit, in `number_e
 events holds a lock until its own commit, sees only committed events, and continues after the last number. So no event
 gets a lower number than one that was already listed, writers do not wait for each other, and the order depends on
 nothing but the tables.
+
+Entries of the audit log are events that are kept longer than others. The feed begins after the last event that was old
+enough to be deleted. Audit entries before this place are no longer part of the feed. So clients and webhooks, which
+follow it, never receive some of the events of a period without the others.
 """
 
 from __future__ import annotations
@@ -13,7 +17,21 @@ from collections.abc import Iterable
 from itertools import takewhile
 from typing import Any, NamedTuple
 
-from sqlalchemy import BigInteger, ColumnElement, Row, and_, cast, delete, exists, func, insert, select, text, update
+from sqlalchemy import (
+    BigInteger,
+    ColumnElement,
+    Row,
+    Select,
+    and_,
+    cast,
+    delete,
+    exists,
+    func,
+    insert,
+    select,
+    text,
+    update,
+)
 
 from marey_schemas.items import Event
 from marey_server.access.roles import require_administrator
@@ -48,6 +66,7 @@ def list_events(
     `GoneProblem` if events after `after` were deleted, unless `after` is 0, which means the oldest stored event.
     """
     require_kept(tx, after)
+    after = start_of_feed(tx, after)
     number = number_of(tx)
     statement = select(*_COLUMNS, number.label("number"), project.c.name.label("project")).select_from(
         event.outerjoin(project, project.c.id == event.c.project_id)
@@ -67,8 +86,8 @@ def require_kept(tx: Transaction, after: int) -> None:
 
     Raises `GoneProblem`.
     """
-    last = tx.execute(select(server_state.c.value).where(server_state.c.key == _LAST_DELETED)).scalar()
-    if 0 < after < (last or 0):
+    last = _last_deleted(tx)
+    if 0 < after < last:
         raise GoneProblem(
             f"Events up to number {last} were deleted because they are old; read the resources that you "
             f"follow again, then continue with after={last}.",
@@ -77,28 +96,54 @@ def require_kept(tx: Transaction, after: int) -> None:
         )
 
 
-class OldEvents(NamedTuple):
-    """Oldest events: how many there are, and the number of the last one."""
-
-    found: int
-    last: int
+def _last_deleted(tx: Transaction) -> int:
+    """Return the number of the last event that was deleted from the feed, 0 if there is none."""
+    return int(tx.execute(select(server_state.c.value).where(server_state.c.key == _LAST_DELETED)).scalar() or 0)
 
 
-def find_oldest(tx: Transaction, age_us: int) -> OldEvents | None:
-    """Return some of the oldest events if they are older than `age_us`; the newest event is not among them."""
+def start_of_feed(tx: Transaction, after: int) -> int:
+    """Return the number after which the feed begins for a client that has received the events up to `after`."""
+    return max(after, _last_deleted(tx))
+
+
+# -- deletion of old events --------------------------------------------------------------------------------------------
+
+
+def find_last_old(tx: Transaction, age_us: int) -> int | None:
+    """Return the number of one of the oldest events of the feed if all up to it are older than `age_us`.
+
+    There are at most `DELETED_AT_ONCE` events up to it in the feed, and it is not the newest event.
+    """
     number = number_of(tx)
-    oldest = select(number.label("number"), event.c.at_us).where(follows(tx, 0), number < newest_number(tx))
-    rows = tx.execute(oldest.order_by(number).limit(DELETED_AT_ONCE)).all()
+    oldest = select(number.label("number"), event.c.at_us).where(follows(tx, _last_deleted(tx)))
+    return _last_of_old(tx, oldest.where(number < newest_number(tx)).order_by(number), age_us)
+
+
+def _last_of_old(tx: Transaction, oldest: Select[Any], age_us: int) -> int | None:
+    rows = tx.execute(oldest.limit(DELETED_AT_ONCE)).all()
     old = list(takewhile(lambda row: row.at_us < tx.now_us - age_us, rows))
-    return OldEvents(len(old), old[-1].number) if old else None
+    return int(old[-1].number) if old else None
 
 
-def delete_until(tx: Transaction, last: int) -> None:
-    """Delete the events up to the one numbered `last`, and store that they were deleted."""
-    tx.execute(delete(event).where(follows(tx, 0), number_of(tx) <= last))
+def delete_until(tx: Transaction, last: int) -> int:
+    """Delete events up to the one numbered `last`, but keep audit entries; return the number of deleted events.
+
+    The feed then begins after `last`.
+    """
+    of_feed = follows(tx, _last_deleted(tx)), number_of(tx) <= last
+    deleted = tx.execute(delete(event).where(*of_feed, event.c.about.is_(None))).rowcount
     is_mark = server_state.c.key == _LAST_DELETED
     if tx.execute(update(server_state).where(is_mark).values(value=last)).rowcount == 0:
         tx.execute(insert(server_state).values(key=_LAST_DELETED, value=last))
+    return deleted
+
+
+def delete_old_audit_entries(tx: Transaction, age_us: int) -> int:
+    """Delete some audit entries that are older than `age_us` and no longer in the feed; return how many."""
+    number = number_of(tx)
+    left_feed = follows(tx, 0), number <= _last_deleted(tx)
+    last = _last_of_old(tx, select(number.label("number"), event.c.at_us).where(*left_feed).order_by(number), age_us)
+    return 0 if last is None else tx.execute(delete(event).where(*left_feed, number <= last)).rowcount
 
 
 _COLUMNS = (event.c.at_us, event.c.kind, event.c.subject, event.c.actor, event.c.body)

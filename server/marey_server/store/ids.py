@@ -1,9 +1,11 @@
 """Ids: opaque, sortable by time of creation, prefixed by type, never reused."""
 
+import re
 import secrets
 import time
 
 _ALPHABET = "0123456789abcdefghjkmnpqrstvwxyz"
+_ID = re.compile(f"[a-z_-]{{1,13}}_[{_ALPHABET}]{{26}}")
 
 
 def new_id(prefix: str) -> str:
@@ -11,3 +13,8 @@ def new_id(prefix: str) -> str:
     number = (time.time_ns() // 1_000_000) << 80 | secrets.randbits(80)
     digits = [_ALPHABET[(number >> shift) & 31] for shift in range(125, -1, -5)]
     return f"{prefix}_{''.join(digits)}"
+
+
+def is_id(text: str) -> bool:
+    """Return whether a text has the form of an id."""
+    return _ID.fullmatch(text) is not None

@@ -58,6 +58,7 @@ def put_member(
         raise NotFoundProblem(f"There is no user {user_name!r}.", code="no-user")
     which = (member.c.project_id == project_row.id, member.c.user_id == user_id)
     row = {"project_id": project_row.id, "user_id": user_id, "role": request.role.value, "since_us": tx.now_us}
+    was = tx.execute(select(member.c.role).where(*which)).scalar()
     added = None
     if expected_rev is None:
         added = tx.execute(tx.insert_or_ignore(member, row).returning(*member.c)).first()
@@ -69,13 +70,11 @@ def put_member(
         tx, member, which, {"role": request.role.value}, expected_rev=expected_rev, absent=_no_member(user_name)
     )
     _require_owner(tx, project_row)
-    tx.emit(
-        "member.changed" if added is None else "member.added",
-        project_row.id,
-        project_id=project_row.id,
-        user=user_name,
-        role=request.role.value,
-    )
+    details = {"user": user_name, "role": request.role.value}
+    if added is not None:
+        tx.audit("member.added", project_row.id, about=user_name, project_id=project_row.id, **details)
+    else:
+        tx.audit("member.changed", project_row.id, about=user_name, project_id=project_row.id, was=was, **details)
     return _shown(user_name, changed)
 
 
@@ -86,11 +85,12 @@ def remove_member(tx: Transaction, project_name: str, user_name: str, *, expecte
         member.c.project_id == project_row.id,
         member.c.user_id.in_(select(user.c.id).where(user.c.name == user_name)),
     )
-    if tx.execute(delete(member).where(*which, at_rev(member.c.rev, expected_rev))).rowcount == 0:
+    was = tx.execute(delete(member).where(*which, at_rev(member.c.rev, expected_rev)).returning(member.c.role)).scalar()
+    if was is None:
         current = tx.execute(select(member.c.rev).where(*which)).scalar()
         raise _no_member(user_name) if current is None else moved_on(current)
     _require_owner(tx, project_row)
-    tx.emit("member.removed", project_row.id, project_id=project_row.id, user=user_name)
+    tx.audit("member.removed", project_row.id, about=user_name, project_id=project_row.id, user=user_name, was=was)
 
 
 def _lock(tx: Transaction, project_name: str) -> ProjectRow:

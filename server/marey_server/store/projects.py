@@ -274,7 +274,8 @@ def create_project(tx: Transaction, request: ProjectCreate) -> Project:
     if principal.user_id is not None:
         owner = {"project_id": made.id, "user_id": principal.user_id, "role": Role.OWNER.value, "since_us": tx.now_us}
         tx.execute(insert(member), owner)
-    tx.emit("project.created", made.id, project_id=made.id, name=made.name)
+    visibility = made.visibility.value
+    tx.audit("project.created", made.id, about=made.name, project_id=made.id, name=made.name, visibility=visibility)
     return made.shown()
 
 
@@ -290,7 +291,8 @@ def change_project(tx: Transaction, name: str, request: ProjectChange, *, expect
         values["visibility"] = request.visibility.value if request.visibility else None
     values = {key: value for key, value in values.items() if value is not None or key == "title"}
     changed = _change(tx, seen, values, expected_rev, project.c.deleted_us.is_(None))
-    tx.emit("project.changed", seen.id, project_id=seen.id, fields=sorted(values))
+    access = {"visibility": values["visibility"]} if "visibility" in values else {}
+    tx.audit("project.changed", seen.id, about=name, project_id=seen.id, fields=sorted(values), **access)
     return changed
 
 
@@ -298,7 +300,7 @@ def delete_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev) -> 
     """Hide a project and everything in it; an owner can restore it."""
     seen = require(tx, name)
     _change(tx, seen, {"deleted_us": tx.now_us}, expected_rev, project.c.deleted_us.is_(None))
-    tx.emit("project.deleted", seen.id, project_id=seen.id, name=name)
+    tx.audit("project.deleted", seen.id, about=name, project_id=seen.id, name=name)
 
 
 def restore_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev = None) -> Project:
@@ -313,7 +315,7 @@ def restore_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev = N
         quotas.require_room(tx, "user_projects")
     with taken(_name_taken(name)):
         restored = _change(tx, seen, {"deleted_us": None}, expected_rev, project.c.deleted_us.is_not(None))
-    tx.emit("project.restored", seen.id, project_id=seen.id, name=name)
+    tx.audit("project.restored", seen.id, about=name, project_id=seen.id, name=name)
     return restored
 
 
@@ -323,7 +325,7 @@ def change_quotas(tx: Transaction, name: str, change: QuotaChange) -> QuotasInUs
     found = tx.execute(select(project.c.id).where(project.c.name == name, project.c.deleted_us.is_(None))).scalar()
     if found is None:
         raise NotFoundProblem(f"There is no project {name!r}.", code="no-project")
-    return quotas.change_limits(tx, "project", found, change)
+    return quotas.change_limits(tx, "project", found, name, change)
 
 
 def _change(

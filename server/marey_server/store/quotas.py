@@ -198,7 +198,9 @@ def show_quotas(tx: Transaction, of: Literal["project", "user"], owner_id: str) 
     )
 
 
-def change_limits(tx: Transaction, of: Literal["project", "user"], owner_id: str, change: QuotaChange) -> QuotasInUse:
+def change_limits(
+    tx: Transaction, of: Literal["project", "user"], owner_id: str, owner_name: str, change: QuotaChange
+) -> QuotasInUse:
     """Change the quotas of a project or a user, and return all of its quotas and their use.
 
     The caller must have checked that the principal is an administrator.
@@ -207,9 +209,9 @@ def change_limits(tx: Transaction, of: Literal["project", "user"], owner_id: str
     limits = {name: limit for name, limit in changed.items() if limit is not None}
     tx.execute(update(holding).where(holding.c.owner_id == owner_id).values(limits=limits))
     if of == "project":
-        tx.emit("project.limited", owner_id, project_id=owner_id, limits=limits)
+        tx.audit("project.limited", owner_id, about=owner_name, project_id=owner_id, limits=limits)
     else:
-        tx.emit("user.limited", owner_id, limits=limits)
+        tx.audit("user.limited", owner_id, about=owner_name, limits=limits)
     return show_quotas(tx, of, owner_id)
 
 

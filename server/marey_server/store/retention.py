@@ -1,4 +1,4 @@
-"""Retention: deletes events, deliveries of webhooks, logs and jobs that are older than the settings allow.
+"""Retention: deletes events, audit entries, deliveries of webhooks, logs and jobs that are too old by the settings.
 
 Work is done in batches, each in a transaction of its own, so that no other write waits long. If a process dies between
 two batches, the next round continues. A job that created a revision or a commit is never deleted.
@@ -37,53 +37,63 @@ DELETED_LOG = b"[This log was deleted because it was old.]\n"
 
 @dataclass(frozen=True)
 class Retention:
-    """Numbers of days for which events, logs and jobs are kept; 0 means for ever."""
+    """Numbers of days for which events, logs, jobs and audit entries are kept; 0 means for ever."""
 
     events_days: int = 365
     logs_days: int = 90
     jobs_days: int = 365
+    audit_days: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class Retired:
-    """Numbers of deleted events, logs and jobs."""
+    """Numbers of deleted events, logs, jobs and audit entries."""
 
     events: int = 0
     logs: int = 0
     jobs: int = 0
+    audit_entries: int = 0
 
 
 def retire(database: Database, retention: Retention) -> Retired:
-    """Delete events, logs and jobs that are too old, and return how many; may run in several processes at once."""
+    """Delete what is too old, and return how many of each; may run in several processes at once."""
     database.write(SYSTEM, forget_old_secrets)
     return Retired(
         events=_retire_events(database, retention.events_days) if retention.events_days else 0,
         logs=_retire_logs(database, retention.logs_days) if retention.logs_days else 0,
         jobs=_retire_jobs(database, retention.jobs_days) if retention.jobs_days else 0,
+        audit_entries=_retire_audit_entries(database, retention.audit_days) if retention.audit_days else 0,
     )
 
 
 def _retire_events(database: Database, days: int) -> int:
     """Delete old events, and deliveries of webhooks that ended long ago; return the number of events."""
     deleted = 0
-    while count := database.write(SYSTEM, _delete_oldest, days * DAY_US):
+    while (count := database.write(SYSTEM, _delete_oldest, days * DAY_US)) is not None:
         deleted += count
     while database.write(SYSTEM, outbox.delete_old_deliveries, days * DAY_US, BATCH) == BATCH:
         pass
     return deleted
 
 
-def _delete_oldest(tx: Transaction, age_us: int) -> int:
-    """Delete some old events and return their number.
+def _delete_oldest(tx: Transaction, age_us: int) -> int | None:
+    """Delete some old events, except audit entries, and return how many; None if there are no further old events.
 
     Events that a webhook has not delivered yet are counted first, so that the webhook can report them as missed.
     """
-    old = events.find_oldest(tx, age_us)
-    if old is None:
-        return 0
-    outbox.count_missed(tx, old.last)
-    events.delete_until(tx, old.last)
-    return old.found
+    tx.lock("retention of events")  # otherwise a slower process could set the begin of the feed back
+    last = events.find_last_old(tx, age_us)
+    if last is None:
+        return None
+    outbox.count_missed(tx, last)
+    return events.delete_until(tx, last)
+
+
+def _retire_audit_entries(database: Database, days: int) -> int:
+    deleted = 0
+    while count := database.write(SYSTEM, events.delete_old_audit_entries, days * DAY_US):
+        deleted += count
+    return deleted
 
 
 # -- logs --------------------------------------------------------------------------------------------------------------

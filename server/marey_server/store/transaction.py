@@ -10,7 +10,7 @@ import sqlalchemy
 from sqlalchemy import Connection, CursorResult, Executable, Table
 from sqlalchemy.dialects import postgresql, sqlite
 
-from marey_schemas.event_kinds import EventKind
+from marey_schemas.event_kinds import AuditKind, OrdinaryEventKind
 from marey_server.access.principal import Principal
 from marey_server.access.roles import STRICTEST
 from marey_server.store import tables
@@ -22,8 +22,8 @@ from marey_server.store.wakeups import COMMITTED_EVENTS, wakeups
 IN_LIST = 1000
 """Maximum number of list values in one statement; longer lists are split, because databases limit the parameters."""
 
-Event = tuple[EventKind, str | None, str, dict[str, Any]]
-"""Kind of an event, project id, id of its subject, and body."""
+Event = tuple[OrdinaryEventKind, str | None, str, dict[str, Any]]
+"""Kind of an event that is not in the audit log, project id, id of its subject, and body."""
 
 _INSERT_EVENT = Prepared(sqlalchemy.insert(tables.event))
 
@@ -123,17 +123,30 @@ class Transaction:
                 sqlalchemy.select(sqlalchemy.func.pg_advisory_xact_lock(sqlalchemy.func.hashtextextended(name, 0)))
             )
 
-    def emit(self, kind: EventKind, subject: str, *, project_id: str | None = None, **body: Any) -> None:
+    def emit(self, kind: OrdinaryEventKind, subject: str, *, project_id: str | None = None, **body: Any) -> None:
         """Record an event, which becomes visible when the transaction commits."""
         self.emit_each([(kind, project_id, subject, body)])
 
     def emit_each(self, events: Iterable[Event]) -> None:
         """Record events in this order, visible when the transaction commits."""
-        common = {"at_us": self.now_us, "actor": self.principal.actor}
-        rows = [
-            {**common, "kind": kind, "project_id": project_id, "subject": subject, "body": body}
+        self._record(
+            {"kind": kind, "project_id": project_id, "subject": subject, "body": body, "about": None, "token_id": None}
             for kind, project_id, subject, body in events
-        ]
+        )
+
+    def audit(self, kind: AuditKind, subject: str, *, about: str, project_id: str | None = None, **body: Any) -> None:
+        """Record an event that is also an entry of the audit log.
+
+        `about` is the name of the user or object that is changed; only the audit log shows it, and neither it nor the
+        body may contain a secret.
+        """
+        token_id = self.principal.token_id
+        row = {"kind": kind, "project_id": project_id, "subject": subject, "body": body}
+        self._record([{**row, "about": about, "token_id": token_id}])
+
+    def _record(self, events: Iterable[Mapping[str, Any]]) -> None:
+        common = {"at_us": self.now_us, "actor": self.principal.actor}
+        rows = [{**common, **one} for one in events]
         if rows:
             self.run_each(_INSERT_EVENT, rows)
             self._has_emitted = True

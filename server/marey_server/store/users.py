@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from sqlalchemy import ColumnElement, Row, func, insert, select
@@ -49,7 +50,7 @@ def _insert(
     }  # fmt: skip
     with taken(ConflictProblem(f"The name {name!r} is taken by another user.", code="name-taken")):
         made = tx.execute(insert(user).values(**row).returning(*user.c)).one()
-    tx.emit("user.created", made.id, name=name, administrator=administrator)
+    tx.audit("user.created", made.id, about=name, administrator=administrator)
     return _shown(made)
 
 
@@ -76,7 +77,7 @@ def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
 def change_quotas(tx: Transaction, name: str, change: QuotaChange) -> QuotasInUse:
     """Change the quotas of a user, and return all of them and their use. Only administrators may do this."""
     require_administrator(tx.principal)
-    return quotas.change_limits(tx, "user", find_user(tx, name).id, change)
+    return quotas.change_limits(tx, "user", find_user(tx, name).id, name, change)
 
 
 def list_users(tx: Transaction, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT) -> Page:
@@ -121,9 +122,17 @@ def change_user(
         ) from None
     _require_some_administrator(tx)
     default = EndTokens.SESSIONS if password_hash is not None else EndTokens.NONE
-    tokens.end_tokens(tx, row.id, request.end_tokens or default)
-    tx.emit("user.changed", row.id, name=name, fields=sorted(values))
+    ended = request.end_tokens or default
+    tokens.end_tokens(tx, row.id, ended)
+    _audit_change(tx, row, values, ended)
     return _shown(row)
+
+
+def _audit_change(tx: Transaction, row: Row[Any], values: Mapping[str, Any], ended: EndTokens) -> None:
+    """Record the change of a user in the audit log, without the hash of the password."""
+    fields = sorted("password" if name == "password_hash" else name for name in values)
+    rights = {name: value for name, value in values.items() if name in ("administrator", "disabled")}
+    tx.audit("user.changed", row.id, about=row.name, fields=fields, ended_tokens=ended.value, **rights)
 
 
 def _require_changes(principal: Principal, name: str, request: UserChange) -> bool:

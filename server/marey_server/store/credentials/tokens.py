@@ -182,7 +182,8 @@ def _insert(
         "expires_us": expires_us, "session": session, "created_by": tx.principal.token_id, "labels": labels,
     }  # fmt: skip
     made = tx.execute(insert(token).values(**row).returning(*token.c)).one()
-    tx.emit("token.created", made.id, name=made.name, scopes=list(request.scopes))
+    details = {"name": made.name, "scopes": list(request.scopes), "session": session}
+    tx.audit("token.created", made.id, about=tx.principal.owner, **details)
     return NewToken(**shown(made, tx.principal.user_name).model_dump(), secret=issued.text)
 
 
@@ -346,8 +347,11 @@ def end_tokens(tx: Transaction, user_id: str, which: EndTokens) -> None:
 
 
 def _revoke(tx: Transaction, which: ColumnElement[bool]) -> None:
-    for token_id in tx.execute(delete(token).where(which).returning(token.c.id)).scalars().all():
-        tx.emit("token.revoked", token_id)
+    gone = tx.execute(delete(token).where(which).returning(token.c.id, token.c.name, token.c.user_id)).all()
+    owners = select(user.c.id, user.c.name).where(user.c.id.in_({row.user_id for row in gone}))
+    names = {row.id: row.name for row in tx.execute(owners)} if gone else {}
+    for row in gone:
+        tx.audit("token.revoked", row.id, about=names[row.user_id], name=row.name)
 
 
 def forget_ended(tx: Transaction) -> int:

@@ -9,7 +9,7 @@ from sqlalchemy import CTE, Row, delete, func, insert, literal_column, null, sel
 
 from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind, RefMove
 from marey_schemas.datasets.protection import ProtectionRule
-from marey_schemas.event_kinds import EventKind
+from marey_schemas.event_kinds import AuditKind, OrdinaryEventKind
 from marey_schemas.items import Page
 from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import collections, listing, projects
@@ -117,7 +117,7 @@ def delete_dataset(tx: Transaction, project: str, name: str, *, expected_rev: Ex
     absent = NotFoundProblem(f"There is no dataset {name!r} in this project.", code="no-dataset")
     values = {"deleted_us": tx.now_us, "updated_us": tx.now_us}
     change_row(tx, dataset, (dataset.c.id == row.id, _ALIVE), values, expected_rev=expected_rev, absent=absent)
-    tx.emit("dataset.deleted", row.id, project_id=project_row.id, name=name)
+    tx.audit("dataset.deleted", row.id, about=name, project_id=project_row.id, name=name)
 
 
 # -- branches and tags ------------------------------------------------------------------------------------------------
@@ -179,7 +179,7 @@ def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> 
     _require_room(held, MOST_REFS, "branches and tags in a dataset", "too-many-refs")
     with taken(ConflictProblem(f"There is a branch or tag {request.name!r} already.", code="name-taken")):
         tx.execute(insert(dataset_ref).values(**new_ref(tx, row.id, request.name, request.kind, digest)))
-    created: EventKind = "branch.created" if request.kind is RefKind.BRANCH else "tag.created"
+    created: OrdinaryEventKind = "branch.created" if request.kind is RefKind.BRANCH else "tag.created"
     tx.emit(created, row.id, project_id=project_row.id, name=request.name, commit=digest)
     made = find_ref(tx, row.id, request.name)
     assert made is not None
@@ -199,11 +199,14 @@ def move_branch(
     digest = resolve(tx, row.id, request.at)
     which = (dataset_ref.c.dataset_id == row.id, dataset_ref.c.name == branch)
     values = {"digest": digest, "updated_us": tx.now_us}
+    was = find_ref(tx, row.id, branch, lock=True)
     changed = change_row(tx, dataset_ref, which, values, expected_rev=expected_rev, absent=_no_version(branch))
     if changed.kind != RefKind.BRANCH:
         raise is_tag(branch)
     require_reset(changed)
     tx.emit("branch.moved", row.id, project_id=project_row.id, branch=branch, commit=digest)
+    moved = {"branch": branch, "was": None if was is None else was.digest, "commit": digest}
+    tx.audit("branch.reset", row.id, about=name, project_id=project_row.id, **moved)
     return _shown_ref(changed)
 
 
@@ -228,8 +231,8 @@ def delete_ref(tx: Transaction, project: str, name: str, ref: str, *, expected_r
     )
     require_deletable(tx, changed)
     tx.execute(delete(dataset_ref).where(*which))
-    gone: EventKind = "branch.deleted" if changed.kind == RefKind.BRANCH else "tag.deleted"
-    tx.emit(gone, row.id, project_id=project_row.id, name=ref, commit=changed.digest)
+    gone: AuditKind = "branch.deleted" if changed.kind == RefKind.BRANCH else "tag.deleted"
+    tx.audit(gone, row.id, about=name, project_id=project_row.id, name=ref, commit=changed.digest)
 
 
 def protect_branch(
@@ -250,8 +253,10 @@ def protect_branch(
         raise is_tag(branch)
     if changed.digest is None:
         raise InvalidProblem(f"The branch {branch!r} has no commits yet; commit to it first.", code="no-commits")
-    kind: EventKind = "branch.protected" if rule is not None else "branch.unprotected"
-    tx.emit(kind, row.id, project_id=project_row.id, branch=branch)
+    if rule is None:
+        tx.audit("branch.unprotected", row.id, about=name, project_id=project_row.id, branch=branch)
+    else:
+        tx.audit("branch.protected", row.id, about=name, project_id=project_row.id, branch=branch, rule=stored)
     return _shown_ref(changed)
 
 

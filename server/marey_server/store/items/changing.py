@@ -21,7 +21,7 @@ from marey_server.store.items.reading import find_item, no_item, shown_items
 from marey_server.store.items.references import ReferenceCheck
 from marey_server.store.items.revisions import (
     NewRevision,
-    emit_item,
+    event_of_item,
     read_part_digests,
     write_head,
     write_revisions,
@@ -100,7 +100,7 @@ def put_part(
             write_revisions(tx, [made], author_id=tx.principal.user_id, job_id=None)
             quotas.hold(tx, project_row.id, {found.creator_id: Held(stored_bytes=added)})
             shown = _shown(tx, project_row, kind, item_id)
-            emit_item(tx, "item.revised", project_row, shown, revision=shown.revision, job=None)
+            tx.emit("item.revised", **event_of_item(project_row, shown), revision=shown.revision, job=None)
             return shown
         found = find_item(tx, project_row, kind, item_id)
     raise moved_on(found.rev)
@@ -126,7 +126,7 @@ def set_parts(
     write_revisions(tx, [made], author_id=tx.principal.user_id, job_id=None)
     quotas.hold(tx, project_row.id, {found.creator_id: Held(stored_bytes=added)})
     shown = _shown(tx, project_row, kind, item_id)
-    emit_item(tx, "item.revised", project_row, shown, revision=shown.revision, job=None)
+    tx.emit("item.revised", **event_of_item(project_row, shown), revision=shown.revision, job=None)
 
 
 def revert_item(
@@ -166,7 +166,7 @@ def change_item(
         if request.tags:
             tx.execute(insert(item_tag), [{"item_id": item_id, "tag": tag} for tag in dict.fromkeys(request.tags)])
     shown = _shown(tx, project_row, kind, item_id)
-    emit_item(tx, "item.changed", project_row, shown, fields=sorted(request.model_fields_set))
+    tx.emit("item.changed", **event_of_item(project_row, shown), fields=sorted(request.model_fields_set))
     return shown
 
 
@@ -178,7 +178,7 @@ def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expe
     absent = no_item(kind, item_id)
     row = change_row(tx, item, which, {"deleted_us": tx.now_us}, expected_rev=expected_rev, absent=absent)
     quotas.release(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
-    emit_item(tx, "item.deleted", project_row, gone)
+    tx.audit("item.deleted", about=gone.name, **event_of_item(project_row, gone))
 
 
 def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev = None) -> Item:
@@ -195,7 +195,7 @@ def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, exp
         row = change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))
     quotas.hold(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
     shown = _shown(tx, project_row, kind, item_id)
-    emit_item(tx, "item.restored", project_row, shown)
+    tx.audit("item.restored", about=shown.name, **event_of_item(project_row, shown))
     return shown
 
 

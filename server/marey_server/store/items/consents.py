@@ -103,11 +103,13 @@ def permit_export(tx: Transaction, project: str, kind: Kind, item_id: str, overr
 def record_override(
     tx: Transaction, project_id: str, subject: str, override: ConsentOverride, ended: Collection[EndedConsent]
 ) -> None:
-    """Record as an event that the caller allows the export of clips whose consent has `ended`.
+    """Record in the audit log that the caller allows the export of clips whose consent has `ended`.
 
     `subject` is the id of what exports them: a job, a dataset, or the item itself.
     """
-    tx.emit("consent.overridden", subject, project_id=project_id, reason=override.consent_reason, **_named(ended))
+    names = [one.path.rpartition("/")[2] for one in ended] or [subject]  # a job may not know its clips yet
+    details = {"reason": override.consent_reason, **_named(ended)}
+    tx.audit("consent.overridden", subject, about=names[0], project_id=project_id, **details)
 
 
 def _named(ended: Collection[EndedConsent]) -> dict[str, Any]:

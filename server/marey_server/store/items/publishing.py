@@ -10,7 +10,7 @@ from typing import Any
 
 from sqlalchemy import Row, and_, insert, select
 
-from marey_schemas.event_kinds import EventKind
+from marey_schemas.event_kinds import OrdinaryEventKind
 from marey_schemas.kinds import PARTS, Kind
 from marey_server import faults
 from marey_server.errors import ConflictProblem, InvalidProblem
@@ -362,7 +362,7 @@ class _Publication:
     def _add(self, creator_id: str | None, more: Held) -> None:
         self.added[creator_id] = self.added.get(creator_id, Held()) + more
 
-    def _write(self, event: EventKind, made: Sequence[tuple[_Ready, _Head]]) -> None:
+    def _write(self, event: OrdinaryEventKind, made: Sequence[tuple[_Ready, _Head]]) -> None:
         """Insert the newest revisions of items, with their tags, sources and events."""
         if not made:
             return

@@ -8,7 +8,6 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, insert, select, update
 
-from marey_schemas.event_kinds import EventKind
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_server.store.documents import load_body
@@ -88,9 +87,9 @@ def write_revisions(
     )
 
 
-def emit_item(tx: Transaction, event: EventKind, project_row: ProjectRow, subject: Item, **body: Any) -> None:
-    """Record an event about an item."""
-    tx.emit(
-        event, subject.id, project_id=project_row.id, item_kind=subject.kind.value, name=subject.name,
-        collection=subject.collection, **body,
-    )  # fmt: skip
+def event_of_item(project_row: ProjectRow, subject: Item) -> dict[str, Any]:
+    """Return the values that events about an item have in common, as arguments of `Transaction.emit` and `audit`."""
+    return {
+        "subject": subject.id, "project_id": project_row.id, "item_kind": subject.kind.value, "name": subject.name,
+        "collection": subject.collection,
+    }  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from marey_schemas.event_kinds import EventKind
+from marey_schemas.event_kinds import OrdinaryEventKind
 from marey_server.store.transaction import Transaction
 from marey_server.store.wakeups import job_topic, wakeups, work_topic
 
@@ -13,7 +13,7 @@ EventOfJob = tuple[str, str, dict[str, Any]]
 """Project id, job id and body of an event."""
 
 
-def emit_job_events(tx: Transaction, kind: EventKind, events: Sequence[EventOfJob]) -> None:
+def emit_job_events(tx: Transaction, kind: OrdinaryEventKind, events: Sequence[EventOfJob]) -> None:
     """Record one event per job, visible when the transaction commits."""
     tx.emit_each((kind, *one) for one in events)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from sqlalchemy import Row, and_, bindparam, delete, false, select, tuple_, update
 
-from marey_schemas.event_kinds import EventKind
+from marey_schemas.event_kinds import OrdinaryEventKind
 from marey_schemas.queue.jobs import JobState
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs import late_inputs, result_cache
@@ -56,7 +56,7 @@ def make_ready(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
 
 READY_COLUMNS = (job.c.id, job.c.project_id, job.c.kind, job.c.size, job.c.unbound, job.c.cache_key, job.c.cache_mode)
 
-_ENDINGS: dict[str, EventKind] = {
+_ENDINGS: dict[str, OrdinaryEventKind] = {
     JobState.SUCCEEDED: "job.succeeded",
     JobState.FAILED: "job.failed",
     JobState.CANCELLED: "job.cancelled",

@@ -1,9 +1,17 @@
 """Tables of what the server keeps for itself: events, webhooks, repeated requests, streams, and its own state."""
 
-from sqlalchemy import BigInteger, Boolean, Column, ForeignKey, Index, Integer, LargeBinary, String, Table, Text
+from sqlalchemy import BigInteger, Boolean, Column, ForeignKey, Index, Integer, LargeBinary, String, Table, Text, text
 
 from marey_schemas.webhooks import MAX_URL_LENGTH
 from marey_server.store.tables.columns import DIGEST, ID, Document, Micros, Sequence64, metadata
+
+_AUDITED = text("about IS NOT NULL")
+
+
+def _audit_index(name: str, *columns: str) -> Index:
+    """Return an index of the entries of the audit log, which costs nothing for the many other events."""
+    return Index(f"ix_event_audit_{name}", *columns, sqlite_where=_AUDITED, postgresql_where=_AUDITED)
+
 
 event = Table(
     "event",
@@ -16,8 +24,19 @@ event = Table(
     Column("subject", String(64), nullable=False, index=True),
     Column("actor", String(255)),
     Column("body", Document, nullable=False),
+    Column("about", String(1024)),  # name of what an entry of the audit log is about; null for all other events
+    Column("token_id", ID),  # of the token with which an entry of the audit log was made
     Index("uq_event_number", "number", unique=True),
     Index("ix_event_feed", "project_id", "number", "seq"),
+    _audit_index("at", "at_us", "seq"),
+    _audit_index("kind", "kind", "at_us", "seq", "actor"),
+    _audit_index("actor", "actor", "at_us", "seq", "kind"),
+    _audit_index("about", "about", "at_us", "seq"),
+    _audit_index("subject", "subject", "at_us", "seq"),
+    _audit_index("project", "project_id", "at_us", "seq"),
+    _audit_index("project_kind", "project_id", "kind", "at_us", "seq", "actor"),
+    _audit_index("project_actor", "project_id", "actor", "at_us", "seq", "kind"),
+    _audit_index("project_about", "project_id", "about", "at_us", "seq"),
     sqlite_autoincrement=True,
 )
 

@@ -99,7 +99,7 @@ def create_webhook(tx: Transaction, project: str, request: WebhookCreate, networ
         "position": events.newest_number(tx), "created_us": tx.now_us, "updated_us": tx.now_us,
     }  # fmt: skip
     tx.execute(insert(webhook).values(**values))
-    tx.emit("webhook.created", webhook_id, project_id=project_row.id)
+    tx.audit("webhook.created", webhook_id, about=host_of(request.url), project_id=project_row.id)
     return _with_secret(tx, project_row, webhook_id, secret)
 
 
@@ -115,8 +115,13 @@ def _require_free_place(tx: Transaction, project_row: ProjectRow) -> None:
         )
 
 
+def host_of(url: str) -> str:
+    """Return the host of a URL. The rest of the URL may contain secrets, so the audit log does not contain it."""
+    return urlsplit(url).hostname or ""
+
+
 def _require_public(url: str, networks: Sequence[Network]) -> None:
-    host = urlsplit(url).hostname or ""
+    host = host_of(url)
     address = literal_address(host)
     if address is not None and not may_connect(address, networks):
         raise InvalidProblem(
@@ -153,8 +158,9 @@ def change_webhook(
         values |= RETRY_NOW
     _update(tx, project_row, webhook_id, values)
     fields = sorted(request.model_dump(exclude_none=True))
-    tx.emit("webhook.changed", webhook_id, project_id=project_row.id, fields=fields)
-    return _shown(project, find_webhook(tx, project_row, webhook_id))
+    changed = find_webhook(tx, project_row, webhook_id)
+    tx.audit("webhook.changed", webhook_id, about=host_of(changed.url), project_id=project_row.id, fields=fields)
+    return _shown(project, changed)
 
 
 def give_up_retries(tx: Transaction, webhook_id: str) -> None:
@@ -182,8 +188,9 @@ def rotate_secret(tx: Transaction, project: str, webhook_id: str, request: Webho
         "secret": secret,
     }
     _update(tx, project_row, webhook_id, values)
-    tx.emit("webhook.rotated", webhook_id, project_id=project_row.id)
-    return _with_secret(tx, project_row, webhook_id, secret)
+    rotated = _with_secret(tx, project_row, webhook_id, secret)
+    tx.audit("webhook.rotated", webhook_id, about=host_of(rotated.url), project_id=project_row.id)
+    return rotated
 
 
 def forget_old_secrets(tx: Transaction) -> None:
@@ -196,8 +203,9 @@ def delete_webhook(tx: Transaction, project: str, webhook_id: str) -> None:
     """Delete a webhook and its deliveries."""
     project_row = projects.require(tx, project)
     which = (webhook.c.id == webhook_id, webhook.c.project_id == project_row.id)
-    if tx.execute(select(webhook.c.id).where(*which).with_for_update()).first() is None:
+    url = tx.execute(select(webhook.c.url).where(*which).with_for_update()).scalar()
+    if url is None:
         raise no_webhook(webhook_id)
     tx.execute(delete(webhook_delivery).where(webhook_delivery.c.webhook_id == webhook_id))
     tx.execute(delete(webhook).where(*which))
-    tx.emit("webhook.deleted", webhook_id, project_id=project_row.id)
+    tx.audit("webhook.deleted", webhook_id, about=host_of(url), project_id=project_row.id)

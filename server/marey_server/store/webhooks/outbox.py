@@ -22,7 +22,7 @@ from marey_server.store.database.clock import DAY_US, datetime_of
 from marey_server.store.leader import Lead
 from marey_server.store.tables import event, project, webhook, webhook_delivery
 from marey_server.store.transaction import Transaction
-from marey_server.store.webhooks.managing import give_up_retries
+from marey_server.store.webhooks.managing import give_up_retries, host_of
 
 MOST_ATTEMPTS = 8
 """Number of attempts after which a delivery is given up."""
@@ -121,7 +121,8 @@ def next_batch(tx: Transaction, webhook_id: str, scanned: int) -> Batch | None:
         return _batch(tx, row, found, complete=True, waits=True)
     if row.missed:
         found.append(_missed(row, tx.now_us))
-    following = [] if len(found) >= BATCH else _events(tx, row, max(row.position, scanned))
+    start = events.start_of_feed(tx, max(row.position, scanned))
+    following = [] if len(found) >= BATCH else _events(tx, row, start)
     complete = len(found) < BATCH and len(following) < BATCH
     return _batch(tx, row, [*found, *following], complete=complete, waits=False)
 
@@ -258,7 +259,7 @@ def _fail(tx: Transaction, row: Row[Any], delivery: Delivery, result: DeliveryRe
     if failing_days and since_us < tx.now_us - failing_days * DAY_US:
         reason = f"every attempt has failed for {failing_days} days; the last error: {result.error}"
         values |= {"paused": True, "paused_reason": reason, "updated_us": tx.now_us}
-        tx.emit("webhook.changed", row.id, project_id=row.project_id, fields=["paused"])
+        tx.audit("webhook.changed", row.id, about=host_of(row.url), project_id=row.project_id, fields=["paused"])
     tx.execute(update(webhook).where(webhook.c.id == row.id).values(**values))
     return "dead" if dead else "retry"
 
@@ -282,14 +283,14 @@ def _note(tx: Transaction, delivery: Delivery, result: DeliveryResult, outcome: 
 
 
 def count_missed(tx: Transaction, last: int) -> None:
-    """Count, for each webhook, the undelivered events up to the one numbered `last`, which are about to be deleted.
+    """Count, for each webhook, the undelivered events up to the one numbered `last`, which are about to leave the feed.
 
     The webhook later reports how many events it missed. Its position moves to `last`.
     """
     for row in tx.execute(select(webhook).where(webhook.c.position < last).with_for_update()).all():
         number = events.number_of(tx)
         concerned = (event.c.project_id == row.project_id, event.c.kind.in_(row.kinds), number <= last)
-        missed = select(func.count()).where(*concerned, events.follows(tx, row.position))
+        missed = select(func.count()).where(*concerned, events.follows(tx, events.start_of_feed(tx, row.position)))
         count = tx.execute(missed).scalar_one()
         if count:
             moved = {"position": last, "missed": webhook.c.missed + count, "attempts": 0}

@@ -1,0 +1,69 @@
+"""Audit log: who gave or took access, deleted or restored something, and when."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import datetime
+from typing import Any
+
+from pydantic import Field
+
+from marey_schemas.base import Answer
+from marey_schemas.event_kinds import AuditKind
+
+AUDIT_WORDS: Mapping[AuditKind, str] = {
+    "project.created": "created the project",
+    "project.changed": "changed the project",
+    "project.deleted": "deleted the project",
+    "project.restored": "restored the project",
+    "project.limited": "changed the quotas of the project",
+    "member.added": "added the member",
+    "member.changed": "changed the role of the member",
+    "member.removed": "removed the member",
+    "collection.deleted": "deleted the collection",
+    "collection.restored": "restored the collection",
+    "item.deleted": "deleted the item",
+    "item.restored": "restored the item",
+    "consent.overridden": "allowed an export after the end of the consent for",
+    "dataset.deleted": "deleted the dataset",
+    "branch.deleted": "deleted a branch of the dataset",
+    "branch.reset": "reset a branch of the dataset",
+    "branch.protected": "protected a branch of the dataset",
+    "branch.unprotected": "removed the protection of a branch of the dataset",
+    "tag.deleted": "deleted a tag of the dataset",
+    "webhook.created": "created a webhook to the host",
+    "webhook.changed": "changed a webhook to the host",
+    "webhook.rotated": "replaced the secret of a webhook to the host",
+    "webhook.deleted": "deleted a webhook to the host",
+    "user.created": "created the user",
+    "user.changed": "changed the user",
+    "user.limited": "changed the quotas of the user",
+    "token.created": "created a token of the user",
+    "token.rotated": "replaced a token of the user",
+    "token.revoked": "revoked a token of the user",
+}
+"""What an entry of each kind records, as the words between `actor` and `about`."""
+
+
+class AuditEntry(Answer):
+    """Entry of the audit log: one change of access, or one deletion or restoration.
+
+    The words of `AUDIT_WORDS` for `kind` connect `actor` and `about`: "ada", "added the member", "ben".
+    """
+
+    seq: int = Field(description="Number of the event. The feed of events uses the same number.")
+    at: datetime
+    kind: str
+    project: str | None = Field(description="Present name of the project; null: the entry concerns the whole server.")
+    actor: str | None = Field(
+        description="Name of the user who made the change, or `job:<id>`; null: the server itself."
+    )
+    token: str | None = Field(None, description="Id of the token that the actor used; null: none, as in a sign-in.")
+    about: str = Field(description="Name, at that time, of the user or of the object that was changed.")
+    subject: str = Field(description="Id of the object; for members, of the project.")
+    body: dict[str, Any] = Field(default_factory=dict, description="Details, such as the new role.")
+
+    @property
+    def words(self) -> str:
+        """The words between `actor` and `about`, which say what was done; for a kind without words, the kind."""
+        return next((words for kind, words in AUDIT_WORDS.items() if kind == self.kind), self.kind)

@@ -1,0 +1,92 @@
+"""Audit log: the events that concern access and deletion, newest first.
+
+Nothing but the retention deletes its entries, and nothing changes them.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, NamedTuple
+
+from sqlalchemy import ColumnElement, Row, select
+
+from marey_schemas.audit import AuditEntry
+from marey_schemas.items import Page
+from marey_server.access.roles import require_administrator
+from marey_server.store import events, listing, projects
+from marey_server.store.database.clock import datetime_of, micros_of
+from marey_server.store.ids import is_id
+from marey_server.store.tables import event, project
+from marey_server.store.transaction import Transaction
+
+_KEYS: dict[str, ColumnElement[Any]] = {"at": event.c.at_us, "seq": event.c.seq}
+_ORDER = listing.parse_order("-at,-seq", _KEYS, unique="seq")
+
+
+class AuditFilter(NamedTuple):
+    """Filter of the audit log; None selects all entries.
+
+    `subject` is the id of an object, or the name that entries are about; a text with the form of an id is no name.
+    Entries at `since` are selected, entries at `until` are not.
+    """
+
+    kind: str | None = None
+    actor: str | None = None
+    subject: str | None = None
+    since: datetime | None = None
+    until: datetime | None = None
+
+    def conditions(self) -> list[ColumnElement[bool]]:
+        """Return the conditions for rows of `event`."""
+        found: list[ColumnElement[bool]] = []
+        if self.kind is not None:
+            found.append(event.c.kind == self.kind)
+        if self.actor is not None:
+            found.append(event.c.actor == self.actor)
+        if self.subject is not None:
+            found.append((event.c.subject if is_id(self.subject) else event.c.about) == self.subject)
+        if self.since is not None:
+            found.append(event.c.at_us >= micros_of(self.since))
+        if self.until is not None:
+            found.append(event.c.at_us < micros_of(self.until))
+        return found
+
+
+def list_audit(tx: Transaction, wanted: AuditFilter, *, cursor: str | None, limit: int) -> Page:
+    """List the entries of the whole server. Only administrators may do this."""
+    require_administrator(tx.principal)
+    return _list(tx, wanted, [], "", cursor, limit)
+
+
+def list_project_audit(tx: Transaction, name: str, wanted: AuditFilter, *, cursor: str | None, limit: int) -> Page:
+    """List the entries of a project."""
+    project_id = projects.require(tx, name).id
+    return _list(tx, wanted, [event.c.project_id == project_id], project_id, cursor, limit)
+
+
+def _list(
+    tx: Transaction, wanted: AuditFilter, of: list[ColumnElement[bool]], project_id: str, cursor: str | None, limit: int
+) -> Page:
+    """Return a page of entries. On Postgres, call `number_events` before."""
+    number = events.number_of(tx)
+    statement = (
+        select(*_COLUMNS, number.label("number"), project.c.name.label("project"))
+        .select_from(event.outerjoin(project, project.c.id == event.c.project_id))
+        .where(event.c.about.is_not(None), number.is_not(None), *of, *wanted.conditions())
+    )
+    identity = ["audit", project_id, *(None if one is None else str(one) for one in wanted)]
+    rows, following = listing.read_page(tx, statement, _ORDER, identity, cursor, limit)
+    return Page(items=tuple(map(_shown, rows)), next_cursor=following)
+
+
+_COLUMNS = (
+    event.c.seq, event.c.at_us, event.c.kind, event.c.subject, event.c.actor, event.c.token_id, event.c.about,
+    event.c.body,
+)  # fmt: skip
+
+
+def _shown(row: Row[Any]) -> AuditEntry:
+    return AuditEntry(
+        seq=row.number, at=datetime_of(row.at_us), kind=row.kind, project=row.project, actor=row.actor,
+        token=row.token_id, about=row.about, subject=row.subject, body=row.body,
+    )  # fmt: skip
