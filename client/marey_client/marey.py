@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from datetime import datetime
 from functools import cached_property
 from types import TracebackType
 from typing import Self
@@ -10,6 +11,7 @@ from typing import Self
 import httpx
 
 from marey_client.access import Tokens, Users
+from marey_client.audit import read_audit
 from marey_client.blobs import Blobs
 from marey_client.credentials import TokenFile, resolve
 from marey_client.jobs import Jobs
@@ -18,6 +20,8 @@ from marey_client.project import ProjectHandle
 from marey_client.retries import Retries
 from marey_client.transport import Transport
 from marey_schemas.access import Login, Me, NewToken, Project, ProjectCreate
+from marey_schemas.audit import AuditEntry
+from marey_schemas.event_kinds import AuditKind
 
 
 class Marey:
@@ -82,6 +86,22 @@ class Marey:
     def create_project(self, project: ProjectCreate) -> ProjectHandle:
         """Create a project; the caller becomes its owner."""
         return self.project(self.transport.post(Project, "/projects", project).name)
+
+    def audit(
+        self,
+        *,
+        kind: AuditKind | None = None,
+        actor: str | None = None,
+        subject: str | None = None,
+        since: datetime | None = None,
+        until: datetime | None = None,
+    ) -> Iterator[AuditEntry]:
+        """List changes of users, tokens and access, and deletions, of all projects, newest first. For administrators.
+
+        `subject` is the name or id of the user or object that was changed. Entries at `since` are listed, entries at
+        `until` are not; times without a time zone are local times.
+        """
+        return read_audit(self.transport, "/audit", kind=kind, actor=actor, subject=subject, since=since, until=until)
 
     @cached_property
     def jobs(self) -> Jobs:

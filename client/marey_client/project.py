@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from datetime import datetime
 from functools import cached_property
 from typing import Any
 
 from marey_client.access import Members, change_quotas
+from marey_client.audit import read_audit
 from marey_client.handles.bisections import read_range
 from marey_client.handles.coverage_streams import CoverageStreams
 from marey_client.handles.crossings import Crossing, Limit, OnMeasured, VersionEvaluations, find_crossing
@@ -34,7 +36,9 @@ from marey_client.requests import (
 )
 from marey_client.transport import Params, as_json, read_model
 from marey_schemas.access import Project, ProjectChange, QuotaChange, QuotasInUse
+from marey_schemas.audit import AuditEntry
 from marey_schemas.datasets.naming import MAIN
+from marey_schemas.event_kinds import AuditKind
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.job_params import (
     AlignParams,
@@ -114,6 +118,24 @@ class ProjectHandle(ProjectItems):
     def webhooks(self) -> Webhooks:
         """The webhooks of the project: addresses to which the server sends events."""
         return Webhooks(self.transport, f"{self.url}/webhooks")
+
+    def audit(
+        self,
+        *,
+        kind: AuditKind | None = None,
+        actor: str | None = None,
+        subject: str | None = None,
+        since: datetime | None = None,
+        until: datetime | None = None,
+    ) -> Iterator[AuditEntry]:
+        """List changes of members and settings, deletions and restorations, newest first. For owners.
+
+        `subject` is the name or id of the user or object that was changed. Entries at `since` are listed, entries at
+        `until` are not; times without a time zone are local times.
+        """
+        return read_audit(
+            self.transport, f"{self.url}/audit", kind=kind, actor=actor, subject=subject, since=since, until=until
+        )
 
     # -- jobs ----------------------------------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ import typer
 from marey_client.cli import (
     accounts,
     annotating,
+    audit,
     clip_jobs,
     edits,
     evaluations,
@@ -94,5 +95,6 @@ for register in (
     jobs,
     pipelines,
     webhooks,
+    audit,
 ):
     register.add_to(app)
