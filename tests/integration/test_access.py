@@ -114,6 +114,8 @@ def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
         "DELETE /users/{user}": "administrator",
         "PATCH /users/{user}/quotas": "administrator",
         "PATCH /projects/{project}/quotas": "administrator",
+        "GET /audit": "administrator",
+        "GET /projects/{project}/audit": "owner",
         "PATCH /projects/{project}": "owner",
         "DELETE /projects/{project}": "owner",
         "POST /projects/{project}/restore": "owner",

@@ -191,7 +191,7 @@ class Program:
             self.read_project, self.list_projects, self.list_items, self.list_items, self.create_item, self.create_item,
             self.send_blob, self.read_blob, self.read_blob, self.ask_missing, self.put_member, self.remove_member,
             self.change_visibility, self.list_members, self.list_events, self.list_tokens, self.disable, self.list_jobs,
-            self.read_job, self.read_quotas, self.begin_upload, self.read_upload, self.claim,
+            self.read_job, self.read_quotas, self.begin_upload, self.read_upload, self.claim, self.list_audit,
         )  # fmt: skip
         while self.calls < count and not self.differences:
             self.chance.choice(kinds)(self.chance.choice(CALLERS), self.chance.choice(PROJECTS))
@@ -290,6 +290,10 @@ class Program:
     def list_events(self, caller: Caller, project: str) -> None:
         expected = self.world.status(caller, project, Role.READER, "read", guests=False)
         self._call(caller, "GET", f"/projects/{project}/events?limit=1000", expected or 200)
+
+    def list_audit(self, caller: Caller, project: str) -> None:
+        expected = self.world.status(caller, project, Role.OWNER, "read", guests=False)
+        self._call(caller, "GET", f"/projects/{project}/audit?limit=1000", expected or 200)
 
     def list_tokens(self, caller: Caller, _project: str) -> None:
         expected = self._user(caller, "read")

@@ -6,7 +6,9 @@ from hypothesis import strategies as st
 
 from marey_schemas.access import Role
 from marey_server.access import passwords, roles, scopes
+from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
 from marey_server.access.secret_tokens import attempt_secret, issue_attempt_token, issue_user_token, split_user_token
+from marey_server.store.ids import is_id, new_id
 
 
 @pytest.fixture
@@ -66,3 +68,17 @@ def test_tokens_of_users_and_attempts_are_told_apart() -> None:
     assert split_user_token(attempt.text) is None
     assert attempt_secret(attempt.text)
     assert attempt_secret(user.text) is None
+
+
+def test_only_a_principal_with_a_user_owns_tokens() -> None:
+    assert Principal("user", "user_1", "ada").owner == "ada"
+    for other in (ANONYMOUS, SYSTEM, Principal("attempt", job_id="job_1")):
+        with pytest.raises(TypeError, match=f"{other.kind} has no tokens"):
+            _ = other.owner
+
+
+@pytest.mark.parametrize("text", [new_id("project"), new_id("clip"), new_id("search-tree")])
+def test_ids_have_a_form_that_names_rarely_have(text: str) -> None:
+    assert is_id(text)
+    for other in (text[:-1], f"{text}0", text.upper(), text.partition("_")[2], f"raw/{text}", "ada", "walk_01", ""):
+        assert not is_id(other)

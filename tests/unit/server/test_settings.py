@@ -41,6 +41,18 @@ def test_leases_of_two_heartbeats_are_taken() -> None:
     assert Settings(lease_ttl_s=30).heartbeat_s == 15
 
 
+@pytest.mark.parametrize("given", [{"audit_days": 364}, {"audit_days": 1, "events_days": 2}, {"events_days": 0}])
+def test_audit_entries_cannot_end_before_other_events(given: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match=r"audit_days\n.* at least events_days"):
+        Settings(**{"audit_days": 9, **given})
+
+
+def test_audit_entries_may_be_kept_longer_or_for_ever() -> None:
+    assert Settings().retention.audit_days == 0
+    assert Settings(audit_days=365).retention.audit_days == 365
+    assert Settings(audit_days=30, events_days=30).retention.events_days == 30
+
+
 def test_every_setting_is_documented() -> None:
     undocumented = {name for name, field in Settings.model_fields.items() if not field.description}
     assert undocumented <= {"log_level"}
