@@ -20,6 +20,7 @@ ProjectAuditKind = Literal[
     "collection.restored",
     "item.deleted",
     "item.restored",
+    "item.purged",
     "consent.overridden",
     "dataset.deleted",
     "branch.deleted",

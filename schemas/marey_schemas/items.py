@@ -147,7 +147,8 @@ class LineageEdge(Answer):
 
     item: str
     kind: Kind
-    name: str
+    name: str = Field(description="Name of the item; empty if it was purged.")
+    purged: bool = Field(False, description="Whether the item was deleted for good; nothing else is left of it.")
     revision: int
     job: str | None
     role: str = Field(description="Name of the job input for which the revision was used.")

@@ -49,12 +49,13 @@ class LineageRevision(Answer):
 
     item: str
     kind: Kind
-    path: str = Field(description="Current folder and name of the item.")
+    path: str = Field(description="Current folder and name of the item; empty if it was purged.")
     revision: int
     newest: int = Field(
         description="Newest revision of the item. If it is greater than `revision`, `revision` is outdated."
     )
     deleted: bool = False
+    purged: bool = Field(False, description="Whether the item was deleted for good; nothing else is left of it.")
     distance: int = Field(
         description="Number of jobs between the start and this revision: negative for inputs, positive for results."
     )
@@ -147,23 +148,28 @@ def grouped(graph: LineageGraph) -> tuple[list[LineageGroup], list[GroupLink]]:
 
 
 def title_of(graph: LineageGraph, group: LineageGroup) -> str:
-    """Return a title: "raw/walk@2" for one revision, "12 clips in raw" for several."""
+    """Return a title: "raw/walk@2" for one revision, "12 clips in raw" for several.
+
+    A purged item has no path; its title is its id.
+    """
     members = [graph.revisions[position] for position in group.revisions]
     if len(members) == 1:
-        return f"{members[0].path}@{members[0].revision}"
+        return f"{members[0].path or members[0].item}@{members[0].revision}"
     shared = commonpath([one.path.rpartition("/")[0] for one in members])
     return f"{counted(len(members), group.kind.value)}{f' in {shared}' if shared else ''}"
 
 
 def remarks_on(graph: LineageGraph, group: LineageGroup) -> list[str]:
-    """Return remarks about the revisions of a group: how many of them are outdated, and how many deleted."""
+    """Return remarks about the revisions of a group: how many of them are outdated, deleted and purged."""
     members = [graph.revisions[position] for position in group.revisions]
-    old = [one for one in members if one.newest > one.revision]
-    deleted = [one for one in members if one.deleted]
+    purged = [one for one in members if one.purged]
+    old = [one for one in members if one.newest > one.revision and not one.purged]
+    deleted = [one for one in members if one.deleted and not one.purged]
     if len(members) == 1:
-        return [f"newest: {one.newest}" for one in old] + ["deleted" for _ in deleted]
+        return [f"newest: {one.newest}" for one in old] + ["deleted" for _ in deleted] + ["purged" for _ in purged]
     counts = (
         (len(old), "with a newer revision" if len(old) == 1 else "with newer revisions"),
         (len(deleted), "deleted"),
+        (len(purged), "purged"),
     )
     return [f"{count} {what}" for count, what in counts if count]

@@ -183,6 +183,7 @@ class JobOutput(Answer):
     kind: Kind
     revision: int
     created: bool = Field(description="False if the item had the same content before.")
+    purged: bool = Field(False, description="Whether the item was deleted for good since then; its name is then empty.")
     entry: str | None = Field(
         None, description="Path at which the job commits the output to a dataset; null if the job makes no commit."
     )
@@ -210,7 +211,8 @@ class Job(Answer):
     inputs: dict[str, Any] = Field(
         description="Inputs by name: items with their revisions, and the commits that they were taken from. Outputs of "
         "a job that has not ended are given as `{job}`. If the items of an input were distributed over tasks, only "
-        "their number and their commits are given."
+        "their number and their commits are given. An item that was purged since then has no name here, and the member "
+        "`purged`."
     )
     after: tuple[str, ...] = Field((), description="Jobs that must succeed before this one starts.")
     into: str

@@ -25,13 +25,15 @@ from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.field_errors import field_errors
 from marey_server.store import blobs
 from marey_server.store.database.prepared import Prepared, padded
-from marey_server.store.tables import blob, document, document_blob
+from marey_server.store.tables import blob, document, document_blob, document_item
 from marey_server.store.transaction import IN_LIST, Transaction
+from marey_versions.records import references_in
 
 OPEN_SCHEMA = "marey/document@1"
 
 _NUL = re.compile(rb"(?<!\\)(?:\\\\)*\\u0000")
 _POINTER_LENGTH = 512
+_ID_LENGTH = 40
 
 Tree = dict[str, Any]
 
@@ -195,6 +197,7 @@ def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> di
             for pointer, digest in [*((at, digest) for at, (digest, _data) in one.arrays.items()), *one.files.items()]
         ],
     )
+    _refer_to_items(tx, {one.digest: one.body for one in added})
     return {one.digest: one.size_bytes + _file_bytes(one, file_sizes) for one in added}
 
 
@@ -230,6 +233,7 @@ def store_variants(tx: Transaction, variants: Sequence[tuple[str, Tree]]) -> Non
     for row in tx.execute(select(document_blob).where(document_blob.c.document_digest.in_(sorted(added.values())))):
         held.setdefault(row.document_digest, []).append((row.pointer, row.blob_digest))
     _refer(tx, [(digest, *place) for digest, original in added.items() for place in held.get(original, ())])
+    _refer_to_items(tx, {digest: body for digest, (_, body) in zip(digests, variants, strict=True) if digest in added})
 
 
 def _require_files(tx: Transaction, contents: Iterable[PreparedDocument]) -> dict[str, int]:
@@ -253,6 +257,25 @@ def _refer(tx: Transaction, references: Iterable[tuple[str, str, str]]) -> None:
     rows = [dict(zip(columns, one, strict=True)) for one in references]
     if rows:
         tx.execute(insert(document_blob), rows)
+
+
+def items_named_in(body: Tree) -> set[str]:
+    """Return the ids of the items to whose revisions a document refers.
+
+    Texts that are too long for an id are left out: the members of some documents are not checked.
+    """
+    return {reference.item for reference in references_in(body) if len(reference.item) <= _ID_LENGTH}
+
+
+def _refer_to_items(tx: Transaction, bodies: Mapping[str, Tree]) -> None:
+    """Record which items documents refer to, so that no purge deletes these items. `bodies` are the new documents."""
+    rows = [
+        {"document_digest": digest, "item_id": item}
+        for digest, body in bodies.items()
+        for item in sorted(items_named_in(body))
+    ]
+    if rows:
+        tx.execute(insert(document_item), rows)
 
 
 _STORED_BYTES = Prepared(

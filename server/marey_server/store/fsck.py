@@ -28,6 +28,7 @@ from marey_server.store.database.connections import Database
 from marey_server.store.database.schema import schema_at_head
 from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.history import revisions_with
+from marey_server.store.documents import items_named_in
 from marey_server.store.events import newest_number
 from marey_server.store.items.summaries import summarise
 from marey_server.store.tables import (
@@ -39,7 +40,9 @@ from marey_server.store.tables import (
     dataset_ref,
     document,
     document_blob,
+    document_item,
     item,
+    item_tag,
     project,
     proposal,
     revision,
@@ -154,6 +157,10 @@ def _check_document(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     for pointer in sorted(held.keys() ^ (arrays.keys() | files.keys())):
         what = "has no blob" if pointer not in held else "is not a reference, but has a blob"
         findings.append(StoreDefect("document-reference", row.digest, f"{pointer} {what}"))
+    named_items = select(document_item.c.item_id).where(document_item.c.document_digest == row.digest)
+    if set(tx.execute(named_items).scalars()) != items_named_in(row.body):
+        detail = "the items to which it refers are not those that are recorded"
+        findings.append(StoreDefect("document-reference", row.digest, detail))
     for pointer, named in files.items():
         if pointer in held and held[pointer].blob_digest != named:
             findings.append(StoreDefect("document-reference", row.digest, f"{pointer} has another blob"))
@@ -182,6 +189,8 @@ def _check_item(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         return [
             StoreDefect("revisions-lost", row.id, f"{count} revisions up to {newest}; the newest should be {row.head}")
         ]
+    if row.purged_us is not None:
+        return _check_purged(tx, row)
     findings = []
     bodies, complete = {}, True
     for found in tx.execute(_head_parts(row)):
@@ -206,6 +215,17 @@ def _check_item(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
             StoreDefect("misplaced-item", row.id, "its collection is deleted, missing, or in another project")
         )
     return findings
+
+
+def _check_purged(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
+    """Return a fault if anything is left of the content, the name or the tags of a purged item."""
+    left = [
+        table.name
+        for table in (revision_part, item_tag)
+        if tx.execute(select(table).where(table.c.item_id == row.id).limit(1)).first() is not None
+    ]
+    left += [name for name in ("name", "summary", "stored_bytes") if row._mapping[name]]
+    return [StoreDefect("purge-incomplete", row.id, f"the item was purged, but has {', '.join(left)}")] if left else []
 
 
 def _head_parts(row: Row[Any]) -> Select[Any]:

@@ -29,6 +29,7 @@ from marey_server.store.tables import (
     blob_holder,
     document,
     document_blob,
+    document_item,
     idempotency_key,
     job,
     job_blob,
@@ -121,7 +122,8 @@ def _still_garbage(tx: Transaction, table: Table, digests: Sequence[str], grace_
 def delete_documents(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_US) -> int:
     """Delete those of the given documents that have had no reference for `grace_us`; return their number."""
     going = set(_still_garbage(tx, document, digests, grace_us)) - _staged_documents(tx)
-    tx.execute(delete(document_blob).where(document_blob.c.document_digest.in_(going)))
+    for references in (document_blob, document_item):
+        tx.execute(delete(references).where(references.c.document_digest.in_(going)))
     tx.execute(delete(document).where(document.c.digest.in_(going)))
     faults.point("garbage.before_commit")
     return len(going)

@@ -113,15 +113,15 @@ class Transaction:
         added = postgresql.insert(table) if self.is_postgres else sqlite.insert(table)
         return added if row is None else added.values(**row)
 
-    def lock(self, name: str) -> None:
-        """Acquire the lock `name` and hold it until the end of the write.
+    def lock(self, name: str, *, shared: bool = False) -> None:
+        """Acquire the lock `name` and hold it until the end of the write; `shared` locks exclude only others.
 
         On SQLite it does nothing, because there is only one writer at a time.
         """
         if self.is_postgres:
-            self.execute(
-                sqlalchemy.select(sqlalchemy.func.pg_advisory_xact_lock(sqlalchemy.func.hashtextextended(name, 0)))
-            )
+            functions = sqlalchemy.func
+            acquire = functions.pg_advisory_xact_lock_shared if shared else functions.pg_advisory_xact_lock
+            self.execute(sqlalchemy.select(acquire(functions.hashtextextended(name, 0))))
 
     def emit(self, kind: OrdinaryEventKind, subject: str, *, project_id: str | None = None, **body: Any) -> None:
         """Record an event, which becomes visible when the transaction commits."""

@@ -36,6 +36,7 @@ from marey_server.store.datasets.protection import Mover, require_move
 from marey_server.store.datasets.revisions import store_combined
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.projects import ProjectRow
+from marey_server.store.purge_lock import last_purge, require_no_purge_since
 from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, fast_forward, item, user
 from marey_server.store.transaction import IN_LIST, Transaction
 from marey_versions.merging import CombinedEntry
@@ -73,6 +74,8 @@ class PreparedCommit:
     """Existing commit to which the branch moves, in place of a new one."""
     recorded: str | None = None
     """Commit that an earlier request with the same `write_id` has recorded, so that nothing is left to do."""
+    last_purge: int = 0
+    """Time of the last purge of the project before the commit was prepared."""
 
 
 def prepare_commit(tx: Transaction, project: str, name: str, request: CommitCreate) -> PreparedCommit:
@@ -87,8 +90,9 @@ def prepare_commit(tx: Transaction, project: str, name: str, request: CommitCrea
     head = head_of(tx, found.id, request.branch, None if recorded else request.expected)
     parents = () if head is None else (head,)
     prepared = PreparedCommit(
-        found.id, request.branch, head, parents, request.message, request.write_id, recorded=recorded
-    )
+        found.id, request.branch, head, parents, request.message, request.write_id, recorded=recorded,
+        last_purge=last_purge(tx, project_row.id),
+    )  # fmt: skip
     if recorded is not None:
         return prepared
     store = StoredChunks(tx)
@@ -111,7 +115,8 @@ def record_commit(
 ) -> Commit:
     """Record a prepared commit, and move the branch to it on behalf of the `mover`, by default the caller.
 
-    Raises `ConflictProblem` if the branch has moved since the commit was prepared, and the errors of `require_move`.
+    Raises `ConflictProblem` if the branch has moved or items were purged since the commit was prepared, and the errors
+    of `require_move`.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
@@ -120,6 +125,7 @@ def record_commit(
     recorded = prepared.recorded or recorded_as(tx, found.id, prepared.write_id)
     if recorded is not None:
         return read_commit(tx, project, name, recorded)
+    require_no_purge_since(tx, project_row.id, prepared.last_purge)
     mover = mover or Mover(author_of(tx), project_row.role)
     store_chunks(tx, prepared.chunks)
     store_contents(tx, prepared.contents)

@@ -31,6 +31,7 @@ from marey_server.store.datasets.committing import PreparedCommit, head_of, reco
 from marey_server.store.datasets.history import CommitReader, read_commit, revisions_with, shown_entry, tree_of
 from marey_server.store.datasets.naming import find_dataset, resolve
 from marey_server.store.datasets.protection import Mover
+from marey_server.store.purge_lock import last_purge
 from marey_server.store.transaction import Transaction
 from marey_versions.ancestry import nearest_common
 from marey_versions.annotations import LabelClash, LabelledRange
@@ -128,8 +129,9 @@ def _start(
     if ours is None:
         raise InvalidProblem(f"The branch {request.into!r} has no commits yet.", code="no-commits")
     commit = PreparedCommit(
-        found.id, request.into, ours, (ours,), request.message or message, request.write_id, recorded=recorded
-    )
+        found.id, request.into, ours, (ours,), request.message or message, request.write_id, recorded=recorded,
+        last_purge=last_purge(tx, found.project_id),
+    )  # fmt: skip
     answer = MergeAnswer(commit=None, base=None, ours=ours, theirs=theirs, changes=0, conflicts=(), conflict_count=0)
     return PreparedMerge(answer, commit)
 

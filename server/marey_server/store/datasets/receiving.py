@@ -27,6 +27,7 @@ from marey_server.store.documents import PreparedDocument
 from marey_server.store.items import Draft, StoredDocument
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.projects import ProjectRow
+from marey_server.store.purge_lock import last_purge, require_no_purge_since
 from marey_server.store.tables import dataset_commit
 from marey_server.store.transaction import Transaction
 from marey_versions.records import CommitRecord, RevisionKey, contents_in, key_of, local_document, revision_content
@@ -111,6 +112,8 @@ class PreparedReceipt:
     record: CommitRecord
     entries: int
     chunks: Mapping[str, bytes]
+    last_purge: int
+    """Time of the last purge of the project before the receipt was prepared."""
 
 
 def prepare_receipt(tx: Transaction, project: str, name: str, request: ReceivedCommit) -> PreparedReceipt:
@@ -122,8 +125,9 @@ def prepare_receipt(tx: Transaction, project: str, name: str, request: ReceivedC
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
     record = CommitRecord(request.tree, request.parents, request.author, request.message, request.at)
+    last = last_purge(tx, project_row.id)
     if _is_known(tx, found, record.digest):
-        return PreparedReceipt(record, 0, {})
+        return PreparedReceipt(record, 0, {}, last)
     _require_parents(tx, found, record)
     changes = {key_of(one.path, one.kind): _value(one.parts, one.tags) for one in request.changes}
     contents = {revision_content(one.kind, one.parts) for one in request.changes if one.parts is not None}
@@ -135,7 +139,7 @@ def prepare_receipt(tx: Transaction, project: str, name: str, request: ReceivedC
         raise InvalidProblem(
             f"The changes give a version with the tree {tree}, but the commit names {record.tree}.", code="other-tree"
         )
-    return PreparedReceipt(record, len(Tree(store, tree)), store.new)
+    return PreparedReceipt(record, len(Tree(store, tree)), store.new, last)
 
 
 def _value(parts: Mapping[str, str] | None, tags: Iterable[str]) -> Value | None:
@@ -148,13 +152,14 @@ def record_receipt(
     """Record a commit from an archive or another server; recording it again has no effect.
 
     If the request names a branch without commits, the branch is set to this commit. Raises `ConflictProblem` if the
-    branch has other commits, and the errors of `require_move`.
+    branch has other commits or items were purged since the receipt was prepared, and the errors of `require_move`.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
     digest = prepared.record.digest
     if not _is_known(tx, found, digest):
         _require_parents(tx, found, prepared.record)
+        require_no_purge_since(tx, project_row.id, prepared.last_purge)
         store_chunks(tx, prepared.chunks)
         insert_commit(tx, found.id, prepared.record, entries=prepared.entries)
         tx.emit("commit.received", found.id, project_id=project_row.id, commit=digest)

@@ -184,12 +184,13 @@ def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expe
 def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev = None) -> Item:
     """Restore a deleted item, and its collection if that was deleted.
 
-    Raises `ConflictProblem` if another item of the collection has the same name now.
+    Raises `ConflictProblem` if another item of the collection has the same name now, and `GoneProblem` if the item was
+    purged.
     """
     project_row = projects.require(tx, project)
     gone = find_item(tx, project_row, kind, item_id, deleted=True)
     collection_id = collections.ensure(tx, project_row, gone.path)
-    which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_not(None))
+    which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_not(None), item.c.purged_us.is_(None))
     values = {"deleted_us": None, "updated_us": tx.now_us, "collection_id": collection_id}
     with taken(ConflictProblem(f"The collection now contains another {kind} named {gone.name!r}.", code="name-taken")):
         row = change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))

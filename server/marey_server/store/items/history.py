@@ -98,6 +98,7 @@ def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[Li
     """
     statement = (
         select(other.label("item"), number.label("revision"), item.c.kind, item.c.name)
+        .add_columns(item.c.purged_us.is_not(None).label("purged"))
         .add_columns(lineage.c.job_id.label("job"), lineage.c.role)
         .join(item, item.c.id == other)
         .join(project, project.c.id == item.c.project_id)

@@ -144,7 +144,7 @@ class _LineageWalk:
         statement: Select[Any] = (
             select(
                 revision.c.item_id, revision.c.number, revision.c.job_id, revision.c.created_us, item.c.kind,
-                item.c.name, item.c.head, item.c.deleted_us, collection.c.path,
+                item.c.name, item.c.head, item.c.deleted_us, item.c.purged_us, collection.c.path,
             )
             .join(item, item.c.id == revision.c.item_id)
             .join(collection, collection.c.id == item.c.collection_id)
@@ -217,8 +217,8 @@ class _LineageWalk:
 def _shown_revision(row: Row[Any], distance: int, parents: Mapping[str, str]) -> LineageRevision:
     return LineageRevision(
         item=row.item_id, kind=Kind(row.kind), path=f"{row.path}/{row.name}".lstrip("/"), revision=row.number,
-        newest=row.head, deleted=row.deleted_us is not None, distance=distance, job=parents.get(row.job_id),
-        created_at=datetime_of(row.created_us),
+        newest=row.head, deleted=row.deleted_us is not None, purged=row.purged_us is not None, distance=distance,
+        job=parents.get(row.job_id), created_at=datetime_of(row.created_us),
     )  # fmt: skip
 
 

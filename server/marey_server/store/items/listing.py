@@ -84,7 +84,7 @@ def list_items(
     project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if filters.deleted else Role.READER)
     order = listing.parse_order(sort, SORT_KEYS)
     identity = [project_row.id, kind.value, asdict(filters)]
-    conditions = _conditions(project_row.id, kind, filters)
+    conditions = conditions_of(project_row.id, filters, kind)
     total = None
     if count:
         total = tx.execute(select(func.count()).select_from(item).where(*conditions)).scalar_one()
@@ -103,12 +103,19 @@ def _shown(tx: Transaction, rows: Any, fields: Collection[str] | None) -> list[A
     return [found.model_dump(mode="json", include=set(fields)) for found in shown]
 
 
-def _conditions(project_id: str, kind: Kind, filters: ItemFilters) -> list[ColumnElement[bool]]:
+def conditions_of(project_id: str, filters: ItemFilters, *kinds: Kind) -> list[ColumnElement[bool]]:
+    """Return the SQL conditions that the items of the given kinds meet if they match `filters`.
+
+    Raises `BadRequestProblem` if the query of the filters is malformed.
+    """
     conditions = [
         item.c.project_id == project_id,
-        item.c.kind == kind.value,
-        item.c.deleted_us.is_not(None) if filters.deleted else item.c.deleted_us.is_(None),
+        item.c.kind.in_([kind.value for kind in kinds]) if len(kinds) > 1 else item.c.kind == kinds[0].value,
     ]
+    if filters.deleted:
+        conditions += [item.c.deleted_us.is_not(None), item.c.purged_us.is_(None)]
+    else:
+        conditions.append(item.c.deleted_us.is_(None))
     if filters.collection:
         conditions.append(item.c.collection_id.in_(_below(project_id, filters.collection)))
     if filters.directly_in is not None:
@@ -158,7 +165,7 @@ def explain_query(tx: Transaction, project: str, kind: Kind, filters: ItemFilter
     for number, one in enumerate(met):
         others = [other for at, other in enumerate(met) if at != number]
         columns += [func.count(case((not_(one), 1))), func.count(case((and_(true(), *others, not_(one)), 1)))]
-    conditions = _conditions(project_row.id, kind, filters)
+    conditions = conditions_of(project_row.id, filters, kind)
     counts = tx.execute(select(*columns).select_from(item).where(*conditions)).one()
     total, selected, *hidden = tuple(counts)
     shown = [

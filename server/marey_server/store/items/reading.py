@@ -10,7 +10,7 @@ from sqlalchemy import Row, Select, and_, bindparam, select
 
 from marey_schemas.items import Item, PartPlace, PartSummary
 from marey_schemas.kinds import Kind
-from marey_server.errors import InvalidProblem, NotFoundProblem
+from marey_server.errors import GoneProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import documents, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared, padded
@@ -97,17 +97,32 @@ _PART_OF_REVISION = Prepared(_PART.where(revision_part.c.number == bindparam("nu
 
 
 def find_item(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, *, deleted: bool = False) -> Any:
-    """Return the row of an item. Raises `NotFoundProblem` if the project has no such item of this kind."""
+    """Return the row of an item, or of a deleted item.
+
+    Raises `NotFoundProblem` if the project has no such item of this kind, and `GoneProblem` if a deleted item is wanted
+    that was purged.
+    """
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value}
     row = tx.execute(_DELETED_ITEM, which).one_or_none() if deleted else tx.first(_ITEM, which)
     if row is None:
         raise no_item(kind, item_id)
+    if row.purged_us is not None:
+        raise was_purged(kind, item_id, row.purged_us)
     return row
 
 
 def no_item(kind: Kind, item_id: str) -> NotFoundProblem:
     """Return the error for an item that does not exist."""
     return NotFoundProblem(f"There is no {kind} {item_id!r} in this project.", code="no-item")
+
+
+def was_purged(kind: Kind, item_id: str, purged_us: int) -> GoneProblem:
+    """Return the error for an item that cannot be restored, because it was purged."""
+    at = f"{datetime_of(purged_us):%Y-%m-%d %H:%M} UTC"
+    return GoneProblem(
+        f"The {kind} {item_id!r} was purged on {at}: its content was deleted for good, and nothing can restore it.",
+        code="purged",
+    )
 
 
 def shown_items(tx: Transaction, rows: Sequence[Row[Any]], *, tags: bool = True, parts: bool = True) -> list[Item]:

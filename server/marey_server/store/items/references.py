@@ -154,6 +154,7 @@ class ReferenceCheck:
         return self._seen[key]
 
     def _look_up(self, item_id: str, number: int, kind: Kind, part: str) -> Tree | None:
+        """Return the document of a part, and lock its item, so that the item is not purged before this write ends."""
         statement = (
             select(document.c.body)
             .join(revision_part, revision_part.c.document_digest == document.c.digest)
@@ -162,9 +163,11 @@ class ReferenceCheck:
                 item.c.id == item_id,
                 item.c.project_id == self._project_id,
                 item.c.kind == kind.value,
+                item.c.purged_us.is_(None),
                 revision_part.c.number == number,
                 revision_part.c.part == part,
             )
+            .with_for_update(read=True, key_share=True, of=item)
         )
         if not self._to_deleted:
             statement = statement.where(item.c.deleted_us.is_(None))

@@ -32,6 +32,7 @@ from marey_server.store.jobs import staging
 from marey_server.store.jobs.endings import failure_document
 from marey_server.store.jobs.staging import StagedDraft
 from marey_server.store.projects import ProjectRow
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import job, member, user
 from marey_server.store.transaction import Transaction
 from marey_versions.records import DatasetEntry, RevisionKey, key_of
@@ -183,6 +184,7 @@ def publish_outputs(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]
         return PublishedOutputs(staging.publish_drafts(tx, row, drafts))
     if row.parent_id is not None:
         return PublishedOutputs(_publish_entries(tx, row, drafts))
+    hold_off_purges(tx, row.project_id)
     try:
         with tx.connection.begin_nested():
             outputs = _publish_entries(tx, row, drafts)
@@ -198,6 +200,7 @@ def commit_tasks(tx: Transaction, row: Any) -> PublishedOutputs:
     """
     if row.commit_to is None:
         return PublishedOutputs()
+    hold_off_purges(tx, row.project_id)
     tasks = select(job.c.outputs).where(job.c.parent_id == row.id).order_by(job.c.position)
     outputs = [one for of_task in tx.execute(tasks).scalars() for one in of_task or ()]
     try:

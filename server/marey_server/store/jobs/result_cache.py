@@ -26,7 +26,7 @@ from marey_server.store.jobs.endings import Ended, end_jobs
 from marey_server.store.jobs.events import wake_workers
 from marey_server.store.jobs.fencing import QUEUED, RUNNING, WAITING
 from marey_server.store.jobs.inputs import Pin, PinnedInputs
-from marey_server.store.tables import job, job_dependency, revision_part
+from marey_server.store.tables import job, job_dependency, revision_part, staged_output
 from marey_server.store.transaction import IN_LIST, Transaction
 
 SHARED_AT_ONCE = 64
@@ -292,3 +292,20 @@ def _compute_again(tx: Transaction, job_id: str) -> None:
         .values(state="queued", cached_from=None, dependencies_left=0, rev=job.c.rev + 1)
     )
     wake_workers(tx, [row.kind])
+
+
+# -- forgetting -------------------------------------------------------------------------------------------------------
+
+
+def forget_results(tx: Transaction, job_ids: Sequence[str]) -> None:
+    """Forget the results of ended jobs, so that identical jobs compute them again.
+
+    Deletes the drafts that the jobs staged. Jobs that wait to share one of the results are queued.
+    """
+    for start in range(0, len(job_ids), IN_LIST):
+        some = job_ids[start : start + IN_LIST]
+        tx.execute(delete(staged_output).where(staged_output.c.job_id.in_(some)))
+        tx.execute(update(job).where(job.c.id.in_(some)).values(cache_key=None))
+        waiting = select(job.c.id).where(job.c.state == WAITING, job.c.cached_from.in_(some)).order_by(job.c.id)
+        for job_id in tx.execute(waiting).scalars().all():
+            _compute_again(tx, job_id)

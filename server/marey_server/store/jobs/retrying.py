@@ -148,11 +148,15 @@ def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_
             f"accepted: {error}.",
             code="unknown-kind",
         ) from error
+    pins = _late_pins(row, stand_ins) if row.unbound else _pins_of(tx, row, kind.fan_out)
+    if purged := [pin["item"] for many in pins.values() for pin in many if "purged" in pin]:
+        detail = f"The job cannot run again: its input {purged[0]} was purged, so that its content is gone."
+        raise ConflictProblem(detail, code="purged")
     return Submission(
         kind,
         request_of(row).model_copy(update={"concurrency_key": _concurrency_key(tx, row)}),
         row.params,
-        _late_pins(row, stand_ins) if row.unbound else _pins_of(tx, row, kind.fan_out),
+        pins,
         row.size or 1,
         row.labels_key,
         tx.principal.user_id,

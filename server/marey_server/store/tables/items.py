@@ -17,6 +17,8 @@ collection = Table(
     unique_alive("collection", "project_id", "path"),
 )
 
+_PURGED = text("purged_us IS NOT NULL")
+
 item = Table(
     "item",
     metadata,
@@ -35,8 +37,10 @@ item = Table(
     Column("created_us", Micros, nullable=False),
     Column("updated_us", Micros, nullable=False),
     Column("deleted_us", Micros),
+    Column("purged_us", Micros),  # when its content, name and tags were deleted for good; `deleted_us` is set, too
     Column("rev", Integer, nullable=False, default=1),
     unique_alive("item", "collection_id", "kind", "name"),
+    Index("ix_item_purged", "project_id", "purged_us", sqlite_where=_PURGED, postgresql_where=_PURGED),
     Index("ix_item_listing", "project_id", "kind", "id"),
     Index("ix_item_by_name", "project_id", "kind", "name", "id"),
     Index("ix_item_by_creation", "project_id", "kind", "created_us", "id"),
@@ -91,6 +95,13 @@ document_blob = Table(
     Column("document_digest", DIGEST, ForeignKey("document.digest"), primary_key=True),
     Column("pointer", String(512), primary_key=True),  # JSON Pointer of the array leaf or of the digest in `body`
     Column("blob_digest", DIGEST, ForeignKey("blob.digest"), nullable=False, index=True),
+)
+
+document_item = Table(  # items to which documents refer
+    "document_item",
+    metadata,
+    Column("document_digest", DIGEST, ForeignKey("document.digest"), primary_key=True),
+    Column("item_id", ID, primary_key=True, index=True),
 )
 
 lineage = Table(

@@ -1,0 +1,127 @@
+"""Purges: deletion of deleted items for good, and what still holds an item."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from marey_schemas.base import Answer, Request
+from marey_schemas.kinds import Kind
+from marey_schemas.names import CollectionPath
+from marey_schemas.queries.grammar import MOST_CHARACTERS
+from marey_schemas.queue.jobs import JobState
+
+MOST_PURGED = 500
+"""Greatest number of items that one request examines."""
+MOST_HOLDERS = 20
+"""Greatest number of holders of one item that an answer lists."""
+
+
+class PurgeRequest(Request):
+    """Request to delete deleted items for good; all given conditions must be met.
+
+    One request examines at most `MOST_PURGED` items; `next` in the answer continues the purge.
+    """
+
+    item: str | None = Field(None, max_length=64, description="Id of one deleted item.")
+    path: str | None = Field(
+        None, max_length=1300, description="Path, made of folder and name, that deleted items had."
+    )
+    collection: CollectionPath | None = Field(
+        None, description="Folder: the deleted items in it and below it; empty: those of the whole project."
+    )
+    kind: Kind | None = Field(None, description="Kind of the items; absent: all kinds.")
+    query: str | None = Field(
+        None, max_length=MOST_CHARACTERS, description="Query that the items meet, such as `subject = 02`."
+    )
+    older_than_days: int | None = Field(
+        None, ge=0, le=100_000, description="Only items that were deleted at least this number of days ago."
+    )
+    preview: bool = Field(False, description="Answer what a purge would do, but change nothing.")
+    after: str | None = Field(
+        None, max_length=64, description="Value of `next` in the last answer, to continue a purge of many items."
+    )
+
+    @model_validator(mode="after")
+    def _names_items(self) -> Self:
+        if self.item is None and self.path is None and self.collection is None and self.query is None:
+            raise ValueError("give an item, a path, a collection or a query; an empty collection is the whole project")
+        return self
+
+
+class DatasetHolder(Answer):
+    """Dataset whose versions contain a revision of an item."""
+
+    type: Literal["dataset"] = "dataset"
+    dataset: str = Field(description="Name of the dataset.")
+    deleted: bool = Field(False, description="Whether the dataset was deleted; its versions still exist.")
+    branches: tuple[str, ...] = Field((), description="Branches whose newest commit contains the revision.")
+    tags: tuple[str, ...] = ()
+    proposals: tuple[int, ...] = Field((), description="Open proposals to merge a version that contains the revision.")
+    commits: int = Field(description="Number of commits that contain a revision of the item.")
+
+
+class ItemHolder(Answer):
+    """Item with a document that refers to the held item, such as a clip that refers to its skeleton."""
+
+    type: Literal["item"] = "item"
+    item: str
+    kind: Kind
+    path: str
+    deleted: bool = Field(False, description="Whether this item was deleted, too, so that it can be purged.")
+
+
+class JobHolder(Answer):
+    """Job that has not ended and reads the item or made it."""
+
+    type: Literal["job"] = "job"
+    job: str
+    kind: str
+    state: JobState
+
+
+Holder = Annotated[DatasetHolder | ItemHolder | JobHolder, Field(discriminator="type")]
+
+
+class PurgedItem(Answer):
+    """Item that was purged, or that a purge would delete, with the path that it had."""
+
+    item: str
+    kind: Kind
+    path: str
+
+
+class HeldItem(PurgedItem):
+    """Item that was not purged, because something still needs it."""
+
+    holders: tuple[Holder, ...] = Field(description=f"What holds the item, at most {MOST_HOLDERS}.")
+    others: int = Field(0, description="Number of further holders that are not listed.")
+
+
+class PurgeAnswer(Answer):
+    """What a purge did, or would do: which items it deleted for good, and which it refused."""
+
+    preview: bool
+    purged: tuple[PurgedItem, ...]
+    refused: tuple[HeldItem, ...]
+    freed_bytes: int = Field(
+        description="Bytes that the next garbage collection can free: those of the documents, and of the arrays and "
+        "files, that nothing else refers to. An estimate: sizes are those of the content, without the rows around it."
+    )
+    next: str | None = Field(None, description="Send it as `after` to examine further items; null: there are none.")
+
+
+def words_of(holder: Holder) -> str:
+    """Describe a holder in a few words, such as "the clip raw/walk (clip_…)"."""
+    if isinstance(holder, ItemHolder):
+        return f"the {'deleted ' if holder.deleted else ''}{holder.kind} {holder.path} ({holder.item})"
+    if isinstance(holder, JobHolder):
+        return f"the {holder.state} job {holder.job} ({holder.kind})"
+    named = [f"{name} {', '.join(map(str, ones))}" for name, ones in _refs_of(holder) if ones]
+    commits = f"{holder.commits:,} {'commit' if holder.commits == 1 else 'commits'}"
+    return f"the {'deleted ' if holder.deleted else ''}dataset {holder.dataset} ({'; '.join([*named, commits])})"
+
+
+def _refs_of(holder: DatasetHolder) -> list[tuple[str, tuple[str, ...] | tuple[int, ...]]]:
+    return [("branch", holder.branches), ("tag", holder.tags), ("proposal", holder.proposals)]

@@ -1,0 +1,31 @@
+"""Resource of purges, which delete deleted items for good."""
+
+from __future__ import annotations
+
+from marey_schemas.purges import PurgeAnswer, PurgeRequest
+from marey_server.http.declarations import Access, writes
+from marey_server.http.reply import Rendered
+from marey_server.http.resource import Resource
+from marey_server.store import purging
+
+
+class ProjectPurges(Resource):
+    """Purges of deleted items."""
+
+    path = "/projects/{project}/purges"
+    tag = "Items"
+
+    @writes(access=Access.OWNER, body=PurgeRequest, answer=PurgeAnswer)
+    async def post(self, project: str, body: PurgeRequest) -> Rendered:
+        """Purge deleted items: delete their revisions, documents and names for good, or preview this.
+
+        An item that something still needs is not purged, and the answer says what holds it: versions of datasets,
+        documents of other items, jobs that have not ended. If the request names one item, the answer is then 409, with
+        the holders in `context`. Garbage collection frees the bytes later. One request examines a limited number of
+        items; send `next` of the answer as `after` to continue.
+        """
+        prepared = await self.look_up(purging.prepare_purge, project, body)
+        return await self.answer(purging.record_purge, project, body, prepared)
+
+
+RESOURCES: tuple[type[Resource], ...] = (ProjectPurges,)

@@ -1,0 +1,10 @@
+"""Purges: deletion of deleted items for good, so that garbage collection can free the bytes of their content.
+
+Of a purged item, an empty row remains, with a row for each of its revisions: lineage and jobs refer to them. An item
+that something still needs is not purged; `holders` says what holds it.
+"""
+
+from marey_server.store.purging.candidates import PreparedPurge, prepare_purge
+from marey_server.store.purging.recording import record_purge
+
+__all__ = ["PreparedPurge", "prepare_purge", "record_purge"]

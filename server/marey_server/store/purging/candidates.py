@@ -1,0 +1,130 @@
+"""Choice of the deleted items that a request for a purge names, and of what must be searched before the purge."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import ColumnElement, Row, and_, case, or_, select
+
+from marey_schemas.kinds import Kind
+from marey_schemas.purges import MOST_PURGED, PurgeRequest
+from marey_server.errors import BadRequestProblem, ConflictProblem, NotFoundProblem
+from marey_server.store import projects
+from marey_server.store.database.clock import DAY_US
+from marey_server.store.items.listing import ItemFilters, conditions_of
+from marey_server.store.items.reading import item_rows, was_purged
+from marey_server.store.projects import ProjectRow
+from marey_server.store.purging.naming_jobs import jobs_naming
+from marey_server.store.purging.versions import VersionSearch
+from marey_server.store.tables import item, revision, revision_part
+from marey_server.store.transaction import Transaction
+
+MOST_REVISIONS = 20_000
+"""Greatest number of revisions that one request purges; a single item may have more."""
+
+_ORDER = (
+    Kind.STUDY, Kind.METRIC, Kind.CHARACTER, Kind.EVALUATION, Kind.GRAPH, Kind.EDIT, Kind.ANNOTATION, Kind.MODEL,
+    Kind.PROCESSED, Kind.CLIP, Kind.SKELETON,
+)  # fmt: skip
+"""Kinds in the order of a purge: documents refer to items of kinds that come later, and so do not hold them."""
+_RANKS = {kind: rank for rank, kind in enumerate(_ORDER)}
+assert _RANKS.keys() == set(Kind), "every kind needs a place in the order of a purge"
+_RANK = case({kind.value: rank for kind, rank in _RANKS.items()}, value=item.c.kind)
+
+
+@dataclass(frozen=True)
+class PreparedPurge:
+    """Items that a request may purge, and what was found about them before the purge."""
+
+    ids: tuple[str, ...]
+    search: VersionSearch
+    jobs: tuple[str, ...]
+    """Ids of the jobs, ended or not, that name one of the items."""
+    next: str | None = None
+    """Last of the items, if there are more."""
+
+
+def prepare_purge(tx: Transaction, project: str, request: PurgeRequest) -> PreparedPurge:
+    """Choose the next items of a purge, and search all versions and jobs of the project for them.
+
+    Raises `NotFoundProblem`, `GoneProblem` or `ConflictProblem` if the item that the request names does not exist, was
+    purged, or was not deleted, and `BadRequestProblem` for a malformed query.
+    """
+    project_row = projects.require(tx, project)
+    if request.item is not None:
+        _require_deleted(tx, project_row, request.item)
+    rows = _candidates(tx, project_row, request)
+    chosen: list[Row[Any]] = []
+    left = MOST_REVISIONS
+    for row in rows[:MOST_PURGED]:
+        left -= row.head
+        if chosen and left < 0:
+            break
+        chosen.append(row)
+    ids = tuple(row.id for row in chosen)
+    _, parts = contents_of(tx, ids)
+    search = VersionSearch(project_row.id, parts)
+    search.update(tx)
+    jobs = tuple(one.id for one in jobs_naming(tx, project_row.id, ids)) if ids else ()
+    return PreparedPurge(ids, search, jobs, ids[-1] if len(rows) > len(chosen) else None)
+
+
+def _require_deleted(tx: Transaction, project_row: ProjectRow, item_id: str) -> None:
+    row = tx.execute(select(item).where(item.c.id == item_id, item.c.project_id == project_row.id)).first()
+    if row is None:
+        raise NotFoundProblem(f"There is no item {item_id!r} in this project.", code="no-item")
+    if row.purged_us is not None:
+        raise was_purged(Kind(row.kind), item_id, row.purged_us)
+    if row.deleted_us is None:
+        raise ConflictProblem(
+            f"The {row.kind} {item_id!r} is not deleted; delete it first, then purge it.", code="not-deleted"
+        )
+
+
+def _candidates(tx: Transaction, project_row: ProjectRow, request: PurgeRequest) -> Sequence[Row[Any]]:
+    filters = ItemFilters(collection=request.collection or None, path=request.path, query=request.query, deleted=True)
+    kinds = tuple(Kind) if request.kind is None else (request.kind,)
+    statement = item_rows().where(*conditions_of(project_row.id, filters, *kinds))
+    if request.item is not None:
+        statement = statement.where(item.c.id == request.item)
+    if request.older_than_days is not None:
+        statement = statement.where(item.c.deleted_us <= tx.now_us - request.older_than_days * DAY_US)
+    if request.after is not None:
+        statement = statement.where(_behind(request.after))
+    return tx.execute(statement.order_by(_RANK, item.c.id.desc()).limit(MOST_PURGED + 1)).all()
+
+
+def _behind(last: str) -> ColumnElement[bool]:
+    """Return the condition for items that come after an item in the order of a purge; newer items come first."""
+    try:
+        rank = _RANKS[Kind(last.partition("_")[0])]
+    except ValueError:
+        raise BadRequestProblem(
+            f"`after` is {last!r}, but must be the value of `next` in the last answer.", code="bad-cursor"
+        ) from None
+    return or_(rank < _RANK, and_(_RANK.in_([rank]), item.c.id < last))
+
+
+def contents_of(tx: Transaction, ids: Sequence[str]) -> tuple[dict[str, frozenset[str]], dict[str, frozenset[str]]]:
+    """Return the content digests of the revisions of each item, and those of the parts of each such content.
+
+    A revision that no commit has needed has no content digest and is left out.
+    """
+    of_revision = and_(revision_part.c.item_id == revision.c.item_id, revision_part.c.number == revision.c.number)
+    statement = (
+        select(revision.c.item_id, revision.c.content, revision_part.c.content.label("other"))
+        .add_columns(revision_part.c.document_digest)
+        .join(revision_part, of_revision)
+        .where(revision.c.item_id.in_(ids), revision.c.content.is_not(None))
+    )
+    contents: dict[str, set[str]] = {}
+    parts: dict[str, set[str]] = {}
+    for row in tx.execute(statement) if ids else ():
+        contents.setdefault(row.item_id, set()).add(row.content)
+        parts.setdefault(row.content, set()).add(row.other or row.document_digest)
+    return (
+        {item_id: frozenset(found) for item_id, found in contents.items()},
+        {content: frozenset(found) for content, found in parts.items()},
+    )

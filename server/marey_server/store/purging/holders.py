@@ -1,0 +1,114 @@
+"""What still holds deleted items: versions of datasets, documents of other items, and jobs that have not ended."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from sqlalchemy import Row, Select, func, select
+
+from marey_schemas.kinds import Kind
+from marey_schemas.purges import MOST_HOLDERS, Holder, ItemHolder, JobHolder
+from marey_schemas.queue.jobs import JobState
+from marey_server.store.purging.naming_jobs import jobs_naming
+from marey_server.store.tables import collection, document_item, item, revision_part
+from marey_server.store.transaction import Transaction
+
+
+@dataclass
+class Held:
+    """Holders of one item; only the first `MOST_HOLDERS` are kept."""
+
+    holders: list[Holder] = field(default_factory=list)
+    others: int = 0
+
+    def add(self, holder: Holder, more: int = 0) -> None:
+        """Add a holder, and a number of further holders that are not known by name."""
+        if len(self.holders) < MOST_HOLDERS:
+            self.holders.append(holder)
+        else:
+            self.others += 1
+        self.others += more
+
+
+def find_holders(
+    tx: Transaction, project_id: str, rows: Mapping[str, Row[Any]], versions: Mapping[str, Iterable[Holder]]
+) -> dict[str, Held]:
+    """Return the holders of those items that something holds; `rows` are the items that are to be purged together.
+
+    A document of one of these items does not hold another one, unless something holds the item of the document, too.
+    `versions` are the holders that a `VersionSearch` has found.
+    """
+    held: dict[str, Held] = {}
+    for item_id, found in versions.items():
+        for holder in found:
+            held.setdefault(item_id, Held()).add(holder)
+    for job in jobs_naming(tx, project_id, rows.keys(), unfinished=True):
+        for item_id in sorted(job.named):
+            held.setdefault(item_id, Held()).add(JobHolder(job=job.id, kind=job.kind, state=JobState(job.state)))
+    _add_referring(tx, project_id, rows.keys(), held)
+    _spread(_references_among(tx, rows.keys()), rows, held)
+    return held
+
+
+def _references(items: Collection[str]) -> Select[Any]:
+    """Return the ids of items (`held`), and of other items (`by`) that have documents that refer to them."""
+    return (
+        select(document_item.c.item_id.label("held"), revision_part.c.item_id.label("by"))
+        .join(revision_part, revision_part.c.document_digest == document_item.c.document_digest)
+        .where(document_item.c.item_id.in_(items), revision_part.c.item_id != document_item.c.item_id)
+        .distinct()
+    )
+
+
+def _add_referring(tx: Transaction, project_id: str, items: Collection[str], held: dict[str, Held]) -> None:
+    """Add the items of the project, apart from `items`, that have documents that refer to one of `items`."""
+    referring = (
+        _references(items)
+        .join(item, item.c.id == revision_part.c.item_id)
+        .where(item.c.project_id == project_id, item.c.id.not_in(items))
+        .subquery()
+    )
+    placed = select(
+        referring.c.held,
+        referring.c.by,
+        func.row_number().over(partition_by=referring.c.held, order_by=referring.c.by).label("place"),
+        func.count().over(partition_by=referring.c.held).label("total"),
+    ).subquery()
+    shown = (
+        select(placed.c.held, placed.c.place, placed.c.total, item, collection.c.path)
+        .join(item, item.c.id == placed.c.by)
+        .join(collection, collection.c.id == item.c.collection_id)
+        .where(placed.c.place <= MOST_HOLDERS)
+        .order_by(placed.c.held, placed.c.place)
+    )
+    for row in tx.execute(shown):
+        unnamed = row.total - MOST_HOLDERS if row.place == MOST_HOLDERS else 0
+        held.setdefault(row.held, Held()).add(_holder(row), max(0, unnamed))
+
+
+def _references_among(tx: Transaction, items: Collection[str]) -> dict[str, list[str]]:
+    """Return, for each of `items`, the others of them to which its documents refer."""
+    found: dict[str, list[str]] = {}
+    for row in tx.execute(_references(items).where(revision_part.c.item_id.in_(items))):
+        found.setdefault(row.by, []).append(row.held)
+    return found
+
+
+def _spread(refers: Mapping[str, Iterable[str]], rows: Mapping[str, Row[Any]], held: dict[str, Held]) -> None:
+    """Hold the items to which held items refer, directly or through others."""
+    waiting = sorted(held)
+    spread = set(waiting)
+    while waiting:
+        by = waiting.pop()
+        for item_id in sorted(refers.get(by, ())):
+            held.setdefault(item_id, Held()).add(_holder(rows[by]))
+            if item_id not in spread:
+                spread.add(item_id)
+                waiting.append(item_id)
+
+
+def _holder(row: Row[Any]) -> ItemHolder:
+    path = f"{row.path}/{row.name}".lstrip("/")
+    return ItemHolder(item=row.id, kind=Kind(row.kind), path=path, deleted=row.deleted_us is not None)

@@ -1,0 +1,100 @@
+"""The write of a purge: erases those of the prepared items that nothing holds now, and names what holds the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy import Row
+
+from marey_schemas.kinds import Kind
+from marey_schemas.purges import HeldItem, PurgeAnswer, PurgedItem, PurgeRequest, words_of
+from marey_server import faults
+from marey_server.errors import ConflictProblem
+from marey_server.store import projects
+from marey_server.store.items.reading import item_rows
+from marey_server.store.projects import ProjectRow
+from marey_server.store.purge_lock import begin_purge
+from marey_server.store.purging.candidates import PreparedPurge, contents_of
+from marey_server.store.purging.erasing import erase
+from marey_server.store.purging.holders import Held, find_holders
+from marey_server.store.purging.sizes import freed_by
+from marey_server.store.purging.versions import VersionSearch
+from marey_server.store.tables import item
+from marey_server.store.transaction import Transaction
+
+STILL_HELD = "still-held"
+"""Code of the error for an item that something still needs; `context.holders` says what."""
+
+
+def record_purge(tx: Transaction, project: str, request: PurgeRequest, prepared: PreparedPurge) -> PurgeAnswer:
+    """Purge the prepared items that nothing holds, all in this transaction; with `preview`, only say which.
+
+    Items that were restored since they were chosen are left out. Raises `ConflictProblem` if the request names a single
+    item and something holds it.
+    """
+    project_row = projects.require(tx, project)
+    at_us = 0 if request.preview else begin_purge(tx, project_row.id)
+    rows = _lock(tx, project_row, prepared)
+    held = find_holders(tx, project_row.id, rows, _versions(tx, project_row, prepared, rows))
+    refused = tuple(_refused(rows[item_id], held[item_id]) for item_id in prepared.ids if item_id in held)
+    if request.item is not None and refused and not request.preview:
+        raise _still_held(refused[0])
+    free = [row for item_id, row in rows.items() if item_id not in held]
+    freed_bytes = freed_by(tx, [row.id for row in free])
+    if free and not request.preview:
+        erase(tx, project_row, free, prepared.jobs, at_us)
+        faults.point("purge.before_commit")
+        tx.after_commit(lambda: faults.point("purge.after_commit"))
+    return PurgeAnswer(
+        preview=request.preview,
+        purged=tuple(PurgedItem(item=row.id, kind=Kind(row.kind), path=_path(row)) for row in free),
+        refused=refused,
+        freed_bytes=freed_bytes,
+        next=prepared.next,
+    )
+
+
+def _lock(tx: Transaction, project_row: ProjectRow, prepared: PreparedPurge) -> dict[str, Row[Any]]:
+    """Return the rows of the prepared items that are still deleted, in their order, and lock them."""
+    statement = item_rows().where(
+        item.c.id.in_(prepared.ids),
+        item.c.project_id == project_row.id,
+        item.c.deleted_us.is_not(None),
+        item.c.purged_us.is_(None),
+    )
+    found = {row.id: row for row in tx.execute(statement.order_by(item.c.id).with_for_update(of=item))}
+    return {item_id: found[item_id] for item_id in prepared.ids if item_id in found}
+
+
+def _versions(
+    tx: Transaction, project_row: ProjectRow, prepared: PreparedPurge, rows: Mapping[str, Row[Any]]
+) -> dict[str, list[Any]]:
+    """Return the datasets that hold the items, after a search of the commits that were added since the preparation.
+
+    If a revision has a content digest now that it did not have then, all versions are searched again.
+    """
+    contents, parts = contents_of(tx, tuple(rows))
+    search = prepared.search
+    if not parts.keys() <= search.wanted.keys():
+        search = VersionSearch(project_row.id, parts)
+    search.update(tx)
+    return search.holders(tx, contents)
+
+
+def _refused(row: Row[Any], held: Held) -> HeldItem:
+    return HeldItem(item=row.id, kind=Kind(row.kind), path=_path(row), holders=tuple(held.holders), others=held.others)
+
+
+def _path(row: Row[Any]) -> str:
+    return f"{row.path}/{row.name}".lstrip("/")
+
+
+def _still_held(refused: HeldItem) -> ConflictProblem:
+    more = f" and {refused.others:,} more" if refused.others else ""
+    return ConflictProblem(
+        f"The {refused.kind} {refused.path!r} cannot be purged, because it is still needed by "
+        f"{', '.join(map(words_of, refused.holders))}{more}.",
+        code=STILL_HELD,
+        context=refused.model_dump(mode="json"),
+    )
