@@ -19,9 +19,11 @@ from marey_client.imports import Imports
 from marey_client.items import ItemHandle, Items
 from marey_client.jobs import Jobs
 from marey_client.paging import pages
+from marey_client.purges import purge_items
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
 from marey_schemas.kinds import Kind
+from marey_schemas.purges import PurgeAnswer, PurgeRequest
 from marey_schemas.queue.jobs import ItemInput
 
 
@@ -83,6 +85,15 @@ class ProjectItems:
     def collections(self) -> Collections:
         """The folders of the project."""
         return Collections(self.transport, self.name)
+
+    def purge(self, **conditions: Any) -> PurgeAnswer:
+        """Delete deleted items for good, so that garbage collection frees their bytes. For owners of the project.
+
+        `conditions` are the fields of `PurgeRequest`, such as `collection="raw", older_than_days=30`; with
+        `preview=True`, nothing changes. The answer says which items something still needs, and what; these are not
+        purged. Raises `Conflict` if `item` names a single item that something needs.
+        """
+        return purge_items(self.transport, self.name, PurgeRequest.model_validate(conditions))
 
     def edited_rigs(self, clips: Iterable[Item]) -> tuple[ItemInput, ...]:
         """Return the skeletons of `clips` whose joint mapping may have been edited: those with several revisions."""

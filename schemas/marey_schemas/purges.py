@@ -85,16 +85,21 @@ Holder = Annotated[DatasetHolder | ItemHolder | JobHolder, Field(discriminator="
 
 
 class PurgedItem(Answer):
-    """Item that was purged, or that a purge would delete, with the path that it had."""
+    """Item that was purged, or that a purge would delete."""
+
+    item: str
+    kind: Kind
+    path: str = Field(
+        description="Folder and name that the item had; empty after the purge, because answers are stored for repeats."
+    )
+
+
+class HeldItem(Answer):
+    """Item that was not purged, because something still needs it."""
 
     item: str
     kind: Kind
     path: str
-
-
-class HeldItem(PurgedItem):
-    """Item that was not purged, because something still needs it."""
-
     holders: tuple[Holder, ...] = Field(description=f"What holds the item, at most {MOST_HOLDERS}.")
     others: int = Field(0, description="Number of further holders that are not listed.")
 

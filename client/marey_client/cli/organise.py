@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -20,6 +19,7 @@ from marey_client.cli.addresses import (
     the_thing,
 )
 from marey_client.cli.revisions import require_revision
+from marey_client.cli.terminal.confirming import ask
 from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
 from marey_client.cli.terminal.invocation import AsJson, QueryText, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_table, progress
@@ -118,7 +118,7 @@ def rm(
         if preview:
             return _preview(("name", "kind"), [(one.place, one.kind) for one in things], things, "removed", as_json)
         if (count > 1 or query is not None) and not yes:
-            _ask(f"remove {counted(count, 'item')} ({_named(things)})?")
+            ask(f"remove {counted(count, 'item')} ({_named(things)})?", otherwise="nothing was removed")
 
         def remove(thing: Thing) -> Any:
             thing.delete()
@@ -316,17 +316,6 @@ def _typed(thing: Thing) -> str:
 def _named(things: Sequence[Thing]) -> str:
     first, others = _typed(things[0]), len(things) - 1
     return f"{first} and {others} more" if others else first
-
-
-def _ask(question: str) -> None:
-    """Ask for confirmation. Raises `Refused` unless the answer is yes, and `WrongUsage` without a terminal."""
-    if not sys.stdin.isatty():
-        raise WrongUsage(
-            f"{question} This needs a confirmation, but standard input is not a terminal; confirm with --yes"
-        )
-    if not typer.confirm(question, err=True):
-        print_message("nothing was removed")
-        raise Refused
 
 
 def _do_each(

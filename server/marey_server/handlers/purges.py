@@ -15,7 +15,7 @@ class ProjectPurges(Resource):
     path = "/projects/{project}/purges"
     tag = "Items"
 
-    @writes(access=Access.OWNER, body=PurgeRequest, answer=PurgeAnswer)
+    @writes(access=Access.OWNER, body=PurgeRequest, answer=PurgeAnswer, idempotency="key")
     async def post(self, project: str, body: PurgeRequest) -> Rendered:
         """Purge deleted items: delete their revisions, documents and names for good, or preview this.
 

@@ -10,11 +10,11 @@ from sqlalchemy import ColumnElement, Row, and_, case, or_, select
 
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import MOST_PURGED, PurgeRequest
-from marey_server.errors import BadRequestProblem, ConflictProblem, NotFoundProblem
+from marey_server.errors import BadRequestProblem
 from marey_server.store import projects
 from marey_server.store.database.clock import DAY_US
 from marey_server.store.items.listing import ItemFilters, conditions_of
-from marey_server.store.items.reading import item_rows, was_purged
+from marey_server.store.items.reading import item_rows
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purging.naming_jobs import jobs_naming
 from marey_server.store.purging.versions import VersionSearch
@@ -49,12 +49,9 @@ class PreparedPurge:
 def prepare_purge(tx: Transaction, project: str, request: PurgeRequest) -> PreparedPurge:
     """Choose the next items of a purge, and search all versions and jobs of the project for them.
 
-    Raises `NotFoundProblem`, `GoneProblem` or `ConflictProblem` if the item that the request names does not exist, was
-    purged, or was not deleted, and `BadRequestProblem` for a malformed query.
+    Raises `BadRequestProblem` for a malformed query.
     """
     project_row = projects.require(tx, project)
-    if request.item is not None:
-        _require_deleted(tx, project_row, request.item)
     rows = _candidates(tx, project_row, request)
     chosen: list[Row[Any]] = []
     left = MOST_REVISIONS
@@ -69,18 +66,6 @@ def prepare_purge(tx: Transaction, project: str, request: PurgeRequest) -> Prepa
     search.update(tx)
     jobs = tuple(one.id for one in jobs_naming(tx, project_row.id, ids)) if ids else ()
     return PreparedPurge(ids, search, jobs, ids[-1] if len(rows) > len(chosen) else None)
-
-
-def _require_deleted(tx: Transaction, project_row: ProjectRow, item_id: str) -> None:
-    row = tx.execute(select(item).where(item.c.id == item_id, item.c.project_id == project_row.id)).first()
-    if row is None:
-        raise NotFoundProblem(f"There is no item {item_id!r} in this project.", code="no-item")
-    if row.purged_us is not None:
-        raise was_purged(Kind(row.kind), item_id, row.purged_us)
-    if row.deleted_us is None:
-        raise ConflictProblem(
-            f"The {row.kind} {item_id!r} is not deleted; delete it first, then purge it.", code="not-deleted"
-        )
 
 
 def _candidates(tx: Transaction, project_row: ProjectRow, request: PurgeRequest) -> Sequence[Row[Any]]:

@@ -16,7 +16,7 @@ from marey_schemas.kinds import Kind
 from marey_server.store import collections
 from marey_server.store.jobs.result_cache import forget_results
 from marey_server.store.projects import ProjectRow
-from marey_server.store.tables import collection, dataset, event, item, item_tag, job, revision, revision_part
+from marey_server.store.tables import attempt, collection, dataset, event, item, item_tag, job, revision, revision_part
 from marey_server.store.transaction import IN_LIST, Transaction
 
 
@@ -24,7 +24,7 @@ def erase(tx: Transaction, project_row: ProjectRow, rows: Sequence[Row[Any]], jo
     """Erase deleted items, and record an event for each; `jobs` are the jobs that name one of them."""
     ids = [row.id for row in rows]
     _forget_in_jobs(tx, frozenset(ids), jobs)
-    _forget_in_events(tx, ids)
+    _forget_in_events(tx, ids, "name", "collection")
     tx.execute(delete(revision_part).where(revision_part.c.item_id.in_(ids)))
     tx.execute(delete(item_tag).where(item_tag.c.item_id.in_(ids)))
     bare = {"author_id": None, "message": "", "content": None}
@@ -53,7 +53,21 @@ def _forget_in_jobs(tx: Transaction, items: frozenset[str], jobs: Sequence[str])
                 makers.append(row.id)
             if (inputs, outputs) != (row.inputs, row.outputs):
                 tx.execute(update(job).where(job.c.id == row.id).values(inputs=inputs, outputs=outputs))
+    _forget_in_answers(tx, items, makers)
     forget_results(tx, makers)
+
+
+def _forget_in_answers(tx: Transaction, items: Collection[str], jobs: Sequence[str]) -> None:
+    """Remove the names of items from the answers to workers, which are stored in case that a worker asks again."""
+    for start in range(0, len(jobs), IN_LIST):
+        some = select(attempt.c.job_id, attempt.c.fence, attempt.c.answer).where(
+            attempt.c.job_id.in_(jobs[start : start + IN_LIST]), attempt.c.answer.is_not(None)
+        )
+        for row in tx.execute(some).all():
+            answer = {**row.answer, "outputs": _outputs_without_names(row.answer.get("outputs"), items)}
+            if answer["outputs"] is not None:
+                this = attempt.c.job_id == row.job_id, attempt.c.fence == row.fence
+                tx.execute(update(attempt).where(*this).values(answer=answer))
 
 
 def _without_names(inputs: Mapping[str, Any], items: Collection[str]) -> dict[str, Any]:
@@ -90,16 +104,18 @@ def _outputs_without_names(
 # -- events and folders -----------------------------------------------------------------------------------------------
 
 
-def _forget_in_events(tx: Transaction, ids: Sequence[str]) -> None:
-    """Remove the names and folders of items from the events about them."""
-    body: ColumnElement[Any] = func.json_remove(event.c.body, "$.name", "$.collection")
+def _forget_in_events(tx: Transaction, ids: Sequence[str], *members: str) -> None:
+    """Remove members, which contain names, from the events about items or folders."""
+    body: ColumnElement[Any] = func.json_remove(event.c.body, *(f"$.{name}" for name in members))
     if tx.is_postgres:
-        body = event.c.body.op("-", return_type=event.c.body.type)(cast(array(["name", "collection"]), ARRAY(Text)))
-    tx.execute(update(event).where(event.c.subject.in_(ids)).values(body=body))
+        body = event.c.body.op("-", return_type=event.c.body.type)(cast(array(members), ARRAY(Text)))
+    for start in range(0, len(ids), IN_LIST):
+        about = event.c.subject.in_(ids[start : start + IN_LIST])
+        tx.execute(update(event).where(about).values(body=body))
 
 
 def _drop_empty_folders(tx: Transaction, project_id: str, paths: Collection[str]) -> None:
-    """Delete deleted folders, at `paths` and above, that contain no items any more: their names are gone, too.
+    """Delete deleted folders, at `paths` and above, that contain no items any more, and their names in events.
 
     Folders that a dataset needs remain.
     """
@@ -116,11 +132,9 @@ def _drop_empty_folders(tx: Transaction, project_id: str, paths: Collection[str]
         .where(placed.c.collection_id == inner.c.id)
     )
     used = exists().where(dataset.c.collection_id == collection.c.id)
+    empty = (collection.c.project_id == project_id, collection.c.deleted_us.is_not(None), ~holds_items, ~used)
     chosen = sorted(above)
     for start in range(0, len(chosen), IN_LIST):
         some = collection.c.path.in_(chosen[start : start + IN_LIST])
-        tx.execute(
-            delete(collection).where(
-                collection.c.project_id == project_id, collection.c.deleted_us.is_not(None), some, ~holds_items, ~used
-            )
-        )
+        dropped = tx.execute(delete(collection).where(*empty, some).returning(collection.c.id)).scalars().all()
+        _forget_in_events(tx, dropped, "path", "was")

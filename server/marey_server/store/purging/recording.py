@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import Row
+from sqlalchemy import Row, select
 
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import HeldItem, PurgeAnswer, PurgedItem, PurgeRequest, words_of
 from marey_server import faults
-from marey_server.errors import ConflictProblem
+from marey_server.errors import ApiProblem, ConflictProblem, NotFoundProblem
 from marey_server.store import projects
-from marey_server.store.items.reading import item_rows
+from marey_server.store.items.reading import item_rows, was_purged
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import begin_purge
 from marey_server.store.purging.candidates import PreparedPurge, contents_of
@@ -30,12 +30,15 @@ STILL_HELD = "still-held"
 def record_purge(tx: Transaction, project: str, request: PurgeRequest, prepared: PreparedPurge) -> PurgeAnswer:
     """Purge the prepared items that nothing holds, all in this transaction; with `preview`, only say which.
 
-    Items that were restored since they were chosen are left out. Raises `ConflictProblem` if the request names a single
-    item and something holds it.
+    Items that were restored since they were chosen are left out. If the request names a single item, raises
+    `ConflictProblem` if something holds it or it is not deleted, `GoneProblem` if it was purged already, and
+    `NotFoundProblem` if it does not exist.
     """
     project_row = projects.require(tx, project)
     at_us = 0 if request.preview else begin_purge(tx, project_row.id)
     rows = _lock(tx, project_row, prepared)
+    if request.item is not None and not rows:
+        raise _not_deleted(tx, project_row, request.item)
     held = find_holders(tx, project_row.id, rows, _versions(tx, project_row, prepared, rows))
     refused = tuple(_refused(rows[item_id], held[item_id]) for item_id in prepared.ids if item_id in held)
     if request.item is not None and refused and not request.preview:
@@ -48,7 +51,7 @@ def record_purge(tx: Transaction, project: str, request: PurgeRequest, prepared:
         tx.after_commit(lambda: faults.point("purge.after_commit"))
     return PurgeAnswer(
         preview=request.preview,
-        purged=tuple(PurgedItem(item=row.id, kind=Kind(row.kind), path=_path(row)) for row in free),
+        purged=tuple(_purged(row, named=request.preview) for row in free),
         refused=refused,
         freed_bytes=freed_bytes,
         next=prepared.next,
@@ -67,6 +70,20 @@ def _lock(tx: Transaction, project_row: ProjectRow, prepared: PreparedPurge) -> 
     return {item_id: found[item_id] for item_id in prepared.ids if item_id in found}
 
 
+def _not_deleted(tx: Transaction, project_row: ProjectRow, item_id: str) -> ApiProblem:
+    """Return the error for an item that is not among the deleted items of the project."""
+    row = tx.execute(select(item).where(item.c.id == item_id, item.c.project_id == project_row.id)).first()
+    if row is None:
+        return NotFoundProblem(f"There is no item {item_id!r} in this project.", code="no-item")
+    if row.purged_us is not None:
+        return was_purged(Kind(row.kind), item_id, row.purged_us)
+    return ConflictProblem(
+        f"The {row.kind} {item_id!r} is not among the deleted items that the request selects; delete it first, or "
+        "leave out the other conditions.",
+        code="not-deleted",
+    )
+
+
 def _versions(
     tx: Transaction, project_row: ProjectRow, prepared: PreparedPurge, rows: Mapping[str, Row[Any]]
 ) -> dict[str, list[Any]]:
@@ -80,6 +97,10 @@ def _versions(
         search = VersionSearch(project_row.id, parts)
     search.update(tx)
     return search.holders(tx, contents)
+
+
+def _purged(row: Row[Any], *, named: bool) -> PurgedItem:
+    return PurgedItem(item=row.id, kind=Kind(row.kind), path=_path(row) if named else "")
 
 
 def _refused(row: Row[Any], held: Held) -> HeldItem:

@@ -1,0 +1,24 @@
+"""Confirmation of commands that delete something."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from marey_client.cli.terminal.failures import Refused, WrongUsage
+from marey_client.cli.terminal.output import print_message
+
+
+def ask(question: str, *, otherwise: str) -> None:
+    """Ask for confirmation, and print `otherwise` if the answer is not yes.
+
+    Raises `Refused` unless the answer is yes, and `WrongUsage` without a terminal.
+    """
+    if not sys.stdin.isatty():
+        raise WrongUsage(
+            f"{question} This needs a confirmation, but standard input is not a terminal; confirm with --yes"
+        )
+    if not typer.confirm(question, err=True):
+        print_message(otherwise)
+        raise Refused

@@ -1,0 +1,34 @@
+"""Purges of deleted items, in as many requests as they need."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from marey_client.transport import Transport
+from marey_schemas.purges import PurgeAnswer, PurgeRequest
+
+
+def purge_step_by_step(transport: Transport, project: str, request: PurgeRequest) -> Iterator[PurgeAnswer]:
+    """Yield the answer to each request of a purge; each answer is about other items than those before it."""
+    wanted = request
+    while True:
+        answer = transport.post(PurgeAnswer, f"/projects/{project}/purges", wanted)
+        yield answer
+        if answer.next is None:
+            return
+        wanted = request.model_copy(update={"after": answer.next})
+
+
+def purge_items(transport: Transport, project: str, request: PurgeRequest) -> PurgeAnswer:
+    """Purge all items that a request selects, and return what was done with each of them."""
+    return combined(list(purge_step_by_step(transport, project, request)))
+
+
+def combined(answers: Sequence[PurgeAnswer]) -> PurgeAnswer:
+    """Return one answer for several of them, at least one; an item that several previews name is listed once."""
+    return PurgeAnswer(
+        preview=answers[0].preview,
+        purged=tuple({one.item: one for answer in answers for one in answer.purged}.values()),
+        refused=tuple({one.item: one for answer in answers for one in answer.refused}.values()),
+        freed_bytes=sum(answer.freed_bytes for answer in answers),
+    )
