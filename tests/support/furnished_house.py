@@ -87,6 +87,7 @@ BODIES = {
     },
     "PartsRequest": {"parts": [{"kind": "clip", "item": "item_of_nobody", "revision": 1, "part": "info"}]},
     "ItemChange": {"name": "renamed"},
+    "PurgeRequest": {"collection": "", "preview": True},
     "ItemRevert": {"revision": 1},
     "Document": {"schema": "marey/clip-info@1", "comment": CANARY},
     "JobCreate": {"kind": "no-such-kind"},

@@ -21,6 +21,7 @@ from marey_schemas.items import Event, ItemChange
 from marey_schemas.kinds import Kind
 from marey_schemas.lineage import LineageRequest, grouped, remarks_on, title_of
 from marey_schemas.purges import DatasetHolder, HeldItem, ItemHolder, JobHolder, PurgeAnswer, PurgeRequest
+from marey_schemas.queue.jobs import JobState
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ApiProblem, ConflictProblem, GoneProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import blobs, collections, datasets, events, fsck, garbage, items, purging, quotas
@@ -392,7 +393,7 @@ def test_results_of_a_task_are_held_until_its_parent_job_has_ended(house: House)
     house.desk.complete(first)
     (made,) = house.desk.outputs(parent)
     house.delete(made.item)
-    assert [holder.job for holder in house.holders(made.item).holders if isinstance(holder, JobHolder)] == [first.job]
+    assert house.holders(made.item).holders == (JobHolder(job=parent, kind="square", state=JobState.RUNNING),)
     house.gaits.work("rest")
     assert house.desk.state(parent) == "succeeded"
     assert house.holders(made.item).holders == (DatasetHolder(dataset="gaits", branches=("main",), commits=1),)
@@ -578,7 +579,8 @@ def test_a_purge_that_was_prepared_before_a_commit_sees_the_commit(house: House)
     prepared = house.read(purging.prepare_purge, "lab", request)
     house.write(items.restore_item, "lab", Kind.STUDY, walk)
     house.gaits.change(PutEntry(path="walk", item=walk))
-    assert house.write(purging.record_purge, "lab", request, prepared).purged == ()
+    with pytest.raises(ConflictProblem, match="delete it first"):
+        house.write(purging.record_purge, "lab", request, prepared)
     house.delete(walk)
     with pytest.raises(ConflictProblem, match=r"the dataset gaits \(branch main; 1 commit\)"):
         house.write(purging.record_purge, "lab", request, prepared)
@@ -622,3 +624,25 @@ def test_blobs_of_jobs_are_not_counted_as_freed(house: House) -> None:
     house.write(blobs.keep_for_job, job, [blobs.digest_of(data)])
     house.delete(one)
     assert house.purge(item=one).freed_bytes < 1000
+
+
+def test_files_that_jobs_imported_or_made_of_a_purged_item_are_released(house: House) -> None:
+    """A job that imported a file, and one that exported it, keep no copy of the content."""
+    source, archive = b"s" * 3000, b"a" * 4000
+    made = house.desk.submit("sum")
+    lease = house.desk.claim()
+    house.desk.database.write(house.desk.attempt(lease), blobs.put_blob, source)
+    house.desk.stage(lease, "take", facts={"blob": blobs.digest_of(source)})
+    house.desk.complete(lease, result={"source": {"blob": blobs.digest_of(source)}})
+    (take,) = house.desk.outputs(made)
+    export = house.desk.submit("square", inputs={"things": ({"item": take.item},)})
+    lease = house.desk.claim()
+    house.desk.database.write(house.desk.attempt(lease), blobs.put_blob, archive)
+    house.desk.complete(lease, result={"archive": {"blob": blobs.digest_of(archive)}})
+    house.delete(take.item)
+    assert house.purge(item=take.item, preview=True).freed_bytes > 3000
+    assert house.purge(item=take.item).freed_bytes > 3000
+    assert house.collect().blobs == 2
+    assert (house.desk.job(export).result or {})["archive"] == {"blob": blobs.digest_of(archive)}
+    assert house.read(blobs.readable, [blobs.digest_of(data) for data in (source, archive)]) == set()
+    assert house.faults() == []

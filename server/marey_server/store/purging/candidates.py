@@ -41,7 +41,7 @@ class PreparedPurge:
     ids: tuple[str, ...]
     search: VersionSearch
     jobs: tuple[str, ...]
-    """Ids of the jobs, ended or not, that name one of the items."""
+    """Ids of the jobs, ended or not, that name one of the items, and of their parent jobs."""
     next: str | None = None
     """Last of the items, if there are more."""
 
@@ -64,8 +64,9 @@ def prepare_purge(tx: Transaction, project: str, request: PurgeRequest) -> Prepa
     _, parts = contents_of(tx, ids)
     search = VersionSearch(project_row.id, parts)
     search.update(tx)
-    jobs = tuple(one.id for one in jobs_naming(tx, project_row.id, ids)) if ids else ()
-    return PreparedPurge(ids, search, jobs, ids[-1] if len(rows) > len(chosen) else None)
+    naming = list(jobs_naming(tx, project_row.id, ids)) if ids else []
+    jobs = {one.id for one in naming} | {one.parent for one in naming if one.parent is not None}
+    return PreparedPurge(ids, search, tuple(sorted(jobs)), ids[-1] if len(rows) > len(chosen) else None)
 
 
 def _candidates(tx: Transaction, project_row: ProjectRow, request: PurgeRequest) -> Sequence[Row[Any]]:

@@ -44,12 +44,22 @@ def find_holders(
     for item_id, found in versions.items():
         for holder in found:
             held.setdefault(item_id, Held()).add(holder)
-    for job in jobs_naming(tx, project_id, rows.keys(), unfinished=True):
-        for item_id in sorted(job.named):
-            held.setdefault(item_id, Held()).add(JobHolder(job=job.id, kind=job.kind, state=JobState(job.state)))
+    for item_id, jobs in _unfinished_jobs(tx, project_id, rows.keys()).items():
+        for job in jobs.values():
+            held.setdefault(item_id, Held()).add(job)
     _add_referring(tx, project_id, rows.keys(), held)
     _spread(_references_among(tx, rows.keys()), rows, held)
     return held
+
+
+def _unfinished_jobs(tx: Transaction, project_id: str, items: Collection[str]) -> dict[str, dict[str, JobHolder]]:
+    """Return the jobs that hold items, by the id of the item and the id of the job; tasks count as their parent job."""
+    found: dict[str, dict[str, JobHolder]] = {}
+    for one in jobs_naming(tx, project_id, items, unfinished=True):
+        whole = one.parent or one.id
+        for item_id in one.named:
+            found.setdefault(item_id, {})[whole] = JobHolder(job=whole, kind=one.kind, state=JobState(one.state))
+    return found
 
 
 def _references(items: Collection[str]) -> Select[Any]:

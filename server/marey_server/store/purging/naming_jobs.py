@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
-from sqlalchemy import Text, cast, or_, select
+from sqlalchemy import Text, cast, func, or_, select
 
 from marey_schemas.queue.jobs import JobState
 from marey_server.store.tables import job
@@ -21,34 +21,29 @@ class NamingJob:
     """Job that names items."""
 
     id: str
+    parent: str | None
     kind: str
     state: str
-    busy: bool
-    """Whether the job, or the parent job that will use its results, has not ended."""
-    reads: frozenset[str]
-    """Ids of items in its inputs and parameters."""
-    made: frozenset[str]
-    """Ids of items in its results."""
-
-    @property
-    def named(self) -> frozenset[str]:
-        """The ids of all items that the job names."""
-        return self.reads | self.made
+    """State of the job, or of its parent job if it is a task."""
+    named: frozenset[str]
+    """Ids of items in its inputs, parameters and results."""
 
 
 def jobs_naming(
     tx: Transaction, project_id: str, items: Collection[str], *, unfinished: bool = False
 ) -> Iterator[NamingJob]:
-    """Yield the jobs of a project that name one of `items`; with `unfinished`, only those that may hold an item.
+    """Yield the jobs of a project that name one of `items`.
 
+    With `unfinished`, only those are searched that have not ended, or whose parent job has not ended.
     The texts of all jobs of the project are searched, because ids can be anywhere in parameters.
     """
     parent = job.alias("parent")
     statement = (
         select(
-            job.c.id, job.c.kind, job.c.state, parent.c.state.label("parent_state"),
-            (cast(job.c.inputs, Text) + cast(job.c.params, Text)).label("reads"),
-            cast(job.c.outputs, Text).label("made"),
+            job.c.id, job.c.parent_id, job.c.kind, func.coalesce(parent.c.state, job.c.state).label("state"),
+            (cast(job.c.inputs, Text) + cast(job.c.params, Text) + func.coalesce(cast(job.c.outputs, Text), "")).label(
+                "text"
+            ),
         )
         .outerjoin(parent, parent.c.id == job.c.parent_id)
         .where(job.c.project_id == project_id)
@@ -59,8 +54,5 @@ def jobs_naming(
         statement = statement.where(or_(job.c.state.in_(UNFINISHED), parent.c.state.in_(UNFINISHED)))
     wanted = frozenset(items)
     for row in tx.execute(statement):
-        reads = wanted.intersection(_ITEM_ID.findall(row.reads))
-        made = wanted.intersection(_ITEM_ID.findall(row.made or ""))
-        if reads or made:
-            busy = row.state in UNFINISHED or row.parent_state in UNFINISHED
-            yield NamingJob(row.id, row.kind, row.state, busy, reads, made)
+        if named := wanted.intersection(_ITEM_ID.findall(row.text)):
+            yield NamingJob(row.id, row.parent_id, row.kind, row.state, named)

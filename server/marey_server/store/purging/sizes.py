@@ -10,8 +10,8 @@ from marey_server.store.tables import blob, document, document_blob, job_blob, r
 from marey_server.store.transaction import IN_LIST, Transaction
 
 
-def freed_by(tx: Transaction, items: Collection[str]) -> int:
-    """Return the sizes of the documents, arrays and files that only revisions of `items` refer to.
+def freed_by(tx: Transaction, items: Collection[str], jobs: Collection[str]) -> int:
+    """Return the sizes of the documents, arrays and files that only revisions of `items`, and `jobs`, refer to.
 
     The true number may be greater, because an array that another unused document refers to does not count.
     """
@@ -30,7 +30,8 @@ def freed_by(tx: Transaction, items: Collection[str]) -> int:
         for row in tx.execute(referring.where(document_blob.c.blob_digest.in_(some))):
             if row.document_digest not in documents:
                 needed.add(row.blob_digest)
-        needed.update(tx.execute(select(job_blob.c.blob_digest).where(job_blob.c.blob_digest.in_(some))).scalars())
+        keeping = select(job_blob.c.blob_digest, job_blob.c.job_id).where(job_blob.c.blob_digest.in_(some))
+        needed.update(row.blob_digest for row in tx.execute(keeping) if row.job_id not in jobs)
     return text_bytes + sum(size for digest, size in sizes.items() if digest not in needed)
 
 
