@@ -113,6 +113,36 @@ def test_a_collector_that_dies_deletes_nothing_it_did_not_finish(lab: Lab, write
     assert_sound(lab)
 
 
+def left_deleted(lab: Lab) -> int:
+    return len(lab.read(items.list_items, "lab", Kind.STUDY, items.ItemFilters(deleted=True)).items)
+
+
+def purged(lab: Lab) -> list[str]:
+    return [one.subject for one in lab.events() if one.kind == "item.purged"]
+
+
+@pytest.mark.every_database
+@pytest.mark.parametrize(("fault", "gone"), [("purge.before_commit@2:kill", 1), ("purge.after_commit@2:kill", 2)])
+def test_a_purger_that_dies_leaves_each_item_whole_or_purged(lab: Lab, writer: Writer, fault: str, gone: int) -> None:
+    writer.run("send")
+    writer.run("publish")
+    ids = [one.id for one in lab.read(items.list_items, "lab", Kind.STUDY).items]
+    for one in ids:
+        lab.write(items.delete_item, "lab", Kind.STUDY, one, expected_rev=None)
+    assert writer.run("purge", fault) == -signal.SIGKILL
+    assert (left_deleted(lab), len(purged(lab))) == (3 - gone, gone)
+    garbage.collect_garbage(lab.database, grace_us=-1)
+    assert_sound(lab)
+    for one in set(ids) - set(purged(lab)):
+        assert lab.write(items.restore_item, "lab", Kind.STUDY, one).parts["study"].size_bytes > 0
+        lab.write(items.delete_item, "lab", Kind.STUDY, one, expected_rev=None)
+    assert writer.run("purge") == 0
+    assert sorted(purged(lab)) == sorted(ids)
+    garbage.collect_garbage(lab.database, grace_us=-1)
+    assert stored(lab) == [False, False, False]
+    assert_sound(lab)
+
+
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 @pytest.mark.every_database
 @pytest.mark.parametrize("place", ["before_copy", "after_copy"])

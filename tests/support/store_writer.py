@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from marey_schemas.kinds import Kind
+from marey_schemas.purges import PurgeRequest
 from marey_schemas.queue.worker_protocol import CompleteRequest
 from marey_server.access.principal import Principal
-from marey_server.store import blobs, garbage, items, projects
+from marey_server.store import blobs, garbage, items, projects, purging
 from marey_server.store.blob_backings import DirectoryBlobs
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs import completion
+from marey_server.store.purging import candidates
 from marey_server.store.transaction import Transaction
 
 LARGE_FILES = [bytes([number]) * 2**20 for number in range(12)]
@@ -29,10 +31,20 @@ def publish(tx: Transaction) -> Any:
     return items.publish(tx, row, drafts, author_id=tx.principal.user_id)
 
 
-def main(url: str, user_id: str, user_name: str, work: str, folder: str) -> None:
-    """Send the files, publish, or collect garbage; blobs are in `folder`, or in the database if `folder` is empty.
+def purge(database: Database, who: Principal) -> None:
+    """Purge all deleted items of `lab`, each in a transaction of its own."""
+    candidates.MOST_PURGED = 1
+    request: PurgeRequest | None = PurgeRequest(collection="")
+    while request is not None:
+        prepared = database.read(who, purging.prepare_purge, "lab", request)
+        answer = database.write(who, purging.record_purge, "lab", request, prepared)
+        request = None if answer.next is None else PurgeRequest(collection="", after=answer.next)
 
-    After each large file, its digest is printed.
+
+def main(url: str, user_id: str, user_name: str, work: str, folder: str) -> None:
+    """Send the files, publish, purge, or collect garbage. After each large file, its digest is printed.
+
+    Blobs are in `folder`, or in the database if `folder` is empty.
     """
     database = Database(url, blobs=DirectoryBlobs(Path(folder)) if folder else None)
     who = Principal("user", user_id, user_name, scopes=("read", "write"))
@@ -44,6 +56,8 @@ def main(url: str, user_id: str, user_name: str, work: str, folder: str) -> None
             print(database.write(who, blobs.put_blob, data), flush=True)
     elif work == "publish":
         database.write(who, publish)
+    elif work == "purge":
+        purge(database, who)
     elif work.startswith("complete "):
         _, job_id, fence = work.split()
         attempt = Principal("attempt", job_id=job_id, fence=int(fence), scopes=("read",))

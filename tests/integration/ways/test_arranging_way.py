@@ -148,6 +148,61 @@ def test_what_was_removed_is_listed_and_comes_back(run: Command, lab: ProjectHan
     assert clips(lab) == ["raw/a", "raw/b", "raw/c"]
 
 
+def test_what_was_removed_is_purged_after_a_yes_and_never_comes_back(run: Command, lab: ProjectHandle) -> None:
+    ids = {clip.name: clip.id for clip in lab.clips.list()}
+    run("rm", "lab/raw/a", "lab/raw/b", "--yes")
+    shown = run("purge", "lab/raw", "--preview")
+    assert [f"lab/raw/{name}" in shown.stdout for name in "abc"] == [True, True, False]
+    assert "2 items would be purged; garbage collection can free about" in shown.stderr
+    assert "delete 2 items (lab/raw/" in run("purge", "lab/raw", status=2).stderr
+    assert "nothing is purged" in run("purge", "lab/raw/a", terminal="n\n", status=1).stderr
+    assert "1 item purged for good" in run("purge", "lab/raw/a", terminal="y\n").stderr
+    told = run("restore", f"lab/{ids['a']}", status=2).stderr
+    assert f"there is no deleted item at lab/{ids['a']}" in told
+    run("restore", "lab/raw/b")
+    assert clips(lab) == ["raw/b", "raw/c"]
+    assert "there is nothing to purge at lab/raw" in run("purge", "lab/raw", "--yes", status=2).stderr
+    run("rm", "lab/raw/b")
+    done = json.loads(run("purge", f"lab/{ids['b']}", "--yes", "--json").stdout)
+    assert [one["item"] for one in done["purged"]] == [ids["b"]]
+    assert done["freed_bytes"] > 1000
+
+
+def test_a_query_and_an_age_select_what_is_purged(run: Command, lab: ProjectHandle) -> None:
+    run("record", "lab/raw/b", "--set", "subject=02")
+    run("rm", "lab/raw", "--yes")
+    assert "there is nothing to purge" in run("purge", "lab", "--older-than", "1", "--yes", status=2).stderr
+    assert "1 item purged for good" in run("purge", "lab", "--query", "subject = 02", "--yes").stderr
+    run("restore", "lab/raw/")
+    assert clips(lab) == ["raw/a", "raw/c"]
+
+
+def test_what_still_holds_an_item_is_told_and_the_others_are_purged(run: Command, lab: ProjectHandle) -> None:
+    run("dataset", "create", "lab/gaits", "--folder", "raw")
+    run("dataset", "commit", "lab/gaits", "-m", "first")
+    run("rm", "lab/raw/a", "--yes")
+    free = lab.clips.create("copy", {"motion": next(lab.clips.list(path="raw/c")).part("motion")}, collection="raw")
+    free.delete()
+    refused = run("purge", "lab/raw", "--yes", status=1).stderr
+    assert re.search(r"lab/raw/a \(clip_\w+\) is still needed by the dataset gaits \(branch main; 1 commit\)", refused)
+    assert "1 item purged for good, 1 refused" in refused
+    assert "is still needed by" in run("purge", "lab/raw/a", "--preview", status=1).stderr
+    run("restore", "lab/raw/a")
+    assert clips(lab) == ["raw/a", "raw/b", "raw/c"]
+
+
+def test_of_a_folder_and_a_removed_item_of_one_name_the_address_says_which(run: Command, lab: ProjectHandle) -> None:
+    lab.collections.create("raw/a")
+    item = next(lab.clips.list(path="raw/a")).id
+    run("mv", "lab/raw/b", "lab/raw/a/")
+    run("rm", f"lab/{item}")
+    run("rm", "lab/raw/a/b")
+    assert "lab/raw/a is a folder and a removed item" in run("purge", "lab/raw/a", "--yes", status=2).stderr
+    assert "1 item purged" in run("purge", "lab/raw/a/", "--yes").stderr
+    assert "1 item purged" in run("purge", f"lab/{item}", "--yes").stderr
+    assert "is the id of a folder" in run("purge", f"lab/collection_{item.partition('_')[2]}", status=2).stderr
+
+
 def test_of_several_that_were_removed_at_one_place_the_last_comes_back_and_each_by_its_id(
     run: Command, lab: ProjectHandle
 ) -> None:

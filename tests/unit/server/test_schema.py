@@ -11,7 +11,7 @@ from sqlalchemy import Connection, quoted_name
 from tests.support.store_fixtures import Lab
 
 from marey_schemas.kinds import Kind
-from marey_server.store import items
+from marey_server.store import fsck, items
 from marey_server.store.database import schema
 from marey_server.store.database.connections import Database
 from marey_server.store.tables import metadata
@@ -100,6 +100,21 @@ def test_an_upgrade_copies_take_records_to_the_summaries_of_clips(lab: Lab, data
         assert lab.read(items.read_item, "lab", Kind.CLIP, clip.id).summary == clip.summary
     assert clips[0].summary["subject"] == "02"
     assert "subject" not in plain.summary
+
+
+def test_an_upgrade_records_the_references_of_stored_documents(lab: Lab, database_url: str) -> None:
+    rig = lab.add_skeleton()
+    clips = [lab.add_clip(rig, f"take {number}", seed=number) for number in range(3)]
+    with lab.database.engine.begin() as connection:
+        config = schema._config()
+        config.attributes["connection"] = connection
+        command.downgrade(config, "0019")
+    schema.upgrade_schema(database_url)
+    assert list(fsck.check_store(lab.database)) == []
+    table = metadata.tables["document_item"]
+    rows = lab.read(lambda tx: tx.execute(sqlalchemy.select(table)).all())
+    assert {row.document_digest for row in rows} == {clip.parts["motion"].document for clip in clips}
+    assert {row.item_id for row in rows} == {rig.id}
 
 
 def test_an_upgrade_that_fails_leaves_the_database_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

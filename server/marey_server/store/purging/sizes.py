@@ -13,7 +13,7 @@ from marey_server.store.transaction import IN_LIST, Transaction
 def freed_by(tx: Transaction, items: Collection[str], jobs: Collection[str]) -> int:
     """Return the sizes of the documents, arrays and files that only revisions of `items`, and `jobs`, refer to.
 
-    The true number may be greater, because an array that another unused document refers to does not count.
+    Documents that no revision refers to, such as those of a running job, do not count as needing their arrays.
     """
     if not items:
         return 0
@@ -25,7 +25,8 @@ def freed_by(tx: Transaction, items: Collection[str], jobs: Collection[str]) -> 
         text_bytes += tx.execute(lengths.where(document.c.digest.in_(some))).scalar_one()
         for row in tx.execute(named.where(document_blob.c.document_digest.in_(some))):
             sizes[row.digest] = row.size_bytes
-    referring = select(document_blob.c.blob_digest, document_blob.c.document_digest)
+    is_part = exists().where(revision_part.c.document_digest == document_blob.c.document_digest)
+    referring = select(document_blob.c.blob_digest, document_blob.c.document_digest).where(is_part)
     for some in _batches(sizes.keys()):
         for row in tx.execute(referring.where(document_blob.c.blob_digest.in_(some))):
             if row.document_digest not in documents:
