@@ -15,7 +15,6 @@ from marey_server.store import blobs, garbage, items, projects, purging
 from marey_server.store.blob_backings import DirectoryBlobs
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs import completion
-from marey_server.store.purging import candidates
 from marey_server.store.transaction import Transaction
 
 LARGE_FILES = [bytes([number]) * 2**20 for number in range(12)]
@@ -33,12 +32,11 @@ def publish(tx: Transaction) -> Any:
 
 def purge(database: Database, who: Principal) -> None:
     """Purge all deleted items of `lab`, each in a transaction of its own."""
-    candidates.MOST_PURGED = 1
-    request: PurgeRequest | None = PurgeRequest(collection="")
-    while request is not None:
+    deleted = database.read(who, items.list_items, "lab", Kind.STUDY, items.ItemFilters(deleted=True))
+    for one in deleted.items:
+        request = PurgeRequest(item=one.id)
         prepared = database.read(who, purging.prepare_purge, "lab", request)
-        answer = database.write(who, purging.record_purge, "lab", request, prepared)
-        request = None if answer.next is None else PurgeRequest(collection="", after=answer.next)
+        database.write(who, purging.record_purge, "lab", request, prepared)
 
 
 def main(url: str, user_id: str, user_name: str, work: str, folder: str) -> None:

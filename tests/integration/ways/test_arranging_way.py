@@ -155,10 +155,10 @@ def test_what_was_removed_is_purged_after_a_yes_and_never_comes_back(run: Comman
     assert [f"lab/raw/{name}" in shown.stdout for name in "abc"] == [True, True, False]
     assert "2 items would be purged; garbage collection can free about" in shown.stderr
     assert "delete 2 items (lab/raw/" in run("purge", "lab/raw", status=2).stderr
-    assert "nothing is purged" in run("purge", "lab/raw/a", terminal="n\n", status=1).stderr
+    assert "nothing was purged" in run("purge", "lab/raw/a", terminal="n\n", status=1).stderr
     assert "1 item purged for good" in run("purge", "lab/raw/a", terminal="y\n").stderr
     told = run("restore", f"lab/{ids['a']}", status=2).stderr
-    assert f"there is no deleted item at lab/{ids['a']}" in told
+    assert f"there is no deleted item or folder at lab/{ids['a']}" in told
     run("restore", "lab/raw/b")
     assert clips(lab) == ["raw/b", "raw/c"]
     assert "there is nothing to purge at lab/raw" in run("purge", "lab/raw", "--yes", status=2).stderr

@@ -491,6 +491,24 @@ def test_the_purge_is_an_event_with_its_actor_and_earlier_events_lose_the_name(h
     assert found[0].body["item_kind"] == "study"
 
 
+def test_the_record_of_an_export_without_consent_loses_the_path_too(house: House) -> None:
+    from marey_schemas.consents import ConsentOverride
+    from marey_server.store.items.consents import EndedConsent, record_override
+
+    walk, other = house.add(NAME), house.add("other")
+    job = house.desk.submit("square", inputs={"things": ({"item": walk}, {"item": other})})
+    project_id = house.read(store_projects.require, "lab").id
+    ended = [EndedConsent(walk, f"raw/{NAME}", "2026-01-01"), EndedConsent(other, "raw/other", "2026-01-01")]
+    override = ConsentOverride(allow_expired_consent=True, consent_reason="by letter")
+    house.write(record_override, project_id, job, override, ended)
+    house.desk.complete(house.desk.claim())
+    house.delete(walk)
+    house.purge(item=walk)
+    (record,) = [one for one in house.events(job) if one.kind == "consent.overridden"]
+    assert [(one["item"], one["path"]) for one in record.body["clips"]] == [(walk, ""), (other, "raw/other")]
+    assert NAME not in texts_of_database(house)
+
+
 def test_a_purged_result_is_computed_again_and_not_taken_from_the_cache(house: House) -> None:
     source = house.add("source")
     job, result = run(house.desk, source, "result")

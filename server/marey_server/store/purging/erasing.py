@@ -25,6 +25,7 @@ def erase(tx: Transaction, project_row: ProjectRow, rows: Sequence[Row[Any]], jo
     ids = [row.id for row in rows]
     forget_in_jobs(tx, frozenset(ids), jobs)
     _forget_in_events(tx, ids, "name", "collection")
+    _forget_in_overrides(tx, frozenset(ids), [*ids, *jobs])
     tx.execute(delete(revision_part).where(revision_part.c.item_id.in_(ids)))
     tx.execute(delete(item_tag).where(item_tag.c.item_id.in_(ids)))
     bare = {"author_id": None, "message": "", "content": None}
@@ -47,6 +48,19 @@ def _forget_in_events(tx: Transaction, ids: Sequence[str], *members: str) -> Non
     for start in range(0, len(ids), IN_LIST):
         about = event.c.subject.in_(ids[start : start + IN_LIST])
         tx.execute(update(event).where(about).values(body=body))
+
+
+def _forget_in_overrides(tx: Transaction, items: frozenset[str], subjects: Sequence[str]) -> None:
+    """Remove the paths of items from the records of exports without consent; `subjects` may have exported the items.
+
+    Exports of versions need no search: a version that contains an item holds it.
+    """
+    for start in range(0, len(subjects), IN_LIST):
+        about = event.c.subject.in_(subjects[start : start + IN_LIST])
+        overrides = select(event.c.seq, event.c.body).where(about, event.c.kind == "consent.overridden")
+        for row in tx.execute(overrides).all():
+            clips = [{**one, "path": ""} if one["item"] in items else one for one in row.body["clips"]]
+            tx.execute(update(event).where(event.c.seq == row.seq).values(body={**row.body, "clips": clips}))
 
 
 def _drop_empty_folders(tx: Transaction, project_id: str, paths: Collection[str]) -> None:
