@@ -1,4 +1,4 @@
-"""Purges: deletion of deleted items for good, and what still holds an item."""
+"""Purges: deletion of deleted items for good, and the holders of items that are still needed."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class HeldItem(Answer):
 
 
 class PurgeAnswer(Answer):
-    """What a purge did, or would do: which items it deleted for good, and which it refused."""
+    """Outcome of a purge: the items that it deleted for good, or would delete, and those that it refused."""
 
     preview: bool
     purged: tuple[PurgedItem, ...]

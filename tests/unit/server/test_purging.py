@@ -506,6 +506,7 @@ def test_the_record_of_an_export_without_consent_loses_the_path_too(house: House
     house.purge(item=walk)
     (record,) = [one for one in house.events(job) if one.kind == "consent.overridden"]
     assert [(one["item"], one["path"]) for one in record.body["clips"]] == [(walk, ""), (other, "raw/other")]
+    house.collect()
     assert NAME not in texts_of_database(house)
 
 

@@ -6,17 +6,29 @@ each revision, with its number, its time and the job that made it. Rows of `line
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, Text, cast, delete, exists, func, or_, update
+from sqlalchemy import ColumnElement, Row, Text, cast, delete, exists, func, or_, select, update
 from sqlalchemy.dialects.postgresql import ARRAY, array
 
 from marey_schemas.kinds import Kind
 from marey_server.store import collections
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purging.job_records import forget_in_jobs
-from marey_server.store.tables import collection, dataset, event, item, item_tag, revision, revision_part
+from marey_server.store.tables import (
+    blob,
+    collection,
+    dataset,
+    document,
+    document_blob,
+    event,
+    item,
+    item_tag,
+    job_blob,
+    revision,
+    revision_part,
+)
 from marey_server.store.transaction import IN_LIST, Transaction
 
 
@@ -87,3 +99,44 @@ def _drop_empty_folders(tx: Transaction, project_id: str, paths: Collection[str]
         some = collection.c.path.in_(chosen[start : start + IN_LIST])
         dropped = tx.execute(delete(collection).where(*empty, some).returning(collection.c.id)).scalars().all()
         _forget_in_events(tx, dropped, "path", "was")
+
+
+# -- freed bytes ------------------------------------------------------------------------------------------------------
+
+
+def freed_by(tx: Transaction, items: Collection[str], jobs: Collection[str]) -> int:
+    """Return the sizes of the documents, arrays and files that only revisions of `items`, and `jobs`, refer to.
+
+    Documents that no revision refers to, such as those of a running job, do not count as needing their arrays.
+    """
+    if not items:
+        return 0
+    documents = _documents_of(tx, items)
+    text_bytes, sizes, needed = 0, dict[str, int](), set[str]()
+    lengths = select(func.coalesce(func.sum(func.length(cast(document.c.body, Text))), 0))
+    named = select(blob.c.digest, blob.c.size_bytes).join(document_blob, document_blob.c.blob_digest == blob.c.digest)
+    for some in _batches(documents):
+        text_bytes += tx.execute(lengths.where(document.c.digest.in_(some))).scalar_one()
+        for row in tx.execute(named.where(document_blob.c.document_digest.in_(some))):
+            sizes[row.digest] = row.size_bytes
+    is_part = exists().where(revision_part.c.document_digest == document_blob.c.document_digest)
+    referring = select(document_blob.c.blob_digest, document_blob.c.document_digest).where(is_part)
+    for some in _batches(sizes.keys()):
+        for row in tx.execute(referring.where(document_blob.c.blob_digest.in_(some))):
+            if row.document_digest not in documents:
+                needed.add(row.blob_digest)
+        keeping = select(job_blob.c.blob_digest, job_blob.c.job_id).where(job_blob.c.blob_digest.in_(some))
+        needed.update(row.blob_digest for row in tx.execute(keeping) if row.job_id not in jobs)
+    return text_bytes + sum(size for digest, size in sizes.items() if digest not in needed)
+
+
+def _documents_of(tx: Transaction, items: Collection[str]) -> set[str]:
+    """Return the digests of the documents that are parts of `items`, and not of any other item."""
+    own = select(revision_part.c.document_digest).where(revision_part.c.item_id.in_(items))
+    others = exists().where(revision_part.c.document_digest == document.c.digest, revision_part.c.item_id.not_in(items))
+    return set(tx.execute(select(document.c.digest).where(document.c.digest.in_(own), ~others)).scalars())
+
+
+def _batches(digests: Collection[str]) -> Iterator[list[str]]:
+    many = sorted(digests)
+    return (many[start : start + IN_LIST] for start in range(0, len(many), IN_LIST))

@@ -1,4 +1,4 @@
-"""What still holds deleted items: versions of datasets, documents of other items, and jobs that have not ended."""
+"""Search for what holds deleted items: versions of datasets, documents of other items, and jobs that have not ended."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from marey_server.store.transaction import Transaction
 
 
 @dataclass
-class Held:
+class FoundHolders:
     """Holders of one item; only the first `MOST_HOLDERS` are kept."""
 
     holders: list[Holder] = field(default_factory=list)
@@ -34,19 +34,19 @@ class Held:
 
 def find_holders(
     tx: Transaction, project_id: str, rows: Mapping[str, Row[Any]], versions: Mapping[str, Iterable[Holder]]
-) -> dict[str, Held]:
+) -> dict[str, FoundHolders]:
     """Return the holders of those items that something holds; `rows` are the items that are to be purged together.
 
     A document of one of these items does not hold another one, unless something holds the item of the document, too.
     `versions` are the holders that a `VersionSearch` has found.
     """
-    held: dict[str, Held] = {}
+    held: dict[str, FoundHolders] = {}
     for item_id, found in versions.items():
         for holder in found:
-            held.setdefault(item_id, Held()).add(holder)
+            held.setdefault(item_id, FoundHolders()).add(holder)
     for item_id, jobs in _unfinished_jobs(tx, project_id, rows.keys()).items():
         for job in jobs.values():
-            held.setdefault(item_id, Held()).add(job)
+            held.setdefault(item_id, FoundHolders()).add(job)
     _add_referring(tx, project_id, rows.keys(), held)
     _spread(_references_among(tx, rows.keys()), rows, held)
     return held
@@ -72,7 +72,7 @@ def _references(items: Collection[str]) -> Select[Any]:
     )
 
 
-def _add_referring(tx: Transaction, project_id: str, items: Collection[str], held: dict[str, Held]) -> None:
+def _add_referring(tx: Transaction, project_id: str, items: Collection[str], held: dict[str, FoundHolders]) -> None:
     """Add the items of the project, apart from `items`, that have documents that refer to one of `items`."""
     referring = (
         _references(items)
@@ -95,7 +95,7 @@ def _add_referring(tx: Transaction, project_id: str, items: Collection[str], hel
     )
     for row in tx.execute(shown):
         unnamed = row.total - MOST_HOLDERS if row.place == MOST_HOLDERS else 0
-        held.setdefault(row.held, Held()).add(_holder(row), max(0, unnamed))
+        held.setdefault(row.held, FoundHolders()).add(_holder(row), max(0, unnamed))
 
 
 def _references_among(tx: Transaction, items: Collection[str]) -> dict[str, list[str]]:
@@ -106,14 +106,14 @@ def _references_among(tx: Transaction, items: Collection[str]) -> dict[str, list
     return found
 
 
-def _spread(refers: Mapping[str, Iterable[str]], rows: Mapping[str, Row[Any]], held: dict[str, Held]) -> None:
+def _spread(refers: Mapping[str, Iterable[str]], rows: Mapping[str, Row[Any]], held: dict[str, FoundHolders]) -> None:
     """Hold the items to which held items refer, directly or through others."""
     waiting = sorted(held)
     spread = set(waiting)
     while waiting:
         by = waiting.pop()
         for item_id in sorted(refers.get(by, ())):
-            held.setdefault(item_id, Held()).add(_holder(rows[by]))
+            held.setdefault(item_id, FoundHolders()).add(_holder(rows[by]))
             if item_id not in spread:
                 spread.add(item_id)
                 waiting.append(item_id)

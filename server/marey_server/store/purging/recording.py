@@ -16,9 +16,8 @@ from marey_server.store.items.reading import item_rows, was_purged
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import begin_purge
 from marey_server.store.purging.candidates import PreparedPurge, contents_of
-from marey_server.store.purging.erasing import erase
-from marey_server.store.purging.holders import Held, find_holders
-from marey_server.store.purging.sizes import freed_by
+from marey_server.store.purging.erasing import erase, freed_by
+from marey_server.store.purging.holders import FoundHolders, find_holders
 from marey_server.store.purging.versions import VersionSearch
 from marey_server.store.tables import item
 from marey_server.store.transaction import Transaction
@@ -103,7 +102,7 @@ def _purged(row: Row[Any], *, named: bool) -> PurgedItem:
     return PurgedItem(item=row.id, kind=Kind(row.kind), path=_path(row) if named else "")
 
 
-def _refused(row: Row[Any], held: Held) -> HeldItem:
+def _refused(row: Row[Any], held: FoundHolders) -> HeldItem:
     return HeldItem(item=row.id, kind=Kind(row.kind), path=_path(row), holders=tuple(held.holders), others=held.others)
 
 
