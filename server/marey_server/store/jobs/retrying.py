@@ -151,7 +151,7 @@ def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_
     pins = _late_pins(row, stand_ins) if row.unbound else _pins_of(tx, row, kind.fan_out)
     if purged := [pin["item"] for many in pins.values() for pin in many if "purged" in pin]:
         detail = f"The job cannot run again: its input {purged[0]} was purged, so that its content is gone."
-        raise ConflictProblem(detail, code="purged")
+        raise ConflictProblem(detail, code="input-purged")
     return Submission(
         kind,
         request_of(row).model_copy(update={"concurrency_key": _concurrency_key(tx, row)}),
