@@ -14,12 +14,12 @@ from marey_client.handles.edits import EditHandle, Edits
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.handles.models import ModelHandle
 from marey_client.handles.processed import ProcessedHandle
+from marey_client.handles.purges import purge_items
 from marey_client.handles.skeletons import SkeletonHandle
 from marey_client.imports import Imports
 from marey_client.items import ItemHandle, Items
 from marey_client.jobs import Jobs
 from marey_client.paging import pages
-from marey_client.purges import purge_items
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
 from marey_schemas.kinds import Kind

@@ -59,7 +59,7 @@ def purge(
     of a dataset, are refused: the command says what holds them, purges the others, and ends with exit status 1. Only
     owners of the project may purge.
     """
-    from marey_client.purges import combined, purge_items, purge_step_by_step
+    from marey_client.handles.purges import combined, purge_items, purge_step_by_step
 
     addresses = addresses_in_one_project(places)
     with connect(context) as marey:

@@ -13,7 +13,7 @@ follow it, never receive some of the events of a period without the others.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import takewhile
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ from sqlalchemy import (
     ColumnElement,
     Row,
     Select,
+    Text,
     and_,
     cast,
     delete,
@@ -32,6 +33,7 @@ from sqlalchemy import (
     text,
     update,
 )
+from sqlalchemy.dialects.postgresql import ARRAY, array
 
 from marey_schemas.items import Event
 from marey_server.access.roles import require_administrator
@@ -40,7 +42,7 @@ from marey_server.store import projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.jobs.fencing import QUEUED
 from marey_server.store.tables import event, job, project, server_state
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import IN_LIST, Transaction
 from marey_server.store.wakeups import events_topic, job_topic, work_topic
 
 MAX_EVENTS = 1000
@@ -248,3 +250,37 @@ def kinds_due(tx: Transaction, since_us: int) -> tuple[set[str], int]:
     """Return the kinds of the queued jobs whose wait for a retry ended after `since_us`, and the present time."""
     due = (job.c.state == QUEUED, job.c.run_at_us > since_us, job.c.run_at_us <= tx.now_us)
     return set(tx.execute(select(job.c.kind).where(*due).distinct()).scalars()), tx.now_us
+
+
+# -- names of purged items ---------------------------------------------------------------------------------------------
+
+
+def forget_names(tx: Transaction, ids: Sequence[str], *members: str) -> None:
+    """Remove members, which contain names, from the events about items or folders.
+
+    The audit log shows the id in place of the name.
+    """
+    body: ColumnElement[Any] = func.json_remove(event.c.body, *(f"$.{name}" for name in members))
+    if tx.is_postgres:
+        body = event.c.body.op("-", return_type=event.c.body.type)(cast(array(members), ARRAY(Text)))
+    for start in range(0, len(ids), IN_LIST):
+        about = event.c.subject.in_(ids[start : start + IN_LIST])
+        tx.execute(update(event).where(about).values(body=body))
+        tx.execute(update(event).where(about, event.c.about.is_not(None)).values(about=event.c.subject))
+
+
+def forget_clips(tx: Transaction, items: frozenset[str], subjects: Sequence[str]) -> None:
+    """Remove the paths of items from the records of exports without consent; `subjects` may have exported the items.
+
+    The audit log shows the id of the first clip in place of its name. Exports of versions need no search: a version
+    that contains an item holds it.
+    """
+    for start in range(0, len(subjects), IN_LIST):
+        about = event.c.subject.in_(subjects[start : start + IN_LIST])
+        overrides = select(event.c.seq, event.c.body).where(about, event.c.kind == "consent.overridden")
+        for row in tx.execute(overrides).all():
+            clips = [{**one, "path": ""} if one["item"] in items else one for one in row.body["clips"]]
+            values: dict[str, Any] = {"body": {**row.body, "clips": clips}}
+            if clips and clips[0]["item"] in items:
+                values["about"] = clips[0]["item"]
+            tx.execute(update(event).where(event.c.seq == row.seq).values(**values))

@@ -29,7 +29,8 @@ def require_no_purge_since(tx: Transaction, project_id: str, last: int) -> None:
     hold_off_purges(tx, project_id)
     if last_purge(tx, project_id) != last:
         raise ConflictProblem(
-            "Items of the project were purged while the version was computed; send the request again.", code="purged-meanwhile"
+            "Items of the project were purged while the version was computed; send the request again.",
+            code="purged-meanwhile",
         )
 
 

@@ -85,10 +85,13 @@ def _changes_event(call: ast.Call) -> str | None:
     return None
 
 
-def test_only_the_retention_deletes_events_and_only_their_numbers_are_set_later() -> None:
+def test_only_the_retention_deletes_events_and_later_they_only_get_numbers_and_lose_names_in_purges() -> None:
     assert sorted(changes_of_events()) == [
         ("store/events.py", "delete_old_audit_entries", "delete"),
         ("store/events.py", "delete_until", "delete"),
+        ("store/events.py", "forget_clips", "update"),
+        ("store/events.py", "forget_names", "update"),
+        ("store/events.py", "forget_names", "update"),
         ("store/events.py", "number_events", "update"),
     ]
 

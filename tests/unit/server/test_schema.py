@@ -108,7 +108,7 @@ def test_an_upgrade_records_the_references_of_stored_documents(lab: Lab, databas
     with lab.database.engine.begin() as connection:
         config = schema._config()
         config.attributes["connection"] = connection
-        command.downgrade(config, "0019")
+        command.downgrade(config, "0020")
     schema.upgrade_schema(database_url)
     assert list(fsck.check_store(lab.database)) == []
     table = metadata.tables["document_item"]

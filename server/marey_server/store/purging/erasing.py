@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, Text, cast, delete, exists, func, or_, select, update
-from sqlalchemy.dialects.postgresql import ARRAY, array
+from sqlalchemy import Row, Text, cast, delete, exists, func, or_, select, update
 
 from marey_schemas.kinds import Kind
-from marey_server.store import collections
+from marey_server.store import collections, events
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purging.job_records import forget_in_jobs
 from marey_server.store.tables import (
@@ -22,7 +21,6 @@ from marey_server.store.tables import (
     dataset,
     document,
     document_blob,
-    event,
     item,
     item_tag,
     job_blob,
@@ -36,8 +34,8 @@ def erase(tx: Transaction, project_row: ProjectRow, rows: Sequence[Row[Any]], jo
     """Erase deleted items, and record an event for each; `jobs` are the jobs that name one of them."""
     ids = [row.id for row in rows]
     forget_in_jobs(tx, frozenset(ids), jobs)
-    _forget_in_events(tx, ids, "name", "collection")
-    _forget_in_overrides(tx, frozenset(ids), [*ids, *jobs])
+    events.forget_names(tx, ids, "name", "collection")
+    events.forget_clips(tx, frozenset(ids), [*ids, *jobs])
     tx.execute(delete(revision_part).where(revision_part.c.item_id.in_(ids)))
     tx.execute(delete(item_tag).where(item_tag.c.item_id.in_(ids)))
     bare = {"author_id": None, "message": "", "content": None}
@@ -49,30 +47,8 @@ def erase(tx: Transaction, project_row: ProjectRow, rows: Sequence[Row[Any]], jo
     changed = {"purged_us": at_us, "updated_us": tx.now_us, "rev": item.c.rev + 1}
     tx.execute(update(item).where(item.c.id.in_(ids)).values(**empty, **changed))
     _drop_empty_folders(tx, project_row.id, {row.path for row in rows})
-    tx.emit_each(("item.purged", project_row.id, row.id, {"item_kind": Kind(row.kind).value}) for row in rows)
-
-
-def _forget_in_events(tx: Transaction, ids: Sequence[str], *members: str) -> None:
-    """Remove members, which contain names, from the events about items or folders."""
-    body: ColumnElement[Any] = func.json_remove(event.c.body, *(f"$.{name}" for name in members))
-    if tx.is_postgres:
-        body = event.c.body.op("-", return_type=event.c.body.type)(cast(array(members), ARRAY(Text)))
-    for start in range(0, len(ids), IN_LIST):
-        about = event.c.subject.in_(ids[start : start + IN_LIST])
-        tx.execute(update(event).where(about).values(body=body))
-
-
-def _forget_in_overrides(tx: Transaction, items: frozenset[str], subjects: Sequence[str]) -> None:
-    """Remove the paths of items from the records of exports without consent; `subjects` may have exported the items.
-
-    Exports of versions need no search: a version that contains an item holds it.
-    """
-    for start in range(0, len(subjects), IN_LIST):
-        about = event.c.subject.in_(subjects[start : start + IN_LIST])
-        overrides = select(event.c.seq, event.c.body).where(about, event.c.kind == "consent.overridden")
-        for row in tx.execute(overrides).all():
-            clips = [{**one, "path": ""} if one["item"] in items else one for one in row.body["clips"]]
-            tx.execute(update(event).where(event.c.seq == row.seq).values(body={**row.body, "clips": clips}))
+    for row in rows:
+        tx.audit("item.purged", row.id, about=row.id, project_id=project_row.id, item_kind=Kind(row.kind).value)
 
 
 def _drop_empty_folders(tx: Transaction, project_id: str, paths: Collection[str]) -> None:
@@ -98,7 +74,7 @@ def _drop_empty_folders(tx: Transaction, project_id: str, paths: Collection[str]
     for start in range(0, len(chosen), IN_LIST):
         some = collection.c.path.in_(chosen[start : start + IN_LIST])
         dropped = tx.execute(delete(collection).where(*empty, some).returning(collection.c.id)).scalars().all()
-        _forget_in_events(tx, dropped, "path", "was")
+        events.forget_names(tx, dropped, "path", "was")
 
 
 # -- freed bytes ------------------------------------------------------------------------------------------------------
