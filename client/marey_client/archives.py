@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
 
 from marey_client.blobs import Blobs
+from marey_client.contents import first_documents, request_contents
 from marey_client.errors import ArchiveInUse, NothingToArchive, UnexpectedAnswer
-from marey_client.transport import BLOCKS, MAX_ANSWER_BYTES, as_json
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
 from marey_schemas.datasets.contents import (
     MOST_CHECKED,
@@ -25,7 +25,6 @@ from marey_schemas.datasets.contents import (
 from marey_schemas.documents.blob_references import references_of
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import canonical_json, detach_arrays
-from marey_schemas.encoding.codecs import MSGPACK, decode_tree
 from marey_versions.archive.checking import check_archive
 from marey_versions.archive.members import ArchiveMember, BadArchive, MemberKind
 from marey_versions.archive.reading import Archive
@@ -307,19 +306,10 @@ class _Making:
 
     def _fetch(self, places: Sequence[PartOfContent]) -> list[Any]:
         """Request the documents at `places` in order; return as many as fit into one answer, at least one."""
-        found: list[Any] = self._ask(ContentsRequest(documents=tuple(places)))["documents"]
-        for place, tree in zip(places, found, strict=False):
-            if not isinstance(tree, dict):
-                raise UnexpectedAnswer(f"the project has no revision with the content {place.content} any more")
-        if not found:
-            raise UnexpectedAnswer("the server's answer has no documents")
-        return found
+        return first_documents(self.dataset.transport, self.dataset.project_url, places, keep_blocks=True)
 
     def _ask(self, request: ContentsRequest) -> dict[str, Any]:
-        url = f"{self.dataset.project_url}/contents"
-        response = self.dataset.transport.send("POST", url, content=as_json(request), headers={"Accept": BLOCKS})
-        answer: dict[str, Any] = decode_tree(response.content, MSGPACK, max_bytes=MAX_ANSWER_BYTES, keep_blocks=True)
-        return answer
+        return request_contents(self.dataset.transport, self.dataset.project_url, request, keep_blocks=True)
 
 
 class _EntryPair(NamedTuple):

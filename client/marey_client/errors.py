@@ -57,6 +57,22 @@ class NothingToArchive(MareyError):
     """All commits of the version to archive are among those to leave out."""
 
 
+class CannotExport(MareyError):
+    """The version of a dataset, or a clip in it, cannot be exported in the chosen layout."""
+
+
+class FolderNotEmpty(MareyError):
+    """The folder to write exists and is not empty, or is a file."""
+
+
+class BadSidecar(MareyError):
+    """The file `marey.json` in a folder is not the sidecar of an export, or is damaged."""
+
+
+class MissingPackage(MareyError):
+    """A Python package is not installed that only some functions need."""
+
+
 class CannotBisect(MareyError):
     """No first bad version can be searched for between two versions of a dataset; the text gives the reason."""
 

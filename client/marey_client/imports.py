@@ -6,8 +6,9 @@ import os
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -16,7 +17,7 @@ from marey_client.errors import BadFileName, NothingToUpload, SameName
 from marey_client.jobs import Jobs
 from marey_client.one_or_several import several
 from marey_client.transport import Transport, as_json, read_model
-from marey_schemas.formats import FORMATS, IMPORTED_ENDINGS, format_named
+from marey_schemas.formats import FORMATS, IMPORTED_ENDINGS, LengthUnit, format_named
 from marey_schemas.imports import (
     FileName,
     ImportAnswer,
@@ -28,6 +29,9 @@ from marey_schemas.imports import (
 )
 from marey_schemas.options.imports import ImportOptions
 from marey_schemas.queue.jobs import Job, JobOutput
+
+if TYPE_CHECKING:
+    from marey_schemas.datasets.exports import ExportedClip
 
 FILES_PER_IMPORT = 50
 BYTES_PER_IMPORT = 64 << 20
@@ -54,32 +58,52 @@ class FoundFiles:
 
     files: tuple[LocalFile, ...]
     left_out: tuple[Path, ...]
+    exported: Mapping[str, ExportedClip] = field(default_factory=dict)
+    """Clips whose files an export of a dataset wrote, by the names of the files."""
+    unit: LengthUnit | None = None
+    """Unit of length of the files, known if all of them come from one export."""
+    changed_tables: tuple[Path, ...] = ()
+    """Tables of take records that differ from the sidecars beside them, which are used instead."""
 
 
 def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
     """Find the motion files in folders and below, except hidden ones; files among `places` are always included.
 
-    Raises `NothingToUpload` if a place does not exist or no motion file is found, `SameName` if two files would get the
-    same name, and `OSError` if a folder cannot be read.
+    In a folder that an export of a dataset wrote, the files get the names of the clips' paths. Raises `NothingToUpload`
+    if a place does not exist or no motion file is found, `SameName` if two files would get the same name, `BadSidecar`
+    if the sidecar of an export is damaged, and `OSError` if a folder cannot be read.
     """
+    from marey_client.bridges.returning import ReturningFolder
+
     searched = [Path(place) for place in several(places)]
     files: dict[str, LocalFile] = {}
     left_out: list[Path] = []
+    returning: list[ReturningFolder] = []
     for place in searched:
         if place.is_file():
             _add(files, place.name, place)
             continue
         if not place.is_dir():
             raise NothingToUpload(f"{place} does not exist")
+        folder = ReturningFolder.at(place)
+        returning += [folder] if folder is not None else []
         for path in _files_below(place):
-            below = path.relative_to(place)
+            below = path.relative_to(place).as_posix()
+            if folder is not None and below in folder.own_files:
+                continue
             if path.name.lower().endswith(IMPORTED_ENDINGS):
-                _add(files, below.as_posix(), path)
+                _add(files, below if folder is None else folder.name_of(below), path)
             else:
                 left_out.append(path)
     if not files:
         raise NothingToUpload(f"no motion files ({', '.join(IMPORTED_ENDINGS)}) in {_listed(searched)}")
-    return FoundFiles(tuple(files.values()), tuple(left_out))
+    return FoundFiles(
+        tuple(files.values()),
+        tuple(left_out),
+        {name: clip for folder in returning for name, clip in folder.clips.items() if name in files},
+        unit=returning[0].unit if len(searched) == len(returning) == 1 else None,
+        changed_tables=tuple(folder.table for folder in returning if folder.table_changed),
+    )
 
 
 def _files_below(folder: Path) -> list[Path]:
@@ -174,6 +198,24 @@ class Imports:
                 entries.setdefault(entry.name, entry)
             notify("importing", len(entries), len(files))
         return list(entries.values())
+
+    def restore(self, found: FoundFiles, entries: Sequence[ImportEntry], *, notice: Notice | None = None) -> int:
+        """Give imported clips the take records and tags that they had when they were exported.
+
+        `entries` are the results of the import of `found`. A value that a clip has already is kept. Return the number
+        of clips that were changed.
+        """
+        from marey_client.bridges.returning import restore_clip
+
+        notify = notice or _ignore_notice
+        known = [(one.item, found.exported[one.name]) for one in entries if one.item and one.name in found.exported]
+        changed = 0
+        with ThreadPoolExecutor(UPLOADS_AT_ONCE, thread_name_prefix="marey-restore") as pool:
+            outcomes = pool.map(lambda pair: restore_clip(self.transport, self.project, *pair), known)
+            for done, outcome in enumerate(outcomes, start=1):
+                changed += outcome
+                notify("restoring records", done, len(known))
+        return changed
 
     def run(self, files: tuple[ImportFile, ...], options: ImportOptions | None = None) -> tuple[ImportEntry, ...]:
         """Import up to 1000 files whose bytes the server has; if the server does this in a job, wait for its end."""

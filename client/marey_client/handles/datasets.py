@@ -27,10 +27,12 @@ from marey_schemas.datasets.merges import (
 )
 from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind, RefMove
 from marey_schemas.datasets.protection import ProtectionRule
+from marey_schemas.formats import DEFAULT_FORMAT
 from marey_schemas.kinds import Kind
 
 if TYPE_CHECKING:
     from marey_client.archives import OnProgress
+    from marey_client.bridges.files import ExportedVersion, MotionFiles
     from marey_versions.archive.reading import Archive
 
 
@@ -354,6 +356,91 @@ class DatasetHandle:
         bases = () if since is None else (since,) if isinstance(since, str) else since
         check = partial(check_consents, self, allow_expired_consent)
         return write_archive(self, version, Path(path), on_progress, since=bases, check=check)
+
+    def export_files(
+        self,
+        folder: str | Path,
+        version: str = MAIN,
+        *,
+        path: str = "",
+        format: str = DEFAULT_FORMAT,  # noqa: A002
+        unit: str | None = None,
+        allow_expired_consent: str | None = None,
+        on_progress: OnProgress = _silent,
+    ) -> ExportedVersion:
+        """Write the clips of a version, all or those below `path`, to motion files in a new folder.
+
+        The files have the paths of their entries. The sidecar `marey.json` names the version and the origin of each
+        clip, so that an upload of the folder restores paths and take records. The folder exists only when it is
+        complete. Raises `FolderNotEmpty` if it exists already, `CannotExport` if the version has no clips or a path is
+        no name of a file, and `Conflict` if the consent for a clip has ended, as `archive` does.
+        """
+        from marey_client.bridges.files import write_files
+
+        motions = self._motion_files(Path(folder), version, path, format, unit, allow_expired_consent)
+        return write_files(motions, Path(folder), on_progress)
+
+    def export_huggingface(
+        self,
+        folder: str | Path,
+        version: str = MAIN,
+        *,
+        path: str = "",
+        format: str = DEFAULT_FORMAT,  # noqa: A002
+        unit: str | None = None,
+        allow_expired_consent: str | None = None,
+        on_progress: OnProgress = _silent,
+    ) -> ExportedVersion:
+        """Write the clips of a version to a new folder that can be uploaded to the Hugging Face Hub as a dataset.
+
+        Its card names the commit, the licences and the lineage. Raises the errors of `export_files`.
+        """
+        from marey_client.bridges.huggingface import write_huggingface
+
+        motions = self._motion_files(Path(folder), version, path, format, unit, allow_expired_consent)
+        return write_huggingface(motions, Path(folder), on_progress)
+
+    def export_lerobot(
+        self,
+        folder: str | Path,
+        version: str = MAIN,
+        *,
+        path: str = "",
+        allow_expired_consent: str | None = None,
+        on_progress: OnProgress = _silent,
+    ) -> ExportedVersion:
+        """Write the clips of a version to a new folder as a LeRobotDataset v3.0, with one episode for each clip.
+
+        Raises the errors of `export_files`, also `CannotExport` if the clips do not have the same skeleton and frame
+        rate, and `MissingPackage` if pyarrow is not installed.
+        """
+        from marey_client.bridges.folders import require_free
+        from marey_client.bridges.lerobot import write_lerobot
+        from marey_client.bridges.parquet import import_pyarrow
+        from marey_client.bridges.version import version_to_export
+
+        import_pyarrow()
+        require_free(Path(folder))
+        found = version_to_export(self, version, path, allow_expired_consent=allow_expired_consent)
+        return write_lerobot(found, Path(folder), on_progress)
+
+    def _motion_files(
+        self,
+        folder: Path,
+        version: str,
+        path: str,
+        format: str,  # noqa: A002
+        unit: str | None,
+        reason: str | None,
+    ) -> MotionFiles:
+        from marey_client.bridges.files import MotionFiles, require_format
+        from marey_client.bridges.folders import require_free
+        from marey_client.bridges.version import version_to_export
+
+        require_format(format)
+        require_free(folder)
+        found = version_to_export(self, version, path, allow_expired_consent=reason)
+        return MotionFiles(found, format, unit, reason)
 
     def receive(self, archive: Archive, *, into: str = MAIN, on_progress: OnProgress = _silent) -> ImportedVersion:
         """Record the versions of an archive without checking it, and move the branch `into` to the newest of them.

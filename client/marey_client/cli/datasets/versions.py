@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from marey_client.cli.addresses import kind_named
-from marey_client.cli.datasets import bisecting, combining, comparing, copying, proposals
+from marey_client.cli.datasets import bisecting, combining, comparing, copying, exporting, proposals
 from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, parse, short
 from marey_client.cli.terminal.invocation import AsJson, ProjectName, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
@@ -30,6 +30,7 @@ def add_to(app: typer.Typer) -> None:
     combining.add_to(dataset)
     comparing.add_to(dataset)
     copying.add_to(dataset)
+    exporting.add_to(dataset)
     proposals.add_protection_to(dataset)
     app.add_typer(dataset, name="dataset")
 

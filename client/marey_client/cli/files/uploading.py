@@ -45,6 +45,8 @@ def upload(
     """Import motion files. Refused files are listed with a reason.
 
     Importing the same file again changes nothing; a changed file of the same name becomes a new revision of its clip.
+    Clips in a folder that `marey dataset export` wrote keep their paths, and get the take records and tags that they
+    had then.
     """
     from marey_client.imports import find_files, left_out_text
     from marey_schemas.options.imports import ImportOptions
@@ -54,12 +56,15 @@ def upload(
     found = find_files(places)
     if found.left_out:
         print_message(left_out_text(found.left_out))
+    if found.unit is not None and not options.keys() & {"unit", "unit_scale_m"}:
+        options["unit"] = found.unit
     with connect(context) as marey:
         to = marey.project(project)
         to.read()  # a missing project is an error before any bytes are sent
         try:
             with progress() as advance:
                 entries = to.imports.upload(found.files, ImportOptions.model_validate(options), notice=advance)
+                restored = to.imports.restore(found, entries, notice=advance)
         except KeyboardInterrupt:
             print_message(
                 "interrupted; imported files stay imported, and repeating the command sends only the missing ones"
@@ -69,8 +74,19 @@ def upload(
         print_json(entries)
     else:
         _print_entries(entries)
+        _print_restored(restored, found.changed_tables, f"{project}/{options.get('collection', '')}".rstrip("/"))
     if any(entry.status == "failed" for entry in entries):
         raise Refused
+
+
+def _print_restored(restored: int, changed_tables: Sequence[Path], place: str) -> None:
+    if restored:
+        typer.echo(f"{counted(restored, 'clip')} got the take record and the tags of the export")
+    for table in changed_tables:
+        print_message(
+            f"{table} was changed after the export and is not used; to apply it, run marey record {place} --table "
+            f"{table}"
+        )
 
 
 def _print_entries(entries: Sequence[ImportEntry]) -> None:

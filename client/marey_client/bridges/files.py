@@ -1,0 +1,121 @@
+"""Export of a version as a tree of motion files."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from marey_client.blobs import digest_of_file
+from marey_client.bridges.folders import file_names, new_folder
+from marey_client.bridges.sidecars import RECORDS, SidecarWriter
+from marey_client.bridges.version import REQUESTS_AT_ONCE, DescribedClip, VersionToExport
+from marey_client.downloads import download
+from marey_client.errors import CannotExport, RequestFailed
+from marey_schemas.datasets.exports import SIDECAR, ExportedClip, Layout
+from marey_schemas.formats import DEFAULT_UNIT, MOTION_FORMATS, format_named
+
+if TYPE_CHECKING:
+    from marey_client.archives import OnProgress
+    from marey_schemas.datasets.commits import Commit
+
+
+class ExportedVersion(NamedTuple):
+    """Result of an export."""
+
+    commit: Commit
+    folder: Path
+    clips: int
+    renamed: Mapping[str, str]
+    """File of each clip whose path is no name of a file on all systems, by the path of the entry."""
+    left_out: Mapping[str, int]
+    """Number of entries that are not clips, by kind."""
+
+
+@dataclass(frozen=True)
+class MotionFiles:
+    """Motion files of a version: their format and unit, and the permission to export."""
+
+    version: VersionToExport
+    format: str
+    unit: str | None
+    allow_expired_consent: str | None
+
+    def header(self, layout: Layout) -> dict[str, object]:
+        """Return the beginning of the sidecar."""
+        identity = self.version.identity.model_dump(mode="json", exclude_none=True)
+        return {**identity, "layout": layout, "format": self.format, "unit": self._unit}
+
+    @property
+    def _unit(self) -> str:
+        units = format_named(self.format).units
+        return (self.unit or DEFAULT_UNIT) if len(units) > 1 else units[0]
+
+    @property
+    def ending(self) -> str:
+        """The ending of the names of the files."""
+        return format_named(self.format).endings[0]
+
+    def write(
+        self,
+        folder: Path,
+        names: Sequence[str],
+        add: Callable[[ExportedClip], None],
+        on_progress: OnProgress,
+    ) -> None:
+        """Write each clip to the file below `folder` with its name, and call `add` with the clips in order."""
+        total, done = len(self.version.clips), 0
+        scratch = folder / ".downloads"
+        with ThreadPoolExecutor(REQUESTS_AT_ONCE, thread_name_prefix="marey-export") as pool:
+            for group in self.version.described(pool):
+                files = names[done : done + len(group)]
+                places = [scratch / str(done + place) for place in range(len(group))]
+                digests = pool.map(self._write_one, group, [folder / name for name in files], places)
+                for one, name, digest in zip(group, files, digests, strict=True):
+                    add(one.clip.model_copy(update={"file": name, "digest": digest}))
+                    done += 1
+                    on_progress("writing files", done, total)
+        shutil.rmtree(scratch)
+
+    def _write_one(self, one: DescribedClip, target: Path, scratch: Path) -> str:
+        """Write a clip to `target` by way of an empty folder `scratch`; return the digest of the file."""
+        query: dict[str, str | int | None] = {"format": self.format, "revision": one.entry.revision, "unit": self.unit}
+        if self.allow_expired_consent is not None:
+            query |= {"allow_expired_consent": "true", "consent_reason": self.allow_expired_consent}
+        dataset = self.version.dataset
+        url = f"{dataset.project_url}/{one.entry.kind.plural}/{one.entry.item}/export"
+        try:
+            written = download(dataset.transport, url, scratch, params=query, name="file")
+        except RequestFailed as error:
+            error.add_note(f"the clip is {one.entry.path}")
+            raise
+        target.parent.mkdir(parents=True, exist_ok=True)
+        written.rename(target)
+        scratch.rmdir()
+        return digest_of_file(target)
+
+
+def require_format(format: str) -> None:  # noqa: A002
+    """Raise `CannotExport` unless clips can be written in the format and uploaded again."""
+    if format not in MOTION_FORMATS:
+        raise CannotExport(f"{format!r} is not a format for motion; the formats are {', '.join(MOTION_FORMATS)}")
+
+
+def write_files(motions: MotionFiles, target: Path, on_progress: OnProgress) -> ExportedVersion:
+    """Write a version to a new folder: a file for each clip, the sidecar, and a table of the take records."""
+    version = motions.version
+    names = file_names([one.path for one in version.clips], motions.ending, reserved=(SIDECAR, RECORDS))
+    with new_folder(target) as folder, SidecarWriter(folder, motions.header("files")) as sidecar:
+        motions.write(folder, names, sidecar.add, on_progress)
+        sidecar.finish()
+    return exported(version, target, names, motions.ending)
+
+
+def exported(version: VersionToExport, target: Path, names: Sequence[str], ending: str) -> ExportedVersion:
+    """Return the result of an export to files, given by names that are relative to the folder of the entries."""
+    pairs = zip((one.path for one in version.clips), names, strict=True)
+    renamed = {path: name for path, name in pairs if name != path + ending}
+    return ExportedVersion(version.commit, target, len(version.clips), renamed, version.left_out)

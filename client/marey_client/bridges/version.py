@@ -1,0 +1,179 @@
+"""The version of a dataset that is being exported: its clips, with their take records and their lineage."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from marey_client.archives import check_consents
+from marey_client.contents import read_documents
+from marey_client.errors import CannotExport
+from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
+from marey_schemas.datasets.contents import MOST_CONTENTS, PartOfContent
+from marey_schemas.datasets.exports import (
+    ExportedClip,
+    ExportedIdentity,
+    ExportedInput,
+    ExportedJob,
+    ExportedRecord,
+    ExportedSource,
+)
+from marey_schemas.datasets.naming import RefKind
+from marey_schemas.documents.clips import ClipInfo
+from marey_schemas.kinds import Kind
+from marey_schemas.lineage import LineageGraph
+from marey_versions.records import revision_content
+
+if TYPE_CHECKING:
+    from marey_client.handles.datasets import DatasetHandle
+    from marey_client.transport import Params
+
+REQUESTS_AT_ONCE = 4
+"""Number of requests that an export sends at the same time."""
+
+
+class DescribedClip(NamedTuple):
+    """Clip of a version, before its motion is read."""
+
+    entry: Entry
+    clip: ExportedClip
+
+
+class _Located(NamedTuple):
+    """Clip entry with the revision of an item that has its content."""
+
+    entry: Entry
+    item: str
+    revision: int
+
+    @property
+    def content(self) -> str:
+        """The content digest of the revision."""
+        return revision_content(self.entry.kind.value, self.entry.parts)
+
+
+@dataclass(frozen=True)
+class VersionToExport:
+    """Version of a dataset whose clips may be exported."""
+
+    dataset: DatasetHandle
+    commit: Commit
+    tag: str | None
+    folder: str
+    clips: tuple[Entry, ...]
+    left_out: Mapping[str, int]
+    """Number of entries that are not clips, by kind."""
+
+    @property
+    def identity(self) -> ExportedIdentity:
+        """The fields that identify the version, independent of the server."""
+        return ExportedIdentity(
+            dataset=self.dataset.name,
+            commit=self.commit.digest,
+            tag=self.tag,
+            folder=self.folder,
+            author=self.commit.author,
+            at=self.commit.at.strftime(TIME_OF_COMMIT),
+            message=self.commit.message,
+        )
+
+    def described(self, pool: ThreadPoolExecutor) -> Iterator[list[DescribedClip]]:
+        """Yield the clips in the order of their paths, with take records and lineage, in groups of limited size."""
+        for start in range(0, len(self.clips), MOST_CONTENTS):
+            group = [_located(one) for one in self.clips[start : start + MOST_CONTENTS]]
+            infos = self._infos(group)
+            jobs = pool.map(self._job_of, group)
+            yield [
+                DescribedClip(one.entry, _exported(one, info, job))
+                for one, info, job in zip(group, infos, jobs, strict=True)
+            ]
+
+    def documents(self, entries: Sequence[Entry], part: str) -> Iterator[dict[str, Any]]:
+        """Yield the document of a part of each entry; in documents, references to revisions are content digests."""
+        places = [PartOfContent(content=_located(one).content, part=part) for one in entries]
+        return read_documents(self.dataset.transport, self.dataset.project_url, places)
+
+    def _infos(self, group: Sequence[_Located]) -> list[ClipInfo]:
+        described = [one.entry for one in group if "info" in one.entry.parts]
+        found = {id(entry): tree for entry, tree in zip(described, self.documents(described, "info"), strict=True)}
+        return [ClipInfo.model_validate(found.get(id(one.entry), {})) for one in group]
+
+    def _job_of(self, clip: _Located) -> ExportedJob | None:
+        """Return the job that made a revision, None if a user did."""
+        url = f"{self.dataset.project_url}/{clip.entry.kind.plural}/{clip.item}/lineage-graph"
+        query: Params = {"revision": clip.revision, "direction": "inputs", "depth": 1}
+        graph = self.dataset.transport.get(LineageGraph, url, query)
+        made = graph.revisions[0].job
+        job = next((one for one in graph.jobs if one.id == made), None)
+        if job is None:
+            return None
+        used = ((link.role, graph.revisions[link.source]) for link in graph.links if link.result == 0)
+        inputs = [
+            ExportedInput(role=role, kind=one.kind.value, item=one.item, revision=one.revision) for role, one in used
+        ]
+        inputs.sort(key=lambda one: (one.role, one.item, one.revision))
+        return ExportedJob(
+            id=job.id,
+            kind=job.kind,
+            seed=job.seed,
+            code_versions=tuple(sorted(job.code_versions)),
+            commits=tuple(sorted(job.commits)),
+            inputs=tuple(inputs),
+        )
+
+
+def version_to_export(
+    dataset: DatasetHandle, version: str, folder: str = "", *, allow_expired_consent: str | None = None
+) -> VersionToExport:
+    """Read the entries of a version, all or those below a folder, and check that its clips may be exported.
+
+    Raises `CannotExport` if there is no clip, and `Conflict` if the consent for a clip has ended, unless
+    `allow_expired_consent` gives the reason why the clip is exported nevertheless.
+    """
+    commit, named = dataset.at(version), dataset.find_ref(version)
+    folder = folder.strip("/")
+    entries = list(dataset.entries(commit.digest, path=folder))
+    clips = tuple(one for one in entries if one.kind is Kind.CLIP)
+    if not clips:
+        place = f"below {folder!r}" if folder else "in any folder"
+        raise CannotExport(f"the version {version} of {dataset.name} has no clips {place}; list it with entries")
+    contents = dict.fromkeys(_located(one).content for one in clips)
+    check_consents(dataset, allow_expired_consent, list(contents))
+    return VersionToExport(
+        dataset,
+        commit,
+        tag=version if named is not None and named.kind is RefKind.TAG else None,
+        folder=folder,
+        clips=clips,
+        left_out=Counter(one.kind.value for one in entries if one.kind is not Kind.CLIP),
+    )
+
+
+def _located(entry: Entry) -> _Located:
+    if entry.item is None or entry.revision is None:
+        raise CannotExport(
+            f"{entry.path}: the project has no revision with the content of this clip any more; restore the clip, or "
+            "export a version without it"
+        )
+    return _Located(entry, entry.item, entry.revision)
+
+
+def _exported(one: _Located, info: ClipInfo, job: ExportedJob | None) -> ExportedClip:
+    record = {name: getattr(info, name) for name in ExportedRecord.model_fields}
+    file = None if info.source is None else info.source.file
+    source = (
+        None
+        if info.source is None or file is None
+        else ExportedSource(name=info.source.file_name, digest=file, format=info.source.format)
+    )
+    return ExportedClip(
+        path=one.entry.path,
+        content=one.content,
+        tags=tuple(sorted(one.entry.tags)),
+        record=ExportedRecord(**{name: value for name, value in record.items() if value is not None}),
+        source=source,
+        job=job,
+    )

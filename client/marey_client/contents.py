@@ -1,0 +1,53 @@
+"""Documents of a project, requested by the content digests of revisions, which are the same on every server."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from marey_client.errors import UnexpectedAnswer
+from marey_client.transport import BLOCKS, MAX_ANSWER_BYTES, as_json
+from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent
+from marey_schemas.encoding.codecs import MSGPACK, decode_tree
+
+if TYPE_CHECKING:
+    from marey_client.transport import Transport
+
+
+def request_contents(
+    transport: Transport, project_url: str, request: ContentsRequest, *, keep_blocks: bool = False
+) -> dict[str, Any]:
+    """Return the server's answer: `revisions` and `documents`, each in the order of the request.
+
+    With `keep_blocks`, arrays stay compressed.
+    """
+    url = f"{project_url}/contents"
+    response = transport.send("POST", url, content=as_json(request), headers={"Accept": BLOCKS})
+    answer: dict[str, Any] = decode_tree(response.content, MSGPACK, max_bytes=MAX_ANSWER_BYTES, keep_blocks=keep_blocks)
+    return answer
+
+
+def first_documents(
+    transport: Transport, project_url: str, places: Sequence[PartOfContent], *, keep_blocks: bool = False
+) -> list[Any]:
+    """Return the documents at `places`, in order, as many as fit into one answer, at least one.
+
+    Raises `UnexpectedAnswer` if the project does not have one of the revisions any more.
+    """
+    request = ContentsRequest(documents=tuple(places))
+    found: list[Any] = request_contents(transport, project_url, request, keep_blocks=keep_blocks)["documents"]
+    for place, tree in zip(places, found, strict=False):
+        if not isinstance(tree, dict):
+            raise UnexpectedAnswer(f"the project has no revision with the content {place.content} any more")
+    if not found:
+        raise UnexpectedAnswer("the server's answer has no documents")
+    return found
+
+
+def read_documents(transport: Transport, project_url: str, places: Sequence[PartOfContent]) -> Iterator[dict[str, Any]]:
+    """Yield the documents at `places`, in order, with numpy arrays; not more than one answer is in memory."""
+    waiting = list(places)
+    while waiting:
+        found = first_documents(transport, project_url, waiting[:MOST_CONTENTS])
+        yield from found
+        waiting = waiting[len(found) :]

@@ -1,0 +1,98 @@
+"""Sidecar of an exported folder: which version of which dataset it contains, and where each clip comes from."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from marey_schemas.base import Answer
+from marey_schemas.documents.clips import Day
+
+EXPORT_SCHEMA = "marey/export@1"
+SIDECAR = "marey.json"
+"""Name of the sidecar, at the top of an exported folder."""
+
+Layout = Literal["files", "huggingface", "lerobot"]
+"""Layouts of exported folders: a tree of motion files, a repository of the Hugging Face Hub, or a LeRobotDataset."""
+LAYOUTS: tuple[Layout, ...] = ("files", "huggingface", "lerobot")
+
+
+class ExportedRecord(Answer):
+    """Take record of an exported clip; fields without a value are left out."""
+
+    subject: str | None = None
+    action: str | None = None
+    take: str | None = None
+    shoot_day: Day | None = None
+    select: Literal["best", "good", "no good"] | None = None
+    licence: str | None = None
+    capture_system: str | None = None
+    consent_until: Day | None = None
+    consent_for: tuple[str, ...] | None = None
+    comment: str | None = None
+
+
+class ExportedSource(Answer):
+    """File from which a clip was imported."""
+
+    name: str | None = None
+    digest: str
+    format: str | None = None
+
+
+class ExportedInput(Answer):
+    """Revision of which a job made a clip; the ids are those of the server from which the clip was exported."""
+
+    role: str = Field(description="Name of the job input for which the revision was used.")
+    kind: str
+    item: str
+    revision: int
+
+
+class ExportedJob(Answer):
+    """Job that made a clip."""
+
+    id: str
+    kind: str
+    seed: int
+    code_versions: tuple[str, ...] = ()
+    commits: tuple[str, ...] = Field((), description="Digests of the commits from which the job took its inputs.")
+    inputs: tuple[ExportedInput, ...] = ()
+
+
+class ExportedClip(Answer):
+    """Clip of an exported version."""
+
+    path: str = Field(description="Path of the entry in the version.")
+    content: str = Field(description="Content digest of the revision; it is the same on every server.")
+    file: str | None = Field(None, description="Path of the clip's file in the folder; null: `episode` has its frames.")
+    digest: str | None = Field(None, description="Digest of the bytes of `file`.")
+    episode: int | None = Field(None, description="Index of the clip's episode.")
+    tags: tuple[str, ...] = ()
+    record: ExportedRecord = ExportedRecord()
+    source: ExportedSource | None = None
+    job: ExportedJob | None = None
+
+
+class ExportedIdentity(Answer):
+    """Version that an exported folder contains. It is complete without the address of a server."""
+
+    dataset: str
+    commit: str
+    tag: str | None = Field(None, description="Tag by which the version was named.")
+    folder: str = Field("", description="Folder of the version to which the export was limited.")
+    author: str
+    at: str
+    message: str
+
+
+class ExportedFolder(ExportedIdentity):
+    """The sidecar `marey.json`."""
+
+    schema_: Literal["marey/export@1"] = Field(alias="schema")
+    layout: Layout
+    format: str | None = Field(None, description="Format of the motion files.")
+    unit: str | None = Field(None, description="Unit of length in the motion files.")
+    licences: tuple[str, ...] = Field((), description="Licences in the take records.")
+    clips: tuple[ExportedClip, ...] = ()
