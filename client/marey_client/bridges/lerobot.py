@@ -32,9 +32,7 @@ from marey_client.bridges.parquet import (
 from marey_client.bridges.sidecars import SidecarWriter
 from marey_client.bridges.statistics import ColumnStatistics
 from marey_client.bridges.version import REQUESTS_AT_ONCE, DescribedClip, VersionToExport
-from marey_client.contents import request_contents
 from marey_client.errors import CannotExport
-from marey_schemas.datasets.contents import ContentsRequest
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -172,12 +170,7 @@ class _Writing:
     def _rig_of(self, motion: Mapping[str, Any]) -> Rig:
         skeleton = motion["skeleton"]["content"]
         if skeleton not in self.hierarchies:
-            dataset = self.version.dataset
-            request = ContentsRequest(revisions=(skeleton,))
-            (found,) = request_contents(dataset.transport, dataset.project_url, request)["revisions"]
-            if found is None:
-                raise CannotExport(f"the project has no skeleton with the content {skeleton} any more; restore it")
-            self.hierarchies[skeleton] = found["parts"]["hierarchy"]
+            self.hierarchies[skeleton] = self.version.parts_of(skeleton)["hierarchy"]
         joints, translated = motion["joints"], motion.get("translated_joints", ())
         return Rig(self.hierarchies[skeleton], tuple(joints), tuple(translated), float(motion["frame_rate_hz"]))
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from marey_client.archives import check_consents
-from marey_client.contents import read_documents
+from marey_client.contents import read_documents, request_contents
 from marey_client.errors import CannotExport
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
-from marey_schemas.datasets.contents import MOST_CONTENTS, PartOfContent
+from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent
 from marey_schemas.datasets.exports import (
     ExportedClip,
     ExportedIdentity,
@@ -95,6 +95,15 @@ class VersionToExport:
         """Yield the document of a part of each entry; in documents, references to revisions are content digests."""
         places = [PartOfContent(content=_located(one).content, part=part) for one in entries]
         return read_documents(self.dataset.transport, self.dataset.project_url, places)
+
+    def parts_of(self, content: str) -> Mapping[str, str]:
+        """Return the content digest of each part of a revision to which a document refers by its content digest."""
+        request = ContentsRequest(revisions=(content,))
+        (found,) = request_contents(self.dataset.transport, self.dataset.project_url, request)["revisions"]
+        if found is None:
+            raise CannotExport(f"the project has no revision with the content {content} any more; restore the item")
+        parts: Mapping[str, str] = found["parts"]
+        return parts
 
     def _infos(self, group: Sequence[_Located]) -> list[ClipInfo]:
         described = [one.entry for one in group if "info" in one.entry.parts]
