@@ -164,6 +164,10 @@ IMPORTED_ENDINGS = tuple(sorted(ending for one in IMPORTED for ending in one.end
 """Endings of the files that the upload of a folder includes."""
 MOTION_FORMATS = tuple(one.name for one in FORMATS if "motion" in one.writes)
 """Formats that a clip can be written in."""
+WHOLE_FORMATS = tuple(
+    one.name for one in FORMATS if "motion" in one.writes and "motion" in one.reads and one.companion is None
+)
+"""Formats whose files contain the skeleton of the motion, so that each file can be imported on its own."""
 SAMPLE_FORMATS = (*MOTION_FORMATS, "json")
 EXPORT_FORMATS = (ORIGINAL, *SAMPLE_FORMATS)
 """Choices of an export."""

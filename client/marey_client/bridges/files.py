@@ -16,7 +16,7 @@ from marey_client.bridges.version import REQUESTS_AT_ONCE, DescribedClip, Versio
 from marey_client.downloads import download
 from marey_client.errors import CannotExport, RequestFailed
 from marey_schemas.datasets.exports import SIDECAR, ExportedClip, Layout
-from marey_schemas.formats import DEFAULT_UNIT, MOTION_FORMATS, format_named
+from marey_schemas.formats import DEFAULT_UNIT, WHOLE_FORMATS, format_named
 
 if TYPE_CHECKING:
     from marey_client.archives import OnProgress
@@ -99,9 +99,12 @@ class MotionFiles:
 
 
 def require_format(format: str) -> None:  # noqa: A002
-    """Raise `CannotExport` unless clips can be written in the format and uploaded again."""
-    if format not in MOTION_FORMATS:
-        raise CannotExport(f"{format!r} is not a format for motion; the formats are {', '.join(MOTION_FORMATS)}")
+    """Raise `CannotExport` unless files of the format can be uploaded again, each on its own."""
+    if format not in WHOLE_FORMATS:
+        raise CannotExport(
+            f"{format!r} is no format whose files contain motion with its skeleton; the formats are "
+            f"{', '.join(WHOLE_FORMATS)}; marey download writes others"
+        )
 
 
 def write_files(motions: MotionFiles, target: Path, on_progress: OnProgress) -> ExportedVersion:

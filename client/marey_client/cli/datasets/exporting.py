@@ -12,7 +12,7 @@ from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AllowExpiredConsent, AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, progress
 from marey_schemas.datasets.exports import LAYOUTS
-from marey_schemas.formats import DEFAULT_FORMAT, MOTION_FORMATS
+from marey_schemas.formats import DEFAULT_FORMAT, WHOLE_FORMATS
 from marey_schemas.wording import counted, one_of
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def export(
     path: Annotated[str, typer.Option(help="Folder of the version; only the clips below it are exported.")] = "",
     format: Annotated[  # noqa: A002
         str | None,
-        typer.Option(help=f"Format of the motion files: {one_of(MOTION_FORMATS)}. Default: {DEFAULT_FORMAT}."),
+        typer.Option(help=f"Format of the motion files: {one_of(WHOLE_FORMATS)}. Default: {DEFAULT_FORMAT}."),
     ] = None,
     unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m. Default: cm.")] = None,
     allow_expired_consent: AllowExpiredConsent = None,
