@@ -10,9 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from marey_client.blobs import digest_of_file
-from marey_client.bridges.folders import file_names, new_folder
+from marey_client.bridges.folders import file_names, new_folder, require_free
 from marey_client.bridges.sidecars import RECORDS, SidecarWriter
-from marey_client.bridges.version import REQUESTS_AT_ONCE, DescribedClip, VersionToExport
+from marey_client.bridges.version import (
+    EXPORTS_AT_ONCE,
+    DatasetToExport,
+    DescribedClip,
+    VersionToExport,
+    version_to_export,
+)
 from marey_client.downloads import download
 from marey_client.errors import CannotExport, RequestFailed
 from marey_schemas.datasets.exports import SIDECAR, ExportedClip, Layout
@@ -69,7 +75,7 @@ class MotionFiles:
         """Write each clip to the file below `folder` with its name, and call `add` with the clips in order."""
         total, done = len(self.version.clips), 0
         scratch = folder / ".downloads"
-        with ThreadPoolExecutor(REQUESTS_AT_ONCE, thread_name_prefix="marey-export") as pool:
+        with ThreadPoolExecutor(EXPORTS_AT_ONCE, thread_name_prefix="marey-export") as pool:
             for group in self.version.described(pool):
                 files = names[done : done + len(group)]
                 places = [scratch / str(done + place) for place in range(len(group))]
@@ -98,13 +104,28 @@ class MotionFiles:
         return digest_of_file(target)
 
 
-def require_format(format: str) -> None:  # noqa: A002
-    """Raise `CannotExport` unless files of the format can be uploaded again, each on its own."""
+def prepare_files(
+    dataset: DatasetToExport,
+    version: str,
+    target: Path,
+    path: str,
+    format: str,  # noqa: A002
+    unit: str | None,
+    allow_expired_consent: str | None,
+) -> MotionFiles:
+    """Check what an export to files needs, and read the entries of the version below `path`.
+
+    Raises `CannotExport` unless files of the format can be uploaded again, each on its own; also the errors of
+    `require_free` and `version_to_export`.
+    """
     if format not in WHOLE_FORMATS:
         raise CannotExport(
             f"{format!r} is no format whose files contain motion with its skeleton; the formats are "
             f"{', '.join(WHOLE_FORMATS)}; marey download writes others"
         )
+    require_free(target)
+    found = version_to_export(dataset, version, path, allow_expired_consent=allow_expired_consent)
+    return MotionFiles(found, format, unit, allow_expired_consent)
 
 
 def write_files(motions: MotionFiles, target: Path, on_progress: OnProgress) -> ExportedVersion:

@@ -17,42 +17,46 @@ from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
+from marey_client.bridges.episodes import (
+    ACTION,
+    COUNTERS,
+    STATE,
+    ColumnStatistics,
+    EpisodeTable,
+    data_table,
+    episode_of,
+)
 from marey_client.bridges.files import ExportedVersion
-from marey_client.bridges.folders import new_folder
+from marey_client.bridges.folders import new_folder, require_free
 from marey_client.bridges.parquet import (
     COMPRESSION,
     MOST_FILE_MB,
     MOST_FILES_PER_CHUNK,
-    FilePlace,
     ParquetFiles,
     import_pyarrow,
 )
 from marey_client.bridges.sidecars import SidecarWriter
-from marey_client.bridges.statistics import ColumnStatistics
-from marey_client.bridges.version import REQUESTS_AT_ONCE, DescribedClip, VersionToExport
+from marey_client.bridges.version import (
+    EXPORTS_AT_ONCE,
+    DatasetToExport,
+    DescribedClip,
+    VersionToExport,
+    version_to_export,
+)
 from marey_client.errors import CannotExport
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-    from numpy.typing import NDArray
-
     from marey_client.archives import OnProgress
 
 CODEBASE_VERSION = "v3.0"
-STATE, ACTION = "observation.state", "action"
-_COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 NO_ACTION = "motion"
 """Task of the clips whose take record names no action."""
 RATE_TOLERANCE = 1e-4
 """Greatest relative difference of frame rates that count as equal; files state them with few digits."""
-EPISODES_PER_GROUP = 100
-"""Number of episodes that are written to the table of episodes at once."""
 NAMES_SHOWN = 10
 
 
-class Rig(NamedTuple):
+class CommonRig(NamedTuple):
     """Facts in which all clips of a LeRobotDataset must agree."""
 
     hierarchy: str
@@ -77,7 +81,7 @@ class Rig(NamedTuple):
         whole = round(self.rate_hz)
         return whole if math.isclose(self.rate_hz, whole, rel_tol=RATE_TOLERANCE) else self.rate_hz
 
-    def difference_to(self, other: Rig) -> str | None:
+    def difference_to(self, other: CommonRig) -> str | None:
         """Return what differs in another rig, in words; None if nothing does."""
         if (self.hierarchy, self.joints) != (other.hierarchy, other.joints):
             return "another skeleton"
@@ -88,30 +92,32 @@ class Rig(NamedTuple):
         return None
 
 
-class _Episode(NamedTuple):
-    """Rows of one clip."""
+def prepare_lerobot(
+    dataset: DatasetToExport, version: str, target: Path, path: str, allow_expired_consent: str | None
+) -> VersionToExport:
+    """Check what an export to LeRobot needs, and read the entries of the version below `path`.
 
-    state: NDArray[np.float32]
-    columns: Mapping[str, NDArray[Any]]
-    """All columns, by name."""
+    Raises `MissingPackage` if pyarrow is not installed; also the errors of `require_free` and `version_to_export`.
+    """
+    import_pyarrow()
+    require_free(target)
+    return version_to_export(dataset, version, path, allow_expired_consent=allow_expired_consent)
 
 
 def write_lerobot(version: VersionToExport, target: Path, on_progress: OnProgress) -> ExportedVersion:
     """Write a version to a new folder as a LeRobotDataset.
 
-    Raises `CannotExport` if the clips do not have the same skeleton and frame rate, and `MissingPackage` if pyarrow is
-    not installed.
+    Raises `CannotExport` if the clips do not have the same skeleton and frame rate.
     """
-    import_pyarrow()
     identity = version.identity.model_dump(mode="json", exclude_none=True)
     with new_folder(target) as folder:
         with (
             SidecarWriter(folder, {**identity, "layout": "lerobot"}) as sidecar,
             ParquetFiles(folder / "data") as data,
             ParquetFiles(folder / "meta" / "episodes") as episodes,
-            ThreadPoolExecutor(REQUESTS_AT_ONCE, thread_name_prefix="marey-export") as pool,
+            ThreadPoolExecutor(EXPORTS_AT_ONCE, thread_name_prefix="marey-export") as pool,
         ):
-            writing = _Writing(version, sidecar, data, _EpisodeTable(episodes))
+            writing = _Writing(version, sidecar, data, EpisodeTable(episodes))
             for group in version.described(pool):
                 writing.add_group(group, on_progress)
             writing.episodes.flush()
@@ -127,8 +133,8 @@ class _Writing:
     version: VersionToExport
     sidecar: SidecarWriter
     data: ParquetFiles
-    episodes: _EpisodeTable
-    rig: Rig | None = None
+    episodes: EpisodeTable
+    rig: CommonRig | None = None
     first: str = ""
     """Path of the first clip, with which the others are compared."""
     hierarchies: dict[str, str] = field(default_factory=dict)
@@ -167,20 +173,20 @@ class _Writing:
             "retarget), resample clips with another frame rate (marey edit), commit the results, and export them"
         )
 
-    def _rig_of(self, motion: Mapping[str, Any]) -> Rig:
+    def _rig_of(self, motion: Mapping[str, Any]) -> CommonRig:
         skeleton = motion["skeleton"]["content"]
         if skeleton not in self.hierarchies:
             self.hierarchies[skeleton] = self.version.parts_of(skeleton)["hierarchy"]
         joints, translated = motion["joints"], motion.get("translated_joints", ())
-        return Rig(self.hierarchies[skeleton], tuple(joints), tuple(translated), float(motion["frame_rate_hz"]))
+        return CommonRig(self.hierarchies[skeleton], tuple(joints), tuple(translated), float(motion["frame_rate_hz"]))
 
     def _add(self, one: DescribedClip, motion: Mapping[str, Any]) -> None:
         assert self.rig is not None
         task = (one.clip.record.action or "").strip() or NO_ACTION
         number = self.tasks.setdefault(task, len(self.tasks))
-        episode = _episode(motion, self.rig.fps, self.done, self.frames, number)
+        episode = episode_of(motion, self.rig.fps, self.done, self.frames, number)
         length = len(episode.state)
-        place = self.data.add(_data_table(episode))
+        place = self.data.add(data_table(episode))
         statistics = {name: ColumnStatistics.of(rows) for name, rows in episode.columns.items()}
         self.episodes.add(self.done, task, self.frames, length, place, statistics)
         for name, new in statistics.items():
@@ -213,85 +219,7 @@ class _Writing:
         _write_tasks(meta / "tasks.parquet", self.tasks)
 
 
-class _EpisodeTable:
-    """Table of episodes, written in groups of rows."""
-
-    def __init__(self, files: ParquetFiles) -> None:
-        self._files = files
-        self._rows: list[dict[str, Any]] = []
-
-    def add(
-        self,
-        number: int,
-        task: str,
-        start: int,
-        length: int,
-        place: FilePlace,
-        statistics: Mapping[str, ColumnStatistics],
-    ) -> None:
-        """Add the episode whose frames begin at the index `start` of the whole, in the data file at `place`."""
-        row: dict[str, Any] = {
-            "episode_index": number, "tasks": [task], "length": length,
-            "data/chunk_index": place.chunk, "data/file_index": place.file,
-            "dataset_from_index": start, "dataset_to_index": start + length,
-        }  # fmt: skip
-        for name, one in statistics.items():
-            row |= {f"stats/{name}/{key}": values for key, values in one.document.items()}
-        self._rows.append(row)
-        if len(self._rows) == EPISODES_PER_GROUP:
-            self.flush()
-
-    def flush(self) -> None:
-        """Write the rows that are still in memory."""
-        if not self._rows:
-            return
-        place = self._files.place_for(self._table(FilePlace(0, 0)).nbytes)
-        self._files.add(self._table(place))
-        self._rows.clear()
-
-    def _table(self, place: FilePlace) -> pa.Table:
-        pyarrow = import_pyarrow()
-        own = {"meta/episodes/chunk_index": place.chunk, "meta/episodes/file_index": place.file}
-        rows = [{**row, **own} for row in self._rows]
-        kinds = {"tasks": pyarrow.list_(pyarrow.string())}
-        for name in rows[0]:
-            if name.startswith("stats/"):
-                number = pyarrow.int64() if name.endswith("/count") else pyarrow.float64()
-                kinds[name] = pyarrow.list_(number)
-        schema = pyarrow.schema([(name, kinds.get(name, pyarrow.int64())) for name in rows[0]])
-        return pyarrow.Table.from_pylist(rows, schema=schema)
-
-
-def _episode(motion: Mapping[str, Any], fps: float, number: int, start: int, task: int) -> _Episode:
-    """Return the rows of a clip: episode `number`, whose first frame has the index `start` in the whole."""
-    poses = np.asarray(motion["poses"], dtype=np.float32)
-    length = len(poses)
-    moved = motion.get("translations")
-    parts = [poses] if moved is None else [poses, np.asarray(moved, dtype=np.float32).reshape(length, -1)]
-    state = np.ascontiguousarray(np.concatenate(parts, axis=1))
-    frames = np.arange(length, dtype=np.int64)
-    columns = {
-        STATE: state,
-        ACTION: np.concatenate([state[1:], state[-1:]]),
-        "timestamp": (frames / fps).astype(np.float32),
-        "frame_index": frames,
-        "episode_index": np.full(length, number, dtype=np.int64),
-        "index": start + frames,
-        "task_index": np.full(length, task, dtype=np.int64),
-    }
-    return _Episode(state, columns)
-
-
-def _data_table(episode: _Episode) -> pa.Table:
-    pyarrow = import_pyarrow()
-    columns = {}
-    for name, rows in episode.columns.items():
-        numbers = pyarrow.array(rows.reshape(-1))
-        columns[name] = numbers if rows.ndim == 1 else pyarrow.FixedSizeListArray.from_arrays(numbers, rows.shape[1])
-    return pyarrow.table(columns)
-
-
-def _info(rig: Rig) -> dict[str, Any]:
+def _info(rig: CommonRig) -> dict[str, Any]:
     names = rig.names
     vector = {"dtype": "float32", "shape": [len(names)], "names": names}
     single = {"shape": [1], "names": None}
@@ -312,7 +240,7 @@ def _info(rig: Rig) -> dict[str, Any]:
             STATE: vector,
             ACTION: vector,
             "timestamp": {"dtype": "float32", **single},
-            **{name: {"dtype": "int64", **single} for name in _COUNTERS},
+            **{name: {"dtype": "int64", **single} for name in COUNTERS},
         },
     }
 

@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from marey_client.archives import check_consents
+from marey_client.archives import DatasetReader, check_consents
 from marey_client.contents import read_documents, request_contents
 from marey_client.errors import CannotExport
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
@@ -21,18 +21,27 @@ from marey_schemas.datasets.exports import (
     ExportedRecord,
     ExportedSource,
 )
-from marey_schemas.datasets.naming import RefKind
+from marey_schemas.datasets.naming import Ref, RefKind
 from marey_schemas.documents.clips import ClipInfo
 from marey_schemas.kinds import Kind
 from marey_schemas.lineage import LineageGraph
 from marey_versions.records import revision_content
 
 if TYPE_CHECKING:
-    from marey_client.handles.datasets import DatasetHandle
     from marey_client.transport import Params
 
-REQUESTS_AT_ONCE = 4
+EXPORTS_AT_ONCE = 4
 """Number of requests that an export sends at the same time."""
+
+
+class DatasetToExport(DatasetReader, Protocol):
+    """Methods of `DatasetHandle` that are needed to export a version."""
+
+    def entries(self, version: str, *, path: str = "") -> Iterator[Entry]:
+        """List the entries of a version, all or those below a folder."""
+
+    def find_ref(self, name: str) -> Ref | None:
+        """Return the branch or tag with a name, or None."""
 
 
 class DescribedClip(NamedTuple):
@@ -59,7 +68,7 @@ class _Located(NamedTuple):
 class VersionToExport:
     """Version of a dataset whose clips may be exported."""
 
-    dataset: DatasetHandle
+    dataset: DatasetToExport
     commit: Commit
     tag: str | None
     folder: str
@@ -135,7 +144,7 @@ class VersionToExport:
 
 
 def version_to_export(
-    dataset: DatasetHandle, version: str, folder: str = "", *, allow_expired_consent: str | None = None
+    dataset: DatasetToExport, version: str, folder: str = "", *, allow_expired_consent: str | None = None
 ) -> VersionToExport:
     """Read the entries of a version, all or those below a folder, and check that its clips may be exported.
 

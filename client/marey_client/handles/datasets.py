@@ -32,7 +32,7 @@ from marey_schemas.kinds import Kind
 
 if TYPE_CHECKING:
     from marey_client.archives import OnProgress
-    from marey_client.bridges.files import ExportedVersion, MotionFiles
+    from marey_client.bridges.files import ExportedVersion
     from marey_versions.archive.reading import Archive
 
 
@@ -375,9 +375,9 @@ class DatasetHandle:
         complete. Raises `FolderNotEmpty` if it exists already, `CannotExport` if the version has no clips or a path is
         no name of a file, and `Conflict` if the consent for a clip has ended, as `archive` does.
         """
-        from marey_client.bridges.files import write_files
+        from marey_client.bridges.files import prepare_files, write_files
 
-        motions = self._motion_files(Path(folder), version, path, format, unit, allow_expired_consent)
+        motions = prepare_files(self, version, Path(folder), path, format, unit, allow_expired_consent)
         return write_files(motions, Path(folder), on_progress)
 
     def export_huggingface(
@@ -395,9 +395,10 @@ class DatasetHandle:
 
         Its card names the commit, the licences and the lineage. Raises the errors of `export_files`.
         """
+        from marey_client.bridges.files import prepare_files
         from marey_client.bridges.huggingface import write_huggingface
 
-        motions = self._motion_files(Path(folder), version, path, format, unit, allow_expired_consent)
+        motions = prepare_files(self, version, Path(folder), path, format, unit, allow_expired_consent)
         return write_huggingface(motions, Path(folder), on_progress)
 
     def export_lerobot(
@@ -414,33 +415,10 @@ class DatasetHandle:
         Raises the errors of `export_files`, also `CannotExport` if the clips do not have the same skeleton and frame
         rate, and `MissingPackage` if pyarrow is not installed.
         """
-        from marey_client.bridges.folders import require_free
-        from marey_client.bridges.lerobot import write_lerobot
-        from marey_client.bridges.parquet import import_pyarrow
-        from marey_client.bridges.version import version_to_export
+        from marey_client.bridges.lerobot import prepare_lerobot, write_lerobot
 
-        import_pyarrow()
-        require_free(Path(folder))
-        found = version_to_export(self, version, path, allow_expired_consent=allow_expired_consent)
+        found = prepare_lerobot(self, version, Path(folder), path, allow_expired_consent)
         return write_lerobot(found, Path(folder), on_progress)
-
-    def _motion_files(
-        self,
-        folder: Path,
-        version: str,
-        path: str,
-        format: str,  # noqa: A002
-        unit: str | None,
-        reason: str | None,
-    ) -> MotionFiles:
-        from marey_client.bridges.files import MotionFiles, require_format
-        from marey_client.bridges.folders import require_free
-        from marey_client.bridges.version import version_to_export
-
-        require_format(format)
-        require_free(folder)
-        found = version_to_export(self, version, path, allow_expired_consent=reason)
-        return MotionFiles(found, format, unit, reason)
 
     def receive(self, archive: Archive, *, into: str = MAIN, on_progress: OnProgress = _silent) -> ImportedVersion:
         """Record the versions of an archive without checking it, and move the branch `into` to the newest of them.

@@ -16,7 +16,7 @@ import pyarrow.parquet as parquet
 import pytest
 from tests.support.version_in_memory import VersionInMemory, tree
 
-from marey_client.bridges import lerobot
+from marey_client.bridges import episodes, lerobot
 from marey_client.bridges.lerobot import write_lerobot
 from marey_client.bridges.parquet import FilePlace, ParquetFiles
 from marey_client.errors import CannotExport, FolderNotEmpty
@@ -160,7 +160,7 @@ def test_files_of_limited_size_hold_many_episodes(
     gaits: VersionInMemory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lerobot, "ParquetFiles", lambda folder: ParquetFiles(folder, most_bytes=200_000))
-    monkeypatch.setattr(lerobot, "EPISODES_PER_GROUP", 2)
+    monkeypatch.setattr(episodes, "EPISODES_PER_GROUP", 2)
     write_lerobot(gaits, tmp_path / "out", silent)
     read = Reading(tmp_path / "out")
     check_specification(read)
@@ -262,7 +262,7 @@ def test_without_pyarrow_the_error_names_the_command_that_installs_it() -> None:
 
 
 def test_memory_does_not_grow_with_the_number_of_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lerobot, "EPISODES_PER_GROUP", 2)
+    monkeypatch.setattr(episodes, "EPISODES_PER_GROUP", 2)
     walk = generate_gait(1.2, 0.0, 4.0)
     peaks = []
     for count in (6, 24):
