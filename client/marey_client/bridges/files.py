@@ -21,7 +21,8 @@ from marey_client.bridges.version import (
 )
 from marey_client.downloads import download
 from marey_client.errors import CannotExport, RequestFailed
-from marey_schemas.datasets.exports import SIDECAR, ExportedClip, Layout
+from marey_schemas.datasets.exports import SIDECAR, ExportedClip
+from marey_schemas.datasets.layouts import Layout
 from marey_schemas.formats import DEFAULT_UNIT, WHOLE_FORMATS, format_named
 
 if TYPE_CHECKING:

@@ -7,15 +7,12 @@ from typing import Literal
 from pydantic import Field
 
 from marey_schemas.base import Answer
+from marey_schemas.datasets.layouts import Layout
 from marey_schemas.documents.clips import Day
 
 EXPORT_SCHEMA = "marey/export@1"
 SIDECAR = "marey.json"
 """Name of the sidecar, at the top of an exported folder."""
-
-Layout = Literal["files", "huggingface", "lerobot"]
-"""Layouts of exported folders: a tree of motion files, a repository of the Hugging Face Hub, or a LeRobotDataset."""
-LAYOUTS: tuple[Layout, ...] = ("files", "huggingface", "lerobot")
 
 
 class ExportedRecord(Answer):

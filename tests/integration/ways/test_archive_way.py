@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from tests.support.command_line import CommandLine
 
-from marey_client import archives, receiving
+from marey_client import archives, contents, receiving
 from marey_client.errors import RequestFailed
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.datasets import DatasetHandle
@@ -186,15 +186,15 @@ def test_an_archive_is_continued_where_an_attempt_ended(
     whole, again = run.folder / "whole.tar", run.folder / "again.tar"
     gaits.archive(whole)
     asked: list[Any] = []
-    once = archives._Making._ask
+    once = contents.request_contents
 
-    def ask(making: archives._Making, request: Any) -> Any:
+    def ask(*request: Any, **options: Any) -> Any:
         asked.append(request)
         if len(asked) == 2:
             raise ConnectionError("the server went away")
-        return once(making, request)
+        return once(*request, **options)
 
-    monkeypatch.setattr(archives._Making, "_ask", ask)
+    monkeypatch.setattr(contents, "request_contents", ask)
     monkeypatch.setattr(archives, "MOST_CONTENTS", 2)
     with pytest.raises(ConnectionError):
         gaits.archive(again)
