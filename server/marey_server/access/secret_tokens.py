@@ -1,7 +1,7 @@
 """Bearer tokens as text: functions that create them, split them, and hash their secrets.
 
 `marey_<prefix>_<secret>` belongs to a user; the prefix identifies its row. `mareyjob_<secret>` belongs to an attempt of
-a job. The database stores the SHA-256 of the secret. A secret has 256 random bits, so a slow hash is not needed.
+a job. The code of an invitation, `mareyinvite_<prefix>_<secret>`, is built in the same way, but authenticates nobody. The database stores the SHA-256 of the secret. A secret has 256 random bits, so a slow hash is not needed.
 """
 
 from __future__ import annotations
@@ -11,12 +11,14 @@ import hmac
 import secrets
 from typing import NamedTuple
 
+from marey_schemas.invitations import CODE_PREFIX
+
 _USER = "marey_"
 _ATTEMPT = "mareyjob_"
 
 
 class IssuedToken(NamedTuple):
-    """New token: its text, which is shown once, and the parts that the database stores."""
+    """New token or code: its text, which is shown once, and the parts that the database stores."""
 
     text: str
     prefix: str
@@ -29,13 +31,19 @@ def issue_user_token() -> IssuedToken:
 
 
 def issue_prefix() -> str:
-    """Return a random prefix for a new token of a user."""
+    """Return a random prefix for a new token of a user, or a new invitation."""
     return secrets.token_hex(6)
 
 
 def issue_attempt_token() -> IssuedToken:
     """Return a new token of an attempt; the hash of its secret identifies the attempt in the database."""
     return _attempt_token(secrets.token_hex(32))
+
+
+def issue_invitation() -> IssuedToken:
+    """Return the code of a new invitation, with a random secret."""
+    prefix, secret = issue_prefix(), secrets.token_hex(32)
+    return IssuedToken(f"{CODE_PREFIX}{prefix}_{secret}", prefix, hash_secret(secret))
 
 
 def derive_token_key(secret: str) -> bytes:
@@ -82,9 +90,18 @@ def secret_matches(secret: str, secret_hash: str) -> bool:
 
 def split_user_token(text: str) -> tuple[str, str] | None:
     """Return prefix and secret of a user's token, or None if `text` is not one."""
-    if not text.startswith(_USER):
+    return _split(text, _USER)
+
+
+def split_invitation(text: str) -> tuple[str, str] | None:
+    """Return prefix and secret of the code of an invitation, or None if `text` is not one."""
+    return _split(text, CODE_PREFIX)
+
+
+def _split(text: str, start: str) -> tuple[str, str] | None:
+    if not text.startswith(start):
         return None
-    prefix, _, secret = text[len(_USER) :].partition("_")
+    prefix, _, secret = text[len(start) :].partition("_")
     return (prefix, secret) if prefix.isalnum() and prefix.isascii() and secret else None
 
 

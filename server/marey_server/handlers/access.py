@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 from pydantic import Field
 
 from marey_schemas.access import (
@@ -34,6 +37,8 @@ from marey_server.store.credentials.sign_ins import SignInTry
 from marey_server.store.credentials.tokens import TokenFilter
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.transaction import Transaction
+
+T = TypeVar("T")
 
 MAX_LOGIN_BYTES = 4 * KIB
 """Greatest size of the body of a sign-in."""
@@ -102,13 +107,20 @@ class PasswordResource(Resource):
         known = await self.look_up(sign_ins.is_known, attempt)
         lane = services.password_lane if known else services.unknown_lane
         with lane.place(address):
-            try:
-                stored = await self.change(count_try, attempt)
-            except TooManyRequestsProblem as refusal:
-                services.refused_tries.note(attempt, refusal)
-                raise
+            stored = await self.count(count_try, attempt)
             matches = await lane.run(passwords.password_matches, password, stored)
         return attempt, stored if matches else None
+
+    async def count(self, function: Callable[[Transaction, SignInTry], T], attempt: SignInTry) -> T:
+        """Run `function`, which counts a try, and return its result; a refusal is remembered.
+
+        Raises `TooManyRequestsProblem`.
+        """
+        try:
+            return await self.change(function, attempt)
+        except TooManyRequestsProblem as refusal:
+            self.services.refused_tries.note(attempt, refusal)
+            raise
 
     async def hash_password(self, password: str) -> str:
         """Return the hash of a new password; call this only for a caller who may set the password."""

@@ -13,6 +13,7 @@ from marey_server.handlers import (
     exports,
     health,
     imports,
+    invitations,
     items,
     parts,
     projects,
@@ -30,6 +31,7 @@ from marey_server.http.resource import Resource
 RESOURCES: tuple[type[Resource], ...] = (
     *access.RESOURCES,
     *projects.RESOURCES,
+    *invitations.RESOURCES,
     *collections.RESOURCES,
     *items.RESOURCES,
     *parts.RESOURCES,

@@ -37,6 +37,7 @@ PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
     "dataset": ("Name of the dataset.", _NAME),
     "ref": ("Name of the branch or tag.", _NAME),
     "proposal": ("Number of the proposal.", {"type": "integer", "minimum": 1, "maximum": 999_999_999}),
+    "invitation": ("Id or prefix of the invitation.", _NAME),
     "webhook": ("Id of the webhook.", _NAME),
     "delivery": ("Id of the delivery.", _NAME),
     "version": ("Branch, tag or commit; with ~n at its end, the version n commits earlier.", _NAME),

@@ -215,6 +215,12 @@ class Settings(BaseSettings):
     project_webhooks: int = Field(
         Quotas.project_webhooks, ge=0, description="Greatest number of webhooks of a project; 0: no webhooks."
     )
+    project_invitations: int = Field(
+        Quotas.project_invitations, ge=0, description="Greatest number of open invitations to a project."
+    )
+    user_invitations: int = Field(
+        Quotas.user_invitations, ge=0, description="Greatest number of open invitations that a user has created."
+    )
     webhook_networks: tuple[IPv4Network | IPv6Network, ...] = Field(
         (),
         description='Networks to which webhooks may be sent although they are not public, such as ["10.1.0.0/16"].',

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, update
 
 from marey_server.store.database.clock import datetime_of, set_high_water, stored_high_water_us, wall_clock_us
-from marey_server.store.tables import job, metadata, token
+from marey_server.store.tables import invitation, job, metadata, token
 
 PAST = frozenset(
     {
@@ -23,7 +23,11 @@ PAST = frozenset(
 """Columns of moments that have passed; none may lie in the future."""
 WAITING = frozenset({"expires_us", "lease_expires_us", "next_us", "old_secret_until_us", "run_at_us", "until_us"})
 """Columns of times to wait for. If they are set to now, leases are renewed; jobs, sign-ins and webhooks go on."""
-MOVED = {token.c.expires_us: token.c.created_us, job.c.deadline_us: job.c.started_us}
+MOVED = {
+    token.c.expires_us: token.c.created_us,
+    invitation.c.expires_us: invitation.c.created_us,
+    job.c.deadline_us: job.c.started_us,
+}
 """Columns of ends, each with the column of the start: if the start lies in the future, both move by the same time."""
 
 

@@ -1,4 +1,6 @@
-"""Garbage collection: deletes unreferenced documents and blobs, abandoned uploads and streams, expired keys and tokens.
+"""Garbage collection: deletes unreferenced documents and blobs, abandoned uploads and streams, and expired rows.
+
+Rows that expire are keys of repeated requests, tokens and invitations.
 
 A read finds the candidates. Each batch is then deleted in a transaction of its own that locks the rows and checks them
 again. A write that adds a reference to a document or blob first updates the time in the row of the document or blob. So
@@ -22,6 +24,7 @@ from marey_server.store.coverage_streams import drop_old_streams
 from marey_server.store.credentials.tokens import forget_ended
 from marey_server.store.database.connections import Database
 from marey_server.store.idempotency import LIFETIME_US as KEY_LIFETIME_US
+from marey_server.store.invitations import standing
 from marey_server.store.jobs.fencing import RUNNING
 from marey_server.store.tables import (
     attempt_blob,
@@ -58,6 +61,7 @@ class Collected:
     coverage_streams: int = 0
     tokens: int = 0
     ended_holdings: int = 0
+    invitations: int = 0
 
 
 def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collected:
@@ -74,6 +78,7 @@ def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collecte
         coverage_streams=database.write(SYSTEM, drop_old_streams),
         tokens=database.write(SYSTEM, forget_ended),
         ended_holdings=database.write(SYSTEM, _drop_ended_holdings),
+        invitations=database.write(SYSTEM, standing.delete_expired),
     )
 
 

@@ -11,9 +11,10 @@ from marey_schemas.items import Page
 from marey_server.errors import ConflictProblem, NotFoundProblem, PreconditionFailedProblem
 from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
+from marey_server.store.invitations.standing import withdraw_unauthorised
 from marey_server.store.projects import ProjectRow
 from marey_server.store.revs import ExpectedRev, at_rev, change_row, moved_on
-from marey_server.store.tables import member, project, user
+from marey_server.store.tables import invitation, member, project, user
 from marey_server.store.transaction import Transaction
 
 
@@ -52,12 +53,34 @@ def put_member(
 
     Raises `NotFoundProblem` if there is no such user, and `ConflictProblem` if the project would lose its last owner.
     """
-    project_row = _lock(tx, project_name)
+    project_row = lock_project(tx, project_name)
     user_id = tx.execute(select(user.c.id).where(user.c.name == user_name, user.c.disabled.is_(False))).scalar()
     if user_id is None:
         raise NotFoundProblem(f"There is no user {user_name!r}.", code="no-user")
-    which = (member.c.project_id == project_row.id, member.c.user_id == user_id)
-    row = {"project_id": project_row.id, "user_id": user_id, "role": request.role.value, "since_us": tx.now_us}
+    changed = write_role(
+        tx, project_row.id, user_id, user_name, request.role, expected_rev=expected_rev, absent=absent
+    )  # fmt: skip
+    _require_owner(tx, project_row)
+    _withdraw_invitations(tx, project_row, user_name)
+    return _shown(user_name, changed)
+
+
+def write_role(
+    tx: Transaction,
+    project_id: str,
+    user_id: str,
+    user_name: str,
+    role: Role,
+    *,
+    expected_rev: ExpectedRev = None,
+    absent: bool = False,
+) -> Row[Any]:
+    """Add a member, or change the member's role, without a check of rights; return the row.
+
+    The caller must have locked the project.
+    """
+    which = (member.c.project_id == project_id, member.c.user_id == user_id)
+    row = {"project_id": project_id, "user_id": user_id, "role": role.value, "since_us": tx.now_us}
     was = tx.execute(select(member.c.role).where(*which)).scalar()
     added = None
     if expected_rev is None:
@@ -67,20 +90,26 @@ def put_member(
                 f"The user {user_name!r} is already a member of the project.", code="member-exists"
             )
     changed = added or change_row(
-        tx, member, which, {"role": request.role.value}, expected_rev=expected_rev, absent=_no_member(user_name)
+        tx, member, which, {"role": role.value}, expected_rev=expected_rev, absent=_no_member(user_name)
     )
-    _require_owner(tx, project_row)
-    details = {"user": user_name, "role": request.role.value}
+    details = {"user": user_name, "role": role.value}
     if added is not None:
-        tx.audit("member.added", project_row.id, about=user_name, project_id=project_row.id, **details)
+        tx.audit("member.added", project_id, about=user_name, project_id=project_id, **details)
     else:
-        tx.audit("member.changed", project_row.id, about=user_name, project_id=project_row.id, was=was, **details)
-    return _shown(user_name, changed)
+        tx.audit("member.changed", project_id, about=user_name, project_id=project_id, was=was, **details)
+    return changed
+
+
+def find_role(tx: Transaction, project_id: str, user_id: str) -> Role | None:
+    """Return the role of a user in a project, or None if the user is no member. Does not check rights."""
+    which = member.c.project_id == project_id, member.c.user_id == user_id
+    role = tx.execute(select(member.c.role).where(*which)).scalar()
+    return None if role is None else Role(role)
 
 
 def remove_member(tx: Transaction, project_name: str, user_name: str, *, expected_rev: ExpectedRev) -> None:
     """Remove a member. Raises `ConflictProblem` if the project would lose its last owner."""
-    project_row = _lock(tx, project_name)
+    project_row = lock_project(tx, project_name)
     which = (
         member.c.project_id == project_row.id,
         member.c.user_id.in_(select(user.c.id).where(user.c.name == user_name)),
@@ -91,9 +120,16 @@ def remove_member(tx: Transaction, project_name: str, user_name: str, *, expecte
         raise _no_member(user_name) if current is None else moved_on(current)
     _require_owner(tx, project_row)
     tx.audit("member.removed", project_row.id, about=user_name, project_id=project_row.id, user=user_name, was=was)
+    _withdraw_invitations(tx, project_row, user_name)
 
 
-def _lock(tx: Transaction, project_name: str) -> ProjectRow:
+def _withdraw_invitations(tx: Transaction, project_row: ProjectRow, user_name: str) -> None:
+    """Withdraw the invitations to a project that a user created and may no longer create."""
+    invited = invitation.c.inviter_id.in_(select(user.c.id).where(user.c.name == user_name))
+    withdraw_unauthorised(tx, invitation.c.project_id == project_row.id, invited)
+
+
+def lock_project(tx: Transaction, project_name: str) -> ProjectRow:
     """Return a project after locking its members, so that two owners cannot remove each other at the same time."""
     project_row = projects.require(tx, project_name)
     tx.execute(select(project.c.id).where(project.c.id == project_row.id).with_for_update(key_share=True))

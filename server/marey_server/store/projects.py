@@ -38,9 +38,10 @@ from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
+from marey_server.store.invitations.standing import withdraw_unauthorised
 from marey_server.store.rate_limits import RateLimit, key_of
 from marey_server.store.revs import ExpectedRev, change_row
-from marey_server.store.tables import member, project
+from marey_server.store.tables import invitation, member, project
 from marey_server.store.transaction import Transaction
 
 _HOUR_US = 3600 * 1_000_000
@@ -297,9 +298,10 @@ def change_project(tx: Transaction, name: str, request: ProjectChange, *, expect
 
 
 def delete_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev) -> None:
-    """Hide a project and everything in it; an owner can restore it."""
+    """Hide a project and everything in it, and withdraw its invitations; an owner can restore the project."""
     seen = require(tx, name)
     _change(tx, seen, {"deleted_us": tx.now_us}, expected_rev, project.c.deleted_us.is_(None))
+    withdraw_unauthorised(tx, invitation.c.project_id == seen.id)
     tx.audit("project.deleted", seen.id, about=name, project_id=seen.id, name=name)
 
 

@@ -20,6 +20,7 @@ from marey_server.store.tables import (
     UNFINISHED,
     document,
     holding,
+    invitation,
     item,
     job,
     member,
@@ -47,6 +48,7 @@ _RULES = {
     "user_tokens": _Rule("valid tokens", "Revoke one that you do not need; see `marey token ls`."),
     "user_projects": _Rule("projects that you own", "Delete one, or let another owner take over."),
     "user_jobs": _Rule("unfinished jobs", "Wait until some have ended, or cancel some; see `marey job ls`."),
+    "user_invitations": _Rule("open invitations", "Withdraw one that is not needed; see `marey member invitations`."),
     "items": _Rule("items", _DELETE),
     "stored_bytes": _Rule("bytes of items", _DELETE),
 }
@@ -91,6 +93,9 @@ def _used(tx: Transaction, quota: str, user_id: str) -> Select[Any]:
         return select(func.count()).select_from(token).where(*counted)
     if quota == "user_jobs":
         return select(func.count()).select_from(job).where(job.c.author_id == user_id, UNFINISHED)
+    if quota == "user_invitations":
+        unused = invitation.c.inviter_id == user_id, invitation.c.used < invitation.c.uses
+        return select(func.count()).select_from(invitation).where(*unused, invitation.c.expires_us > tx.now_us)
     owned = select(func.count()).select_from(member.join(project, project.c.id == member.c.project_id))
     return owned.where(member.c.user_id == user_id, member.c.role == Role.OWNER.value, project.c.deleted_us.is_(None))
 

@@ -42,6 +42,8 @@ class Quotas:
     project_items: int = 1_000_000
     project_stored_bytes: int = 64 * 2**30
     project_webhooks: int = 20
+    project_invitations: int = 100
+    user_invitations: int = 1000
 
 
 class Transaction:

@@ -24,8 +24,9 @@ from marey_server.store.credentials import tokens
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
+from marey_server.store.invitations.standing import withdraw_unauthorised
 from marey_server.store.revs import ExpectedRev, change_row
-from marey_server.store.tables import user
+from marey_server.store.tables import invitation, user
 from marey_server.store.transaction import Transaction
 
 FIRST_ADMINISTRATOR = "admin"
@@ -41,11 +42,27 @@ def create_user(tx: Transaction, request: UserCreate, *, password_hash: str | No
     return _insert(tx, request.name, request.display_name, request.administrator, password_hash)
 
 
+def sign_up(tx: Transaction, name: str, display_name: str | None, password_hash: str) -> Principal:
+    """Create a user without a check of rights, as this user, and return the principal of the user.
+
+    Raises `ConflictProblem` if the name is taken.
+    """
+    tx.principal = Principal("user", new_id("user"), name, scopes=_reach(administrator=False))
+    _insert(tx, name, display_name, False, password_hash, user_id=tx.principal.user_id)
+    return tx.principal
+
+
 def _insert(
-    tx: Transaction, name: str, display_name: str | None, administrator: bool, password_hash: str | None
+    tx: Transaction,
+    name: str,
+    display_name: str | None,
+    administrator: bool,
+    password_hash: str | None,
+    *,
+    user_id: str | None = None,
 ) -> User:
     row = {
-        "id": new_id("user"), "name": name, "display_name": display_name, "password_hash": password_hash,
+        "id": user_id or new_id("user"), "name": name, "display_name": display_name, "password_hash": password_hash,
         "administrator": administrator, "disabled": False, "created_us": tx.now_us, "rev": 1,
     }  # fmt: skip
     with taken(ConflictProblem(f"The name {name!r} is taken by another user.", code="name-taken")):
@@ -121,6 +138,8 @@ def change_user(
             code="wrong-password",
         ) from None
     _require_some_administrator(tx)
+    if request.disabled or request.administrator is False:
+        withdraw_unauthorised(tx, invitation.c.inviter_id == row.id)
     default = EndTokens.SESSIONS if password_hash is not None else EndTokens.NONE
     ended = request.end_tokens or default
     tokens.end_tokens(tx, row.id, ended)
@@ -203,8 +222,12 @@ def wrong_password() -> UnauthenticatedProblem:
 
 
 def _principal(row: Row[Any]) -> Principal:
-    reach = tuple(scope.value for scope in Scope if scope is not Scope.ADMIN or row.administrator)
-    return Principal("user", row.id, row.name, row.administrator, reach)
+    return Principal("user", row.id, row.name, row.administrator, _reach(administrator=row.administrator))
+
+
+def _reach(*, administrator: bool) -> tuple[str, ...]:
+    """Return the scopes of a user who has signed in."""
+    return tuple(scope.value for scope in Scope if scope is not Scope.ADMIN or administrator)
 
 
 def ensure_first_administrator(tx: Transaction) -> User | None:

@@ -1,10 +1,11 @@
-"""Limits on wrong passwords, shared by all servers; nobody can use them to lock out the owner of an account.
+"""Limits on wrong passwords and invitation codes, shared by all servers; they never lock out the owner of an account.
 
 Every try with a wrong password counts towards two limits: that of this account from this address, and that of this
 address for all accounts. If the address is unknown, which means that nobody has signed in to the account from it, the
 try also counts towards a third limit: that of the account from all unknown addresses together. The third limit does not
 apply to known addresses. So guesses from elsewhere never lock out an owner who signs in from a known address
-(docs/decisions/0020-sign-in-limits.md).
+(docs/decisions/0020-sign-in-limits.md). For the code of an invitation, the prefix of the code takes the place of the
+account.
 """
 
 from __future__ import annotations
@@ -31,18 +32,19 @@ KNOWN_FOR_US = 90 * DAY_US
 """Time for which an address is known after a sign-in."""
 LimitScope = Literal["account-at-address", "address", "account"]
 _IN_WORDS: dict[LimitScope, str] = {
-    "account-at-address": "user name from your address",
+    "account-at-address": "user name or code from your address",
     "address": "address of yours",
-    "account": "user name from addresses where it never signed in",
+    "account": "user name or code from addresses where it was never right",
 }
 _MINUTE_US = 60_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class SignInTry:
-    """A try to sign in: the name of the account, which may not exist, and the client's address or network."""
+    """A try to sign in or to use a code: the account, which may not exist, and the client's address or network."""
 
     name: str
+    """Name of the account, or a text with a space, which no account has, that stands for the code."""
     address: str
     per_minute: int
     """Number of tries per minute for an account from one address."""
@@ -66,11 +68,16 @@ def count(tx: Transaction, attempt: SignInTry) -> None:
 
 def forgive(tx: Transaction, attempt: SignInTry) -> None:
     """Remove a try with the right password from the counts, and remember its address as known."""
-    for limit, _scope in _limits(attempt, known=is_known(tx, attempt)):
-        rate_limits.take_back(tx, limit)
+    take_back(tx, attempt)
     row = {"key": _known_key(attempt), "until_us": tx.now_us + KNOWN_FOR_US}
     remembered = tx.insert_into(sign_in_limit, row)
     tx.execute(remembered.on_conflict_do_update(index_elements=["key"], set_={"until_us": row["until_us"]}))
+
+
+def take_back(tx: Transaction, attempt: SignInTry) -> None:
+    """Remove a try from the counts, because it was right."""
+    for limit, _scope in _limits(attempt, known=is_known(tx, attempt)):
+        rate_limits.take_back(tx, limit)
 
 
 def _limits(attempt: SignInTry, *, known: bool) -> Iterator[tuple[RateLimit, LimitScope]]:
@@ -89,7 +96,7 @@ def _limits(attempt: SignInTry, *, known: bool) -> Iterator[tuple[RateLimit, Lim
 def too_many_sign_ins(limit: LimitScope, wait_s: int) -> TooManyRequestsProblem:
     """Return the error for a try that exceeds a limit, whether or not the account exists."""
     return TooManyRequestsProblem(
-        f"Too many wrong passwords for this {_IN_WORDS[limit]}; wait {wait_s} s.",
+        f"Too many wrong passwords or invitation codes for this {_IN_WORDS[limit]}; wait {wait_s} s.",
         code="too-many-sign-ins",
         context={"limit": limit, "wait_s": wait_s},
         headers={"Retry-After": str(wait_s)},

@@ -1,6 +1,15 @@
 """Tables of the database, for SQLite and Postgres. Times are integer microseconds since the epoch, UTC, named `_us`."""
 
-from marey_server.store.tables.access import holding, member, project, sign_in_limit, token, user
+from marey_server.store.tables.access import (
+    holding,
+    invitation,
+    invitation_use,
+    member,
+    project,
+    sign_in_limit,
+    token,
+    user,
+)
 from marey_server.store.tables.blobs import attempt_blob, blob, blob_chunk, blob_holder, upload, upload_chunk
 from marey_server.store.tables.columns import metadata
 from marey_server.store.tables.datasets import (
@@ -67,6 +76,8 @@ __all__ = [
     "fast_forward",
     "holding",
     "idempotency_key",
+    "invitation",
+    "invitation_use",
     "item",
     "item_tag",
     "job",

@@ -59,6 +59,30 @@ project = Table(
     unique_alive("project", "name"),
 )
 
+invitation = Table(
+    "invitation",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("inviter_id", ID, ForeignKey("user.id"), nullable=False, index=True),
+    Column("project_id", ID, ForeignKey("project.id"), index=True),
+    Column("role", String(16)),  # in the project
+    Column("creates_account", Boolean, nullable=False),
+    Column("prefix", String(16), nullable=False, unique=True),
+    Column("secret_hash", String(64), nullable=False),
+    Column("note", String(255), nullable=False),
+    Column("uses", Integer, nullable=False),
+    Column("used", Integer, nullable=False),
+    Column("created_us", Micros, nullable=False),
+    Column("expires_us", Micros, nullable=False, index=True),
+)
+
+invitation_use = Table(  # who has used it, so that nobody uses it twice, and a repeated request gets the same answer
+    "invitation_use",
+    metadata,
+    Column("invitation_id", ID, ForeignKey("invitation.id"), primary_key=True),
+    Column("user_id", ID, ForeignKey("user.id"), primary_key=True),
+)
+
 holding = Table(  # what a project or a user holds, and limits other than those of the settings
     "holding",
     metadata,

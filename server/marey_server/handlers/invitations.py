@@ -1,0 +1,176 @@
+"""Resources of invitations: of a project, of the server, and their acceptance.
+
+A code is a secret, so it is only in bodies of requests and in the answer to the request that created it.
+"""
+
+from __future__ import annotations
+
+from pydantic import SecretStr
+
+from marey_schemas.invitations import (
+    AcceptedInvitation,
+    AccountInvitationCreate,
+    Invitation,
+    InvitationAcceptance,
+    InvitationCreate,
+    NewInvitation,
+    SignedUp,
+    SignUp,
+)
+from marey_server.handlers.access import MAX_LOGIN_BYTES, PasswordResource
+from marey_server.http.declarations import Access, RequestBody, reads, writes
+from marey_server.http.queries import PageQuery
+from marey_server.http.reply import Rendered, Reply
+from marey_server.http.resource import Resource
+from marey_server.process.password_lanes import limited_address
+from marey_server.store.credentials import sign_ins
+from marey_server.store.credentials.sign_ins import SignInTry
+from marey_server.store.invitations import accepting, issuing
+
+_PRIVATE = {"Cache-Control": "no-store"}
+
+
+class ProjectInvitations(Resource):
+    """Invitations to a project."""
+
+    path = "/projects/{project}/invitations"
+    tag = "Invitations"
+
+    @reads(access=Access.OWNER, query=PageQuery, answer=Invitation, paged=True, public=False)
+    async def get(self, project: str, query: PageQuery) -> Rendered:
+        """List the open invitations to a project, without their codes."""
+        return await self.answer(issuing.list_invitations, project, cursor=query.cursor, limit=query.limit)
+
+    @writes(access=Access.OWNER, body=InvitationCreate, answer=NewInvitation, status=201)
+    async def post(self, project: str, body: InvitationCreate) -> Rendered:
+        """Invite users of the server to a project; the code is shown only once."""
+        return await self.answer_with(
+            lambda made: Reply(made, location=f"/projects/{project}/invitations/{made.id}", headers=_PRIVATE),
+            issuing.create_invitation,
+            project,
+            body,
+        )
+
+
+class ProjectInvitation(Resource):
+    """An invitation to a project."""
+
+    path = "/projects/{project}/invitations/{invitation}"
+    tag = "Invitations"
+
+    @writes(access=Access.OWNER)
+    async def delete(self, project: str, invitation: str) -> Rendered:
+        """Withdraw an open invitation, named by its id or its prefix; its code is not valid any more."""
+        return await self.answer(issuing.withdraw_invitation, project, invitation)
+
+
+class AccountInvitations(Resource):
+    """Invitations to create an account."""
+
+    path = "/invitations"
+    tag = "Invitations"
+
+    @reads(access=Access.ADMINISTRATOR, scope="admin", query=PageQuery, answer=Invitation, paged=True)
+    async def get(self, query: PageQuery) -> Rendered:
+        """List the open invitations that can create accounts, without their codes."""
+        return await self.answer(issuing.list_account_invitations, cursor=query.cursor, limit=query.limit)
+
+    @writes(
+        access=Access.ADMINISTRATOR, scope="admin", body=AccountInvitationCreate, answer=NewInvitation, status=201
+    )
+    async def post(self, body: AccountInvitationCreate) -> Rendered:
+        """Invite people to create an account and to join a project; the code is shown only once."""
+        return await self.answer_with(
+            lambda made: Reply(made, location=f"/invitations/{made.id}", headers=_PRIVATE),
+            issuing.create_account_invitation,
+            body,
+        )
+
+
+class AccountInvitation(Resource):
+    """An invitation to create an account."""
+
+    path = "/invitations/{invitation}"
+    tag = "Invitations"
+
+    @writes(access=Access.ADMINISTRATOR, scope="admin")
+    async def delete(self, invitation: str) -> Rendered:
+        """Withdraw an open invitation, named by its id or its prefix; its code is not valid any more."""
+        return await self.answer(issuing.withdraw_account_invitation, invitation)
+
+
+class CodeResource(PasswordResource):
+    """Base class of resources that check codes of invitations."""
+
+    async def count_code(self, code: SecretStr) -> SignInTry:
+        """Count a try to use a code, whether or not it is valid, and return the try.
+
+        Raises `TooManyRequestsProblem`.
+        """
+        address, per_minute = limited_address(self.client_address), self.services.settings.login_tries_per_minute
+        attempt = accepting.try_of(code.get_secret_value(), address, per_minute)
+        self.services.refused_tries.check(attempt)
+        await self.count(sign_ins.count, attempt)
+        return attempt
+
+
+class InvitationAcceptances(CodeResource):
+    """Acceptance of invitations by users."""
+
+    path = "/invitations/accept"
+    tag = "Invitations"
+
+    @writes(
+        access=Access.USER,
+        body=RequestBody(InvitationAcceptance, max_bytes=MAX_LOGIN_BYTES),
+        answer=AcceptedInvitation,
+        also=((429, None),),
+    )
+    async def post(self, body: InvitationAcceptance) -> Rendered:
+        """Accept an invitation to a project; you become a member.
+
+        If you have the same or a higher role already, nothing changes, and the invitation is not used.
+        """
+        attempt = await self.count_code(body.code)
+        return await self.answer(accepting.accept_invitation, body.code.get_secret_value(), attempt)
+
+
+class SignUps(CodeResource):
+    """Creation of accounts by invited people."""
+
+    path = "/sign-up"
+    tag = "Invitations"
+
+    @writes(
+        access=Access.ANYONE,
+        scope=None,
+        body=RequestBody(SignUp, max_bytes=MAX_LOGIN_BYTES),
+        answer=SignedUp,
+        status=201,
+        also=((429, None),),
+        reserved=True,
+    )
+    async def post(self, body: SignUp) -> Reply:
+        """Create your account with an invitation of an administrator, and join its project.
+
+        The answer contains a new token, shown only once. A repeated request with the same name and password gets the
+        same membership and another token.
+        """
+        attempt = await self.count_code(body.code)
+        password = body.password.get_secret_value()
+        if await self.look_up(accepting.has_signed_up, body.code.get_secret_value(), body.name):
+            login, verified_hash = await self.check_password(body.name, password)
+            made = await self.change(accepting.sign_up_again, body, verified_hash, login, attempt)
+        else:
+            made = await self.change(accepting.sign_up, body, await self.hash_password(password), attempt)
+        return Reply(made, headers=_PRIVATE)
+
+
+RESOURCES: tuple[type[Resource], ...] = (
+    ProjectInvitations,
+    ProjectInvitation,
+    AccountInvitations,
+    InvitationAcceptances,
+    AccountInvitation,
+    SignUps,
+)
