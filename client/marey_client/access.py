@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 
 from marey_client.errors import UnexpectedAnswer
+from marey_client.handles.invitations import AccountInvitations
 from marey_client.paging import pages
 from marey_client.transport import Transport, as_json, read_model
 from marey_schemas.access import (
@@ -41,6 +42,11 @@ class Users:
     """Users of a server, managed by administrators."""
 
     transport: Transport
+
+    @property
+    def invitations(self) -> AccountInvitations:
+        """The invitations of people who have no account."""
+        return AccountInvitations(self.transport)
 
     def list(self) -> Iterator[User]:
         """List the users."""

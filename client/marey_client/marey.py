@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import Self
 
 import httpx
+from pydantic import SecretStr
 
 from marey_client.access import Tokens, Users
 from marey_client.audit import read_audit
@@ -22,6 +23,7 @@ from marey_client.transport import Transport
 from marey_schemas.access import Login, Me, NewToken, Project, ProjectCreate
 from marey_schemas.audit import AuditEntry
 from marey_schemas.event_kinds import AuditKind
+from marey_schemas.invitations import AcceptedInvitation, InvitationAcceptance, SignedUp, SignUp
 
 
 class Marey:
@@ -70,6 +72,21 @@ class Marey:
     def sign_in(self, login: Login) -> NewToken:
         """Return a token for a name and a password."""
         return self.transport.post(NewToken, "/login", login, repeatable=False)
+
+    def sign_up(self, request: SignUp) -> SignedUp:
+        """Create an account with the invitation of an administrator; the answer contains a token, shown only once.
+
+        The request is sent again if its answer is lost, because a repeated request has no further effect.
+        """
+        return self.transport.post(SignedUp, "/sign-up", request, repeatable=True)
+
+    def accept_invitation(self, code: str) -> AcceptedInvitation:
+        """Become a member of a project by the code of an invitation, which may be sent again if its answer is lost.
+
+        Raises `NotFound` if the code is not valid.
+        """
+        request = InvitationAcceptance(code=SecretStr(code))
+        return self.transport.post(AcceptedInvitation, "/invitations/accept", request, repeatable=True)
 
     def me(self) -> Me:
         """Return the user and the scopes of the token."""

@@ -15,6 +15,7 @@ from marey_client.handles.crossings import Crossing, Limit, OnMeasured, VersionE
 from marey_client.handles.datasets import Datasets
 from marey_client.handles.edits import Commands
 from marey_client.handles.evaluations import EvaluationHandle
+from marey_client.handles.invitations import Invitations
 from marey_client.handles.models import ModelHandle
 from marey_client.handles.pipelines import PipelineRun, submit_pipeline
 from marey_client.handles.webhooks import Webhooks
@@ -113,6 +114,11 @@ class ProjectHandle(ProjectItems):
     def members(self) -> Members:
         """The members of the project and their roles."""
         return Members(self.transport, self.name)
+
+    @cached_property
+    def invitations(self) -> Invitations:
+        """The invitations to the project."""
+        return Invitations(self.transport, f"{self.url}/invitations")
 
     @cached_property
     def webhooks(self) -> Webhooks:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +12,10 @@ from marey_client.cli.projects import ByteLimit, DefaultLimits, ItemLimit, print
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, UserName, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
+from marey_client.cli.terminal.secrets import ask_secret
+
+if TYPE_CHECKING:
+    from marey_client.marey import Marey
 
 user = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage users (for administrators).")
 
@@ -31,6 +35,14 @@ def login(
     with_token: Annotated[
         bool, typer.Option("--with-token", help="Read a token from standard input instead of asking for a password.")
     ] = False,
+    invitation: Annotated[
+        bool,
+        typer.Option(
+            "--invitation",
+            help="Create an account with the invitation of an administrator; the command asks for the code, a new user "
+            "name and a new password.",
+        ),
+    ] = False,
     days: Annotated[int, typer.Option(min=1, max=90, help="Days for which the login is valid.")] = 7,
 ) -> None:
     """Log in to a server, and store its address and a token for it in a file that only you can read."""
@@ -38,13 +50,17 @@ def login(
     from marey_client.marey import Marey
     from marey_schemas.access import Login
 
+    if with_token and invitation:
+        raise WrongUsage("give only one of --with-token and --invitation")
     with connect(context, anonymous=True) as marey:
         url = marey.transport.url
         if with_token:
             secret = typer.get_text_stream("stdin").read().strip()
+        elif invitation:
+            secret = _sign_up(marey, name, days)
         else:
             who = name or _ask_name()
-            password = _ask_secret(f"Password of {who} at {url}")
+            password = ask_secret(f"Password of {who} at {url}")
             secret = marey.sign_in(Login(name=who, password=password, expires_in_s=days * SECONDS_PER_DAY)).secret
     with Marey(url, secret) as marey:
         me = marey.me()
@@ -52,6 +68,19 @@ def login(
     store_login(path, url, secret)
     owner = f"as {me.user.name}" if me.user else "with a token of no user"
     print_message(f"logged in to {url} {owner}; the token is in {path}")
+
+
+def _sign_up(marey: Marey, name: str | None, days: int) -> str:
+    """Create an account with an invitation, report its project, and return a token."""
+    from marey_schemas.invitations import SignUp
+
+    url = marey.transport.url
+    code = ask_secret(f"Invitation code for {url}")
+    who = name or _ask_name()
+    password = ask_secret(f"New password for {who} at {url}", twice=True)
+    made = marey.sign_up(SignUp(code=code, name=who, password=password, expires_in_s=days * SECONDS_PER_DAY))
+    print_message(f"user {who} is created" + (f", as {made.role} of {made.project}" if made.project else ""))
+    return made.secret
 
 
 def logout(context: typer.Context) -> None:
@@ -88,7 +117,7 @@ def create_user(
 
     password = None
     if not without_password:
-        password = _ask_secret(f"Password for {name}", twice=True)
+        password = ask_secret(f"Password for {name}", twice=True)
     wanted = UserCreate(name=name, display_name=display_name, password=password, administrator=administrator)
     with connect(context) as marey:
         made = marey.users.create(wanted)
@@ -149,11 +178,11 @@ def change_password(
             raise WrongUsage(
                 "the token in use does not belong to a user; give the name of the user whose password you want to set"
             )
-        change: dict[str, Any] = {"password": _ask_secret("New password", twice=True)}
+        change: dict[str, Any] = {"password": ask_secret("New password", twice=True)}
         if end_tokens:
             change["end_tokens"] = EndTokens.ALL
         if me is not None and who == me.name:
-            change["current_password"] = _ask_secret("Current password")
+            change["current_password"] = ask_secret("Current password")
         marey.users.change(who, UserChange.model_validate(change))
     print_message(f"the password of {who} is changed")
 
@@ -223,18 +252,6 @@ def _ask_name() -> str:
             "--name, or use --with-token"
         )
     return str(typer.prompt("User name", err=True))
-
-
-def _ask_secret(what: str, *, twice: bool = False) -> str:
-    """Return a password typed at the terminal without echo; without a terminal, the next line of standard input."""
-    if sys.stdin.isatty():
-        return str(typer.prompt(what, hide_input=True, confirmation_prompt=twice, err=True))
-    if secret := sys.stdin.readline().rstrip("\r\n"):
-        return secret
-    raise WrongUsage(
-        f"the command needs {what}, but standard input is not a terminal and contains no line of text; run the "
-        "command in a terminal"
-    )
 
 
 def _yes(value: bool) -> str:

@@ -1,0 +1,160 @@
+"""Commands `member` and `user` for invitations: creating, listing, withdrawing and accepting them."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from marey_client.cli.accounts import user
+from marey_client.cli.projects import member
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.invocation import AsJson, ProjectName, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
+from marey_client.cli.terminal.secrets import ask_secret
+from marey_schemas.invitations import CODE_PREFIX, MAX_DAYS, MAX_USES
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from marey_schemas.access import Role
+    from marey_schemas.invitations import Invitation, NewInvitation
+
+Days = Annotated[int, typer.Option(min=1, max=MAX_DAYS, help="Days for which the invitation is valid.")]
+Uses = Annotated[int, typer.Option(min=1, max=MAX_USES, help="Number of people who can use the invitation.")]
+Note = Annotated[str, typer.Option(help="For whom the invitation is; shown in lists.")]
+Named = Annotated[str, typer.Argument(metavar="PREFIX|ID", help="Prefix or id of the invitation, as in the list.")]
+RoleName = Annotated[
+    str | None, typer.Option("--role", help="Role in the project: reader, contributor, maintainer or owner.")
+]
+
+
+def add_to(_app: typer.Typer) -> None:
+    """Register the commands of this module in the groups `member` and `user`."""
+    member.command("invite")(invite_member)
+    member.command("invitations")(list_invitations)
+    member.command("withdraw")(withdraw)
+    member.command("accept")(accept)
+    user.command("invite")(invite_person)
+    user.command("invitations")(list_account_invitations)
+    user.command("withdraw")(withdraw_account_invitation)
+
+
+def invite_member(
+    context: typer.Context,
+    project_name: ProjectName,
+    role: Annotated[str, typer.Option(help="Role of the new members: reader, contributor, maintainer or owner.")],
+    days: Days = 7,
+    uses: Uses = 1,
+    note: Note = "",
+    as_json: AsJson = False,
+) -> None:
+    """Invite users to a project, and print the code, which is never shown again.
+
+    The invited person runs `marey member accept`.
+    """
+    with connect(context) as marey:
+        invitations = marey.project(project_name).invitations
+        made = invitations.create(_role(role), lifetime=timedelta(days=days), uses=uses, note=note)
+    _print_new(made, "marey member accept", as_json=as_json)
+
+
+def list_invitations(context: typer.Context, project_name: ProjectName, as_json: AsJson = False) -> None:
+    """List the open invitations to a project, without their codes."""
+    with connect(context) as marey:
+        found = list(marey.project(project_name).invitations.list())
+    _print_list(found, as_json=as_json)
+
+
+def withdraw(context: typer.Context, project_name: ProjectName, invitation: Named) -> None:
+    """Withdraw an open invitation to a project; its code is not valid any more."""
+    named = _named(invitation)
+    with connect(context) as marey:
+        marey.project(project_name).invitations.withdraw(named)
+    print_message(f"the invitation {named} is withdrawn")
+
+
+def accept(context: typer.Context, as_json: AsJson = False) -> None:
+    """Become a member of a project by an invitation; the command asks for the code, or reads it from standard input."""
+    with connect(context) as marey:
+        found = marey.accept_invitation(ask_secret("Invitation code"))
+    if as_json:
+        return print_json(found)
+    if found.joined:
+        return print_message(f"you are {found.role} of {found.project}")
+    return print_message(f"you are {found.role} of {found.project} already; the invitation was not used")
+
+
+def invite_person(
+    context: typer.Context,
+    project_name: Annotated[
+        str | None, typer.Option("--project", help="Project of which the new user becomes a member.")
+    ] = None,
+    role: RoleName = None,
+    days: Days = 7,
+    uses: Uses = 1,
+    note: Note = "",
+    as_json: AsJson = False,
+) -> None:
+    """Invite people who have no account, and print the code, which is never shown again.
+
+    The invited person runs `marey login --invitation` and chooses a user name and a password.
+    """
+    if (project_name is None) != (role is None):
+        raise WrongUsage("--project and --role belong together; give both, or neither")
+    wanted = None if role is None else _role(role)
+    with connect(context) as marey:
+        invitations = marey.users.invitations
+        made = invitations.create(project_name, wanted, lifetime=timedelta(days=days), uses=uses, note=note)
+    _print_new(made, "marey login --invitation", as_json=as_json)
+
+
+def list_account_invitations(context: typer.Context, as_json: AsJson = False) -> None:
+    """List the open invitations of people who have no account, without their codes."""
+    with connect(context) as marey:
+        found = list(marey.users.invitations.list())
+    _print_list(found, as_json=as_json)
+
+
+def withdraw_account_invitation(context: typer.Context, invitation: Named) -> None:
+    """Withdraw an open invitation of people who have no account; its code is not valid any more."""
+    named = _named(invitation)
+    with connect(context) as marey:
+        marey.users.invitations.withdraw(named)
+    print_message(f"the invitation {named} is withdrawn")
+
+
+def _role(text: str) -> Role:
+    """Return the role that an option names. Raises `WrongUsage` for another text."""
+    from marey_schemas.access import Role
+
+    if text not in list(Role):
+        raise WrongUsage(f"{text!r} is not a role; the roles are {', '.join(Role)}")
+    return Role(text)
+
+
+def _named(text: str) -> str:
+    """Return the prefix or id of an invitation. Raises `WrongUsage` for a code, which would become part of a URL."""
+    if text.startswith(CODE_PREFIX):
+        raise WrongUsage("this is the code of an invitation, not its name; give the prefix or the id from the list")
+    return text
+
+
+def _print_new(made: NewInvitation, command: str, *, as_json: bool) -> None:
+    if as_json:
+        return print_json(made)
+    print_pairs([("invitation", made.id), ("prefix", made.prefix), ("code", made.code)])
+    return print_message(
+        f"send the code to the invited person, who enters it in {command}; the server never shows it again"
+    )
+
+
+def _print_list(found: Sequence[Invitation], *, as_json: bool) -> None:
+    if as_json:
+        return print_json(found)
+    rows = [
+        (one.id, one.prefix, one.project, one.role, one.inviter, one.expires_at, one.uses_left, one.note)
+        for one in found
+    ]
+    return print_table(("id", "prefix", "project", "role", "invited by", "valid until", "uses left", "note"), rows)

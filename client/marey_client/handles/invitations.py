@@ -1,0 +1,74 @@
+"""Invitations to a project, and of people who have no account."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import timedelta
+
+from marey_client.paging import pages
+from marey_client.transport import Transport
+from marey_schemas.access import Role
+from marey_schemas.invitations import AccountInvitationCreate, Invitation, InvitationCreate, NewInvitation
+
+WEEK = timedelta(days=7)
+
+
+@dataclass(frozen=True)
+class Invitations:
+    """Invitations to a project; only its owners may use them."""
+
+    transport: Transport
+    url: str
+
+    def create(self, role: Role, *, lifetime: timedelta = WEEK, uses: int = 1, note: str = "") -> NewInvitation:
+        """Invite users of the server to the project.
+
+        The code is in the answer and never shown again; send it to the invited people. Raises `Conflict` if there are
+        too many open invitations.
+        """
+        lifetime_s = int(lifetime.total_seconds())
+        request = InvitationCreate(role=role, expires_in_s=lifetime_s, uses=uses, note=note)
+        return self.transport.post(NewInvitation, self.url, request, repeatable=False)
+
+    def list(self) -> Iterator[Invitation]:
+        """List the open invitations, oldest first, without their codes."""
+        return pages(self.transport, Invitation, self.url)
+
+    def withdraw(self, named: str) -> None:
+        """Withdraw an open invitation, named by its id or its prefix."""
+        self.transport.send("DELETE", f"{self.url}/{named}", repeatable=False)
+
+
+@dataclass(frozen=True)
+class AccountInvitations:
+    """Invitations of people who have no account; only administrators may use them."""
+
+    transport: Transport
+
+    def create(
+        self,
+        project: str | None = None,
+        role: Role | None = None,
+        *,
+        lifetime: timedelta = WEEK,
+        uses: int = 1,
+        note: str = "",
+    ) -> NewInvitation:
+        """Invite people to create an account, and to become members of `project` with `role` if these are given.
+
+        The code is in the answer and never shown again; send it to the invited people. Raises `Conflict` if there are
+        too many open invitations.
+        """
+        request = AccountInvitationCreate(
+            project=project, role=role, expires_in_s=int(lifetime.total_seconds()), uses=uses, note=note
+        )
+        return self.transport.post(NewInvitation, "/invitations", request, repeatable=False)
+
+    def list(self) -> Iterator[Invitation]:
+        """List the open invitations, oldest first, without their codes."""
+        return pages(self.transport, Invitation, "/invitations")
+
+    def withdraw(self, named: str) -> None:
+        """Withdraw an open invitation, named by its id or its prefix."""
+        self.transport.send("DELETE", f"/invitations/{named}", repeatable=False)
