@@ -23,6 +23,7 @@ from marey_versions.tree.chunks import ChunksInMemory
 
 CANARY = "canary-5e0f2b"
 ROUTES = tuple(RouteTable(None, RESOURCES))
+UNKNOWN_CODE = "mareyinvite_aaaaaaaaaaaa_" + "b" * 64
 INVENTED = "marey_aaaaaaaaaaaa_" + "b" * 64
 
 HIERARCHY = {"schema": "marey/skeleton@1", "joints": [{"name": CANARY, "parent": -1, "offset": [0, 1, 0]}]}
@@ -49,6 +50,10 @@ BODIES = {
     "ProjectChange": {"title": "T"},
     "QuotaChange": {"items": 10**6},
     "MemberChange": {"role": "reader"},
+    "InvitationCreate": {"role": "reader", "note": CANARY},
+    "AccountInvitationCreate": {"project": "lab", "role": "reader", "note": CANARY},
+    "InvitationAcceptance": {"code": UNKNOWN_CODE},
+    "SignUp": {"code": UNKNOWN_CODE, "name": "newcomer", "password": "correct horse"},
     "CollectionCreate": {"path": CANARY},
     "CollectionChange": {"path": "elsewhere"},
     "ItemCreate": {"name": CANARY, "collection": CANARY, "parts": {"hierarchy": HIERARCHY}},
@@ -255,8 +260,9 @@ def _furnish(owner: Any) -> dict[str, str]:
     hook = owner.post(webhooks, json={"url": f"https://hooks.invalid/{CANARY}", "description": CANARY}).json()["id"]
     delivery = owner.post(f"{webhooks}/{hook}/test").json()["id"]
     assert owner.patch(f"{webhooks}/{hook}", json={"paused": True}).is_success
+    invitation = owner.post("/projects/lab/invitations", json=BODIES["InvitationCreate"]).json()["id"]
     return {
-        "webhook": hook, "delivery": delivery,
+        "invitation": invitation, "webhook": hook, "delivery": delivery,
         "collection": collection, "item": made.json()["id"], "annotation": annotation.json()["id"], "dataset": CANARY,
         "ref": "spare", "version": "spare", "proposal": "1",
     }  # fmt: skip
