@@ -15,6 +15,7 @@ from marey_server.access import passwords
 from marey_server.access.principal import SYSTEM
 from marey_server.store import users
 from marey_server.store.database.connections import Database
+from marey_server.store.transaction import Quotas
 
 PASSWORD = "correct horse battery"
 LAB = "/projects/lab/invitations"
@@ -146,7 +147,8 @@ def test_right_codes_are_not_limited(database: Database, tmp_path: Path) -> None
 
 
 def test_the_number_of_open_invitations_is_bounded(database: Database, tmp_path: Path) -> None:
-    with running(database, tmp_path, project_invitations=1) as server:
+    database.quotas = Quotas(project_invitations=1)
+    with running(database, tmp_path) as server:
         owner = server.client(server.make_project())
         made = invite(owner)
         refused = owner.post(LAB, json={"role": "reader"})
