@@ -20,7 +20,7 @@ from marey_schemas.invitations import (
     SignUp,
 )
 from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
-from marey_server.errors import ApiProblem, ConflictProblem, NotFoundProblem
+from marey_server.errors import ConflictProblem, NotFoundProblem
 from marey_server.store import members, projects, users
 from marey_server.store.database.connections import Database
 from marey_server.store.invitations import accepting, issuing
@@ -100,8 +100,7 @@ def test_a_crowd_gets_in_as_often_as_there_are_uses(lab: Lab, other: Database) -
         database = (lab.database, other)[number % 2]
         try:
             database.write(crowd[number], accepts(made.code))
-        except ApiProblem as refusal:
-            assert refusal.error_code == "invitation-invalid"
+        except NotFoundProblem:
             return False
         return True
 
@@ -138,9 +137,7 @@ def names(lab: Lab) -> set[str]:
 
 
 @pytest.mark.parametrize("loss", ["removal", "disabling", "deletion", "withdrawal"])
-def test_an_acceptance_during_the_loss_of_the_right_to_invite_is_refused(
-    lab: Lab, other: Database, loss: str
-) -> None:
+def test_an_acceptance_during_the_loss_of_the_right_to_invite_is_refused(lab: Lab, other: Database, loss: str) -> None:
     inviter, chief = str(lab.maintainer.user_name), lab.sign_up("chief", administrator=True)
     lab.write(members.put_member, "lab", inviter, MemberChange(role=Role.OWNER), required=OWN)
     made = invite(lab, who=lab.maintainer)

@@ -1,4 +1,4 @@
-"""Invitations over HTTP: codes that nobody sees twice, limits on guesses, and accounts that people create themselves."""
+"""Invitations over HTTP: codes that nobody sees twice, limits on guesses, and accounts that people create."""
 
 from __future__ import annotations
 

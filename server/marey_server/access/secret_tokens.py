@@ -1,7 +1,8 @@
 """Bearer tokens as text: functions that create them, split them, and hash their secrets.
 
 `marey_<prefix>_<secret>` belongs to a user; the prefix identifies its row. `mareyjob_<secret>` belongs to an attempt of
-a job. The code of an invitation, `mareyinvite_<prefix>_<secret>`, is built in the same way, but authenticates nobody. The database stores the SHA-256 of the secret. A secret has 256 random bits, so a slow hash is not needed.
+a job. `mareyinvite_<prefix>_<secret>` is the code of an invitation. The database stores the SHA-256 of the secret. A
+secret has 256 random bits, so a slow hash is not needed.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class ProjectInvitation(Resource):
         return await self.answer(issuing.withdraw_invitation, project, invitation)
 
 
-class AccountInvitations(Resource):
+class ServerInvitations(Resource):
     """Invitations to create an account."""
 
     path = "/invitations"
@@ -75,9 +75,7 @@ class AccountInvitations(Resource):
         """List the open invitations that can create accounts, without their codes."""
         return await self.answer(issuing.list_account_invitations, cursor=query.cursor, limit=query.limit)
 
-    @writes(
-        access=Access.ADMINISTRATOR, scope="admin", body=AccountInvitationCreate, answer=NewInvitation, status=201
-    )
+    @writes(access=Access.ADMINISTRATOR, scope="admin", body=AccountInvitationCreate, answer=NewInvitation, status=201)
     async def post(self, body: AccountInvitationCreate) -> Rendered:
         """Invite people to create an account and to join a project; the code is shown only once."""
         return await self.answer_with(
@@ -87,7 +85,7 @@ class AccountInvitations(Resource):
         )
 
 
-class AccountInvitation(Resource):
+class ServerInvitation(Resource):
     """An invitation to create an account."""
 
     path = "/invitations/{invitation}"
@@ -169,8 +167,8 @@ class SignUps(CodeResource):
 RESOURCES: tuple[type[Resource], ...] = (
     ProjectInvitations,
     ProjectInvitation,
-    AccountInvitations,
+    ServerInvitations,
     InvitationAcceptances,
-    AccountInvitation,
+    ServerInvitation,
     SignUps,
 )

@@ -24,7 +24,7 @@ from marey_server.store.coverage_streams import drop_old_streams
 from marey_server.store.credentials.tokens import forget_ended
 from marey_server.store.database.connections import Database
 from marey_server.store.idempotency import LIFETIME_US as KEY_LIFETIME_US
-from marey_server.store.invitations import standing
+from marey_server.store.invitations import validity
 from marey_server.store.jobs.fencing import RUNNING
 from marey_server.store.tables import (
     attempt_blob,
@@ -78,7 +78,7 @@ def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collecte
         coverage_streams=database.write(SYSTEM, drop_old_streams),
         tokens=database.write(SYSTEM, forget_ended),
         ended_holdings=database.write(SYSTEM, _drop_ended_holdings),
-        invitations=database.write(SYSTEM, standing.delete_expired),
+        invitations=database.write(SYSTEM, validity.delete_expired),
     )
 
 

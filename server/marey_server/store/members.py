@@ -11,7 +11,7 @@ from marey_schemas.items import Page
 from marey_server.errors import ConflictProblem, NotFoundProblem, PreconditionFailedProblem
 from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
-from marey_server.store.invitations.standing import withdraw_unauthorised
+from marey_server.store.invitations.validity import withdraw_unauthorised
 from marey_server.store.projects import ProjectRow
 from marey_server.store.revs import ExpectedRev, at_rev, change_row, moved_on
 from marey_server.store.tables import invitation, member, project, user

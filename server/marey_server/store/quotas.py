@@ -48,7 +48,10 @@ _RULES = {
     "user_tokens": _Rule("valid tokens", "Revoke one that you do not need; see `marey token ls`."),
     "user_projects": _Rule("projects that you own", "Delete one, or let another owner take over."),
     "user_jobs": _Rule("unfinished jobs", "Wait until some have ended, or cancel some; see `marey job ls`."),
-    "user_invitations": _Rule("open invitations", "Withdraw one that is not needed; see `marey member invitations`."),
+    "user_invitations": _Rule(
+        "open invitations",
+        "Withdraw one that is not needed; see `marey member invitations` and `marey user invitations`.",
+    ),
     "items": _Rule("items", _DELETE),
     "stored_bytes": _Rule("bytes of items", _DELETE),
 }

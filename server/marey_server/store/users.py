@@ -24,7 +24,7 @@ from marey_server.store.credentials import tokens
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
-from marey_server.store.invitations.standing import withdraw_unauthorised
+from marey_server.store.invitations.validity import withdraw_unauthorised
 from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import invitation, user
 from marey_server.store.transaction import Transaction

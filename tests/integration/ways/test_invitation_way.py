@@ -7,7 +7,7 @@ import io
 import json
 import re
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ def project(new_lab: Callable[[], ProjectHandle]) -> ProjectHandle:
 
 
 @pytest.fixture
-def guest(server: ServerProcess, marey: Marey, tmp_path: Path) -> Iterator[CommandLine]:
+def guest(server: ServerProcess, marey: Marey, tmp_path: Path) -> CommandLine:
     """The command line of the user `guest-<n>`, who is a member of no project."""
     name = f"guest-{len(list(marey.users.list()))}"
     marey.users.create(UserCreate.model_validate({"name": name, "password": PASSWORD}))
@@ -47,7 +47,7 @@ def guest(server: ServerProcess, marey: Marey, tmp_path: Path) -> Iterator[Comma
     folder.mkdir()
     command_line = CommandLine(server, folder)
     command_line("login", "--name", name, stdin=f"{PASSWORD}\n")
-    yield command_line
+    return command_line
 
 
 def code_in(output: str) -> tuple[str, str]:

@@ -19,7 +19,7 @@ from marey_server.errors import ForbiddenProblem, NotFoundProblem
 from marey_server.store import members, users
 from marey_server.store.credentials import sign_ins, tokens
 from marey_server.store.credentials.sign_ins import SignInTry
-from marey_server.store.invitations.standing import IN_FORCE
+from marey_server.store.invitations.validity import IN_FORCE
 from marey_server.store.tables import invitation, invitation_use, project, user
 from marey_server.store.transaction import Transaction
 

@@ -21,7 +21,7 @@ from marey_server.errors import NotFoundProblem, QuotaExceededProblem
 from marey_server.store import listing, members, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.ids import new_id
-from marey_server.store.invitations.standing import is_open, is_unspent, withdraw
+from marey_server.store.invitations.validity import is_open, is_unspent, withdraw
 from marey_server.store.projects import ProjectRow
 from marey_server.store.quotas import require_room
 from marey_server.store.tables import invitation, project, user
