@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import random
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -128,6 +129,9 @@ class World:
         return held or self.referring(caller, blob)
 
 
+Call = Callable[[Caller, str], None]
+
+
 class Program:
     """Random calls to a server and to the model; `differences` collects the calls with different results."""
 
@@ -187,14 +191,19 @@ class Program:
 
     def run(self, count: int) -> None:
         """Make calls until the server and the model differ, or all calls are made."""
-        kinds = (
+        kinds = self.kinds
+        while self.calls < count and not self.differences:
+            self.chance.choice(kinds)(self.chance.choice(CALLERS), self.chance.choice(PROJECTS))
+
+    @property
+    def kinds(self) -> tuple[Call, ...]:
+        """The kinds of calls; one that is named twice is made twice as often."""
+        return (
             self.read_project, self.list_projects, self.list_items, self.list_items, self.create_item, self.create_item,
             self.send_blob, self.read_blob, self.read_blob, self.ask_missing, self.put_member, self.remove_member,
             self.change_visibility, self.list_members, self.list_events, self.list_tokens, self.disable, self.list_jobs,
             self.read_job, self.read_quotas, self.begin_upload, self.read_upload, self.claim, self.list_audit,
         )  # fmt: skip
-        while self.calls < count and not self.differences:
-            self.chance.choice(kinds)(self.chance.choice(CALLERS), self.chance.choice(PROJECTS))
 
     # -- calls --------------------------------------------------------------------------------------------------------
 

@@ -65,18 +65,19 @@ def _create(
         _require_free_place(tx, project_row)
     issued = issue_invitation()
     project_id = None if project_row is None else project_row.id
+    invitation_id, role_name = new_id("invitation"), None if role is None else role.value
     row = {
-        "id": new_id("invitation"), "inviter_id": tx.principal.user_id, "project_id": project_id,
-        "role": None if role is None else role.value, "creates_account": creates_account, "prefix": issued.prefix,
+        "id": invitation_id, "inviter_id": tx.principal.user_id, "project_id": project_id,
+        "role": role_name, "creates_account": creates_account, "prefix": issued.prefix,
         "secret_hash": issued.secret_hash, "note": terms.note, "uses": terms.uses, "used": 0, "created_us": tx.now_us,
         "expires_us": tx.now_us + terms.expires_in_s * 1_000_000,
     }  # fmt: skip
     tx.execute(insert(invitation).values(**row))
     tx.audit(
-        "invitation.created", row["id"], about=issued.prefix, project_id=project_id, role=row["role"],
+        "invitation.created", invitation_id, about=issued.prefix, project_id=project_id, role=role_name,
         uses=terms.uses, creates_account=creates_account,
     )  # fmt: skip
-    made = tx.execute(_ROWS.where(invitation.c.id == row["id"])).one()
+    made = tx.execute(_ROWS.where(invitation.c.id == invitation_id)).one()
     return NewInvitation(**_shown(made).model_dump(), code=issued.text)
 
 
