@@ -15,6 +15,7 @@ from marey_schemas.access import Role
 from marey_server.access import roles, scopes
 from marey_server.store import blobs, projects
 from marey_server.store.database.connections import Database
+from marey_server.store.invitations import accepting
 
 pytestmark = pytest.mark.timeout(7200)
 
@@ -49,6 +50,10 @@ def _every_role_is_enough(_role: Any, _required: Any) -> bool:
     return True
 
 
+def _every_invitation_is_open(_tx: Any, _row: Any) -> bool:
+    return True
+
+
 def _everybody_is_an_administrator(_principal: Any) -> bool:
     return True
 
@@ -62,6 +67,7 @@ HOLES: dict[str, tuple[Any, str, Callable[..., Any]]] = {
     "a token reaches beyond its project": (scopes, "allows", _bounds_of_tokens_are_forgotten),
     "a digest is enough to have the bytes": (blobs, "_held", _everybody_holds_all_bytes),
     "everybody is an administrator": (roles, "is_administrator", _everybody_is_an_administrator),
+    "an invitation that is used up still works": (accepting, "_is_open", _every_invitation_is_open),
     "private projects have guests": (projects, "_as_seen", _every_project_has_guests),
 }
 

@@ -10,7 +10,7 @@ import httpx
 import pytest
 from tests.support.rest_server import ALL_SCOPES, Server, running
 
-from marey_schemas.access import Role
+from marey_schemas.access import Role, UserCreate
 from marey_server.access import passwords
 from marey_server.access.principal import SYSTEM
 from marey_server.store import users
@@ -132,7 +132,7 @@ def test_guesses_are_limited_by_the_address_and_do_not_hinder_sign_ins(database:
         assert int(answers[-1].headers["Retry-After"]) > 0
         assert guest.post("/invitations/accept", json={"code": made["code"]}).status_code == 429
         assert sign_up(server, made["code"]).status_code == 429
-        request = users.UserCreate(name=prefix)
+        request = UserCreate(name=prefix)
         database.write(SYSTEM, users.create_user, request, password_hash=stored)
         assert server.client().post("/login", json={"name": prefix, "password": PASSWORD}).status_code == 200
 
