@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from marey_client.archives import DatasetReader, check_consents
-from marey_client.contents import read_documents, request_contents
+from marey_client.archives.contents import read_documents, request_contents
+from marey_client.archives.writing import DatasetReader, check_consents
 from marey_client.errors import CannotExport
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
 from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent

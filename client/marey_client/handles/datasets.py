@@ -31,7 +31,7 @@ from marey_schemas.formats import DEFAULT_FORMAT
 from marey_schemas.kinds import Kind
 
 if TYPE_CHECKING:
-    from marey_client.archives import OnProgress
+    from marey_client.archives.writing import OnProgress
     from marey_client.bridges.files import ExportedVersion
     from marey_versions.archive.reading import Archive
 
@@ -74,7 +74,7 @@ class Datasets:
         Raises `marey_versions.archive.members.BadArchive`, which names the member that was changed or is missing, and
         `EarlierVersionsMissing` if the archive builds on a version that the dataset does not have.
         """
-        from marey_client.receiving import require_base
+        from marey_client.archives.receiving import require_base
         from marey_versions.archive.checking import check_archive
         from marey_versions.archive.reading import Archive
 
@@ -105,7 +105,7 @@ class Datasets:
         `version` names or `main`, moves as in `import_archive`. If `version` is a tag, the tag is created too, unless a
         branch or tag of this name exists.
         """
-        from marey_client.transfers import fetched_versions, find_missing
+        from marey_client.archives.transfers import fetched_versions, find_missing
 
         head, named = source.at(version), source.find_ref(version)
         target = self._opened_or_created(name)
@@ -351,7 +351,7 @@ class DatasetHandle:
         If the consent for a clip has ended, raises `Conflict`, unless `allow_expired_consent` gives the reason why the
         clip is exported nevertheless. The server records the reason; the caller must be a maintainer or owner.
         """
-        from marey_client.archives import check_consents, write_archive
+        from marey_client.archives.writing import check_consents, write_archive
 
         bases = () if since is None else (since,) if isinstance(since, str) else since
         check = partial(check_consents, self, allow_expired_consent)
@@ -425,7 +425,7 @@ class DatasetHandle:
 
         The branch stays where it is if its newest commit is not an ancestor of that version.
         """
-        from marey_client.receiving import send_versions
+        from marey_client.archives.receiving import send_versions
 
         ref = self.find_ref(into)
         empty = ref is not None and ref.commit is None

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from tests.support.command_line import CommandLine
 
-from marey_client import archives, contents, receiving
+from marey_client.archives import contents, receiving, writing
 from marey_client.errors import RequestFailed
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.datasets import DatasetHandle
@@ -195,7 +195,7 @@ def test_an_archive_is_continued_where_an_attempt_ended(
         return once(*request, **options)
 
     monkeypatch.setattr(contents, "request_contents", ask)
-    monkeypatch.setattr(archives, "MOST_CONTENTS", 2)
+    monkeypatch.setattr(writing, "MOST_CONTENTS", 2)
     with pytest.raises(ConnectionError):
         gaits.archive(again)
     assert not again.exists()
@@ -210,7 +210,7 @@ def test_versions_that_differ_in_many_entries_are_listed_whole(
 ) -> None:
     gaits = project.datasets.at("gaits")
     gaits.archive(run.folder / "one.tar")
-    monkeypatch.setattr(archives, "MOST_LISTED", 1)
+    monkeypatch.setattr(writing, "MOST_LISTED", 1)
     gaits.archive(run.folder / "other.tar")
     assert (run.folder / "one.tar").read_bytes() == (run.folder / "other.tar").read_bytes()
 

@@ -100,7 +100,7 @@ def extract(
 
     No server is needed. An existing file is replaced.
     """
-    from marey_client.extraction import extract_archive
+    from marey_client.archives.extraction import extract_archive
 
     with _opened(file) as opened:
         written = list(extract_archive(opened, output))

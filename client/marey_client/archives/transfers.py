@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from marey_client.archives import DatasetReader, OnProgress, short_name, write_archive
+from marey_client.archives.writing import DatasetReader, OnProgress, short_name, write_archive
 from marey_schemas.datasets.commits import Commit
 from marey_versions.archive.reading import Archive
 

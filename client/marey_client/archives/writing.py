@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
 
+from marey_client.archives.contents import first_documents, request_contents
 from marey_client.blobs import Blobs
-from marey_client.contents import first_documents, request_contents
 from marey_client.errors import ArchiveInUse, NothingToArchive, UnexpectedAnswer
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
 from marey_schemas.datasets.contents import (
