@@ -65,7 +65,7 @@ def overrides(project: ProjectHandle) -> list[tuple[str, int]]:
 
 
 def test_the_page_finds_refuses_and_allows(run: CommandLine, project: ProjectHandle, marey: Marey) -> None:
-    record, ended, soon, without, download, archive, submit, webhook = commands()
+    record, ended, soon, without, *_withdrawn, download, archive, submit, webhook = commands()
     run(*record)
     set_consent(project, "turn", 10)
     gaits = project.datasets.at("gaits")
@@ -102,6 +102,23 @@ def test_the_page_finds_refuses_and_allows(run: CommandLine, project: ProjectHan
     reasons = [download[-1], archive[-1], submit[-1].partition("=")[2]]
     assert overrides(project) == [(reason, 1) for reason in reasons]
     run(*webhook)
+
+
+def test_the_page_deletes_the_recordings_of_a_performer_for_good(run: CommandLine, project: ProjectHandle) -> None:
+    listed, lineage, remove, preview, purge = commands()[4:9]
+    run("record", "lab/raw/walk", "--set", "subject=02")
+    walk = clip(project, "walk")
+    assert [one["name"] for one in json.loads(run(*listed, "--json").stdout)["items"]] == ["walk"]
+    assert "raw/walk" in run(*lineage).stdout
+    run(*remove, "--yes")
+    assert "lab/raw/walk" in run(*preview).stdout
+    assert "1 item purged for good" in run(*purge, "--yes").stderr
+    assert [one.name for one in project.clips.list()] == ["turn"]
+    assert list(project.clips.list(deleted=True)) == []
+    page = project.transport.send("GET", f"{project.url}/events", params={"limit": 1000}).json()["items"]
+    of_walk = [one for one in page if one["subject"] == walk.id]
+    assert of_walk[-1]["kind"] == "item.purged"
+    assert all("walk" not in json.dumps(one["body"]) for one in of_walk)
 
 
 def test_an_archive_with_an_earlier_version_of_a_deleted_clip_is_refused(
