@@ -157,7 +157,9 @@ def version_to_export(
     clips = tuple(one for one in entries if one.kind is Kind.CLIP)
     if not clips:
         place = f"below {folder!r}" if folder else "in any folder"
-        raise CannotExport(f"the version {version} of {dataset.name} has no clips {place}; list it with entries")
+        raise CannotExport(
+            f"the version {version} of {dataset.name} has no clips {place}; marey dataset entries lists what it has"
+        )
     contents = dict.fromkeys(_located(one).content for one in clips)
     check_consents(dataset, allow_expired_consent, list(contents))
     return VersionToExport(
