@@ -40,14 +40,15 @@ def other(open_database: Callable[[], Database]) -> Database:
     return open_database()
 
 
-def invite(lab: Lab, *, uses: int = 1, who: Principal | None = None) -> NewInvitation:
-    request = InvitationCreate(role=Role.CONTRIBUTOR, uses=uses)
+def invite(lab: Lab, role: Role = Role.CONTRIBUTOR, *, uses: int = 1, who: Principal | None = None) -> NewInvitation:
+    request = InvitationCreate(role=role, uses=uses)
     made: NewInvitation = lab.write(issuing.create_invitation, "lab", request, who=who, required=OWN)
     return made
 
 
 def invite_person(lab: Lab, chief: Principal) -> NewInvitation:
-    request = AccountInvitationCreate(project="lab", role=Role.READER)
+    """Invite a person to create an account; without a project, nothing else than the invitation can be locked."""
+    request = AccountInvitationCreate()
     made: NewInvitation = lab.write(issuing.create_account_invitation, request, who=chief, required=OWN)
     return made
 
@@ -89,6 +90,17 @@ def test_the_same_person_twice_at_once_uses_an_invitation_once(lab: Lab, other: 
     assert one == two == AcceptedInvitation(project="lab", role=Role.CONTRIBUTOR, joined=True)
     page = lab.read(issuing.list_invitations, "lab", cursor=None, limit=5, required=OWN)
     assert [left.uses_left for left in page.items] == [1]
+
+
+def test_two_invitations_at_once_give_the_higher_role_and_the_lower_one_is_not_used(lab: Lab, other: Database) -> None:
+    high, low = invite(lab, Role.MAINTAINER), invite(lab, Role.READER)
+    one, two = interleave(
+        Step(lab.database, lab.stranger, accepts(high.code)), Step(other, lab.stranger, accepts(low.code))
+    )
+    assert (one.role, one.joined) == (Role.MAINTAINER, True)
+    assert (two.role, two.joined) == (Role.MAINTAINER, False)
+    found = {member.user: member.role for member in lab.read(members.list_members, "lab").items}
+    assert found[str(lab.stranger.user_name)] is Role.MAINTAINER
 
 
 def test_a_crowd_gets_in_as_often_as_there_are_uses(lab: Lab, other: Database) -> None:

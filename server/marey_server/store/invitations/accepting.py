@@ -1,7 +1,8 @@
 """Acceptance of invitations: by users, who become members of a project, and by people who create an account.
 
-Each acceptance locks the project, the inviter and the invitation, in this order, before it checks anything. So a change
-that ends the inviter's right, or the last use, is either complete before the acceptance or waits for it.
+Each acceptance locks the project and the invitation, in this order, before it checks anything. A change that ends the
+inviter's right withdraws the invitation, so it is either complete before the acceptance or waits for it; so is the last
+use, and another change of the members.
 """
 
 from __future__ import annotations
@@ -57,10 +58,9 @@ def _find(tx: Transaction, code: str) -> Row[Any]:
 
 
 def _lock(tx: Transaction, code: str) -> Row[Any]:
-    """Return the invitation with a code, after locking it and the rows on which its validity depends."""
+    """Return the invitation with a code, after locking its project and itself."""
     found = _find(tx, code)
     tx.execute(select(project.c.id).where(project.c.id == found.project_id).with_for_update(key_share=True))
-    tx.execute(select(user.c.id).where(user.c.id == found.inviter_id).with_for_update(read=True))
     tx.execute(select(invitation.c.id).where(invitation.c.id == found.id).with_for_update())
     return _find(tx, code)
 
