@@ -13,7 +13,6 @@ from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, ProjectName, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 from marey_client.cli.terminal.secrets import ask_secret
-from marey_schemas.invitations import CODE_PREFIX, MAX_DAYS, MAX_USES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,8 +20,8 @@ if TYPE_CHECKING:
     from marey_schemas.access import Role
     from marey_schemas.invitations import Invitation, NewInvitation
 
-Days = Annotated[int, typer.Option(min=1, max=MAX_DAYS, help="Days for which the invitation is valid.")]
-Uses = Annotated[int, typer.Option(min=1, max=MAX_USES, help="Number of people who can use the invitation.")]
+Days = Annotated[int, typer.Option(min=1, help="Days for which the invitation is valid, at most 30.")]
+Uses = Annotated[int, typer.Option(min=1, help="Number of people who can use the invitation, at most 100.")]
 Note = Annotated[str, typer.Option(help="For whom the invitation is; shown in lists.")]
 Named = Annotated[str, typer.Argument(metavar="PREFIX|ID", help="Prefix or id of the invitation, as in the list.")]
 RoleName = Annotated[
@@ -54,9 +53,9 @@ def invite_member(
 
     The invited person runs `marey member accept`.
     """
+    wanted, lifetime = _role(role), _lifetime(days, uses)
     with connect(context) as marey:
-        invitations = marey.project(project_name).invitations
-        made = invitations.create(_role(role), lifetime=timedelta(days=days), uses=uses, note=note)
+        made = marey.project(project_name).invitations.create(wanted, lifetime=lifetime, uses=uses, note=note)
     _print_new(made, "marey member accept", as_json=as_json)
 
 
@@ -103,10 +102,9 @@ def invite_person(
     """
     if (project_name is None) != (role is None):
         raise WrongUsage("--project and --role belong together; give both, or neither")
-    wanted = None if role is None else _role(role)
+    wanted, lifetime = None if role is None else _role(role), _lifetime(days, uses)
     with connect(context) as marey:
-        invitations = marey.users.invitations
-        made = invitations.create(project_name, wanted, lifetime=timedelta(days=days), uses=uses, note=note)
+        made = marey.users.invitations.create(project_name, wanted, lifetime=lifetime, uses=uses, note=note)
     _print_new(made, "marey login --invitation", as_json=as_json)
 
 
@@ -134,8 +132,20 @@ def _role(text: str) -> Role:
     return Role(text)
 
 
+def _lifetime(days: int, uses: int) -> timedelta:
+    """Return the days of an option as a duration. Raises `WrongUsage` if the days or the uses are too many."""
+    from marey_schemas.invitations import MAX_DAYS, MAX_USES
+
+    for option, given, most in (("--days", days, MAX_DAYS), ("--uses", uses, MAX_USES)):
+        if given > most:
+            raise WrongUsage(f"{option} {given} is too many; give at most {most}")
+    return timedelta(days=days)
+
+
 def _named(text: str) -> str:
     """Return the prefix or id of an invitation. Raises `WrongUsage` for a code, which would become part of a URL."""
+    from marey_schemas.invitations import CODE_PREFIX
+
     if text.startswith(CODE_PREFIX):
         raise WrongUsage("this is the code of an invitation, not its name; give the prefix or the id from the list")
     return text

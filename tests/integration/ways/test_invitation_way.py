@@ -18,7 +18,7 @@ from tests.support.server_process import ServerProcess
 from marey_client import Marey
 from marey_client.project import ProjectHandle
 from marey_schemas.access import Login, Role, UserCreate
-from marey_schemas.invitations import CODE_PREFIX
+from marey_schemas.invitations import CODE_PREFIX, MAX_DAYS, MAX_USES
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -113,7 +113,10 @@ def test_an_owner_withdraws_by_prefix_and_is_warned_of_a_code(run: CommandLine, 
 def test_wrong_arguments_are_refused_with_what_to_write_instead(run: CommandLine, project: ProjectHandle) -> None:
     assert "the roles are" in run("member", "invite", "lab", "--role", "king", status=2).stderr
     assert "give both" in run("user", "invite", "--project", "lab", status=2).stderr
-    assert "30" in run("member", "invite", "lab", "--role", "reader", "--days", "31", status=2).stderr
+    for option, most in (("--days", MAX_DAYS), ("--uses", MAX_USES)):
+        for words in (("member", "invite", "lab", "--role", "reader"), ("user", "invite")):
+            assert f"at most {most}" in run(*words, option, most + 1, status=2).stderr
+            assert f"at most {most}" in run(*words, "--help").stdout.replace("\n", " ").replace("  ", "")
     assert "only one of" in run("login", "--invitation", "--with-token", status=2).stderr
     assert "Invitation code" in run("member", "accept", status=2).stderr
 
