@@ -150,6 +150,24 @@ def test_the_same_file_again_changes_nothing_and_a_new_take_makes_a_revision(own
     assert len(owner.get("/projects/lab/skeletons").json()["items"]) == 1
 
 
+def test_an_import_keeps_the_take_record_of_the_clip(owner: httpx.Client) -> None:
+    first = send(owner, {"walk.bvh": bvh()}).json()["entries"][0]
+    info_url = f"/projects/lab/clips/{first['item']}/parts/info"
+    stored = owner.get(info_url)
+    record = {"action": "walk", "consent_until": "2020-01-31", "consent_for": ["games"], "comment": "limps"}
+    put = owner.put(info_url, json={**stored.json(), **record}, headers={"If-Match": stored.headers["ETag"]})
+    assert put.is_success, put.text
+    again = send(owner, {"walk.bvh": bvh()}).json()["entries"][0]
+    assert (again["status"], again["revision"]) == ("unchanged", 2)
+    other = send(owner, {"walk.bvh": bvh(1)}, licence="CC0-1.0").json()["entries"][0]
+    assert (other["item"], other["revision"]) == (first["item"], 3)
+    info = owner.get(info_url).json()
+    assert {name: info[name] for name in record} == record
+    assert info["licence"] == "CC0-1.0"
+    refused = owner.get(f"/projects/lab/clips/{first['item']}/export")
+    assert (refused.status_code, refused.json()["code"]) == (409, "consent-expired")
+
+
 def test_files_can_be_named_by_digest(owner: httpx.Client, server: Server) -> None:
     data = bvh()
     digest = f"sha256:{hashlib.sha256(data).hexdigest()}"

@@ -7,7 +7,7 @@ Lengths are metres, times seconds, quaternions w,x,y,z; axes are right-handed wi
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import date
 from typing import Annotated, Any, Literal, Self
 
@@ -123,6 +123,16 @@ class TakeRecord(Request):
     consent_until: Day | None = Field(
         None, description="Last day of the performer's consent; clips are not exported after this day, in UTC."
     )
+
+
+def keep_record(info: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the part `info` of a clip with the facts about the recording that only an earlier revision of it states.
+
+    These are the fields of the take record, `consent_for` and `comment`.
+    """
+    names = (*TakeRecord.model_fields, "consent_for", "comment")
+    kept = {name: earlier[name] for name in names if info.get(name) is None and earlier.get(name) is not None}
+    return {**info, **kept}
 
 
 class ClipInfo(TakeRecord):
