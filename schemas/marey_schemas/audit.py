@@ -27,6 +27,7 @@ AUDIT_WORDS: Mapping[AuditKind, str] = {
     "collection.restored": "restored the collection",
     "item.deleted": "deleted the item",
     "item.restored": "restored the item",
+    "item.purged": "deleted for good the item",
     "consent.overridden": "allowed an export after the end of the consent for",
     "dataset.deleted": "deleted the dataset",
     "branch.deleted": "deleted a branch of the dataset",

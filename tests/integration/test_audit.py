@@ -136,6 +136,29 @@ def delete_and_restore(story: Story) -> None:
     story.send(owner, "POST", f"{path}/restore", None, ("collection.restored", "olga", "raw", "lab"))
 
 
+def purge(story: Story) -> None:
+    """Purge an item, which also replaces its name in the entry about its deletion."""
+    owner = story.owner
+    hierarchy = {"schema": "marey/skeleton@1", "joints": [{"name": "Hips", "parent": -1, "offset": [0, 1, 0]}]}
+    body = {"name": "gone", "collection": "raw", "parts": {"hierarchy": hierarchy}}
+    item = story.send(owner, "POST", f"{LAB}/skeletons", body)["id"]
+    story.send(owner, "DELETE", f"{LAB}/skeletons/{item}", None, ("item.deleted", "olga", item, "lab"))
+    story.send(owner, "POST", f"{LAB}/purges", {"item": item}, ("item.purged", "olga", item, "lab"))
+
+
+def invite(story: Story) -> None:
+    owner, path = story.owner, f"{LAB}/invitations"
+    created, withdrawn = (owner.post(path, json={"role": "reader"}).json() for _ in range(2))
+    story.secrets += [created["code"], withdrawn["code"]]
+    story.expected += [("invitation.created", "olga", one["prefix"], "lab") for one in (created, withdrawn)]
+    gone = ("invitation.withdrawn", "olga", withdrawn["prefix"], "lab")
+    story.send(owner, "DELETE", f"{path}/{withdrawn['id']}", None, gone)
+    guest = story.server.client(story.server.make_user("guest"))
+    found = [("user.created", None, "guest", None), ("token.created", "guest", "guest", None)]
+    accepted = [("member.added", "guest", "guest", "lab"), ("invitation.accepted", "guest", created["prefix"], "lab")]
+    story.send(guest, "POST", "/invitations/accept", {"code": created["code"]}, *found, *accepted)
+
+
 def change_datasets(story: Story) -> None:
     owner, gaits = story.owner, ("olga", "gaits", "lab")
     story.send(owner, "POST", f"{LAB}/datasets", {"name": "gaits", "collection": "raw"})
@@ -175,7 +198,10 @@ def _stored_secrets(story: Story) -> list[str]:
     return [one for one in story.server.database.read(SYSTEM, lambda tx: list(read(tx))) if one]
 
 
-CHAPTERS = (change_users_and_tokens, change_projects_and_members, delete_and_restore, change_datasets, change_webhooks)
+CHAPTERS = (
+    change_users_and_tokens, change_projects_and_members, delete_and_restore, purge, invite, change_datasets,
+    change_webhooks,
+)  # fmt: skip
 
 
 def tell(story: Story) -> list[dict[str, Any]]:
