@@ -112,7 +112,7 @@ def test_no_format_is_exported_after_the_last_day(studio: Studio, export: Export
     source = {"file": digest, "file_name": "walk.bvh"}
     walk = studio.clip("walk", day(-1), source=source)
     problem = refused(export(walk, format=file_format), 409, "consent-expired")
-    assert f"the clip 'raw/walk', whose last day was {day(-1)}." in problem["detail"]
+    assert f"the clip 'raw/walk' ended; its last day was {day(-1)}." in problem["detail"]
     for remedy in ("consent_until", "maintainer", "allow_expired_consent"):
         assert remedy in problem["detail"]
     assert problem["context"] == {

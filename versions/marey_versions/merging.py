@@ -246,7 +246,7 @@ def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: Datas
 
 
 def _made_together(kind: str) -> Iterator[tuple[str, str]]:
-    """Return the pairs of parts of which one is made from the other."""
+    """Yield pairs of parts: a part, and one that is computed from it."""
     for name, spec in PARTS[Kind(kind)].items():
         if spec.made_from is not None:
             yield spec.made_from, name

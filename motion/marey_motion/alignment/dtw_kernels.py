@@ -267,9 +267,9 @@ def total_within(a, b, rest, limit):  # type: ignore[no-untyped-def]
 
 @compiled
 def box_costs(a, low, high, out):  # type: ignore[no-untyped-def]
-    """Fill out (n,) with the mean distance of the points of each frame of a (n, P, 3) from the nearest of B boxes.
+    """Write to out (n,), for each frame of a (n, P, 3), the mean distance of its points from the nearest of B boxes.
 
-    low, high (P, 3, B) are the corners of the boxes.
+    low and high (P, 3, B) are the corners of the boxes.
     """
     points, boxes = low.shape[0], low.shape[2]
     costs = np.empty(boxes)

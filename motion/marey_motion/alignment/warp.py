@@ -50,8 +50,8 @@ def time_function(path: NDArray[np.integer]) -> Floats:
 def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
     """Find the points between which a time function is interpolated: canonical frames (k,) and source frames (k,).
 
-    Each is the mean of a run of cells of the path that share a frame of one motion; the first and the last are the ends
-    of the path.
+    Where the path stays at one frame of either motion for several cells, the mean of these cells is one point. The
+    first and the last point are the ends of the path.
     """
     steps = np.diff(path, axis=0)
     side = steps[:, 0] - steps[:, 1]  # 0 for a step in both, else which motion steps alone

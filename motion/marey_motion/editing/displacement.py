@@ -120,15 +120,15 @@ def _check_windows(frames: AnyInts, windows: Sequence[Window]) -> None:
         held = (frames >= start) & (frames < stop)
         if not held.any():
             raise EditError(
-                f"the window {window.start}:{window.stop} contains no changed frame, or only at a smooth end; "
-                "remove it, or choose a window around a changed frame",
+                f"the window {window.start}:{window.stop} contains no changed frame, or only at an end at which it "
+                "is faded out; remove it, or choose a window around a changed frame",
                 where="windows",
             )
         inside |= held
     if not inside.all():
         raise EditError(
-            f"the changed frame {int(frames[~inside][0])} is in no window, or only at a smooth end; add or extend "
-            "a window",
+            f"no window contains the changed frame {int(frames[~inside][0])}, or only at an end at which the window "
+            "is faded out; add or extend a window",
             where="windows",
         )
 

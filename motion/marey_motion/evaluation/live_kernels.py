@@ -78,7 +78,10 @@ def _smooth(take, filters, frame, shortest_mean):  # type: ignore[no-untyped-def
 
 @compiled
 def newest_window(take, duration_s, window):  # type: ignore[no-untyped-def]
-    """Write speed, turn rate, forward and strafe velocity of the last window to `window`; return whether one exists."""
+    """Write the speed, turn rate, forward and strafe velocity of the newest frames of `take` to `window`.
+
+    Returns whether the take is long enough.
+    """
     frame, span = take.counters[SMOOTHED] - 1, take.steps.shape[0]
     if frame < span:
         return False

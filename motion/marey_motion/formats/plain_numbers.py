@@ -87,7 +87,9 @@ def _digits(word):  # type: ignore[no-untyped-def]
 
 @compiled
 def read_plain_numbers(text, values, i, count):  # type: ignore[no-untyped-def]
-    """Read plain numbers separated by spaces, up to the first other byte or to a number near the end of the text.
+    """Read plain numbers separated by spaces, up to the first other byte.
+
+    Reading also stops before a number whose bytes are too close to the end of the text to be read all at once.
 
     A plain number has at most 15 digits, with at most 8 before and 8 after the point, and fits in 15 bytes. It can have
     a minus sign before it and a negative power of ten after it.

@@ -53,9 +53,7 @@ class ModelPlan(Request):
         if (self.files is None) == (not self.clips):
             raise ValueError("give either files to import or clips, not both")
         if self.annotations and (self.files is not None or self.annotate is not None):
-            raise ValueError(
-                "annotations: cannot be combined with `files` or `annotate`; with annotations, give `clips` alone"
-            )
+            raise ValueError("annotations: can be combined only with `clips`, not with `files` or `annotate`")
         if self.cut is not None and not self.annotations and self.annotate is None:
             raise ValueError("cut: cutting needs annotations; give `annotations`, or `annotate` to have them proposed")
         if self.annotations and self.skeleton is not None and self.cut is None:

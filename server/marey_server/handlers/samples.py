@@ -35,7 +35,7 @@ class SampleQuery(Request):
 
 
 class SampleFileQuery(SampleQuery):
-    """Query parameters of samples as files: in addition, the file format and the unit of length."""
+    """Query parameters of samples that are sent as files: those of `SampleQuery`, the file format and the unit."""
 
     format: MotionFormat = Field(
         DEFAULT_FORMAT, description="File format; several files are returned in one ZIP archive."

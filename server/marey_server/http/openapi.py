@@ -120,11 +120,11 @@ class _Models:
         self.components: dict[str, Schema] = definitions.get("$defs", {})
 
     def reading(self, model: type[BaseModel]) -> Schema:
-        """Return a `$ref` to the schema of a model that requests contain."""
+        """Return a `$ref` to the schema of a model in requests."""
         return dict(self._refs[model, "validation"])
 
     def writing(self, model: type[BaseModel]) -> Schema:
-        """Return a `$ref` to the schema of a model that answers contain."""
+        """Return a `$ref` to the schema of a model in answers."""
         return dict(self._refs[model, "serialization"])
 
     def partial(self, model: type[BaseModel]) -> Schema:

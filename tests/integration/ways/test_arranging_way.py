@@ -390,7 +390,7 @@ def test_a_wrong_table_changes_no_record(
     ("arguments", "told"),
     [
         (["ls", "lab", "--query", "frames >"], "query, column 9: the query ends too early"),
-        (["ls", "lab", "--explain"], "--explain counts what the conditions of a query hide; add --query"),
+        (["ls", "lab", "--explain"], "--explain counts the items that each condition of a query excludes; add --query"),
         (["record", "lab/raw"], "give either values with --set"),
         (["record", "lab/raw", "--set", "selcet=best"], "there is no field 'selcet'"),
         (["record", "lab/raw", "--set", "best"], "'best' has no name and value"),

@@ -108,8 +108,8 @@ def test_a_model_can_do_without_a_tree() -> None:
     [
         ((), "either files"),
         ((FILES, CLIPS), "either files"),
-        ((FILES, LAYER), "annotations: cannot be combined with `files` or `annotate`"),
-        ((CLIPS, LAYER, STEPS), "annotations: cannot be combined with `files` or `annotate`"),
+        ((FILES, LAYER), "annotations: can be combined only with `clips`"),
+        ((CLIPS, LAYER, STEPS), "annotations: can be combined only with `clips`"),
         ((CLIPS, {"cut": {}}), "needs annotations"),
         ((CLIPS, LAYER, GAME), "cannot be used after retargeting"),
         ((CLIPS, {"align": {"window": 4}}), "odd"),

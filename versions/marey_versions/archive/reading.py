@@ -146,7 +146,7 @@ class Archive:
     # -- versions ------------------------------------------------------------------------------------------------------
 
     def history(self) -> list[tuple[str, CommitRecord]]:
-        """Return the commit that the manifest names and its ancestors in the archive, each commit after its parents."""
+        """Return the commit of the manifest, and those of its ancestors that are in the archive; parents come first."""
         records: dict[str, CommitRecord] = {}
         ordered: dict[str, None] = {}
         path = [self.manifest.commit]
@@ -184,7 +184,7 @@ class Archive:
                 raise BadArchive(f"{name}: an entry is not valid: {error}") from error
             if root != record.tree:
                 raise BadArchive(
-                    f"{name}: the entries do not have the digest that the commit names; the changes were altered"
+                    f"{name}: the entries do not have the digest in the commit; this file was altered later"
                 )
             roots[digest] = root
         return Versions(store, roots)

@@ -200,7 +200,7 @@ class _Editing:
 def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | None, EditDocument]:
     """Return the edit item and its commands; the item is None if the parameters of the job contain the commands.
 
-    Raises `JobRefused` if there are no commands, commands in both places, or an item that is not valid.
+    Raises `JobRefused` if neither or both of them give commands, or if the item is not valid.
     """
     (pin,) = context.inputs.get("edit", ()) or (None,)
     if (pin is None) == (not params.commands):

@@ -122,9 +122,9 @@ def ls(
 def _explain(
     context: typer.Context, address: Address, kinds: Sequence[str] | None, query: str | None, as_json: bool
 ) -> None:
-    """Print how many items each condition of a query hides, for each of `kinds`; default: for clips."""
+    """Print how many items each condition of a query excludes, for each of `kinds`; default: for clips."""
     if query is None:
-        raise WrongUsage("--explain counts what the conditions of a query hide; add --query")
+        raise WrongUsage("--explain counts the items that each condition of a query excludes; add --query")
     with connect(context) as marey:
         project = marey.project(address.project)
         for kind in map(kind_named, kinds or ["clip"]):

@@ -108,8 +108,8 @@ def prepare_pick(tx: Transaction, project: str, name: str, request: PickRequest,
 def _parent_of(picked: Commit, parent: int | None) -> str | None:
     if parent is None and len(picked.parents) > 1:
         raise InvalidProblem(
-            "The commit is a merge. Choose the parent with which it is compared: 1, the branch that the merge changed, "
-            "or 2, the version that was merged.",
+            "The commit is a merge. Choose the parent with which it is compared: 1 (the branch before the merge) or 2 "
+            "(the version that was merged into it).",
             code="is-merge",
         )
     if parent is not None and parent > max(1, len(picked.parents)):

@@ -81,9 +81,11 @@ def require_consent(ended: Collection[EndedConsent]) -> None:
     if not ended:
         return
     first = next(iter(ended))
-    clips = "the clip" if len(ended) == 1 else f"{counted(len(ended), 'clip')}, the first of which is"
+    what = f"The consent for the clip {first.path!r} ended; its last day was {first.until}"
+    if len(ended) > 1:
+        what += f". The consent for {counted(len(ended) - 1, 'other clip')} ended, too"
     raise ConflictProblem(
-        f"The consent has ended for {clips} {first.path!r}, whose last day was {first.until}. {CONSENT_REMEDY}",
+        f"{what}. {CONSENT_REMEDY}",
         code=CONSENT_EXPIRED,
         context=_named(ended),
     )

@@ -1,4 +1,4 @@
-"""Records of jobs that name purged items: names are removed, and the content that the jobs keep is released."""
+"""Removal of the names of purged items from the records of jobs, and of the content that the jobs hold for them."""
 
 from __future__ import annotations
 
