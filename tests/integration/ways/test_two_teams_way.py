@@ -12,7 +12,7 @@ import pytest
 from tests.support.command_line import CommandLine
 from tests.support.server_process import ServerProcess, serving
 
-from marey_client import receiving, transfers
+from marey_client.archives import receiving, transfers
 from marey_client.credentials import store_login
 from marey_client.errors import Unreachable
 from marey_client.handles.clips import ClipHandle

@@ -77,8 +77,9 @@ def test_only_a_principal_with_a_user_owns_tokens() -> None:
             _ = other.owner
 
 
-@pytest.mark.parametrize("text", [new_id("project"), new_id("clip"), new_id("search-tree")])
-def test_ids_have_a_form_that_names_rarely_have(text: str) -> None:
+@pytest.mark.parametrize("kind", ["project", "clip", "search-tree"])
+def test_ids_have_a_form_that_names_rarely_have(kind: str) -> None:
+    text = new_id(kind)
     assert is_id(text)
     for other in (text[:-1], f"{text}0", text.upper(), text.partition("_")[2], f"raw/{text}", "ada", "walk_01", ""):
         assert not is_id(other)
