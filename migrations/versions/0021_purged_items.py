@@ -55,6 +55,8 @@ def items_in(body: Any) -> Iterator[str]:
             item, number = one.get("item"), one.get("revision")
             if isinstance(item, str) and len(item) <= 40 and isinstance(number, int) and not isinstance(number, bool):
                 yield item
+            if one.get("schema") == "marey/edit@1":
+                yield from (command["source"] for command in one["commands"] if "source" in command)
         members = one.values() if isinstance(one, dict) else one
         waiting.extend(member for member in members if isinstance(member, dict | list))
 

@@ -112,7 +112,8 @@ class PurgeAnswer(Answer):
     refused: tuple[HeldItem, ...]
     freed_bytes: int = Field(
         description="Bytes that the next garbage collection can free: those of the documents, and of the arrays and "
-        "files, that nothing else refers to. An estimate: sizes are those of the content, without the rows around it."
+        "files, that nothing else in the project refers to. An estimate: content that other projects have, too, is not "
+        "freed, and the rows around the content are not counted."
     )
     next: str | None = Field(None, description="Send it as `after` to examine further items; null: there are none.")
 

@@ -94,6 +94,33 @@ def test_bytes_of_the_database_and_the_folder_of_blobs_shrink_after_a_purge(
     assert list(fsck.check_store(lab.database)) == []
 
 
+def test_a_preview_does_not_show_names_to_a_token_that_may_not_read(server: Server, owner: httpx.Client) -> None:
+    writer = server.client(server.make_user("willa", scopes=("write",)))
+    assert owner.put("/projects/lab/members/willa", json={"role": "owner"}).is_success
+    refused = purge(writer, collection="", preview=True)
+    assert (refused.status_code, refused.json()["code"]) == (403, "insufficient-scope")
+
+
+def test_freed_bytes_do_not_reveal_what_hidden_projects_contain(server: Server, lab: Lab, owner: httpx.Client) -> None:
+    clip = lab.add_clip(lab.add_skeleton(), seed=5, frames=FRAMES).id
+    remove(owner, clip)
+    before = purge(owner, item=clip, preview=True).json()["freed_bytes"]
+    hidden = Lab(server.database, "hidden")
+    hidden.add_clip(hidden.add_skeleton(), seed=5, frames=FRAMES)
+    assert purge(owner, item=clip, preview=True).json()["freed_bytes"] == before > MOTION_BYTES / 2
+
+
+def test_a_saved_edit_holds_the_clips_that_its_commands_name(lab: Lab, owner: httpx.Client) -> None:
+    clip = lab.add_clip(lab.add_skeleton()).id
+    edit = {"schema": "marey/edit@1", "commands": [{"command": "concatenate", "source": clip}]}
+    made = owner.post("/projects/lab/edits", json={"name": "longer", "parts": {"edit": edit}})
+    assert made.status_code == 201, made.text
+    remove(owner, clip)
+    answer = purge(owner, item=clip)
+    assert (answer.status_code, answer.json()["code"]) == (409, "still-held")
+    assert list(fsck.check_store(lab.database)) == []
+
+
 def test_an_item_that_is_held_is_refused_with_its_holders(lab: Lab, owner: httpx.Client) -> None:
     rig = lab.add_skeleton()
     clip = lab.add_clip(rig)

@@ -20,6 +20,7 @@ from marey_schemas.documents.registry import SCHEMAS
 from marey_schemas.encoding import blocks
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import canonical_json, detach_arrays
+from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import FieldError
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.field_errors import field_errors
@@ -34,6 +35,7 @@ OPEN_SCHEMA = "marey/document@1"
 _NUL = re.compile(rb"(?<!\\)(?:\\\\)*\\u0000")
 _POINTER_LENGTH = 512
 _ID_LENGTH = 40
+EDIT_SCHEMA = PARTS[Kind.EDIT]["edit"].schema
 
 Tree = dict[str, Any]
 
@@ -260,11 +262,14 @@ def _refer(tx: Transaction, references: Iterable[tuple[str, str, str]]) -> None:
 
 
 def items_named_in(body: Tree) -> set[str]:
-    """Return the ids of the items to whose revisions a document refers.
+    """Return the ids of the items to which a document refers, also as the source of a command of an edit.
 
     Texts that are too long for an id are left out: the members of some documents are not checked.
     """
-    return {reference.item for reference in references_in(body) if len(reference.item) <= _ID_LENGTH}
+    named = {reference.item for reference in references_in(body)}
+    if body.get("schema") == EDIT_SCHEMA:
+        named |= {one["source"] for one in body["commands"] if "source" in one}
+    return {one for one in named if len(one) <= _ID_LENGTH}
 
 
 def _refer_to_items(tx: Transaction, bodies: Mapping[str, Tree]) -> None:

@@ -269,18 +269,17 @@ def forget_names(tx: Transaction, ids: Sequence[str], *members: str) -> None:
         tx.execute(update(event).where(about, event.c.about.is_not(None)).values(about=event.c.subject))
 
 
-def forget_clips(tx: Transaction, items: frozenset[str], subjects: Sequence[str]) -> None:
-    """Remove the paths of items from the records of exports without consent; `subjects` may have exported the items.
+def forget_clips(tx: Transaction, project_id: str, items: frozenset[str]) -> None:
+    """Remove the paths of items from the project's records of exports without consent.
 
-    The audit log shows the id of the first clip in place of its name. Exports of versions need no search: a version
-    that contains an item holds it.
+    The audit log shows the id of the first clip in place of its name.
     """
-    for start in range(0, len(subjects), IN_LIST):
-        about = event.c.subject.in_(subjects[start : start + IN_LIST])
-        overrides = select(event.c.seq, event.c.body).where(about, event.c.kind == "consent.overridden")
-        for row in tx.execute(overrides).all():
-            clips = [{**one, "path": ""} if one["item"] in items else one for one in row.body["clips"]]
-            values: dict[str, Any] = {"body": {**row.body, "clips": clips}}
-            if clips and clips[0]["item"] in items:
-                values["about"] = clips[0]["item"]
-            tx.execute(update(event).where(event.c.seq == row.seq).values(**values))
+    recorded = event.c.about.is_not(None), event.c.project_id == project_id, event.c.kind == "consent.overridden"
+    for row in tx.execute(select(event.c.seq, event.c.body).where(*recorded)).all():
+        if all(one["item"] not in items for one in row.body["clips"]):
+            continue
+        clips = [{**one, "path": ""} if one["item"] in items else one for one in row.body["clips"]]
+        values: dict[str, Any] = {"body": {**row.body, "clips": clips}}
+        if clips[0]["item"] in items:
+            values["about"] = clips[0]["item"]
+        tx.execute(update(event).where(event.c.seq == row.seq).values(**values))

@@ -117,12 +117,17 @@ def require(
         raise ForbiddenProblem(
             f"You need at least the role {need.value} in the project {name!r} for this.", code="insufficient-role"
         )
-    if not seen.guest and not scopes.allows(tx.principal.scopes, required.scope, name):
-        raise ForbiddenProblem(
-            f"This request needs a token with the scope {required.scope!r} in the project {name!r}.",
-            code="insufficient-scope",
-        )
+    if not seen.guest:
+        require_scope(tx, name, required.scope)
     return seen
+
+
+def require_scope(tx: Transaction, name: str, scope: str) -> None:
+    """Raise `ForbiddenProblem` if the token of the caller does not have a scope in the project `name`."""
+    if not scopes.allows(tx.principal.scopes, scope, name):
+        raise ForbiddenProblem(
+            f"This request needs a token with the scope {scope!r} in the project {name!r}.", code="insufficient-scope"
+        )
 
 
 def find_by_id(tx: Transaction, project_id: str) -> ProjectRow:

@@ -500,12 +500,15 @@ def test_the_record_of_an_export_without_consent_loses_the_path_too(house: House
     project_id = house.read(store_projects.require, "lab").id
     ended = [EndedConsent(walk, f"raw/{NAME}", "2026-01-01"), EndedConsent(other, "raw/other", "2026-01-01")]
     override = ConsentOverride(allow_expired_consent=True, consent_reason="by letter")
-    house.write(record_override, project_id, job, override, ended)
+    elsewhere = "dataset_that_never_contained_the_clip"
+    for subject in (job, elsewhere):
+        house.write(record_override, project_id, subject, override, ended)
     house.desk.complete(house.desk.claim())
     house.delete(walk)
     house.purge(item=walk)
-    (record,) = [one for one in house.events(job) if one.kind == "consent.overridden"]
-    assert [(one["item"], one["path"]) for one in record.body["clips"]] == [(walk, ""), (other, "raw/other")]
+    for subject in (job, elsewhere):
+        (record,) = [one for one in house.events(subject) if one.kind == "consent.overridden"]
+        assert [(one["item"], one["path"]) for one in record.body["clips"]] == [(walk, ""), (other, "raw/other")]
     house.collect()
     assert NAME not in texts_of_database(house)
 

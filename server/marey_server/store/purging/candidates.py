@@ -49,9 +49,10 @@ class PreparedPurge:
 def prepare_purge(tx: Transaction, project: str, request: PurgeRequest) -> PreparedPurge:
     """Choose the next items of a purge, and search all versions and jobs of the project for them.
 
-    Raises `BadRequestProblem` for a malformed query.
+    Raises `BadRequestProblem` for a malformed query, and `ForbiddenProblem` if the caller lacks the scope `read`.
     """
     project_row = projects.require(tx, project)
+    projects.require_scope(tx, project, "read")  # because the answer shows names
     rows = _candidates(tx, project_row, request)
     chosen: list[Row[Any]] = []
     left = MOST_REVISIONS

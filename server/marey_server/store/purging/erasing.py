@@ -6,10 +6,11 @@ each revision, with its number, its time and the job that made it. Rows of `line
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from bisect import bisect_left
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any
 
-from sqlalchemy import Row, Text, cast, delete, exists, func, or_, select, update
+from sqlalchemy import Row, Text, cast, delete, exists, func, select, update
 
 from marey_schemas.kinds import Kind
 from marey_server.store import collections, events
@@ -23,6 +24,7 @@ from marey_server.store.tables import (
     document_blob,
     item,
     item_tag,
+    job,
     job_blob,
     revision,
     revision_part,
@@ -35,7 +37,7 @@ def erase(tx: Transaction, project_row: ProjectRow, rows: Sequence[Row[Any]], jo
     ids = [row.id for row in rows]
     forget_in_jobs(tx, frozenset(ids), jobs)
     events.forget_names(tx, ids, "name", "collection")
-    events.forget_clips(tx, frozenset(ids), [*ids, *jobs])
+    events.forget_clips(tx, project_row.id, frozenset(ids))
     tx.execute(delete(revision_part).where(revision_part.c.item_id.in_(ids)))
     tx.execute(delete(item_tag).where(item_tag.c.item_id.in_(ids)))
     bare = {"author_id": None, "message": "", "content": None}
@@ -56,38 +58,45 @@ def _drop_empty_folders(tx: Transaction, project_id: str, paths: Collection[str]
 
     Folders that a dataset needs remain.
     """
-    parts = [path.split("/") for path in paths if path]
-    above = {"/".join(names[:count]) for names in parts for count in range(1, len(names) + 1)}
-    inner, placed = collection.alias("inner"), item.alias("placed")
-    within = or_(
-        inner.c.path == collection.c.path,
-        func.substr(inner.c.path, 1, func.length(collection.c.path) + 1) == collection.c.path + "/",
-    )
-    holds_items = (
-        exists()
-        .where(inner.c.project_id == project_id, inner.c.deleted_us.is_not(None), within)
-        .where(placed.c.collection_id == inner.c.id)
-    )
+    deleted = (collection.c.project_id == project_id, collection.c.deleted_us.is_not(None))
+    with_items = select(collection.c.path).where(*deleted, exists().where(item.c.collection_id == collection.c.id))
+    holding = sorted(tx.execute(with_items).scalars())
     used = exists().where(dataset.c.collection_id == collection.c.id)
-    empty = (collection.c.project_id == project_id, collection.c.deleted_us.is_not(None), ~holds_items, ~used)
-    chosen = sorted(above)
-    for start in range(0, len(chosen), IN_LIST):
-        some = collection.c.path.in_(chosen[start : start + IN_LIST])
-        dropped = tx.execute(delete(collection).where(*empty, some).returning(collection.c.id)).scalars().all()
-        events.forget_names(tx, dropped, "path", "was")
+    empty = sorted({path for path in _with_ancestors(paths) if not _is_within(holding, path)})
+    for start in range(0, len(empty), IN_LIST):
+        some = collection.c.path.in_(empty[start : start + IN_LIST])
+        dropping = delete(collection).where(*deleted, ~used, some).returning(collection.c.id)
+        events.forget_names(tx, tx.execute(dropping).scalars().all(), "path", "was")
+
+
+def _with_ancestors(paths: Iterable[str]) -> Iterator[str]:
+    """Yield each path that is not empty, and the paths of the folders above it."""
+    for path in paths:
+        while path:
+            yield path
+            path = path.rpartition("/")[0]
+
+
+def _is_within(ordered: Sequence[str], folder: str) -> bool:
+    """Return whether one of the sorted paths is `folder` or below it."""
+    below = f"{folder}/"
+    place, first_below = bisect_left(ordered, folder), bisect_left(ordered, below)
+    same = place < len(ordered) and ordered[place] == folder
+    return same or (first_below < len(ordered) and ordered[first_below].startswith(below))
 
 
 # -- freed bytes ------------------------------------------------------------------------------------------------------
 
 
-def freed_by(tx: Transaction, items: Collection[str], jobs: Collection[str]) -> int:
-    """Return the sizes of the documents, arrays and files that only revisions of `items`, and `jobs`, refer to.
+def freed_by(tx: Transaction, project_id: str, items: Collection[str], jobs: Collection[str]) -> int:
+    """Return the sizes of the documents, arrays and files of `items` that nothing else in the project refers to.
 
-    Documents that no revision refers to, such as those of a running job, do not count as needing their arrays.
+    References of `jobs` do not count, nor do documents that no revision refers to, such as those of a running job.
+    References of other projects do not count either: their content is not shown to the caller.
     """
     if not items:
         return 0
-    documents = _documents_of(tx, items)
+    documents = _documents_of(tx, project_id, items)
     text_bytes, sizes, needed = 0, dict[str, int](), set[str]()
     lengths = select(func.coalesce(func.sum(func.length(cast(document.c.body, Text))), 0))
     named = select(blob.c.digest, blob.c.size_bytes).join(document_blob, document_blob.c.blob_digest == blob.c.digest)
@@ -95,21 +104,34 @@ def freed_by(tx: Transaction, items: Collection[str], jobs: Collection[str]) -> 
         text_bytes += tx.execute(lengths.where(document.c.digest.in_(some))).scalar_one()
         for row in tx.execute(named.where(document_blob.c.document_digest.in_(some))):
             sizes[row.digest] = row.size_bytes
-    is_part = exists().where(revision_part.c.document_digest == document_blob.c.document_digest)
+    is_part = exists().where(
+        revision_part.c.document_digest == document_blob.c.document_digest,
+        item.c.id == revision_part.c.item_id,
+        item.c.project_id == project_id,
+    )
     referring = select(document_blob.c.blob_digest, document_blob.c.document_digest).where(is_part)
     for some in _batches(sizes.keys()):
         for row in tx.execute(referring.where(document_blob.c.blob_digest.in_(some))):
             if row.document_digest not in documents:
                 needed.add(row.blob_digest)
-        keeping = select(job_blob.c.blob_digest, job_blob.c.job_id).where(job_blob.c.blob_digest.in_(some))
+        keeping = (
+            select(job_blob.c.blob_digest, job_blob.c.job_id)
+            .join(job, job.c.id == job_blob.c.job_id)
+            .where(job_blob.c.blob_digest.in_(some), job.c.project_id == project_id)
+        )
         needed.update(row.blob_digest for row in tx.execute(keeping) if row.job_id not in jobs)
     return text_bytes + sum(size for digest, size in sizes.items() if digest not in needed)
 
 
-def _documents_of(tx: Transaction, items: Collection[str]) -> set[str]:
-    """Return the digests of the documents that are parts of `items`, and not of any other item."""
+def _documents_of(tx: Transaction, project_id: str, items: Collection[str]) -> set[str]:
+    """Return the digests of the documents that are parts of `items`, and of no other item of the project."""
     own = select(revision_part.c.document_digest).where(revision_part.c.item_id.in_(items))
-    others = exists().where(revision_part.c.document_digest == document.c.digest, revision_part.c.item_id.not_in(items))
+    others = exists().where(
+        revision_part.c.document_digest == document.c.digest,
+        item.c.id == revision_part.c.item_id,
+        item.c.project_id == project_id,
+        item.c.id.not_in(items),
+    )
     return set(tx.execute(select(document.c.digest).where(document.c.digest.in_(own), ~others)).scalars())
 
 

@@ -21,15 +21,16 @@ def forget_in_jobs(tx: Transaction, items: frozenset[str], jobs: Sequence[str]) 
     makers: list[str] = []
     touched: set[str] = set()
     columns = (job.c.id, job.c.parent_id, job.c.inputs, job.c.outputs)
-    for start in range(0, len(jobs), IN_LIST):
-        some = select(*columns).where(job.c.id.in_(jobs[start : start + IN_LIST]))
-        for row in tx.execute(some.order_by(job.c.id).with_for_update()).all():
-            inputs, outputs = _without_names(row.inputs, items), _outputs_without_names(row.outputs, items)
-            if outputs != row.outputs:
-                makers.append(row.id)
-            if (inputs, outputs) != (row.inputs, row.outputs):
-                tx.execute(update(job).where(job.c.id == row.id).values(inputs=inputs, outputs=outputs))
-                touched.update({row.id, row.parent_id} - {None})
+    for job_id in sorted(jobs):  # one by one, because the inputs of a job may take megabytes
+        row = tx.execute(select(*columns).where(job.c.id == job_id).with_for_update()).one_or_none()
+        if row is None:
+            continue
+        inputs, outputs = _without_names(row.inputs, items), _outputs_without_names(row.outputs, items)
+        if outputs != row.outputs:
+            makers.append(row.id)
+        if (inputs, outputs) != (row.inputs, row.outputs):
+            tx.execute(update(job).where(job.c.id == row.id).values(inputs=inputs, outputs=outputs))
+            touched.update({row.id, row.parent_id} - {None})
     _forget_in_answers(tx, items, makers)
     _release_files(tx, sorted(touched))
     _release_sources(tx, items, makers)

@@ -48,7 +48,7 @@ def jobs_naming(
         .outerjoin(parent, parent.c.id == job.c.parent_id)
         .where(job.c.project_id == project_id)
         .order_by(job.c.id)
-        .execution_options(yield_per=500)
+        .execution_options(yield_per=10)
     )  # fmt: skip
     if unfinished:
         statement = statement.where(or_(job.c.state.in_(UNFINISHED), parent.c.state.in_(UNFINISHED)))

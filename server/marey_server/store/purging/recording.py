@@ -43,7 +43,7 @@ def record_purge(tx: Transaction, project: str, request: PurgeRequest, prepared:
     if request.item is not None and refused and not request.preview:
         raise _still_held(refused[0])
     free = [row for item_id, row in rows.items() if item_id not in held]
-    freed_bytes = freed_by(tx, [row.id for row in free], frozenset(prepared.jobs))
+    freed_bytes = freed_by(tx, project_row.id, [row.id for row in free], frozenset(prepared.jobs))
     if free and not request.preview:
         erase(tx, project_row, free, prepared.jobs, at_us)
         faults.point("purge.before_commit")
