@@ -27,7 +27,7 @@ AUDIT_WORDS: Mapping[AuditKind, str] = {
     "collection.restored": "restored the collection",
     "item.deleted": "deleted the item",
     "item.restored": "restored the item",
-    "item.purged": "deleted for good the item",
+    "item.purged": "purged the item",
     "consent.overridden": "allowed an export after the end of the consent for",
     "dataset.deleted": "deleted the dataset",
     "branch.deleted": "deleted a branch of the dataset",
@@ -63,7 +63,10 @@ class AuditEntry(Answer):
         description="Name of the user who made the change, or `job:<id>`; null: the server itself."
     )
     token: str | None = Field(None, description="Id of the token that the actor used; null: none, as in a sign-in.")
-    about: str = Field(description="Name, at that time, of the user or of the object that was changed.")
+    about: str = Field(
+        description="Name, at that time, of the user or of the object that was changed; for an item that was purged "
+        "since, its id."
+    )
     subject: str = Field(description="Id of the object; for members, of the project.")
     body: dict[str, Any] = Field(default_factory=dict, description="Details, such as the new role.")
 

@@ -183,6 +183,25 @@ def test_who_is_no_maintainer_cannot_allow_an_export(studio: Studio, export: Exp
     assert studio.overrides() == []
 
 
+def test_a_maintainer_with_a_token_that_only_reads_cannot_allow_an_export(studio: Studio, export: Export) -> None:
+    walk = studio.clip("walk", day(-1))
+    reader = studio.server.client(studio.server.make_user("max", scopes=("read",)))
+    assert studio.owner.put(f"{LAB}/members/max", json={"role": "maintainer"}).is_success
+    refused(export(walk, reader, **ALLOWED), 403, "insufficient-scope")
+    ok(studio.owner.post(f"{LAB}/datasets", json={"name": "raw", "collection": "raw"}), 201)
+    body = {"contents": contents_of(studio), "allow_expired_consent": True, "consent_reason": "why"}
+    refused(reader.post(f"{LAB}/datasets/raw/archive-checks", json=body), 403, "insufficient-scope")
+    assert studio.overrides() == []
+
+
+def test_no_cache_answers_for_an_export_without_asking_the_server(studio: Studio, export: Export) -> None:
+    file = b"HIERARCHY"
+    assert studio.owner.put(f"/blobs/{digest_of(file)}", content=file).is_success
+    walk = studio.clip("walk", day(9), source={"file": digest_of(file), "file_name": "walk.bvh"})
+    for file_format in ("original", "bvh"):
+        assert export(walk, format=file_format).headers["Cache-Control"] == "private, no-cache"
+
+
 def test_guests_of_a_public_project_are_asked_to_sign_in(studio: Studio, export: Export) -> None:
     walk, guest = studio.clip("walk", day(-1)), studio.server.client()
     ok(studio.owner.patch(LAB, json={"visibility": "public"}, headers={"If-Match": "*"}))
@@ -268,7 +287,7 @@ def test_an_archive_of_several_such_clips_names_their_number(studio: Studio, che
     for number in range(3):
         studio.clip(f"walk-{number}", day(-1))
     problem = refused(check(), 409, "consent-expired")
-    assert "3 clips" in problem["detail"]
+    assert "The consent for 2 other clips ended, too" in problem["detail"]
     assert (problem["context"]["count"], len(problem["context"]["clips"])) == (3, 3)
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from marey_client.bridges.files import ExportedVersion, MotionFiles, exported
 from marey_client.bridges.folders import file_names, new_folder
-from marey_client.bridges.sidecars import RECORD_FIELDS, RECORDS, SidecarWriter, record_cells
+from marey_client.bridges.sidecars import CARD, RECORD_FIELDS, RECORDS, TABLE, SidecarWriter, record_cells
 from marey_schemas.datasets.exports import SIDECAR, ExportedClip, ExportedIdentity
 from marey_schemas.wording import counted
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from marey_client.archives.writing import OnProgress
 
 MOST_FILES_PER_FOLDER = 10_000
-CARD, TABLE = "README.md", "metadata.csv"
 
 LICENCES = frozenset(
     {

@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from marey_client.bridges.sidecars import RECORDS, read_sidecar, write_table
+from marey_client.bridges.sidecars import CARD, RECORDS, TABLE, read_sidecar, write_table
 from marey_client.errors import NotFound, NothingToUpload
 from marey_client.handles.clips import ClipHandle
 from marey_client.items import Items
@@ -50,7 +50,7 @@ class ReturningFolder:
     @property
     def own_files(self) -> tuple[str, ...]:
         """Files of the folder that describe the clips, and are not imported."""
-        return (SIDECAR, RECORDS)
+        return (SIDECAR, RECORDS, *((CARD, TABLE) if self.sidecar.layout == "huggingface" else ()))
 
     @property
     def unit(self) -> LengthUnit | None:

@@ -19,6 +19,8 @@ from marey_schemas.encoding.canonical import canonical_json
 MOST_SIDECAR_BYTES = 1 << 30
 RECORDS = "records.csv"
 """Table of the take records, in the form that `marey record --table` reads."""
+CARD, TABLE = "README.md", "metadata.csv"
+"""Dataset card and table of clips in a folder for the Hugging Face Hub."""
 RECORD_FIELDS = tuple(TakeRecord.model_fields)
 
 

@@ -193,7 +193,7 @@ def _exported(one: _Located, info: ClipInfo, job: ExportedJob | None) -> Exporte
         path=one.entry.path,
         content=one.content,
         tags=tuple(sorted(one.entry.tags)),
-        record=ExportedRecord(**{name: value for name, value in record.items() if value is not None}),
+        record=ExportedRecord(**record),
         source=source,
         job=job,
     )

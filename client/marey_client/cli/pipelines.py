@@ -164,6 +164,11 @@ def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[st
     from marey_schemas.options.imports import ImportOptions
 
     found = find_files(map(Path, takes))
+    if found.exported:
+        raise WrongUsage(
+            "the takes are a folder that `marey dataset export` wrote; import it with `marey upload`, which also "
+            "imports take records and consents, and give the clips that it creates"
+        )
     if found.left_out:
         print_message(left_out_text(found.left_out))
     return project, {"takes": found.files, "options": ImportOptions.model_validate(options)}

@@ -4,30 +4,21 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from marey_schemas.base import Answer
 from marey_schemas.datasets.layouts import Layout
-from marey_schemas.documents.clips import Day
+from marey_schemas.documents.clips import RecordingFacts
 
 EXPORT_SCHEMA = "marey/export@1"
 SIDECAR = "marey.json"
 """Name of the sidecar, at the top of an exported folder."""
 
 
-class ExportedRecord(Answer):
-    """Take record of an exported clip; fields without a value are left out."""
+class ExportedRecord(RecordingFacts):
+    """Facts about the recording of an exported clip. Unknown fields are ignored, as in answers."""
 
-    subject: str | None = None
-    action: str | None = None
-    take: str | None = None
-    shoot_day: Day | None = None
-    select: Literal["best", "good", "no good"] | None = None
-    licence: str | None = None
-    capture_system: str | None = None
-    consent_until: Day | None = None
-    consent_for: tuple[str, ...] | None = None
-    comment: str | None = None
+    model_config = ConfigDict(extra="ignore")
 
 
 class ExportedSource(Answer):

@@ -125,25 +125,34 @@ class TakeRecord(Request):
     )
 
 
-def keep_record(info: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the part `info` of a clip with the facts about the recording that only an earlier revision of it states.
+class RecordingFacts(TakeRecord):
+    """Facts about a recording that its motion file does not contain."""
 
-    These are the fields of the take record, `consent_for` and `comment`.
-    """
-    names = (*TakeRecord.model_fields, "consent_for", "comment")
-    kept = {name: earlier[name] for name in names if info.get(name) is None and earlier.get(name) is not None}
-    return {**info, **kept}
-
-
-class ClipInfo(TakeRecord):
-    """Part `info` of a clip: descriptions by users and importers."""
-
-    schema_: Literal["marey/clip-info@1"] = Field("marey/clip-info@1", alias="schema")
-    tags: tuple[Tag, ...] = ()
     consent_for: tuple[Annotated[str, StringConstraints(min_length=1, max_length=64)], ...] | None = Field(
         None, max_length=32, description="Purposes for which the performer gave consent; absent: not recorded."
     )
     comment: str | None = None
+
+
+def with_earlier_facts(info: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the part `info` of a clip with the facts about the recording that only an earlier revision states.
+
+    If both state a consent, the stricter one counts: the earlier day, and the purposes that both contain.
+    """
+    names = [name for name in RecordingFacts.model_fields if info.get(name) is None and earlier.get(name) is not None]
+    kept = {**info, **{name: earlier[name] for name in names}}
+    if info.get("consent_until") is not None and earlier.get("consent_until") is not None:
+        kept["consent_until"] = min(info["consent_until"], earlier["consent_until"])
+    if info.get("consent_for") is not None and earlier.get("consent_for") is not None:
+        kept["consent_for"] = [one for one in info["consent_for"] if one in earlier["consent_for"]]
+    return kept
+
+
+class ClipInfo(RecordingFacts):
+    """Part `info` of a clip: descriptions by users and importers."""
+
+    schema_: Literal["marey/clip-info@1"] = Field("marey/clip-info@1", alias="schema")
+    tags: tuple[Tag, ...] = ()
     source: ClipSource | None = None
     checks: tuple[Check, ...] = ()
 

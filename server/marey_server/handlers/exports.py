@@ -30,6 +30,9 @@ from marey_server.motions.exporting import ExportTime
 from marey_server.motions.predecessor_exports import PredecessorOptions
 from marey_server.store import items
 
+NOT_CACHED = "private, no-cache"
+"""Cache control of exports: whether an export is allowed, and what it contains, may change."""
+
 
 class ExportQuery(ConsentOverride):
     """Query parameters of an export: the format and the options of the file."""
@@ -91,20 +94,22 @@ class Export(BlobSender):
         place = (project, kind_of(kind), item, query.revision)
         options = PredecessorOptions(query.end_index, query.form, query.part, query.layout)
         options.require_part_of(place[1])
-        permitted = query.allow_expired_consent
-        if permitted:
-            await self.change(items.permit_export, *place[:3], query)
+        permitted = query.allow_expired_consent and await self.change(items.permit_export, *place[:3], query)
         if query.format == "original":
             original = await self.look_up(exporting.find_original, *place, options, permitted=permitted)
-            return await self.send_blob(original.digest, disposition=attachment(original.name))
+            return await self.send_blob(
+                original.digest, disposition=attachment(original.name), cache_control=NOT_CACHED
+            )
         if query.format == "predecessor":
             unchanged = await self.look_up(exporting.find_unchanged_original, *place, options)
             if unchanged is not None:
-                return await self.send_blob(unchanged.digest, disposition=attachment(unchanged.name))
+                return await self.send_blob(
+                    unchanged.digest, disposition=attachment(unchanged.name), cache_control=NOT_CACHED
+                )
         source = await self.look_up(exporting.read_source, *place, permitted=permitted)
         order = partial(exporting.export_order, source, query.format, query.unit, query.time, options)
         file = await self.compute_apart(exporting.EXPORT_ITEM, order, ComputedFile.unpack)
-        headers = {"Content-Disposition": attachment(file.name), "Cache-Control": "private, no-cache"}
+        headers = {"Content-Disposition": attachment(file.name), "Cache-Control": NOT_CACHED}
         return Reply(file.data, media_type=file.media_type, headers=headers)
 
 

@@ -295,7 +295,7 @@ class Settings(BaseSettings):
 
     @property
     def retention(self) -> Retention:
-        """Return the numbers of days for which events, logs and jobs are kept."""
+        """Return the numbers of days for which events, audit entries, logs and jobs are kept."""
         return Retention(self.events_days, self.logs_days, self.jobs_days, self.audit_days)
 
     @property

@@ -1,6 +1,7 @@
 """Audit log: the events that concern access and deletion, newest first.
 
-Nothing but the retention deletes its entries, and nothing changes them.
+Nothing but the retention deletes its entries. Nothing changes them, except that a purge of an item replaces its name by
+its id.
 """
 
 from __future__ import annotations

@@ -261,7 +261,9 @@ def test_other_formats_come_back(
     layout: str,
 ) -> None:
     run("dataset", "export", "lab/gaits@v1", "out", "--as", layout, "--format", "npz")
-    run("upload", "out", "--project", "lab", "--collection", "copies")
+    assert "left out" not in run("upload", "out", "--project", "lab", "--collection", "copies").stderr
+    refused = run("build-model", "out", "--project", "lab", "--name", "walks", status=2).stderr
+    assert "import it with `marey upload`, which also imports take records and consents" in " ".join(refused.split())
     for one in project.clips.list(collection="gaits"):
         again = clip(project, one.name, f"copies/{one.item.collection.removeprefix('gaits/')}")
         assert np.allclose(one.motion().poses, again.motion().poses, atol=1e-4)

@@ -50,7 +50,7 @@ def test_a_file_that_cannot_be_stored_harms_no_other(lab: Lab) -> None:
 
 def test_an_import_without_a_main_item_is_an_error_that_ends_the_request(lab: Lab) -> None:
     edit = Draft("clean-up", Kind.EDIT, "clean-up", {"edit": {"commands": [{"command": "trim", "start": 1}]}}, "takes")
-    with pytest.raises(RuntimeError, match=r"the import of walk\.bvh published no clip, model, graph or skeleton"):
+    with pytest.raises(RuntimeError, match=r"no clip, model, graph or skeleton was created from .walk\.bvh."):
         store(lab, PreparedImport("walk.bvh", drafts=(edit,)))
 
 

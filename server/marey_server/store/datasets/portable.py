@@ -26,10 +26,12 @@ def check_archive(tx: Transaction, project: str, name: str, request: ArchiveChec
 
     Clips whose consent has ended may be, if the request allows it; an event then names them. Raises `ConflictProblem`
     if the consent has ended and the request does not allow the export, and `ForbiddenProblem` if it allows the export,
-    but the caller is not a maintainer or an owner.
+    but the caller is not a maintainer or an owner, or lacks the scope `write`.
     """
     role = Role.MAINTAINER if request.allow_expired_consent else Role.READER
     project_row = projects.require(tx, project, at_least=role)
+    if request.allow_expired_consent:
+        projects.require_scope(tx, project, "write")
     found = find_dataset(tx, project_row, name)
     ended = find_ended_with(tx, project_row.id, request.contents)
     if not request.allow_expired_consent:

@@ -22,7 +22,7 @@ from marey_server.store.items.reading import find_item
 from marey_server.store.tables import collection, item, revision
 from marey_server.store.transaction import IN_LIST, Transaction
 
-MOST_NAMED = 100
+MOST_NAMED = 10
 """Greatest number of clips that an error or an event names; both also contain the number of all clips."""
 
 
@@ -91,15 +91,19 @@ def require_consent(ended: Collection[EndedConsent]) -> None:
     )
 
 
-def permit_export(tx: Transaction, project: str, kind: Kind, item_id: str, override: ConsentOverride) -> None:
-    """Allow the export of an item although its consent may have ended; if it has ended, record this as an event.
+def permit_export(tx: Transaction, project: str, kind: Kind, item_id: str, override: ConsentOverride) -> bool:
+    """If the consent for an item has ended, record that the caller allows its export; return whether it has ended.
 
-    Raises `ForbiddenProblem` unless the caller is a maintainer or an owner, and `NotFoundProblem`.
+    Raises `ForbiddenProblem` unless the caller is a maintainer or an owner, with the scope `write`, and
+    `NotFoundProblem`.
     """
     project_row = projects.require(tx, project, at_least=Role.MAINTAINER)
+    projects.require_scope(tx, project, "write")
     find_item(tx, project_row, kind, item_id)
-    if ended := find_ended_consents(tx, [item_id]):
+    ended = find_ended_consents(tx, [item_id])
+    if ended:
         record_override(tx, project_row.id, item_id, override, list(ended.values()))
+    return bool(ended)
 
 
 def record_override(

@@ -10,7 +10,7 @@ from typing import Any
 
 from sqlalchemy import Row, and_, insert, select
 
-from marey_schemas.documents.clips import keep_record
+from marey_schemas.documents.clips import with_earlier_facts
 from marey_schemas.event_kinds import OrdinaryEventKind
 from marey_schemas.kinds import PARTS, Kind
 from marey_server import faults
@@ -351,7 +351,7 @@ class _Publication:
     def _reuse(self, one: _Ready, head: _Head) -> None:
         """Use the existing item if it has the content of the draft; otherwise add a revision to it."""
         if one.draft.kind is Kind.CLIP and one.draft.reuse == "by_name":
-            one = self._with_kept_record(one, head)
+            one = self._with_earlier_facts(one, head)
         if one.draft.reuse == "by_content" or one.digests.items() <= head.parts.items():
             self.done[one.draft.name_in_batch] = one.published(head.id, head.number, created=False)
             return
@@ -362,15 +362,15 @@ class _Publication:
             self._write("item.revised", [(one, replace(head, number=head.number + 1, parts=parts))])
             self._add(head.creator_id, Held(stored_bytes=added))
 
-    def _with_kept_record(self, one: _Ready, head: _Head) -> _Ready:
-        """Return the draft with facts about the recording from the existing clip, which files do not contain.
+    def _with_earlier_facts(self, one: _Ready, head: _Head) -> _Ready:
+        """Return the draft with the facts about the recording that the existing clip states and the draft leaves empty.
 
         Otherwise, a second import of a file would remove the consent of the performer.
         """
         digest, earlier = one.digests.get("info"), head.parts.get("info")
         if digest is None or earlier is None or digest == earlier:
             return one
-        body = keep_record(one.bodies["info"], documents.load_body(self.tx, earlier))
+        body = with_earlier_facts(one.bodies["info"], documents.load_body(self.tx, earlier))
         if body == one.bodies["info"]:
             return one
         documents.store_variants(self.tx, [(digest, body)])
