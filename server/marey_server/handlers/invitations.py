@@ -156,7 +156,7 @@ class SignUps(CodeResource):
         """
         attempt = await self.count_code(body.code)
         password = body.password.get_secret_value()
-        if await self.look_up(accepting.has_signed_up, body.code.get_secret_value(), body.name):
+        if await self.look_up(accepting.needs_password_check, body.code.get_secret_value(), body.name):
             login, verified_hash = await self.check_password(body.name, password)
             made = await self.change(accepting.sign_up_again, body, verified_hash, login, attempt)
         else:

@@ -126,17 +126,16 @@ def _use(tx: Transaction, row: Row[Any], user_id: str, user_name: str) -> None:
 # -- accounts ----------------------------------------------------------------------------------------------------------
 
 
-def has_signed_up(tx: Transaction, code: str, name: str) -> bool:
-    """Return whether the user `name` has used an invitation already; such a request is a repeated one.
+def needs_password_check(tx: Transaction, code: str, name: str) -> bool:
+    """Return whether `sign_up_again` must answer: the user `name` has used the code, or it is not valid for an account.
 
-    Raises `NotFoundProblem` if the code is not valid for an account, and the user has not used it either.
+    In the second case, the password is checked, too, so that a used code does not show who has used it. Raises
+    `NotFoundProblem` if the secret of the code is wrong.
     """
     row = _find(tx, code)
     user_id = tx.execute(select(user.c.id).where(user.c.name == name)).scalar()
-    if user_id is not None and _has_used(tx, row, user_id):
-        return True
-    _require_open_for_accounts(tx, row)
-    return False
+    used = user_id is not None and _has_used(tx, row, user_id)
+    return used or not row.creates_account or not _is_open(tx, row)
 
 
 def _require_open_for_accounts(tx: Transaction, row: Row[Any]) -> None:
