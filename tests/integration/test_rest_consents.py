@@ -273,7 +273,7 @@ def test_an_archive_with_a_clip_whose_consent_has_ended_is_refused(studio: Studi
     walk = studio.clip("walk", day(9))
     studio.clip("open", None)
     contents = contents_of(studio)
-    assert ok(check(contents=contents)) == {"consent_ended": 0}
+    assert ok(check(contents=contents)) == {"ended": []}
     studio.record(walk, day(-1))
     problem = refused(check(contents=contents), 409, "consent-expired")
     assert [one["path"] for one in problem["context"]["clips"]] == ["raw/walk"]
@@ -298,11 +298,11 @@ def test_maintainers_allow_an_archive_and_others_do_not(studio: Studio, check: E
     contributor, maintainer = studio.client(Role.CONTRIBUTOR), studio.client(Role.MAINTAINER)
     refused(check(contributor, contents, **allowed), 403, "insufficient-role")
     assert studio.overrides() == []
-    assert ok(check(maintainer, contents, **allowed)) == {"consent_ended": 1}
+    assert ok(check(maintainer, contents, **allowed)) == {"ended": [walk]}
     (event,) = studio.overrides()
     assert [one["item"] for one in event["body"]["clips"]] == [walk]
     assert event["body"]["reason"] == ALLOWED["consent_reason"]
-    assert ok(check(maintainer, ["sha256:" + "0" * 64], **allowed)) == {"consent_ended": 0}
+    assert ok(check(maintainer, ["sha256:" + "0" * 64], **allowed)) == {"ended": []}
     assert len(studio.overrides()) == 1
 
 

@@ -45,7 +45,7 @@ OnProgress = Callable[[str, int, int | None], None]
 """Function called with the current activity, the amount done, and the total amount if it is known."""
 
 
-CheckContents = Callable[[Sequence[str]], None]
+CheckContents = Callable[[Sequence[str]], object]
 """Function called with content digests of revisions before their documents are read."""
 
 
@@ -115,12 +115,13 @@ def write_archive(
     return head
 
 
-def check_consents(dataset: DatasetReader, reason: str | None, contents: Sequence[str]) -> None:
-    """Check that revisions, given by content digest, may be exported to an archive.
+def check_consents(dataset: DatasetReader, reason: str | None, contents: Sequence[str]) -> frozenset[str]:
+    """Check that revisions, given by content digest, may be exported.
 
-    Raises `Conflict` if the consent for a clip has ended, unless a `reason` to export it nevertheless is given, which
-    the server records.
+    Returns the ids of the items whose consent has ended. Raises `Conflict` if there are any, unless a `reason` to
+    export them nevertheless is given, which the server records.
     """
+    ended: set[str] = set()
     for start in range(0, len(contents), MOST_CHECKED):
         request = ArchiveCheck(
             contents=tuple(contents[start : start + MOST_CHECKED]),
@@ -128,7 +129,8 @@ def check_consents(dataset: DatasetReader, reason: str | None, contents: Sequenc
             consent_reason=reason,
         )
         url = f"{dataset.project_url}/datasets/{dataset.name}/archive-checks"
-        dataset.transport.post(ArchivePermission, url, request)
+        ended.update(dataset.transport.post(ArchivePermission, url, request).ended)
+    return frozenset(ended)
 
 
 def short_name(commits: Iterable[str]) -> str:

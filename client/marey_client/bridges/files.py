@@ -90,7 +90,7 @@ class MotionFiles:
     def _write_one(self, one: DescribedClip, target: Path, scratch: Path) -> str:
         """Write a clip to `target` by way of an empty folder `scratch`; return the digest of the file."""
         query: dict[str, str | int | None] = {"format": self.format, "revision": one.entry.revision, "unit": self.unit}
-        if self.allow_expired_consent is not None:
+        if self.allow_expired_consent is not None and one.entry.item in self.version.ended:
             query |= {"allow_expired_consent": "true", "consent_reason": self.allow_expired_consent}
         dataset = self.version.dataset
         url = f"{dataset.project_url}/{one.entry.kind.plural}/{one.entry.item}/export"

@@ -75,6 +75,8 @@ class VersionToExport:
     clips: tuple[Entry, ...]
     left_out: Mapping[str, int]
     """Number of entries that are not clips, by kind."""
+    ended: frozenset[str] = frozenset()
+    """Ids of the clips whose consent has ended, and whose export the server has allowed."""
 
     @property
     def identity(self) -> ExportedIdentity:
@@ -161,7 +163,7 @@ def version_to_export(
             f"the version {version} of {dataset.name} has no clips {place}; marey dataset entries lists what it has"
         )
     contents = dict.fromkeys(_located(one).content for one in clips)
-    check_consents(dataset, allow_expired_consent, list(contents))
+    ended = check_consents(dataset, allow_expired_consent, list(contents))
     return VersionToExport(
         dataset,
         commit,
@@ -169,6 +171,7 @@ def version_to_export(
         folder=folder,
         clips=clips,
         left_out=Counter(one.kind.value for one in entries if one.kind is not Kind.CLIP),
+        ended=ended,
     )
 
 

@@ -54,10 +54,10 @@ class ArchiveCheck(ConsentOverride):
 
 
 class ArchivePermission(Answer):
-    """Permission to write revisions to an archive."""
+    """Permission to export revisions."""
 
-    consent_ended: int = Field(
-        description="Number of items whose consent has ended, and whose export the request allows."
+    ended: tuple[str, ...] = Field(
+        description="Ids of the items whose consent has ended, and whose export the request allows."
     )
 
 

@@ -154,6 +154,8 @@ def test_an_ended_consent_refuses_all_layouts(run: CommandLine, project: Project
     with pytest.raises(Conflict):
         gaits_of(project).export_files(tmp_path / "never", "v1", path="raw")
     gaits_of(project).export_files(tmp_path / "others", "v1", path="smooth", allow_expired_consent="the lab agreed")
+    recorded = [one.about for one in project.audit(kind="consent.overridden")]
+    assert recorded == ["walk"] * 5  # of each version, and of each of its files that the server wrote
 
 
 def test_names_that_not_all_systems_accept_come_back(run: CommandLine, project: ProjectHandle, tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ def check_archive(tx: Transaction, project: str, name: str, request: ArchiveChec
         require_consent(ended)
     elif ended:
         record_override(tx, project_row.id, found.id, request, ended)
-    return ArchivePermission(consent_ended=len(ended))
+    return ArchivePermission(ended=tuple(one.item for one in ended))
 
 
 def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> dict[str, Any]:
