@@ -1,4 +1,4 @@
-"""Property of retention: whoever follows the feed knows of every event, or is told how far events were deleted."""
+"""Property of retention: a follower of the feed gets every event, or an error with the last deleted event."""
 
 from __future__ import annotations
 

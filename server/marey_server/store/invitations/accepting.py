@@ -20,14 +20,11 @@ from marey_server.errors import ForbiddenProblem, NotFoundProblem
 from marey_server.store import members, users
 from marey_server.store.credentials import sign_ins, tokens
 from marey_server.store.credentials.sign_ins import SignInTry
-from marey_server.store.invitations.validity import IN_FORCE
+from marey_server.store.invitations.validity import is_open
 from marey_server.store.tables import invitation, invitation_use, project, user
 from marey_server.store.transaction import Transaction
 
 _NO_HASH = hash_secret("")  # of no code, because secrets are not empty
-_ROWS = select(
-    invitation, project.c.name.label("project"), project.c.deleted_us, IN_FORCE.label("in_force")
-).select_from(invitation.outerjoin(project, project.c.id == invitation.c.project_id))
 
 
 def invitation_invalid() -> NotFoundProblem:
@@ -51,7 +48,9 @@ def _find(tx: Transaction, code: str) -> Row[Any]:
     All codes cost the same query and comparison. Raises `NotFoundProblem`.
     """
     prefix, secret = split_invitation(code) or ("", "")
-    row = tx.execute(_ROWS.where(invitation.c.prefix == prefix)).first()
+    statement = select(invitation, project.c.name.label("project"), project.c.deleted_us, is_open(tx).label("open"))
+    statement = statement.select_from(invitation.outerjoin(project, project.c.id == invitation.c.project_id))
+    row = tx.execute(statement.where(invitation.c.prefix == prefix)).first()
     if not secret_matches(secret, _NO_HASH if row is None else row.secret_hash) or row is None:
         raise invitation_invalid()
     return row
@@ -63,10 +62,6 @@ def _lock(tx: Transaction, code: str) -> Row[Any]:
     tx.execute(select(project.c.id).where(project.c.id == found.project_id).with_for_update(key_share=True))
     tx.execute(select(invitation.c.id).where(invitation.c.id == found.id).with_for_update())
     return _find(tx, code)
-
-
-def _is_open(tx: Transaction, row: Row[Any]) -> bool:
-    return bool(row.in_force and row.used < row.uses and row.expires_us > tx.now_us)
 
 
 def _has_used(tx: Transaction, row: Row[Any], user_id: str | None) -> bool:
@@ -89,7 +84,7 @@ def accept_invitation(tx: Transaction, code: str, attempt: SignInTry) -> Accepte
     used_before = _has_used(tx, row, user_id)
     if used_before and present is not None and row.deleted_us is None:
         role = present
-    elif used_before or not _is_open(tx, row):
+    elif used_before or not row.open:
         raise invitation_invalid()
     elif present is not None and includes(present, role):
         sign_ins.take_back(tx, attempt)
@@ -135,11 +130,11 @@ def needs_password_check(tx: Transaction, code: str, name: str) -> bool:
     row = _find(tx, code)
     user_id = tx.execute(select(user.c.id).where(user.c.name == name)).scalar()
     used = user_id is not None and _has_used(tx, row, user_id)
-    return used or not row.creates_account or not _is_open(tx, row)
+    return used or not row.creates_account or not row.open
 
 
-def _require_open_for_accounts(tx: Transaction, row: Row[Any]) -> None:
-    if not row.creates_account or not _is_open(tx, row):
+def _require_open_for_accounts(row: Row[Any]) -> None:
+    if not row.creates_account or not row.open:
         raise invitation_invalid()
 
 
@@ -149,7 +144,7 @@ def sign_up(tx: Transaction, request: SignUp, password_hash: str, attempt: SignI
     Raises `NotFoundProblem` if the code is not valid for this, and `ConflictProblem` if the name is taken.
     """
     row = _lock(tx, request.code.get_secret_value())
-    _require_open_for_accounts(tx, row)
+    _require_open_for_accounts(row)
     tx.principal = users.sign_up(tx, request.name, request.display_name, password_hash)
     _use(tx, row, str(tx.principal.user_id), request.name)
     return _signed_up(tx, row, request, attempt)
