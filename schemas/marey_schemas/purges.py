@@ -11,6 +11,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath
 from marey_schemas.queries.grammar import MOST_CHARACTERS
 from marey_schemas.queue.jobs import JobState
+from marey_schemas.wording import counted
 
 MOST_PURGED = 500
 """Greatest number of items that one request examines."""
@@ -125,8 +126,8 @@ def words_of(holder: Holder) -> str:
     if isinstance(holder, JobHolder):
         return f"the {holder.state} job {holder.job} ({holder.kind})"
     named = [f"{name} {', '.join(map(str, ones))}" for name, ones in _refs_of(holder) if ones]
-    commits = f"{holder.commits:,} {'commit' if holder.commits == 1 else 'commits'}"
-    return f"the {'deleted ' if holder.deleted else ''}dataset {holder.dataset} ({'; '.join([*named, commits])})"
+    details = "; ".join([*named, counted(holder.commits, "commit")])
+    return f"the {'deleted ' if holder.deleted else ''}dataset {holder.dataset} ({details})"
 
 
 def _refs_of(holder: DatasetHolder) -> list[tuple[str, tuple[str, ...] | tuple[int, ...]]]:

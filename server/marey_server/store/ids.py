@@ -6,6 +6,7 @@ import time
 
 _ALPHABET = "0123456789abcdefghjkmnpqrstvwxyz"
 _ID = re.compile(f"[a-z_-]{{1,13}}_[{_ALPHABET}]{{26}}")
+_ID_IN_TEXT = re.compile(rf"\b[a-z]+_[{_ALPHABET}]{{26}}\b")
 
 
 def new_id(prefix: str) -> str:
@@ -13,6 +14,11 @@ def new_id(prefix: str) -> str:
     number = (time.time_ns() // 1_000_000) << 80 | secrets.randbits(80)
     digits = [_ALPHABET[(number >> shift) & 31] for shift in range(125, -1, -5)]
     return f"{prefix}_{''.join(digits)}"
+
+
+def ids_in(text: str) -> list[str]:
+    """Return the ids of items, jobs and so on that a text contains, in order."""
+    return _ID_IN_TEXT.findall(text)
 
 
 def is_id(text: str) -> bool:

@@ -16,6 +16,7 @@ from sqlalchemy import Column, Row, Select, bindparam, exists, func, or_, select
 from marey_schemas.access import QuotaChange, QuotasInUse, QuotaUse, Role
 from marey_server.errors import QuotaExceededProblem
 from marey_server.store.database.prepared import Prepared
+from marey_server.store.invitations.validity import is_unspent
 from marey_server.store.tables import (
     UNFINISHED,
     document,
@@ -97,8 +98,7 @@ def _used(tx: Transaction, quota: str, user_id: str) -> Select[Any]:
     if quota == "user_jobs":
         return select(func.count()).select_from(job).where(job.c.author_id == user_id, UNFINISHED)
     if quota == "user_invitations":
-        unused = invitation.c.inviter_id == user_id, invitation.c.used < invitation.c.uses
-        return select(func.count()).select_from(invitation).where(*unused, invitation.c.expires_us > tx.now_us)
+        return select(func.count()).select_from(invitation).where(invitation.c.inviter_id == user_id, is_unspent(tx))
     owned = select(func.count()).select_from(member.join(project, project.c.id == member.c.project_id))
     return owned.where(member.c.user_id == user_id, member.c.role == Role.OWNER.value, project.c.deleted_us.is_(None))
 

@@ -8,13 +8,13 @@ read only the revisions that are inputs of its job, since these may come from an
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Collection, Iterable, Iterator
 from typing import Any, NamedTuple
 
 from sqlalchemy import Text, cast, or_, select
 
 from marey_schemas.lru import LruCache
+from marey_server.store.ids import ids_in
 from marey_server.store.tables import document, document_blob, item, job, job_blob, revision_part
 from marey_server.store.transaction import IN_LIST, Transaction
 
@@ -25,7 +25,6 @@ MOST_DOCUMENTS = 50_000
 """Greatest number of documents that are searched for references of one job."""
 _REMEMBERED_BYTES = 32 << 20
 _ENTRY_BYTES = 200
-_ITEM_ID = re.compile(r"\b[a-z]+_[0-9a-hjkmnp-tv-z]{26}\b")
 
 _pins: LruCache[str, Pins] = LruCache(
     max_bytes=_REMEMBERED_BYTES, size_of=lambda pins: _ENTRY_BYTES * (1 + len(pins.places) + len(pins.named))
@@ -112,7 +111,7 @@ def _pins_of(tx: Transaction) -> Pins:
 
 
 def _ids_in(text: str) -> list[str]:
-    return _ITEM_ID.findall(text)
+    return ids_in(text)
 
 
 # -- what documents name ----------------------------------------------------------------------------------------------

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 from sqlalchemy import Text, cast, func, or_, select
 
-from marey_schemas.queue.jobs import JobState
+from marey_server.store.ids import ids_in
+from marey_server.store.jobs.reading import UNFINISHED
 from marey_server.store.tables import job
 from marey_server.store.transaction import Transaction
-
-UNFINISHED = tuple(state.value for state in JobState if not state.terminal)
-_ITEM_ID = re.compile(r"\b[a-z]+_[0-9a-hjkmnp-tv-z]{26}\b")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,5 +51,5 @@ def jobs_naming(
         statement = statement.where(or_(job.c.state.in_(UNFINISHED), parent.c.state.in_(UNFINISHED)))
     wanted = frozenset(items)
     for row in tx.execute(statement):
-        if named := wanted.intersection(_ITEM_ID.findall(row.text)):
+        if named := wanted.intersection(ids_in(row.text)):
             yield NamingJob(row.id, row.parent_id, row.kind, row.state, named)
