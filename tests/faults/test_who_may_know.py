@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import ColumnElement, true
 from tests.support.rest_server import Server, running
 from tests.support.tiers import is_soak
 from tests.support.who_may_invite import InvitingProgram
@@ -50,8 +51,8 @@ def _every_role_is_enough(_role: Any, _required: Any) -> bool:
     return True
 
 
-def _every_invitation_is_open(_tx: Any, _row: Any) -> bool:
-    return True
+def _every_invitation_is_open(_tx: Any) -> ColumnElement[bool]:
+    return true()
 
 
 def _everybody_is_an_administrator(_principal: Any) -> bool:
@@ -67,7 +68,7 @@ HOLES: dict[str, tuple[Any, str, Callable[..., Any]]] = {
     "a token reaches beyond its project": (scopes, "allows", _bounds_of_tokens_are_forgotten),
     "a digest is enough to have the bytes": (blobs, "_held", _everybody_holds_all_bytes),
     "everybody is an administrator": (roles, "is_administrator", _everybody_is_an_administrator),
-    "an invitation that is used up still works": (accepting, "_is_open", _every_invitation_is_open),
+    "an invitation that is used up still works": (accepting, "is_open", _every_invitation_is_open),
     "private projects have guests": (projects, "_as_seen", _every_project_has_guests),
 }
 
