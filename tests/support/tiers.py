@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import os
 import zlib
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -184,7 +184,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             gone.append(item)
             config.stash[LEFT_OUT][reason] += 1
     config.hook.pytest_deselected(items=gone)
-    items[:] = kept
+    items[:] = _in_order(kept)
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
@@ -203,6 +203,31 @@ def _group(item: pytest.Item) -> str:
     if folder.startswith("integration/ways/"):
         return f"ways on {backend_of(item)}"
     return item.nodeid if _fault(item) else folder
+
+
+def _in_order(items: Sequence[pytest.Item]) -> list[pytest.Item]:
+    """Return the tests in the order in which processes start them: large groups first, and fault cases among them.
+
+    Fault cases mostly wait, so they should run beside tests that compute; other large groups would end last, alone.
+    """
+    groups: defaultdict[str, list[pytest.Item]] = defaultdict(list)
+    for item in items:
+        groups[_group_of(item)].append(item)
+    computing = sorted((group for group in groups.values() if not _fault(group[0])), key=len, reverse=True)
+    waiting = [group for group in groups.values() if _fault(group[0])]
+    total, ended = sum(map(len, computing)), 0
+    placed: list[tuple[float, list[pytest.Item]]] = []
+    for group in computing:
+        placed.append((ended / total, group))
+        ended += len(group)
+    placed += [(number / len(waiting), group) for number, group in enumerate(waiting)]
+    return [item for _, group in sorted(placed, key=lambda pair: pair[0]) for item in group]
+
+
+def _group_of(item: pytest.Item) -> str:
+    marker = item.get_closest_marker("xdist_group")
+    assert marker is not None
+    return str(marker.args[0])
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
