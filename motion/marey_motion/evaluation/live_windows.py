@@ -142,7 +142,7 @@ class LiveWindows:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> LiveWindows:
-        """Restore a state saved by `as_tree`, bit by bit.
+        """Restore exactly the state that `as_tree` saved, to the last bit.
 
         Parameters
         ----------

@@ -260,7 +260,7 @@ class OnlineCoverage:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> OnlineCoverage:
-        """Restore a state saved by `as_tree`, bit by bit.
+        """Restore exactly the state that `as_tree` saved, to the last bit.
 
         Parameters
         ----------

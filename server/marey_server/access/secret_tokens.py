@@ -55,8 +55,8 @@ def derive_token_key(secret: str) -> bytes:
 def derive_attempt_token(token_key: bytes, claim_id: str, job_id: str, fence: int) -> IssuedToken:
     """Derive the token of an attempt; the same arguments always give the same token.
 
-    So a worker that repeats a claim with the same user token gets the same attempt token again. `fence` is the
-    number of the claim among those of the job.
+    So a worker that repeats a claim with the same user token gets the same attempt token again. `fence` counts the
+    claims of the job.
     """
     return _attempt_token(hmac.digest(token_key, f"{claim_id} {job_id} {fence}".encode(), "sha256").hex())
 

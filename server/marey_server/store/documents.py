@@ -262,9 +262,9 @@ def _refer(tx: Transaction, references: Iterable[tuple[str, str, str]]) -> None:
 
 
 def items_named_in(body: Tree) -> set[str]:
-    """Return the ids of the items to which a document refers, also as the source of a command of an edit.
+    """Return the ids of the items that a document names: in its references, and as sources in the commands of an edit.
 
-    Texts that are too long for an id are left out: the members of some documents are not checked.
+    The fields of some documents are not checked, so texts that are too long for an id are ignored.
     """
     named = {reference.item for reference in references_in(body)}
     if body.get("schema") == EDIT_SCHEMA:

@@ -27,11 +27,13 @@ MOST_NAMED = 10
 
 
 class EndedConsent(NamedTuple):
-    """Item whose consent has ended, the path of the clip with its take record, and the last day of the consent."""
+    """Item whose consent has ended."""
 
     item: str
     path: str
+    """Path of the clip whose take record states the consent: the item itself, or the clip that it was made from."""
     until: str
+    """Last day of the consent."""
 
 
 def find_ended_consents(tx: Transaction, item_ids: Iterable[str]) -> dict[str, EndedConsent]:
