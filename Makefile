@@ -12,7 +12,7 @@ ARGS   ?=
 unexport PYTHONDONTWRITEBYTECODE
 EFFORT ?= 4
 # Twice as many processes as two processors: tests of faults mostly wait, for leases to end or processes to start.
-PYTEST := $(BIN)/python -m pytest -q -n 4 --dist loadgroup --no-loadscope-reorder $(ARGS)
+PYTEST := $(BIN)/python -m pytest -q -n 4 --dist loadgroup $(ARGS)
 
 .DEFAULT_GOAL := help
 .PHONY: help installed demo check test soak lint format dev bench docs pins audit bom clean

@@ -147,6 +147,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[LEFT_OUT] = Counter()
+    config.option.loadscopereorder = False  # pytest-xdist keeps the order of `_in_order`
     name = config.getoption("tier")
     tier = TIERS[name]
     effort = tier.effort
