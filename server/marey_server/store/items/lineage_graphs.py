@@ -193,12 +193,15 @@ class _LineageWalk:
         The database selects them, because a job may have 100,000 inputs.
         """
         if self._tx.connection.dialect.name == "postgresql":
-            named = func.jsonb_each(job.c.inputs).table_valued(column("key"), column("value", JSONB)).render_derived()
+            value = column("value", JSONB)
+            inputs = func.jsonb_each(job.c.inputs).table_valued(column("key"), value, joins_implicitly=True)
+            named = inputs.render_derived()
             listed = case((func.jsonb_typeof(named.c.value) == "array", named.c.value), else_=literal([], JSONB))
-            pins = func.jsonb_array_elements(listed).table_valued(column("value", JSONB)).render_derived()
+            pins = func.jsonb_array_elements(listed).table_valued(value, joins_implicitly=True).render_derived()
         else:
-            named = func.json_each(job.c.inputs).table_valued(column("value", JSON))
-            pins = func.json_each(named.c.value).table_valued(column("value", JSON))
+            value = column("value", JSON)
+            named = func.json_each(job.c.inputs).table_valued(value, joins_implicitly=True)
+            pins = func.json_each(named.c.value).table_valued(value, joins_implicitly=True)
         commit = pins.c.value["commit"].as_string()
         statement = (
             select(func.coalesce(job.c.parent_id, job.c.id).label("whole"), commit.label("commit"))
