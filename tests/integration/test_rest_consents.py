@@ -190,7 +190,7 @@ def test_a_maintainer_with_a_token_that_only_reads_cannot_allow_an_export(studio
     refused(export(walk, reader, **ALLOWED), 403, "insufficient-scope")
     ok(studio.owner.post(f"{LAB}/datasets", json={"name": "raw", "collection": "raw"}), 201)
     body = {"contents": contents_of(studio), "allow_expired_consent": True, "consent_reason": "why"}
-    refused(reader.post(f"{LAB}/datasets/raw/archive-checks", json=body), 403, "insufficient-scope")
+    refused(reader.post(f"{LAB}/datasets/raw/export-checks", json=body), 403, "insufficient-scope")
     assert studio.overrides() == []
 
 
@@ -253,7 +253,7 @@ def check(studio: Studio) -> Callable[..., httpx.Response]:
 
     def send(client: httpx.Client | None = None, contents: list[str] | None = None, **fields: Any) -> httpx.Response:
         body = {"contents": contents if contents is not None else contents_of(studio), **fields}
-        return (client or studio.owner).post(f"{LAB}/datasets/raw/archive-checks", json=body)
+        return (client or studio.owner).post(f"{LAB}/datasets/raw/export-checks", json=body)
 
     return send
 
@@ -310,7 +310,7 @@ def test_a_check_is_bounded_and_of_a_dataset(studio: Studio, check: Export) -> N
     for contents in ([], ["sha256:" + "0" * 64] * 501, ["walk"]):
         refused(check(contents=contents), 422, "invalid-body")
     body = {"contents": ["sha256:" + "0" * 64]}
-    refused(studio.owner.post(f"{LAB}/datasets/none/archive-checks", json=body), 404, "no-dataset")
+    refused(studio.owner.post(f"{LAB}/datasets/none/export-checks", json=body), 404, "no-dataset")
 
 
 def test_the_day_of_a_record_has_one_form(studio: Studio) -> None:

@@ -71,7 +71,7 @@ BODIES = {
     "ProposalMerge": {"when_green": True},
     "CheckoutRequest": {"version": "spare", "discard": True},
     "ContentsRequest": {"revisions": [OTHER_DIGEST]},
-    "ArchiveCheck": {"contents": [OTHER_DIGEST]},
+    "ExportCheck": {"contents": [OTHER_DIGEST]},
     "ReceivedRevisions": {
         "revisions": [
             {

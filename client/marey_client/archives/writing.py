@@ -17,9 +17,9 @@ from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
 from marey_schemas.datasets.contents import (
     MOST_CHECKED,
     MOST_CONTENTS,
-    ArchiveCheck,
-    ArchivePermission,
     ContentsRequest,
+    ExportCheck,
+    ExportPermission,
     PartOfContent,
 )
 from marey_schemas.documents.blob_references import references_of
@@ -123,13 +123,13 @@ def check_consents(dataset: DatasetReader, reason: str | None, contents: Sequenc
     """
     ended: set[str] = set()
     for start in range(0, len(contents), MOST_CHECKED):
-        request = ArchiveCheck(
+        request = ExportCheck(
             contents=tuple(contents[start : start + MOST_CHECKED]),
             allow_expired_consent=reason is not None,
             consent_reason=reason,
         )
-        url = f"{dataset.project_url}/datasets/{dataset.name}/archive-checks"
-        ended.update(dataset.transport.post(ArchivePermission, url, request).ended)
+        url = f"{dataset.project_url}/datasets/{dataset.name}/export-checks"
+        ended.update(dataset.transport.post(ExportPermission, url, request).ended)
     return frozenset(ended)
 
 

@@ -17,7 +17,7 @@ from marey_schemas.names import Digest, Message, Tag
 MOST_CONTENTS = 256
 """Greatest number of revisions, and of documents, in one request."""
 MOST_CHECKED = 500
-"""Greatest number of revisions in one request that checks whether they may be written to an archive."""
+"""Greatest number of revisions in one request that checks whether they may be exported."""
 MOST_RECEIVED_CHANGES = 200_000
 """Greatest number of entries that a commit from elsewhere may change."""
 
@@ -45,15 +45,15 @@ class ContentsRequest(Request):
     documents: tuple[PartOfContent, ...] = Field((), max_length=MOST_CONTENTS)
 
 
-class ArchiveCheck(ConsentOverride):
-    """Question whether the clips of an archive may be exported; a large archive is checked by several requests."""
+class ExportCheck(ConsentOverride):
+    """Question whether revisions of a dataset may be exported; a large export is checked by several requests."""
 
     contents: tuple[Digest, ...] = Field(
-        min_length=1, max_length=MOST_CHECKED, description="Content digests of revisions that the archive will contain."
+        min_length=1, max_length=MOST_CHECKED, description="Content digests of revisions that the export will contain."
     )
 
 
-class ArchivePermission(Answer):
+class ExportPermission(Answer):
     """Permission to export revisions."""
 
     ended: tuple[str, ...] = Field(

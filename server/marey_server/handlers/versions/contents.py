@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from marey_schemas.datasets.commits import Commit
 from marey_schemas.datasets.contents import (
-    ArchiveCheck,
-    ArchivePermission,
     ContentsRequest,
+    ExportCheck,
+    ExportPermission,
     ReceivedCommit,
     ReceivedRevisions,
     StoredRevisions,
@@ -41,23 +41,23 @@ class ProjectContents(Resource):
         return await self.render_document(Reply(found))
 
 
-class ArchiveChecks(Resource):
-    """Checks before revisions are written to an archive."""
+class ExportChecks(Resource):
+    """Checks before revisions of a dataset are exported."""
 
-    path = "/projects/{project}/datasets/{dataset}/archive-checks"
+    path = "/projects/{project}/datasets/{dataset}/export-checks"
     tag = "ProjectDatasets"
 
-    @reads(access=Access.READER, body=ArchiveCheck, answer=ArchivePermission)
-    async def post(self, project: str, dataset: str, body: ArchiveCheck) -> Reply:
-        """Check that the consent for the clips of an archive has not ended.
+    @reads(access=Access.READER, body=ExportCheck, answer=ExportPermission)
+    async def post(self, project: str, dataset: str, body: ExportCheck) -> Reply:
+        """Check that the consent for the clips of an export has not ended.
 
-        A program that writes an archive sends this request before it reads the documents with `POST
+        A program that writes an archive or other files sends this request before it reads the documents with `POST
         /projects/{project}/contents`. Aligned clips are checked, too. If the consent for an item has ended, the answer
         is an error (409, `consent-expired`) that names such items. Maintainers can allow the export with
         `allow_expired_consent` and a reason; an event then names the items.
         """
         run = self.change if body.allow_expired_consent else self.look_up
-        return Reply(await run(datasets.check_archive, project, dataset, body))
+        return Reply(await run(datasets.check_export, project, dataset, body))
 
 
 class ReceivedContents(Resource):
@@ -107,4 +107,4 @@ class ReceivedCommits(Resource):
         return await self.answer(datasets.record_receipt, project, dataset, body, prepared)
 
 
-RESOURCES: tuple[type[Resource], ...] = (ProjectContents, ArchiveChecks, ReceivedContents, ReceivedCommits)
+RESOURCES: tuple[type[Resource], ...] = (ProjectContents, ExportChecks, ReceivedContents, ReceivedCommits)

@@ -23,7 +23,7 @@ from marey_server.store.datasets.naming import (
     read_dataset,
     read_ref,
 )
-from marey_server.store.datasets.portable import check_archive, load_contents
+from marey_server.store.datasets.portable import check_export, load_contents
 from marey_server.store.datasets.receiving import (
     find_local,
     prepare_receipt,
@@ -35,7 +35,7 @@ from marey_server.store.datasets.receiving import (
 __all__ = [
     "PreparedCommit",
     "PreparedMerge",
-    "check_archive",
+    "check_export",
     "check_out",
     "compare_versions",
     "create_dataset",

@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import select
 
 from marey_schemas.access import Role
-from marey_schemas.datasets.contents import ArchiveCheck, ArchivePermission, ContentsRequest
+from marey_schemas.datasets.contents import ContentsRequest, ExportCheck, ExportPermission
 from marey_server.store import documents, projects
 from marey_server.store.datasets.contents import Contents, find_contents_of
 from marey_server.store.datasets.history import revisions_with
@@ -21,12 +21,12 @@ from marey_server.store.transaction import Transaction
 from marey_versions.records import RevisionKey, portable_document, references_in
 
 
-def check_archive(tx: Transaction, project: str, name: str, request: ArchiveCheck) -> ArchivePermission:
-    """Check that revisions may be written to an archive of a dataset.
+def check_export(tx: Transaction, project: str, name: str, request: ExportCheck) -> ExportPermission:
+    """Check that revisions of a dataset may be exported.
 
-    Clips whose consent has ended may be, if the request allows it; an event then names them. Raises `ConflictProblem`
-    if the consent has ended and the request does not allow the export, and `ForbiddenProblem` if it allows the export,
-    but the caller is not a maintainer or an owner, or lacks the scope `write`.
+    Clips whose consent has ended may be exported if the request allows it; an event then names them. Raises
+    `ConflictProblem` if the consent has ended and the request does not allow the export, and `ForbiddenProblem` if it
+    allows the export, but the caller is not a maintainer or an owner, or lacks the scope `write`.
     """
     role = Role.MAINTAINER if request.allow_expired_consent else Role.READER
     project_row = projects.require(tx, project, at_least=role)
@@ -38,7 +38,7 @@ def check_archive(tx: Transaction, project: str, name: str, request: ArchiveChec
         require_consent(ended)
     elif ended:
         record_override(tx, project_row.id, found.id, request, ended)
-    return ArchivePermission(ended=tuple(one.item for one in ended))
+    return ExportPermission(ended=tuple(one.item for one in ended))
 
 
 def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> dict[str, Any]:
