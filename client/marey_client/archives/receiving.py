@@ -8,14 +8,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+from marey_client.archives.contents import request_contents
 from marey_client.blobs import Blobs
 from marey_client.errors import EarlierVersionsMissing
-from marey_client.transport import BLOCKS, Transport, as_json, read_model
+from marey_client.progress import OnProgress
+from marey_client.transport import Transport, as_json, read_model
 from marey_schemas.datasets.commits import Commit
 from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, ReceivedChange, ReceivedCommit
 from marey_schemas.documents.blob_references import references_of
 from marey_schemas.encoding.canonical import attach_arrays
-from marey_schemas.encoding.codecs import MSGPACK, decode_tree
 from marey_schemas.kinds import Kind
 from marey_schemas.sizes import MIB
 from marey_versions.archive.members import ArchiveMember, MemberKind
@@ -24,9 +25,6 @@ from marey_versions.records import CommitRecord, contents_in, path_and_kind, rev
 
 MOST_BYTES_SENT = 16 * MIB
 """Size of the documents from which on a request contains no further revision."""
-
-OnProgress = Callable[[str, int, int | None], None]
-"""Function called with the current activity, the amount done, and the total amount if it is known."""
 
 
 class ReceivingDataset(Protocol):
@@ -148,10 +146,8 @@ class _Import:
         missing = []
         for start in range(0, len(contents), MOST_CONTENTS):
             some = contents[start : start + MOST_CONTENTS]
-            body = as_json(ContentsRequest(revisions=tuple(some)))
-            url = f"{self.dataset.project_url}/contents"
-            response = self.dataset.transport.send("POST", url, content=body, headers={"Accept": BLOCKS})
-            found = decode_tree(response.content, MSGPACK)["revisions"]
+            request = ContentsRequest(revisions=tuple(some))
+            found = request_contents(self.dataset.transport, self.dataset.project_url, request)["revisions"]
             missing += [content for content, one in zip(some, found, strict=True) if one is None]
         self._note(set(contents) - set(missing))
         return missing

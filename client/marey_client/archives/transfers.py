@@ -9,7 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from marey_client.archives.writing import DatasetReader, OnProgress, short_name, write_archive
+from marey_client.archives.writing import DatasetReader, short_name, write_archive
+from marey_client.progress import OnProgress
 from marey_schemas.datasets.commits import Commit
 from marey_versions.archive.reading import Archive
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
 from marey_client.archives.contents import first_documents, request_contents
 from marey_client.blobs import Blobs
 from marey_client.errors import ArchiveInUse, NothingToArchive, UnexpectedAnswer
+from marey_client.progress import OnProgress
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
 from marey_schemas.datasets.contents import (
     MOST_CHECKED,
@@ -40,10 +41,6 @@ if TYPE_CHECKING:
 
 MOST_LISTED = 10_000
 """Number of differences that are requested at once; versions that differ in more entries are listed whole."""
-
-OnProgress = Callable[[str, int, int | None], None]
-"""Function called with the current activity, the amount done, and the total amount if it is known."""
-
 
 CheckContents = Callable[[Sequence[str]], object]
 """Function called with content digests of revisions before their documents are read."""

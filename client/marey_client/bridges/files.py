@@ -26,7 +26,7 @@ from marey_schemas.datasets.layouts import Layout
 from marey_schemas.formats import DEFAULT_UNIT, WHOLE_FORMATS, format_named
 
 if TYPE_CHECKING:
-    from marey_client.archives.writing import OnProgress
+    from marey_client.progress import OnProgress
     from marey_schemas.datasets.commits import Commit
 
 

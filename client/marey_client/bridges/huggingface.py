@@ -22,7 +22,7 @@ from marey_schemas.datasets.exports import SIDECAR, ExportedClip, ExportedIdenti
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
-    from marey_client.archives.writing import OnProgress
+    from marey_client.progress import OnProgress
 
 MOST_FILES_PER_FOLDER = 10_000
 

@@ -46,7 +46,7 @@ from marey_client.bridges.version import (
 from marey_client.errors import CannotExport
 
 if TYPE_CHECKING:
-    from marey_client.archives.writing import OnProgress
+    from marey_client.progress import OnProgress
 
 CODEBASE_VERSION = "v3.0"
 NO_ACTION = "motion"

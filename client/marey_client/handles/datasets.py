@@ -14,6 +14,7 @@ from marey_client.errors import NotFound, RequestFailed
 from marey_client.handles.bisections import Bisection, IsBad, OnStep, bisect, read_range
 from marey_client.handles.proposals import Proposals
 from marey_client.paging import pages
+from marey_client.progress import OnProgress, ignore_progress
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.datasets.commits import Commit, CommitCreate, Entry, EntryChange, EntryOrigins
 from marey_schemas.datasets.differences import DatasetDifference, ListedCommit
@@ -31,13 +32,8 @@ from marey_schemas.formats import DEFAULT_FORMAT
 from marey_schemas.kinds import Kind
 
 if TYPE_CHECKING:
-    from marey_client.archives.writing import OnProgress
     from marey_client.bridges.files import ExportedVersion
     from marey_versions.archive.reading import Archive
-
-
-def _silent(_what: str, _done: int, _total: int | None) -> None:
-    """Ignore a report of progress."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +59,7 @@ class Datasets:
         return pages(self.transport, Dataset, self.url)
 
     def import_archive(
-        self, path: str | Path, name: str, *, into: str = MAIN, on_progress: OnProgress = _silent
+        self, path: str | Path, name: str, *, into: str = MAIN, on_progress: OnProgress = ignore_progress
     ) -> ImportedVersion:
         """Check an archive, and record its versions in a dataset, which is created if it does not exist.
 
@@ -96,7 +92,7 @@ class Datasets:
         version: str = MAIN,
         *,
         into: str | None = None,
-        on_progress: OnProgress = _silent,
+        on_progress: OnProgress = ignore_progress,
     ) -> ImportedVersion:
         """Copy a version of another dataset, and all versions before it, into the dataset `name` of this project.
 
@@ -340,7 +336,7 @@ class DatasetHandle:
         *,
         since: str | Sequence[str] | None = None,
         allow_expired_consent: str | None = None,
-        on_progress: OnProgress = _silent,
+        on_progress: OnProgress = ignore_progress,
     ) -> Commit:
         """Write a version, all versions before it, and everything that they contain to one file.
 
@@ -366,7 +362,7 @@ class DatasetHandle:
         format: str = DEFAULT_FORMAT,  # noqa: A002
         unit: str | None = None,
         allow_expired_consent: str | None = None,
-        on_progress: OnProgress = _silent,
+        on_progress: OnProgress = ignore_progress,
     ) -> ExportedVersion:
         """Write the clips of a version, all or those below `path`, to motion files in a new folder.
 
@@ -389,7 +385,7 @@ class DatasetHandle:
         format: str = DEFAULT_FORMAT,  # noqa: A002
         unit: str | None = None,
         allow_expired_consent: str | None = None,
-        on_progress: OnProgress = _silent,
+        on_progress: OnProgress = ignore_progress,
     ) -> ExportedVersion:
         """Write the clips of a version to a new folder that can be uploaded to the Hugging Face Hub as a dataset.
 
@@ -408,7 +404,7 @@ class DatasetHandle:
         *,
         path: str = "",
         allow_expired_consent: str | None = None,
-        on_progress: OnProgress = _silent,
+        on_progress: OnProgress = ignore_progress,
     ) -> ExportedVersion:
         """Write the clips of a version to a new folder as a LeRobotDataset v3.0, with one episode for each clip.
 
@@ -420,7 +416,9 @@ class DatasetHandle:
         found = prepare_lerobot(self, version, Path(folder), path, allow_expired_consent)
         return write_lerobot(found, Path(folder), on_progress)
 
-    def receive(self, archive: Archive, *, into: str = MAIN, on_progress: OnProgress = _silent) -> ImportedVersion:
+    def receive(
+        self, archive: Archive, *, into: str = MAIN, on_progress: OnProgress = ignore_progress
+    ) -> ImportedVersion:
         """Record the versions of an archive without checking it, and move the branch `into` to the newest of them.
 
         The branch stays where it is if its newest commit is not an ancestor of that version.

@@ -16,9 +16,9 @@ from marey_schemas.formats import DEFAULT_FORMAT, WHOLE_FORMATS
 from marey_schemas.wording import counted, one_of
 
 if TYPE_CHECKING:
-    from marey_client.archives.writing import OnProgress
     from marey_client.bridges.files import ExportedVersion
     from marey_client.handles.datasets import DatasetHandle
+    from marey_client.progress import OnProgress
 
 RENAMED_SHOWN = 5
 
