@@ -26,6 +26,7 @@ from marey_schemas.sizes import KIB
 from marey_server.access import passwords
 from marey_server.access.roles import require_administrator
 from marey_server.errors import ForbiddenProblem, TooManyRequestsProblem
+from marey_server.http.caching import WITH_SECRET
 from marey_server.http.declarations import Access, RequestBody, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
@@ -149,7 +150,7 @@ class LoginResource(PasswordResource):
         if verified_hash is None:
             raise users.wrong_password()
         made = await self.change(sign_in, attempt, verified_hash, body.expires_in_s)
-        return Reply(made, headers={"Cache-Control": "no-store"})
+        return Reply(made, headers=WITH_SECRET)
 
 
 class LogoutResource(Resource):
@@ -202,9 +203,8 @@ class OwnTokens(Resource):
     @writes(access=Access.USER, body=TokenCreate, answer=NewToken, status=201)
     async def post(self, body: TokenCreate) -> Rendered:
         """Create a token; its secret is shown only once."""
-        private = {"Cache-Control": "no-store"}
         return await self.answer_with(
-            lambda made: Reply(made, location=f"/tokens/{made.id}", headers=private), tokens.create_token, body
+            lambda made: Reply(made, location=f"/tokens/{made.id}", headers=WITH_SECRET), tokens.create_token, body
         )
 
 
@@ -232,8 +232,7 @@ class RotatedToken(Resource):
 
         The replaced token remains valid for `grace_s`. A repeated request gets the same successor.
         """
-        private = {"Cache-Control": "no-store"}
-        return await self.answer_with(lambda made: Reply(made, headers=private), rotation.rotate_token, token, body)
+        return await self.answer_with(lambda made: Reply(made, headers=WITH_SECRET), rotation.rotate_token, token, body)
 
 
 class AllUsers(PasswordResource):

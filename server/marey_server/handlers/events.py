@@ -10,6 +10,7 @@ from pydantic import Field
 from marey_schemas.base import Request
 from marey_schemas.items import Event, Page
 from marey_server.errors import BadRequestProblem, TooManyRequestsProblem
+from marey_server.http.caching import NOT_STORED
 from marey_server.http.declarations import Access, reads
 from marey_server.http.negotiation import EVENT_STREAM
 from marey_server.http.reply import Reply
@@ -60,7 +61,7 @@ class Events(Resource):
         await self.look_up(events.require_kept, after)
         with self._counted(), wakeups.listen([events_topic(project_id)]) as listener:
             self.set_header("Content-Type", "text/event-stream")
-            self.set_header("Cache-Control", "no-store")
+            self.set_header("Cache-Control", NOT_STORED)
             if self.request.method != "HEAD":
                 self._listener = listener
                 await self._follow(project, after, listener)

@@ -19,6 +19,7 @@ from marey_schemas.formats import (
     WrittenUnit,
 )
 from marey_server.handlers.items import kind_of
+from marey_server.http.caching import REVALIDATED
 from marey_server.http.declarations import Access, Bytes, reads
 from marey_server.http.queries import MAX_INTEGER
 from marey_server.http.reply import Rendered, Reply
@@ -30,7 +31,6 @@ from marey_server.motions.exporting import ExportTime
 from marey_server.motions.predecessor_exports import PredecessorOptions
 from marey_server.store import items
 
-NOT_CACHED = "private, no-cache"
 """Cache control of exports: whether an export is allowed, and what it contains, may change."""
 
 
@@ -98,18 +98,18 @@ class Export(BlobSender):
         if query.format == "original":
             original = await self.look_up(exporting.find_original, *place, options, permitted=permitted)
             return await self.send_blob(
-                original.digest, disposition=attachment(original.name), cache_control=NOT_CACHED
+                original.digest, disposition=attachment(original.name), cache_control=REVALIDATED
             )
         if query.format == "predecessor":
             unchanged = await self.look_up(exporting.find_unchanged_original, *place, options)
             if unchanged is not None:
                 return await self.send_blob(
-                    unchanged.digest, disposition=attachment(unchanged.name), cache_control=NOT_CACHED
+                    unchanged.digest, disposition=attachment(unchanged.name), cache_control=REVALIDATED
                 )
         source = await self.look_up(exporting.read_source, *place, permitted=permitted)
         order = partial(exporting.export_order, source, query.format, query.unit, query.time, options)
         file = await self.compute_apart(exporting.EXPORT_ITEM, order, ComputedFile.unpack)
-        headers = {"Content-Disposition": attachment(file.name), "Cache-Control": NOT_CACHED}
+        headers = {"Content-Disposition": attachment(file.name), "Cache-Control": REVALIDATED}
         return Reply(file.data, media_type=file.media_type, headers=headers)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from marey_schemas.base import Answer
 from marey_server.errors import UnavailableProblem
+from marey_server.http.caching import NOT_STORED
 from marey_server.http.declarations import Access, Bytes, reads
 from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
@@ -27,7 +28,7 @@ class Healthz(Resource):
     @reads(access=Access.ANYONE, scope=None, answer=Health)
     async def get(self) -> Reply:
         """Return the status `ok`, which shows that the process answers requests."""
-        return Reply(Health(status="ok"), headers={"Cache-Control": "no-store"})
+        return Reply(Health(status="ok"), headers={"Cache-Control": NOT_STORED})
 
 
 class Readyz(Resource):
@@ -58,7 +59,7 @@ class Readyz(Resource):
             reasons = " ".join(f"{fault[:1].upper()}{fault[1:]}." for fault in faults)
             detail = f"The server is not ready. {reasons if shown else 'Its log gives the reason.'}"
             raise UnavailableProblem(detail, code="not-ready", headers={"Retry-After": "5"})
-        return Reply(Health(status="ready"), headers={"Cache-Control": "no-store"})
+        return Reply(Health(status="ready"), headers={"Cache-Control": NOT_STORED})
 
 
 class MetricsPage(Resource):
@@ -73,7 +74,7 @@ class MetricsPage(Resource):
     async def get(self) -> Reply:
         """Return metrics in the text format of Prometheus."""
         text, media_type = await self.services.metrics.exposition()
-        return Reply(text, media_type=media_type, headers={"Cache-Control": "no-store"})
+        return Reply(text, media_type=media_type, headers={"Cache-Control": NOT_STORED})
 
 
 RESOURCES: tuple[type[Resource], ...] = (Healthz, Readyz, MetricsPage)

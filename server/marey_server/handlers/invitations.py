@@ -18,6 +18,7 @@ from marey_schemas.invitations import (
     SignUp,
 )
 from marey_server.handlers.access import MAX_LOGIN_BYTES, PasswordResource
+from marey_server.http.caching import WITH_SECRET
 from marey_server.http.declarations import Access, RequestBody, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
@@ -26,8 +27,6 @@ from marey_server.process.password_lanes import limited_address
 from marey_server.store.credentials import sign_ins
 from marey_server.store.credentials.sign_ins import SignInTry
 from marey_server.store.invitations import accepting, issuing
-
-_PRIVATE = {"Cache-Control": "no-store"}
 
 
 class ProjectInvitations(Resource):
@@ -45,7 +44,7 @@ class ProjectInvitations(Resource):
     async def post(self, project: str, body: InvitationCreate) -> Rendered:
         """Invite users of the server to a project; the code is shown only once."""
         return await self.answer_with(
-            lambda made: Reply(made, location=f"/projects/{project}/invitations/{made.id}", headers=_PRIVATE),
+            lambda made: Reply(made, location=f"/projects/{project}/invitations/{made.id}", headers=WITH_SECRET),
             issuing.create_invitation,
             project,
             body,
@@ -79,7 +78,7 @@ class ServerInvitations(Resource):
     async def post(self, body: AccountInvitationCreate) -> Rendered:
         """Invite people to create an account and to join a project; the code is shown only once."""
         return await self.answer_with(
-            lambda made: Reply(made, location=f"/invitations/{made.id}", headers=_PRIVATE),
+            lambda made: Reply(made, location=f"/invitations/{made.id}", headers=WITH_SECRET),
             issuing.create_account_invitation,
             body,
         )
@@ -161,7 +160,7 @@ class SignUps(CodeResource):
             made = await self.change(accepting.sign_up_again, body, verified_hash, login, attempt)
         else:
             made = await self.change(accepting.sign_up, body, await self.hash_password(password), attempt)
-        return Reply(made, headers=_PRIVATE)
+        return Reply(made, headers=WITH_SECRET)
 
 
 RESOURCES: tuple[type[Resource], ...] = (

@@ -13,11 +13,11 @@ from marey_schemas.items import Item, PartsRequest
 from marey_schemas.kinds import Kind
 from marey_schemas.names import Message
 from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
+from marey_server.http.caching import IMMUTABLE
 from marey_server.http.declarations import Access, Document, RequestBody, reads, writes
 from marey_server.http.queries import MAX_INTEGER, CommaSeparated
 from marey_server.http.reply import Lasting, Loaded, Rendered, Reply
 from marey_server.http.resource import Resource
-from marey_server.http.streaming import IMMUTABLE
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
 

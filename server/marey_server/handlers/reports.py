@@ -13,11 +13,12 @@ from marey_schemas.documents.reports import Report as ReportDocument
 from marey_schemas.kinds import Kind
 from marey_server.errors import NotFoundProblem
 from marey_server.handlers.items import kind_of
+from marey_server.http.caching import caching_of_revision
 from marey_server.http.declarations import Access, Bytes, reads
 from marey_server.http.queries import MAX_INTEGER
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
-from marey_server.http.streaming import IMMUTABLE, BlobSender, attachment
+from marey_server.http.streaming import BlobSender, attachment
 from marey_server.motions import walk_graphs
 from marey_server.motions.walk_graphs import MEDIA_TYPES, WalkGraphFormat
 from marey_server.store import items
@@ -62,7 +63,7 @@ class StoredFileSender(BlobSender):
             file.blob,
             disposition="inline",
             media_type=media_type,
-            cache_control=IMMUTABLE if query.revision is not None else "private, no-cache",
+            cache_control=caching_of_revision(query.revision),
             headers={"Content-Security-Policy": f"{SHOWN_ONLY}; {sandbox}"},
         )
 
@@ -180,7 +181,7 @@ class EvaluationWalkGraph(Resource):
         data = await self.compute_apart(walk_graphs.MAKE_WALK_GRAPH, order, bytes)
         headers = {
             "Content-Disposition": attachment(f"{source.name}-walks.{query.format}"),
-            "Cache-Control": IMMUTABLE if query.revision is not None else "private, no-cache",
+            "Cache-Control": caching_of_revision(query.revision),
         }
         return Reply(data, media_type=MEDIA_TYPES[query.format], headers=headers)
 

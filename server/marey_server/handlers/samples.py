@@ -8,11 +8,12 @@ from marey_schemas.base import Request
 from marey_schemas.documents.models import MOST_SAMPLES, MOST_SEED
 from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, MOTION_MEDIA_TYPES, MotionFormat, WrittenUnit
 from marey_server.handlers.items import kind_of
+from marey_server.http.caching import caching_of_revision
 from marey_server.http.declarations import Access, Bytes, Document, reads
 from marey_server.http.queries import MAX_INTEGER
 from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
-from marey_server.http.streaming import IMMUTABLE, attachment
+from marey_server.http.streaming import attachment
 from marey_server.motions import models, searching
 from marey_server.motions.child import ComputedFile
 from marey_server.motions.models import FoundModel, SampleFileOrder, SampleOrder
@@ -108,8 +109,7 @@ def _state(found: FoundModel, query: SampleQuery) -> str:
 
 
 def _caching(query: SampleQuery) -> dict[str, str]:
-    """Return caching headers; the answer for a named revision never changes."""
-    return {"Cache-Control": IMMUTABLE if query.revision is not None else "private, no-cache"}
+    return {"Cache-Control": caching_of_revision(query.revision)}
 
 
 RESOURCES: tuple[type[Resource], ...] = (ModelSamples, SampleFiles)

@@ -9,6 +9,7 @@ from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, MOTION_MEDIA_TYP
 from marey_schemas.search import SearchRequest
 from marey_server.handlers.items import kind_of
 from marey_server.handlers.samples import ModelUser
+from marey_server.http.caching import REVALIDATED
 from marey_server.http.declarations import Access, Bytes, Document, reads
 from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
@@ -77,7 +78,7 @@ class SearchFile(Searcher):
         models, limits = await self.searched_models(project, kind, item, body), search_answers.search_limits()
         order = SearchFileOrder(request=body, models=models, limits=limits, format=query.format, unit=query.unit)
         file = await self.compute_apart(search_answers.WRITE_SEARCH, order.pack, ComputedFile.unpack)
-        headers = {"Content-Disposition": attachment(file.name), "Cache-Control": "private, no-cache"}
+        headers = {"Content-Disposition": attachment(file.name), "Cache-Control": REVALIDATED}
         return Reply(file.data, media_type=file.media_type, headers=headers)
 
 

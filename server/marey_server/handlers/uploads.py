@@ -14,6 +14,7 @@ from marey_schemas.items import Upload, UploadCreate
 from marey_schemas.sizes import MIB
 from marey_server.access.principal import ANONYMOUS
 from marey_server.errors import BadRequestProblem, ConflictProblem
+from marey_server.http.caching import NOT_STORED
 from marey_server.http.declarations import Access, Bytes, RequestBody, reads, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
@@ -76,7 +77,7 @@ async def finish_upload(resource: Resource, upload: uploads.StoredUpload) -> upl
 def upload_reply(upload: uploads.StoredUpload) -> Reply:
     """Return the state of an upload in body and headers."""
     shown = Upload(id=upload.id, length=upload.length, offset=upload.offset, digest=upload.digest)
-    headers = {"Upload-Offset": str(upload.offset), "Upload-Length": str(upload.length), "Cache-Control": "no-store"}
+    headers = {"Upload-Offset": str(upload.offset), "Upload-Length": str(upload.length), "Cache-Control": NOT_STORED}
     return Reply(shown, headers=headers)
 
 

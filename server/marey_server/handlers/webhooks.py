@@ -13,14 +13,12 @@ from marey_schemas.webhooks import (
     WebhookDelivery,
     WebhookRotation,
 )
+from marey_server.http.caching import WITH_SECRET
 from marey_server.http.declarations import Access, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store.webhooks import deliveries, managing
-
-PRIVATE = {"Cache-Control": "no-store"}
-"""Headers of answers with a secret."""
 
 
 class DeliveriesQuery(PageQuery):
@@ -44,7 +42,7 @@ class ProjectWebhooks(Resource):
     async def post(self, project: str, body: WebhookCreate) -> Rendered:
         """Create a webhook; its secret is shown only once."""
         return await self.answer_with(
-            lambda made: Reply(made, location=f"/projects/{project}/webhooks/{made.id}", headers=PRIVATE),
+            lambda made: Reply(made, location=f"/projects/{project}/webhooks/{made.id}", headers=WITH_SECRET),
             managing.create_webhook,
             project,
             body,
@@ -88,7 +86,7 @@ class WebhookSecret(Resource):
         For `grace_s` seconds, deliveries are signed with both secrets.
         """
         return await self.answer_with(
-            lambda made: Reply(made, headers=PRIVATE), managing.rotate_secret, project, webhook, body
+            lambda made: Reply(made, headers=WITH_SECRET), managing.rotate_secret, project, webhook, body
         )
 
 

@@ -17,6 +17,7 @@ from marey_schemas.address import API
 from marey_schemas.problems import MEDIA_TYPE, Problem
 from marey_schemas.sizes import KIB, MIB
 from marey_server.errors import ApiProblem, MethodNotAllowedProblem, UnauthenticatedProblem, forget_origin
+from marey_server.http.caching import NOT_STORED
 from marey_server.http.declarations import Declared, Operation
 from marey_server.http.etags import entity_tag
 from marey_server.http.reply import Rendered
@@ -266,7 +267,7 @@ def render_problem(error: BaseException, request_id: str) -> Rendered:
         headers.setdefault("WWW-Authenticate", 'Bearer realm="marey"')
     if problem.status == 412 and isinstance(rev := problem.context.get("rev"), int):
         headers.setdefault("ETag", entity_tag(rev, "json"))
-    headers |= {"Content-Type": MEDIA_TYPE, "Cache-Control": "no-store"}
+    headers |= {"Content-Type": MEDIA_TYPE, "Cache-Control": NOT_STORED}
     return Rendered(problem.status, headers, problem.model_dump_json(by_alias=True).encode())
 
 

@@ -18,6 +18,7 @@ from marey_schemas.address import API
 from marey_schemas.encoding.codecs import JSON as JSON_NAME
 from marey_schemas.encoding.codecs import encode_tree
 from marey_schemas.lru import LruCache
+from marey_server.http.caching import REVALIDATED
 from marey_server.http.etags import entity_tag, matches
 from marey_server.http.negotiation import MediaType
 
@@ -125,7 +126,7 @@ def render(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Rendered:
         headers["Location"] = API + reply.location
     if reply.rev is not None:
         headers["ETag"] = entity_tag(reply.rev, form.media.form)
-        headers.setdefault("Cache-Control", "private, no-cache")
+        headers.setdefault("Cache-Control", REVALIDATED)
         if matches(form.if_none_match, headers["ETag"]):
             return Rendered(304, headers, b"")
     if reply.content is None:

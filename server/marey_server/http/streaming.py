@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 from marey_schemas.sizes import MIB
 from marey_server.errors import RangeNotSatisfiableProblem, UnavailableProblem
+from marey_server.http.caching import IMMUTABLE
 from marey_server.http.etags import entity_tag, matches
 from marey_server.http.reply import Rendered
 from marey_server.http.resource import Resource
@@ -19,7 +20,6 @@ from marey_server.store.transaction import Transaction
 
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 PIECE_BYTES = MIB
-IMMUTABLE = "private, max-age=31536000, immutable"
 
 
 @dataclass(frozen=True, slots=True)
