@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import datetime
+from typing import Any, TypedDict, Unpack
 
 from marey_client.paging import pages
 from marey_client.transport import Transport
@@ -11,23 +12,26 @@ from marey_schemas.audit import AuditEntry
 from marey_schemas.event_kinds import AuditKind
 
 
-def read_audit(
-    transport: Transport,
-    path: str,
-    *,
-    kind: AuditKind | None = None,
-    actor: str | None = None,
-    subject: str | None = None,
-    since: datetime | None = None,
-    until: datetime | None = None,
-) -> Iterator[AuditEntry]:
-    """List the entries of the audit log at `path` that meet all conditions, newest first.
+class AuditConditions(TypedDict, total=False):
+    """Conditions on the entries of an audit log; None, like a missing condition, matches every entry."""
 
-    `subject` is the name or id of the user or object that was changed. Entries at `since` are listed, entries at
-    `until` are not; times without a time zone are local times.
-    """
-    times = {"since": _text_of(since), "until": _text_of(until)}
-    return pages(transport, AuditEntry, path, {"kind": kind, "actor": actor, "subject": subject, **times})
+    kind: AuditKind | None
+    """Kind of the change."""
+    actor: str | None
+    """Name of the user who made the change."""
+    subject: str | None
+    """Name or id of the user or object that was changed."""
+    since: datetime | None
+    """Earliest time; without a time zone, a local time."""
+    until: datetime | None
+    """Time before which the change was made; without a time zone, a local time."""
+
+
+def read_audit(transport: Transport, path: str, **conditions: Unpack[AuditConditions]) -> Iterator[AuditEntry]:
+    """List the entries of the audit log at `path` that meet all conditions, newest first."""
+    times = {"since": _text_of(conditions.get("since")), "until": _text_of(conditions.get("until"))}
+    query: dict[str, Any] = {**conditions, **times}
+    return pages(transport, AuditEntry, path, query)
 
 
 def _text_of(moment: datetime | None) -> str | None:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from datetime import datetime
 from functools import cached_property
 from types import TracebackType
-from typing import Self
+from typing import Self, Unpack
 
 import httpx
 from pydantic import SecretStr
 
 from marey_client.access import Tokens, Users
-from marey_client.audit import read_audit
+from marey_client.audit import AuditConditions, read_audit
 from marey_client.blobs import Blobs
 from marey_client.credentials import TokenFile, resolve
 from marey_client.jobs import Jobs
@@ -22,7 +21,6 @@ from marey_client.retries import Retries
 from marey_client.transport import Transport
 from marey_schemas.access import Login, Me, NewToken, Project, ProjectCreate
 from marey_schemas.audit import AuditEntry
-from marey_schemas.event_kinds import AuditKind
 from marey_schemas.invitations import AcceptedInvitation, InvitationAcceptance, SignedUp, SignUp
 
 
@@ -104,21 +102,12 @@ class Marey:
         """Create a project; the caller becomes its owner."""
         return self.project(self.transport.post(Project, "/projects", project).name)
 
-    def audit(
-        self,
-        *,
-        kind: AuditKind | None = None,
-        actor: str | None = None,
-        subject: str | None = None,
-        since: datetime | None = None,
-        until: datetime | None = None,
-    ) -> Iterator[AuditEntry]:
-        """List changes of users, tokens and access, and deletions, of all projects, newest first. For administrators.
+    def audit(self, **conditions: Unpack[AuditConditions]) -> Iterator[AuditEntry]:
+        """List changes of users, tokens and access, and deletions, of all projects, newest first.
 
-        `subject` is the name or id of the user or object that was changed. Entries at `since` are listed, entries at
-        `until` are not; times without a time zone are local times.
+        Only administrators may read this log. `AuditConditions` describes the conditions.
         """
-        return read_audit(self.transport, "/audit", kind=kind, actor=actor, subject=subject, since=since, until=until)
+        return read_audit(self.transport, "/audit", **conditions)
 
     @cached_property
     def jobs(self) -> Jobs:

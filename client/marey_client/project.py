@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from datetime import datetime
 from functools import cached_property
-from typing import Any
+from typing import Any, Unpack
 
 from marey_client.access import Members, change_quotas
-from marey_client.audit import read_audit
+from marey_client.audit import AuditConditions, read_audit
 from marey_client.handles.bisections import read_range
 from marey_client.handles.coverage_streams import CoverageStreams
 from marey_client.handles.crossings import Crossing, Limit, OnMeasured, VersionEvaluations, find_crossing
@@ -39,7 +38,6 @@ from marey_client.transport import Params, as_json, read_model
 from marey_schemas.access import Project, ProjectChange, QuotaChange, QuotasInUse
 from marey_schemas.audit import AuditEntry
 from marey_schemas.datasets.naming import MAIN
-from marey_schemas.event_kinds import AuditKind
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.job_params import (
     AlignParams,
@@ -125,23 +123,12 @@ class ProjectHandle(ProjectItems):
         """The webhooks of the project: addresses to which the server sends events."""
         return Webhooks(self.transport, f"{self.url}/webhooks")
 
-    def audit(
-        self,
-        *,
-        kind: AuditKind | None = None,
-        actor: str | None = None,
-        subject: str | None = None,
-        since: datetime | None = None,
-        until: datetime | None = None,
-    ) -> Iterator[AuditEntry]:
-        """List changes of members and settings, deletions and restorations, newest first. For owners.
+    def audit(self, **conditions: Unpack[AuditConditions]) -> Iterator[AuditEntry]:
+        """List changes of members and settings, deletions and restorations, newest first.
 
-        `subject` is the name or id of the user or object that was changed. Entries at `since` are listed, entries at
-        `until` are not; times without a time zone are local times.
+        Only owners of the project may read this log. `AuditConditions` describes the conditions.
         """
-        return read_audit(
-            self.transport, f"{self.url}/audit", kind=kind, actor=actor, subject=subject, since=since, until=until
-        )
+        return read_audit(self.transport, f"{self.url}/audit", **conditions)
 
     # -- jobs ----------------------------------------------------------------------------------------------------------
 
