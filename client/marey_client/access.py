@@ -46,7 +46,7 @@ class Users:
     @property
     def invitations(self) -> AccountInvitations:
         """The invitations of people who have no account."""
-        return AccountInvitations(self.transport)
+        return AccountInvitations(self.transport, "/invitations")
 
     def list(self) -> Iterator[User]:
         """List the users."""

@@ -15,11 +15,23 @@ WEEK = timedelta(days=7)
 
 
 @dataclass(frozen=True)
-class Invitations:
-    """Invitations to a project; only its owners may use them."""
+class _OpenInvitations:
+    """Invitations below `url` that can be listed and withdrawn."""
 
     transport: Transport
     url: str
+
+    def list(self) -> Iterator[Invitation]:
+        """List the open invitations, oldest first, without their codes."""
+        return pages(self.transport, Invitation, self.url)
+
+    def withdraw(self, named: str) -> None:
+        """Withdraw an open invitation, named by its id or its prefix."""
+        self.transport.send("DELETE", f"{self.url}/{named}", repeatable=False)
+
+
+class Invitations(_OpenInvitations):
+    """Invitations to a project; only its owners may use them."""
 
     def create(self, role: Role, *, lifetime: timedelta = WEEK, uses: int = 1, note: str = "") -> NewInvitation:
         """Invite users of the server to the project.
@@ -31,20 +43,9 @@ class Invitations:
         request = InvitationCreate(role=role, expires_in_s=lifetime_s, uses=uses, note=note)
         return self.transport.post(NewInvitation, self.url, request, repeatable=False)
 
-    def list(self) -> Iterator[Invitation]:
-        """List the open invitations, oldest first, without their codes."""
-        return pages(self.transport, Invitation, self.url)
 
-    def withdraw(self, named: str) -> None:
-        """Withdraw an open invitation, named by its id or its prefix."""
-        self.transport.send("DELETE", f"{self.url}/{named}", repeatable=False)
-
-
-@dataclass(frozen=True)
-class AccountInvitations:
+class AccountInvitations(_OpenInvitations):
     """Invitations of people who have no account; only administrators may use them."""
-
-    transport: Transport
 
     def create(
         self,
@@ -63,12 +64,4 @@ class AccountInvitations:
         request = AccountInvitationCreate(
             project=project, role=role, expires_in_s=int(lifetime.total_seconds()), uses=uses, note=note
         )
-        return self.transport.post(NewInvitation, "/invitations", request, repeatable=False)
-
-    def list(self) -> Iterator[Invitation]:
-        """List the open invitations, oldest first, without their codes."""
-        return pages(self.transport, Invitation, "/invitations")
-
-    def withdraw(self, named: str) -> None:
-        """Withdraw an open invitation, named by its id or its prefix."""
-        self.transport.send("DELETE", f"/invitations/{named}", repeatable=False)
+        return self.transport.post(NewInvitation, self.url, request, repeatable=False)
