@@ -16,6 +16,7 @@ from marey_client.one_or_several import several
 from marey_client.transport import Transport, as_json, read_model
 from marey_schemas.formats import OCTETS
 from marey_schemas.items import BlobsMissing, BlobsQuery, Upload, UploadCreate
+from marey_schemas.sizes import batched
 
 CHUNK_BYTES = 1 << 20
 DIGESTS_PER_QUESTION = 10_000
@@ -45,8 +46,8 @@ class Blobs:
         """Return those of `digests` that the server does not have."""
         wanted = list(dict.fromkeys(several(digests)))
         lacking: set[str] = set()
-        for start in range(0, len(wanted), DIGESTS_PER_QUESTION):
-            question = BlobsQuery(digests=tuple(wanted[start : start + DIGESTS_PER_QUESTION]))
+        for some in batched(wanted, DIGESTS_PER_QUESTION):
+            question = BlobsQuery(digests=tuple(some))
             answer = self.transport.post(BlobsMissing, "/blobs/missing", question)
             lacking.update(answer.missing)
         return lacking

@@ -18,7 +18,7 @@ from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, Rece
 from marey_schemas.documents.blob_references import references_of
 from marey_schemas.encoding.canonical import attach_arrays
 from marey_schemas.kinds import Kind
-from marey_schemas.sizes import MIB
+from marey_schemas.sizes import MIB, batched
 from marey_versions.archive.members import ArchiveMember, MemberKind
 from marey_versions.archive.reading import Archive, EntryChange
 from marey_versions.records import CommitRecord, contents_in, path_and_kind, revision_content
@@ -144,8 +144,7 @@ class _Import:
     def _missing(self, contents: list[str]) -> list[str]:
         """Return those of the revisions that the project lacks, and note that it has the others."""
         missing = []
-        for start in range(0, len(contents), MOST_CONTENTS):
-            some = contents[start : start + MOST_CONTENTS]
+        for some in batched(contents, MOST_CONTENTS):
             request = ContentsRequest(revisions=tuple(some))
             found = request_contents(self.dataset.transport, self.dataset.project_url, request)["revisions"]
             missing += [content for content, one in zip(some, found, strict=True) if one is None]

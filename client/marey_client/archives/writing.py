@@ -26,6 +26,7 @@ from marey_schemas.datasets.contents import (
 from marey_schemas.documents.blob_references import references_of
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import canonical_json, detach_arrays
+from marey_schemas.sizes import batched
 from marey_versions.archive.checking import check_archive
 from marey_versions.archive.members import ArchiveMember, BadArchive, MemberKind
 from marey_versions.archive.reading import Archive
@@ -119,12 +120,8 @@ def check_consents(dataset: DatasetReader, reason: str | None, contents: Sequenc
     export them nevertheless is given, which the server records.
     """
     ended: set[str] = set()
-    for start in range(0, len(contents), MOST_CHECKED):
-        request = ExportCheck(
-            contents=tuple(contents[start : start + MOST_CHECKED]),
-            allow_expired_consent=reason is not None,
-            consent_reason=reason,
-        )
+    for some in batched(contents, MOST_CHECKED):
+        request = ExportCheck(contents=tuple(some), allow_expired_consent=reason is not None, consent_reason=reason)
         url = f"{dataset.project_url}/datasets/{dataset.name}/export-checks"
         ended.update(dataset.transport.post(ExportPermission, url, request).ended)
     return frozenset(ended)
@@ -285,8 +282,7 @@ class _Making:
         waiting = sorted(contents)
         self.known.update(waiting)
         self.check(waiting)
-        for start in range(0, len(waiting), MOST_CONTENTS):
-            some = waiting[start : start + MOST_CONTENTS]
+        for some in batched(waiting, MOST_CONTENTS):
             found = self._ask(ContentsRequest(revisions=tuple(some)))["revisions"]
             for content, one in zip(some, found, strict=True):
                 if one is None:

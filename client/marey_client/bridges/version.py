@@ -25,6 +25,7 @@ from marey_schemas.datasets.naming import Ref, RefKind
 from marey_schemas.documents.clips import ClipInfo
 from marey_schemas.kinds import Kind
 from marey_schemas.lineage import LineageGraph
+from marey_schemas.sizes import batched
 from marey_versions.records import revision_content
 
 if TYPE_CHECKING:
@@ -93,8 +94,8 @@ class VersionToExport:
 
     def described(self, pool: ThreadPoolExecutor) -> Iterator[list[DescribedClip]]:
         """Yield the clips in the order of their paths, with take records and lineage, in groups of limited size."""
-        for start in range(0, len(self.clips), MOST_CONTENTS):
-            group = [_located(one) for one in self.clips[start : start + MOST_CONTENTS]]
+        for some in batched(self.clips, MOST_CONTENTS):
+            group = [_located(one) for one in some]
             infos = self._infos(group)
             jobs = pool.map(self._job_of, group)
             yield [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import tempfile
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
@@ -38,7 +37,7 @@ from marey_server.store.tables import (
     project,
     revision_part,
 )
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 GRACE_US = 24 * 3600 * 1_000_000
 """Time after which garbage collection deletes a blob or document that nothing refers to."""
@@ -178,7 +177,7 @@ def insert_new(tx: Transaction, table: Table, rows: Iterable[dict[str, Any]]) ->
     added = tx.insert_or_ignore(table).returning(table.c.digest)
     waiting = {row["digest"]: row for row in sorted(rows, key=itemgetter("digest"))}
     while waiting:
-        for some in _batched(list(waiting)):
+        for some in in_lists(list(waiting)):
             made = set(tx.execute(added, [waiting[digest] for digest in some]).scalars())
             new |= made
             for digest in made | _renew(tx, table, set(some) - made):
@@ -189,7 +188,7 @@ def insert_new(tx: Transaction, table: Table, rows: Iterable[dict[str, Any]]) ->
 def _renew(tx: Transaction, table: Table, digests: Iterable[str]) -> set[str]:
     """Reset the age of rows to zero, and lock these rows; return the digests of those that exist."""
     there: set[str] = set()
-    for some in _batched(sorted(digests)):
+    for some in in_lists(sorted(digests)):
         chosen = table.c.digest.in_(some)
         if tx.is_postgres:  # in one order, so that no two writes wait for each other
             rows = select(table.c.digest).where(chosen).order_by(table.c.digest)
@@ -291,7 +290,7 @@ def sizes_of_readable(tx: Transaction, digests: Collection[str]) -> dict[str, in
 def sizes_of(tx: Transaction, digests: Iterable[str]) -> dict[str, int]:
     """Return the sizes of stored blobs in bytes, by digest, without a check of access."""
     sizes: dict[str, int] = {}
-    for some in _batched(digests):
+    for some in in_lists(digests):
         rows = tx.execute(select(blob.c.digest, blob.c.size_bytes).where(blob.c.digest.in_(some)))
         sizes.update((row.digest, row.size_bytes) for row in rows)
     return sizes
@@ -382,12 +381,6 @@ def _collect(
     tx: Transaction, statement: Select[tuple[str]], column: ColumnElement[str], digests: Iterable[str]
 ) -> set[str]:
     found: set[str] = set()
-    for some in _batched(digests):
+    for some in in_lists(digests):
         found.update(tx.execute(statement.where(column.in_(some))).scalars())
     return found
-
-
-def _batched(digests: Iterable[str]) -> Iterator[list[str]]:
-    rest = iter(digests)
-    while some := list(itertools.islice(rest, IN_LIST)):
-        yield some

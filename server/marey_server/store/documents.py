@@ -27,7 +27,7 @@ from marey_server.field_errors import field_errors
 from marey_server.store import blobs
 from marey_server.store.database.prepared import Prepared, padded
 from marey_server.store.tables import blob, document, document_blob, document_item
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.records import references_in
 
 OPEN_SCHEMA = "marey/document@1"
@@ -295,8 +295,8 @@ def stored_bytes_of(tx: Transaction, digests: Iterable[str]) -> dict[str, int]:
     wanted = sorted(set(digests))
     return {
         row.digest: row.stored_bytes
-        for start in range(0, len(wanted), IN_LIST)
-        for row in tx.run(_STORED_BYTES, {"digests": padded(wanted[start : start + IN_LIST])})
+        for some in in_lists(wanted)
+        for row in tx.run(_STORED_BYTES, {"digests": padded(some)})
     }
 
 
@@ -337,9 +337,7 @@ def load_bodies(tx: Transaction, digests: Collection[str]) -> dict[str, Tree]:
     """Load documents by digest, with references in place of their arrays."""
     wanted = list(digests)
     bodies = {
-        row.digest: dict(row.body)
-        for start in range(0, len(wanted), IN_LIST)
-        for row in tx.run(_BODIES, {"digests": padded(wanted[start : start + IN_LIST])})
+        row.digest: dict(row.body) for some in in_lists(wanted) for row in tx.run(_BODIES, {"digests": padded(some)})
     }
     if missing := [digest for digest in digests if digest not in bodies]:
         raise NotFoundProblem(f"There is no document {missing[0]}.")

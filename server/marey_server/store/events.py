@@ -42,7 +42,7 @@ from marey_server.store import projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.jobs.fencing import QUEUED
 from marey_server.store.tables import event, job, project, server_state
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 from marey_server.store.wakeups import events_topic, job_topic, work_topic
 
 MAX_EVENTS = 1000
@@ -263,8 +263,8 @@ def forget_names(tx: Transaction, ids: Sequence[str], *members: str) -> None:
     body: ColumnElement[Any] = func.json_remove(event.c.body, *(f"$.{name}" for name in members))
     if tx.is_postgres:
         body = event.c.body.op("-", return_type=event.c.body.type)(cast(array(members), ARRAY(Text)))
-    for start in range(0, len(ids), IN_LIST):
-        about = event.c.subject.in_(ids[start : start + IN_LIST])
+    for some in in_lists(ids):
+        about = event.c.subject.in_(some)
         tx.execute(update(event).where(about).values(body=body))
         tx.execute(update(event).where(about, event.c.about.is_not(None)).values(about=event.c.subject))
 

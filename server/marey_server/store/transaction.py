@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import sqlalchemy
 from sqlalchemy import Connection, CursorResult, Executable, Table
 from sqlalchemy.dialects import postgresql, sqlite
 
 from marey_schemas.event_kinds import AuditKind, OrdinaryEventKind
+from marey_schemas.sizes import batched
 from marey_server.access.principal import Principal
 from marey_server.access.roles import STRICTEST
 from marey_server.store import tables
@@ -19,13 +20,20 @@ from marey_server.store.database.clock import Clock
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.wakeups import COMMITTED_EVENTS, wakeups
 
-IN_LIST = 1000
-"""Maximum number of list values in one statement; longer lists are split, because databases limit the parameters."""
+_MOST_IN_LIST = 1000
+"""Greatest number of list values in one statement, because databases limit the parameters."""
+
+T = TypeVar("T")
 
 Event = tuple[OrdinaryEventKind, str | None, str, dict[str, Any]]
 """Kind of an event that is not in the audit log, project id, id of its subject, and body."""
 
 _INSERT_EVENT = Prepared(sqlalchemy.insert(tables.event))
+
+
+def in_lists(values: Iterable[T]) -> Iterator[list[T]]:
+    """Divide values into lists that are short enough for one statement each, for example for `IN`."""
+    return batched(values, _MOST_IN_LIST)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from marey_schemas.sizes import batched
 from marey_versions.tree.building import ChunkWriter, Splitter
 from marey_versions.tree.chunks import Branch, Child, Chunk, ChunkStore, Leaf, Value
 from marey_versions.tree.reading import ChunkReader, leaves_with
@@ -23,8 +24,7 @@ def change(store: ChunkStore, root: str, changes: Changes) -> str:
     """
     keys = sorted(changes)
     writer = ChunkWriter(store)
-    for start in range(0, len(keys), CHANGED_TOGETHER):
-        together = keys[start : start + CHANGED_TOGETHER]
+    for together in batched(keys, CHANGED_TOGETHER):
         root = _Change(writer, root).apply([(key, changes[key]) for key in together])
     writer.save(root)
     return root

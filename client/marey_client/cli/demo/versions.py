@@ -20,6 +20,7 @@ from marey_schemas.datasets.naming import MAIN, Ref, RefKind
 from marey_schemas.editing.commands import Smooth
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import DatasetInput
+from marey_schemas.sizes import batched
 
 DATASET, BRANCH, EDITED = "results", "smoothed", "smoothed"
 SHORTEST_FRAMES = 30
@@ -62,8 +63,8 @@ def version_results(
     smoothed = {clip.path.removeprefix(f"{EDITED}/") for clip in project.clips.list(collection=EDITED)}
     unedited = {path: clip for path, clip in results.items() if path not in smoothed}
     puts = [PutEntry(path=path, item=clip.id, revision=clip.item.revision) for path, clip in unedited.items()]
-    for start in range(0, len(puts), MOST_CHANGES):
-        _commit(dataset, "Retargeted takes", puts[start : start + MOST_CHANGES])
+    for some in batched(puts, MOST_CHANGES):
+        _commit(dataset, "Retargeted takes", some)
     tags = sorted((one for one in dataset.refs() if _is_numbered(one)), key=lambda one: int(one.name[1:]))
     path = max(results, key=lambda path: (results[path].item.summary["frames"], path))
     chosen = results[path] if results[path].item.summary["frames"] >= SHORTEST_FRAMES else None

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from marey_schemas.kinds import Kind
+from marey_schemas.sizes import batched
 from marey_server.store import documents, items
 from marey_server.store.datasets.contents import Contents, find_contents_of
 from marey_server.store.datasets.history import revisions_with
@@ -54,8 +55,7 @@ class AnnotationMerger:
         """
         outcomes: list[str | AnnotationClash | None] = [None] * len(changed)
         places = [at for at, one in enumerate(changed) if one.ours.kind == Kind.ANNOTATION.value and one.part == PART]
-        for start in range(0, len(places), AT_ONCE):
-            some = places[start : start + AT_ONCE]
+        for some in batched(places, AT_ONCE):
             for at, outcome in zip(some, self._merge_some([changed[at] for at in some]), strict=True):
                 outcomes[at] = outcome
         return outcomes

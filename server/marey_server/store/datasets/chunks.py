@@ -9,7 +9,7 @@ from sqlalchemy import bindparam, select
 from marey_server.store import blobs
 from marey_server.store.database.prepared import Prepared, padded
 from marey_server.store.tables import tree_chunk
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 _CHUNKS = Prepared(
     select(tree_chunk.c.digest, tree_chunk.c.data).where(tree_chunk.c.digest.in_(bindparam("digests", expanding=True)))
@@ -28,8 +28,8 @@ class StoredChunks:
         wanted = list(digests)
         found = {digest: self.new[digest] for digest in wanted if digest in self.new}
         missing = [digest for digest in wanted if digest not in found]
-        for start in range(0, len(missing), IN_LIST):
-            rows = self._tx.run(_CHUNKS, {"digests": padded(missing[start : start + IN_LIST])})
+        for some in in_lists(missing):
+            rows = self._tx.run(_CHUNKS, {"digests": padded(some)})
             found.update((row.digest, bytes(row.data)) for row in rows)
         return found
 

@@ -38,7 +38,7 @@ from marey_server.store.documents import PreparedDocument
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import last_purge, require_no_purge_since
 from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, fast_forward, item, user
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.merging import CombinedEntry
 from marey_versions.records import CommitRecord, DatasetEntry, RevisionKey, key_of
 from marey_versions.tree.building import build
@@ -310,11 +310,11 @@ def _from_changes(
 def _items_named(tx: Transaction, project_row: ProjectRow, put: Sequence[PutEntry]) -> dict[str, Row[Any]]:
     wanted = sorted({one.item for one in put})
     rows: dict[str, Row[Any]] = {}
-    for start in range(0, len(wanted), IN_LIST):
+    for some in in_lists(wanted):
         statement = select(item.c.id, item.c.kind, item.c.head).where(
             item.c.project_id == project_row.id,
             item.c.deleted_us.is_(None),
-            item.c.id.in_(wanted[start : start + IN_LIST]),
+            item.c.id.in_(some),
         )
         rows.update((row.id, row) for row in tx.execute(statement))
     if missing := [one for one in wanted if one not in rows]:

@@ -13,7 +13,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, and_, bindparam, select, update
 
 from marey_server.store.tables import document, item, revision, revision_part
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.records import RevisionKey, document_content, references_in, revision_content
 
 
@@ -81,8 +81,7 @@ class _Waiting:
 def _read(tx: Transaction, wanted: Sequence[RevisionKey], found: Contents) -> dict[RevisionKey, _Waiting]:
     """Add the stored digests to `found`, and return the revisions that have none; missing revisions are left out."""
     waiting: dict[RevisionKey, _Waiting] = {}
-    for start in range(0, len(wanted), IN_LIST):
-        some = set(wanted[start : start + IN_LIST])
+    for some in map(set, in_lists(wanted)):
         rows = [row for row in tx.execute(_PARTS.where(*_among(some))) if RevisionKey(row.item_id, row.number) in some]
         lacking = {row.document_digest for row in rows if row.of_revision is None}
         bodies = _bodies(tx, lacking)

@@ -15,7 +15,7 @@ from marey_server.store import collections
 from marey_server.store.datasets.contents import Contents, find_contents_of
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import collection, item, item_tag
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.records import DatasetEntry, RevisionKey
 from marey_versions.tree.chunks import Value
 from marey_versions.tree.reading import Tree
@@ -82,7 +82,7 @@ def _below(folder: str, path: str, name: str) -> str:
 def tags_of(tx: Transaction, item_ids: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Return the tags of items, sorted, by item id; items without tags are left out."""
     rows: list[Row[Any]] = []
-    for start in range(0, len(item_ids), IN_LIST):
-        some = item_tag.c.item_id.in_(item_ids[start : start + IN_LIST])
-        rows += tx.execute(select(item_tag).where(some).order_by(item_tag.c.item_id, item_tag.c.tag)).all()
+    for some in in_lists(item_ids):
+        of_items = item_tag.c.item_id.in_(some)
+        rows += tx.execute(select(item_tag).where(of_items).order_by(item_tag.c.item_id, item_tag.c.tag)).all()
     return {of: tuple(row.tag for row in group) for of, group in groupby(rows, attrgetter("item_id"))}

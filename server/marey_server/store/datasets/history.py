@@ -21,7 +21,7 @@ from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.naming import find_dataset, first_parents, resolve
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import commit_parent, dataset_commit, item, revision
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.at_path import ChangeAtPath, PathComparer, changes_at, path_after, prefixes_of
 from marey_versions.compared import ComparedEntry, compare_entries
 from marey_versions.origins import PATH, TAGS, find_origins
@@ -302,11 +302,11 @@ def revisions_with(tx: Transaction, project_id: str, contents: Iterable[str]) ->
     """
     wanted = sorted(set(contents))
     found: dict[str, tuple[str, int]] = {}
-    for start in range(0, len(wanted), IN_LIST):
+    for some in in_lists(wanted):
         statement = (
             select(revision.c.content, revision.c.item_id, revision.c.number)
             .join(item, item.c.id == revision.c.item_id)
-            .where(revision.c.content.in_(wanted[start : start + IN_LIST]), item.c.project_id == project_id)
+            .where(revision.c.content.in_(some), item.c.project_id == project_id)
             .order_by(item.c.deleted_us.is_(None), revision.c.item_id, revision.c.number)
         )
         found.update((row.content, (row.item_id, row.number)) for row in tx.execute(statement))

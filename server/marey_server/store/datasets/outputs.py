@@ -30,7 +30,7 @@ from marey_server.store.datasets.protection import Mover, require_move
 from marey_server.store.datasets.revisions import store_combined
 from marey_server.store.projects import find_by_id
 from marey_server.store.tables import collection, dataset, dataset_commit, dataset_ref, item
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.compared import ComparedEntry
 from marey_versions.merging import MergedEntries, merge_entries
 from marey_versions.records import CommitRecord, DatasetEntry, RevisionKey, entry_of, path_and_kind
@@ -298,8 +298,7 @@ def _is_in_folder(tx: Transaction, folder: str, wanted: OutputEntries, changes: 
     if len(expected) != len(changes):
         return False
     ids = sorted(expected)
-    for start in range(0, len(ids), IN_LIST):
-        some = ids[start : start + IN_LIST]
+    for some in in_lists(ids):
         statement = (
             select(item.c.id, item.c.head, item.c.name, collection.c.path)
             .join(collection, collection.c.id == item.c.collection_id)

@@ -20,7 +20,7 @@ from marey_server.store import projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.items.reading import find_item
 from marey_server.store.tables import collection, item, revision
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 MOST_NAMED = 10
 """Greatest number of clips that an error or an event names; both also contain the number of all clips."""
@@ -40,8 +40,8 @@ def find_ended_consents(tx: Transaction, item_ids: Iterable[str]) -> dict[str, E
     """Return, by id, those of the items whose consent has ended: whose last day is before the present day, in UTC."""
     wanted = sorted(set(item_ids))
     found: dict[str, EndedConsent] = {}
-    for start in range(0, len(wanted), IN_LIST):
-        rows = tx.execute(_ended(tx).where(item.c.id.in_(wanted[start : start + IN_LIST])))
+    for some in in_lists(wanted):
+        rows = tx.execute(_ended(tx).where(item.c.id.in_(some)))
         found.update((row.id, _shown(row)) for row in rows)
     return found
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 from sqlalchemy import JSON, Column, Row, Select, case, column, func, literal, or_, select
@@ -19,6 +19,7 @@ from marey_schemas.lineage import (
     LineageRequest,
     LineageRevision,
 )
+from marey_schemas.sizes import batched
 from marey_server.store import projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.items.history import find_revision
@@ -113,7 +114,7 @@ class _LineageWalk:
             .where(projects.is_visible(self._tx.principal))
             .limit(MOST_LINKS + 1)  # not ordered: sorting 200,000 clips of one skeleton takes 1.6 s
         )  # fmt: skip
-        for some in _batches(places):
+        for some in batched(places, _AT_ONCE):
             # Not pairs: SQLite would scan the table for them.
             both = (ends.item.in_([one for one, _ in some]), ends.number.in_(sorted({number for _, number in some})))
             wanted = set(some)
@@ -149,7 +150,7 @@ class _LineageWalk:
             .join(item, item.c.id == revision.c.item_id)
             .join(collection, collection.c.id == item.c.collection_id)
         )  # fmt: skip
-        for some in _batches(self._distances):
+        for some in batched(self._distances, _AT_ONCE):
             both = (
                 revision.c.item_id.in_([one for one, _ in some]),
                 revision.c.number.in_(sorted({number for _, number in some})),
@@ -164,7 +165,7 @@ class _LineageWalk:
             job.c.id, job.c.parent_id, job.c.kind, job.c.seed, job.c.code_version, job.c.finished_us, job.c.committed,
         )  # fmt: skip
         found: dict[str, Row[Any]] = {}
-        for some in _batches(sorted(ids)):
+        for some in batched(sorted(ids), _AT_ONCE):
             found |= {row.id: row for row in self._tx.execute(select(*columns).where(job.c.id.in_(some)))}
         return found
 
@@ -209,7 +210,7 @@ class _LineageWalk:
             .distinct()
         )
         found: dict[str, set[str]] = defaultdict(set)
-        for some in _batches(sorted(ids)):
+        for some in batched(sorted(ids), _AT_ONCE):
             for row in self._tx.execute(
                 statement.where(or_(job.c.id.in_(some), job.c.parent_id.in_(some)), commit.is_not(None))
             ):
@@ -223,8 +224,3 @@ def _shown_revision(row: Row[Any], distance: int, parents: Mapping[str, str]) ->
         newest=row.head, deleted=row.deleted_us is not None, purged=row.purged_us is not None, distance=distance,
         job=parents.get(row.job_id), created_at=datetime_of(row.created_us),
     )  # fmt: skip
-
-
-def _batches(values: Iterable[Any]) -> Iterator[list[Any]]:
-    many = list(values)
-    return (many[start : start + _AT_ONCE] for start in range(0, len(many), _AT_ONCE))

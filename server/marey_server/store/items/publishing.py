@@ -13,6 +13,7 @@ from sqlalchemy import Row, and_, insert, select
 from marey_schemas.documents.clips import with_earlier_facts
 from marey_schemas.event_kinds import OrdinaryEventKind
 from marey_schemas.kinds import PARTS, Kind
+from marey_schemas.sizes import batched
 from marey_server import faults
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import collections, documents, quotas
@@ -128,8 +129,7 @@ def _in_turns(loaded: Sequence[_Loaded]) -> Iterator[list[_Loaded]]:
         next_turns[place] = turn + 1
         groups[turn, draft.kind, draft.reuse].append(one)
     for _, group in sorted(groups.items(), key=lambda named: named[0][0]):
-        for start in range(0, len(group), DRAFTS_TOGETHER):
-            yield group[start : start + DRAFTS_TOGETHER]
+        yield from batched(group, DRAFTS_TOGETHER)
 
 
 @dataclass(frozen=True)

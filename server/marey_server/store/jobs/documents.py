@@ -13,7 +13,7 @@ from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs.commits import shown_commit
 from marey_server.store.tables import job, job_dependency, project, user
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 
 def select_jobs() -> Select[Any]:
@@ -31,8 +31,8 @@ _JOBS_BY_ID = Prepared(select_jobs().where(job.c.id.in_(bindparam("ids", expandi
 def job_documents(tx: Transaction, ids: Sequence[str]) -> list[Job]:
     """Return the documents of the given jobs, in the same order."""
     found: dict[str, Job] = {}
-    for start in range(0, len(ids), IN_LIST):
-        rows = tx.run(_JOBS_BY_ID, {"ids": list(ids[start : start + IN_LIST])})
+    for some in in_lists(ids):
+        rows = tx.run(_JOBS_BY_ID, {"ids": some})
         found |= {document.id: document for document in as_documents(tx, rows)}
     return [found[one] for one in ids]
 

@@ -24,7 +24,7 @@ from marey_server.store import datasets
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import collection, item
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 MOST_INPUTS = 100_000
 
@@ -63,8 +63,8 @@ def items_by_id(tx: Transaction, project_id: str, ids: Iterable[str]) -> dict[st
     wanted = sorted(set(ids))
     rows = [
         FoundItem(row.id, row.kind, row.name, row.head, row.path)
-        for start in range(0, len(wanted), IN_LIST)
-        for row in tx.run(_ITEMS_BY_ID, {"project_id": project_id, "ids": wanted[start : start + IN_LIST]})
+        for some in in_lists(wanted)
+        for row in tx.run(_ITEMS_BY_ID, {"project_id": project_id, "ids": some})
     ]
     return {row.id: row for row in rows}
 

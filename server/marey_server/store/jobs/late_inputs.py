@@ -24,7 +24,7 @@ from marey_server.store.jobs.inputs import MOST_INPUTS, Pin, PinnedInputs, items
 from marey_server.store.jobs.layout import NewJob, Submission
 from marey_server.store.jobs.result_places import find_clash
 from marey_server.store.tables import job
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 
 class LateInputError(Exception):
@@ -62,8 +62,8 @@ def pin_late_inputs(tx: Transaction, ids: Sequence[str]) -> list[Ended]:
 
 
 def _ready_for_inputs(tx: Transaction, ids: Sequence[str]) -> Iterable[Row[Any]]:
-    for start in range(0, len(ids), IN_LIST):
-        chosen = and_(job.c.id.in_(ids[start : start + IN_LIST]), job.c.state == WAITING, job.c.unbound)
+    for some in in_lists(ids):
+        chosen = and_(job.c.id.in_(some), job.c.state == WAITING, job.c.unbound)
         yield from tx.execute(select(job).where(chosen).order_by(job.c.id).with_for_update()).all()
 
 
@@ -111,8 +111,8 @@ def _write(tx: Transaction, heads: Sequence[NewJob], tasks: Sequence[NewJob]) ->
             .where(job.c.id == one.id, job.c.state == WAITING)
             .values(**layout.layout_columns(tx, one), rev=job.c.rev + 1)
         )
-    for start in range(0, len(tasks), IN_LIST):
-        tx.execute(insert(job), [layout.new_row(tx, one) for one in tasks[start : start + IN_LIST]])
+    for some in in_lists(tasks):
+        tx.execute(insert(job), [layout.new_row(tx, one) for one in some])
     emit_job_events(tx, "job.bound", [(one.project_id, one.id, {"tasks": one.size or 1}) for one in heads])
 
 

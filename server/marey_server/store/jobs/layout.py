@@ -10,6 +10,7 @@ from sqlalchemy import Row
 
 from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.jobs import JobCreate, Resources, commits_of
+from marey_schemas.sizes import batched
 from marey_server.store.ids import new_id
 from marey_server.store.jobs import result_cache
 from marey_server.store.jobs.commits import Target
@@ -142,7 +143,7 @@ def _shares(submission: Submission) -> list[PinnedInputs]:
     if fanned is None:
         return [submission.pins] * submission.task_count
     pins, size = submission.pins.get(fanned, []), submission.kind.batch_size
-    return [{**submission.pins, fanned: pins[start : start + size]} for start in range(0, len(pins), size)]
+    return [{**submission.pins, fanned: some} for some in batched(pins, size)]
 
 
 def _set_cache_keys(tx: Transaction, jobs: Sequence[NewJob]) -> None:

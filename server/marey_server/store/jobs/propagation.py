@@ -15,6 +15,7 @@ from sqlalchemy import Row, and_, bindparam, delete, false, select, tuple_, upda
 
 from marey_schemas.event_kinds import OrdinaryEventKind
 from marey_schemas.queue.jobs import JobState
+from marey_schemas.sizes import batched
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs import late_inputs, result_cache
 from marey_server.store.jobs.endings import Ended, dependency_failure, end_jobs
@@ -49,7 +50,7 @@ def make_ready(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
         if row.size is not None:
             ended += _open_fan_out(tx, row)
     single = [row for row in rows if row.size is None and not row.unbound]
-    for page in _pages(single):
+    for page in batched(single, PAGE):
         ended += _admit(tx, page)
     return ended
 
@@ -227,8 +228,3 @@ def _stop_sharing(tx: Transaction, rows: Sequence[Row[Any]]) -> None:
         tx.execute(update(job).where(job.c.id.in_(ids)).values(cached_from=None, dependencies_left=0))
         pairs = [(row.id, row.cached_from) for row in rows]
         tx.execute(delete(job_dependency).where(tuple_(job_dependency.c.job_id, job_dependency.c.on_job_id).in_(pairs)))
-
-
-def _pages(rows: Sequence[Row[Any]]) -> Iterable[Sequence[Row[Any]]]:
-    for start in range(0, len(rows), PAGE):
-        yield rows[start : start + PAGE]

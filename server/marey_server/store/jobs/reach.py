@@ -16,7 +16,7 @@ from sqlalchemy import Text, cast, or_, select
 from marey_schemas.lru import LruCache
 from marey_server.store.ids import ids_in
 from marey_server.store.tables import document, document_blob, item, job, job_blob, revision_part
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 PinnedPlace = tuple[str, int]
 """Id and revision of an item."""
@@ -86,7 +86,7 @@ def reachable_blobs(tx: Transaction, digests: Collection[str]) -> set[str]:
         .where(item.c.project_id == principal.project_id)
     )
     found: set[str] = set()
-    for some in _batched(digests):
+    for some in in_lists(digests):
         found.update(tx.execute(of_job.where(job_blob.c.blob_digest.in_(some))).scalars())
         rows = tx.execute(of_document.where(document_blob.c.blob_digest.in_(some))).all()
         refused = unreachable_places(tx, {(row.item_id, row.number) for row in rows}) if rows else set()
@@ -151,10 +151,5 @@ def _texts(tx: Transaction, items: Collection[str]) -> Iterator[Any]:
         .join(item, item.c.id == revision_part.c.item_id)
         .where(item.c.project_id == tx.principal.project_id)
     )
-    for some in _batched(items):
+    for some in in_lists(items):
         yield from tx.execute(statement.where(revision_part.c.item_id.in_(some)))
-
-
-def _batched(values: Collection[str]) -> Iterator[list[str]]:
-    many = list(values)
-    return (many[start : start + IN_LIST] for start in range(0, len(many), IN_LIST))

@@ -27,7 +27,7 @@ from marey_server.store.jobs.events import wake_workers
 from marey_server.store.jobs.fencing import QUEUED, RUNNING, WAITING
 from marey_server.store.jobs.inputs import Pin, PinnedInputs
 from marey_server.store.tables import job, job_dependency, revision_part, staged_output
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 SHARED_AT_ONCE = 64
 """Greatest number of jobs that get a cached result at submission; the leading process serves the others later."""
@@ -92,8 +92,8 @@ def part_digests(tx: Transaction, inputs: Iterable[PinnedInputs]) -> dict[tuple[
     """Return the digests of the parts of all pinned inputs: by item and revision number, then by name of the part."""
     items = sorted({pin["item"] for pins in inputs for many in pins.values() for pin in many})
     found: dict[tuple[str, int], dict[str, str]] = {}
-    for start in range(0, len(items), IN_LIST):
-        statement = select(revision_part).where(revision_part.c.item_id.in_(items[start : start + IN_LIST]))
+    for some in in_lists(items):
+        statement = select(revision_part).where(revision_part.c.item_id.in_(some))
         for row in tx.execute(statement):
             found.setdefault((row.item_id, row.number), {})[row.part] = row.document_digest
     return found
@@ -149,12 +149,12 @@ def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, st
     active = or_(job.c.state == QUEUED, job.c.state == RUNNING)
     finished: dict[tuple[str, str], SharedResult] = {}
     under_way: dict[tuple[str, str], SharedResult] = {}
-    for start in range(0, len(keys), IN_LIST):
+    for some in in_lists(keys):
         rows = tx.execute(
             select(job.c.id, job.c.project_id, job.c.cache_key, job.c.state)
             .where(
                 job.c.project_id.in_(projects),
-                job.c.cache_key.in_(keys[start : start + IN_LIST]),
+                job.c.cache_key.in_(some),
                 job.c.cached_from.is_(None),
                 or_(active, job.c.state == "succeeded"),
             )
@@ -302,8 +302,7 @@ def forget_results(tx: Transaction, job_ids: Sequence[str]) -> None:
 
     Deletes the drafts that the jobs staged. Jobs that wait to share one of the results are queued.
     """
-    for start in range(0, len(job_ids), IN_LIST):
-        some = job_ids[start : start + IN_LIST]
+    for some in in_lists(job_ids):
         tx.execute(delete(staged_output).where(staged_output.c.job_id.in_(some)))
         tx.execute(update(job).where(job.c.id.in_(some)).values(cache_key=None))
         waiting = select(job.c.id).where(job.c.state == WAITING, job.c.cached_from.in_(some)).order_by(job.c.id)

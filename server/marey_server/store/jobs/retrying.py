@@ -20,7 +20,7 @@ from marey_server.store.jobs.reading import find_job, require_own
 from marey_server.store.jobs.submission import lock_jobs, submit_checked
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import job, job_dependency
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 MOST_AT_ONCE = 1000
 UNSUCCESSFUL = ("failed", "cancelled")
@@ -247,5 +247,5 @@ def _select_in(
     A thousand jobs may each depend on a thousand others, and databases limit the parameters of a statement.
     """
     wanted = sorted(set(values))
-    for start in range(0, len(wanted), IN_LIST):
-        yield from tx.execute(statement.where(column.in_(wanted[start : start + IN_LIST]))).all()
+    for some in in_lists(wanted):
+        yield from tx.execute(statement.where(column.in_(some))).all()

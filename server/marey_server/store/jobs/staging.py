@@ -25,7 +25,7 @@ from marey_server.store.jobs.fencing import hold, require_attempt
 from marey_server.store.jobs.inputs import PinnedInputs
 from marey_server.store.projects import find_by_id
 from marey_server.store.tables import document, job, staged_output
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 MOST_STAGED = 20_000
 
@@ -159,8 +159,8 @@ def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> boo
     """
     wanted = sorted({digest for draft in drafts.values() for digest in draft["parts"].values()})
     kept = 0
-    for start in range(0, len(wanted), IN_LIST):
-        page = document.c.digest.in_(wanted[start : start + IN_LIST])
+    for some in in_lists(wanted):
+        page = document.c.digest.in_(some)
         kept += tx.execute(update(document).where(page).values(created_us=tx.now_us)).rowcount
     return kept == len(wanted)
 

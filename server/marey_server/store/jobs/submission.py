@@ -40,7 +40,7 @@ from marey_server.store.jobs.result_places import find_clash
 from marey_server.store.projects import ProjectRow, require
 from marey_server.store.quotas import require_room
 from marey_server.store.tables import job, job_dependency
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 _INSERT_JOB = Prepared(insert(job))
 
@@ -201,10 +201,10 @@ def lock_jobs(tx: Transaction, project: ProjectRow, ids: Iterable[str]) -> dict[
     """Lock the given jobs that exist in the project, so that none ends during this transaction, and return them."""
     wanted = sorted(set(ids))
     found: dict[str, Upstream] = {}
-    for start in range(0, len(wanted), IN_LIST):
+    for some in in_lists(wanted):
         statement = (
             select(job.c.id, job.c.kind, job.c.state)
-            .where(job.c.id.in_(wanted[start : start + IN_LIST]), job.c.project_id == project.id)
+            .where(job.c.id.in_(some), job.c.project_id == project.id)
             .order_by(job.c.id)
             .with_for_update(read=True)
         )
@@ -253,8 +253,8 @@ def _insert_dependencies(tx: Transaction, submissions: Sequence[Submission], ups
         for one in submissions
         for other in one.after
     ]
-    for start in range(0, len(rows), IN_LIST):
-        tx.execute(insert(job_dependency), rows[start : start + IN_LIST])
+    for some in in_lists(rows):
+        tx.execute(insert(job_dependency), some)
 
 
 def submit_pipeline(tx: Transaction, project: str, pipeline: PipelineCreate) -> Pipeline:

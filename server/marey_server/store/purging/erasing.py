@@ -29,7 +29,7 @@ from marey_server.store.tables import (
     revision,
     revision_part,
 )
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 
 def erase(tx: Transaction, project_row: ProjectRow, rows: Sequence[Row[Any]], jobs: Sequence[str], at_us: int) -> None:
@@ -63,9 +63,8 @@ def _drop_empty_folders(tx: Transaction, project_id: str, paths: Collection[str]
     holding = sorted(tx.execute(with_items).scalars())
     used = exists().where(dataset.c.collection_id == collection.c.id)
     empty = sorted({path for path in _with_ancestors(paths) if not _is_within(holding, path)})
-    for start in range(0, len(empty), IN_LIST):
-        some = collection.c.path.in_(empty[start : start + IN_LIST])
-        dropping = delete(collection).where(*deleted, ~used, some).returning(collection.c.id)
+    for some in in_lists(empty):
+        dropping = delete(collection).where(*deleted, ~used, collection.c.path.in_(some)).returning(collection.c.id)
         events.forget_names(tx, tx.execute(dropping).scalars().all(), "path", "was")
 
 
@@ -100,7 +99,7 @@ def freed_by(tx: Transaction, project_id: str, items: Collection[str], jobs: Col
     text_bytes, sizes, needed = 0, dict[str, int](), set[str]()
     lengths = select(func.coalesce(func.sum(func.length(cast(document.c.body, Text))), 0))
     named = select(blob.c.digest, blob.c.size_bytes).join(document_blob, document_blob.c.blob_digest == blob.c.digest)
-    for some in _batches(documents):
+    for some in in_lists(sorted(documents)):
         text_bytes += tx.execute(lengths.where(document.c.digest.in_(some))).scalar_one()
         for row in tx.execute(named.where(document_blob.c.document_digest.in_(some))):
             sizes[row.digest] = row.size_bytes
@@ -110,7 +109,7 @@ def freed_by(tx: Transaction, project_id: str, items: Collection[str], jobs: Col
         item.c.project_id == project_id,
     )
     referring = select(document_blob.c.blob_digest, document_blob.c.document_digest).where(is_part)
-    for some in _batches(sizes.keys()):
+    for some in in_lists(sorted(sizes)):
         for row in tx.execute(referring.where(document_blob.c.blob_digest.in_(some))):
             if row.document_digest not in documents:
                 needed.add(row.blob_digest)
@@ -133,8 +132,3 @@ def _documents_of(tx: Transaction, project_id: str, items: Collection[str]) -> s
         item.c.id.not_in(items),
     )
     return set(tx.execute(select(document.c.digest).where(document.c.digest.in_(own), ~others)).scalars())
-
-
-def _batches(digests: Collection[str]) -> Iterator[list[str]]:
-    many = sorted(digests)
-    return (many[start : start + IN_LIST] for start in range(0, len(many), IN_LIST))

@@ -10,7 +10,7 @@ from sqlalchemy import delete, or_, select, update
 from marey_server.store.jobs.result_cache import forget_results
 from marey_server.store.jobs.staging import named_blobs
 from marey_server.store.tables import attempt, document_blob, job, job_blob, revision_part
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 
 def forget_in_jobs(tx: Transaction, items: frozenset[str], jobs: Sequence[str]) -> None:
@@ -39,9 +39,9 @@ def forget_in_jobs(tx: Transaction, items: frozenset[str], jobs: Sequence[str]) 
 
 def _release_files(tx: Transaction, jobs: Sequence[str]) -> None:
     """Let garbage collection delete the files in the results of jobs, such as an archive of exported clips."""
-    for start in range(0, len(jobs), IN_LIST):
-        some = select(job.c.id, job.c.params, job.c.result).where(job.c.id.in_(jobs[start : start + IN_LIST]))
-        for row in tx.execute(some).all():
+    for some in in_lists(jobs):
+        results = select(job.c.id, job.c.params, job.c.result).where(job.c.id.in_(some))
+        for row in tx.execute(results).all():
             if made := set(named_blobs(row.result)) - set(named_blobs(row.params)):
                 of_job = job_blob.c.job_id == row.id, job_blob.c.blob_digest.in_(sorted(made))
                 tx.execute(delete(job_blob).where(*of_job))
@@ -54,8 +54,7 @@ def _release_sources(tx: Transaction, items: Collection[str], makers: Sequence[s
         .join(revision_part, revision_part.c.document_digest == document_blob.c.document_digest)
         .where(revision_part.c.item_id.in_(items))
     )
-    for start in range(0, len(makers), IN_LIST):
-        some = makers[start : start + IN_LIST]
+    for some in in_lists(makers):
         parents = select(job.c.parent_id).where(job.c.id.in_(some), job.c.parent_id.is_not(None))
         of_jobs = or_(job_blob.c.job_id.in_(some), job_blob.c.job_id.in_(parents))
         tx.execute(delete(job_blob).where(of_jobs, job_blob.c.blob_digest.in_(sources)))
@@ -63,11 +62,11 @@ def _release_sources(tx: Transaction, items: Collection[str], makers: Sequence[s
 
 def _forget_in_answers(tx: Transaction, items: Collection[str], jobs: Sequence[str]) -> None:
     """Remove the names of items from the answers to workers, which are stored in case that a worker asks again."""
-    for start in range(0, len(jobs), IN_LIST):
-        some = select(attempt.c.job_id, attempt.c.fence, attempt.c.answer).where(
-            attempt.c.job_id.in_(jobs[start : start + IN_LIST]), attempt.c.answer.is_not(None)
+    for some in in_lists(jobs):
+        answers = select(attempt.c.job_id, attempt.c.fence, attempt.c.answer).where(
+            attempt.c.job_id.in_(some), attempt.c.answer.is_not(None)
         )
-        for row in tx.execute(some).all():
+        for row in tx.execute(answers).all():
             answer = {**row.answer, "outputs": _outputs_without_names(row.answer.get("outputs"), items)}
             if answer["outputs"] is not None:
                 this = attempt.c.job_id == row.job_id, attempt.c.fence == row.fence
