@@ -40,11 +40,10 @@ class Principal:
         """The name of the user, or `job:<id>` for an attempt of a job, as shown for authors and in events."""
         return self.user_name if self.kind != "attempt" else f"job:{self.job_id}"
 
-    @property
-    def owner(self) -> str:
-        """The name of the user to whom the tokens of this principal belong. Raises `TypeError` if it is not a user."""
+    def require_user_name(self) -> str:
+        """Return the name of the user. Raises `TypeError` if the principal is not a user."""
         if self.user_name is None:
-            raise TypeError(f"a principal of the kind {self.kind} has no tokens")
+            raise TypeError(f"a principal of the kind {self.kind} is not a user")
         return self.user_name
 
 

@@ -70,11 +70,11 @@ def test_tokens_of_users_and_attempts_are_told_apart() -> None:
     assert attempt_secret(user.text) is None
 
 
-def test_only_a_principal_with_a_user_owns_tokens() -> None:
-    assert Principal("user", "user_1", "ada").owner == "ada"
+def test_the_name_of_a_user_is_required_of_users_only() -> None:
+    assert Principal("user", "user_1", "ada").require_user_name() == "ada"
     for other in (ANONYMOUS, SYSTEM, Principal("attempt", job_id="job_1")):
-        with pytest.raises(TypeError, match=f"{other.kind} has no tokens"):
-            _ = other.owner
+        with pytest.raises(TypeError, match=f"{other.kind} is not a user"):
+            other.require_user_name()
 
 
 @pytest.mark.parametrize("kind", ["project", "clip", "search-tree"])

@@ -62,7 +62,7 @@ def _replace(tx: Transaction, old: Row[Any], request: TokenRotation) -> None:
     }  # fmt: skip
     tx.execute(insert(token), made)
     tx.execute(update(token).where(token.c.created_by == old.id).values(created_by=made["id"]))
-    tx.audit("token.rotated", old.id, about=tx.principal.owner, name=old.name, successor=made["id"])
+    tx.audit("token.rotated", old.id, about=tx.principal.require_user_name(), name=old.name, successor=made["id"])
     faults.point("rotate.before_commit")
     tx.after_commit(lambda: faults.point("rotate.after_commit"))
 

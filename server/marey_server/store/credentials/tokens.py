@@ -183,7 +183,7 @@ def _insert(
     }  # fmt: skip
     made = tx.execute(insert(token).values(**row).returning(*token.c)).one()
     details = {"name": made.name, "scopes": list(request.scopes), "session": session}
-    tx.audit("token.created", made.id, about=tx.principal.owner, **details)
+    tx.audit("token.created", made.id, about=tx.principal.require_user_name(), **details)
     return NewToken(**shown(made, tx.principal.user_name).model_dump(), secret=issued.text)
 
 
