@@ -13,8 +13,12 @@ from email.message import Message
 from email.utils import collapse_rfc2231_value
 from io import BufferedRandom
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from marey_client.transport import Params, Transport
+
+if TYPE_CHECKING:
+    import httpx
 
 _NOT_IN_A_NAME = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]+')
 LONGEST_NAME_BYTES = 240
@@ -94,12 +98,26 @@ def download(
             if target is None:
                 offered = _offered_name(response.headers.get("Content-Disposition"))
                 target = places.take(Path(folder) / safe_file_name(offered or name))
-            with saved_atomically(target) as file:
-                for chunk in response.iter_bytes():
-                    file.write(chunk)
+            _save(response, target)
         return target
 
     return transport.repeat(once, repeatable=True, what=f"GET {path}")
+
+
+def download_to(transport: Transport, path: str, target: Path, *, params: Params | None = None) -> None:
+    """Download a file to `target`, whatever name the server has for it; an existing file is replaced."""
+
+    def once() -> None:
+        with transport.stream(path, params=params) as response:
+            _save(response, target)
+
+    transport.repeat(once, repeatable=True, what=f"GET {path}")
+
+
+def _save(response: httpx.Response, target: Path) -> None:
+    with saved_atomically(target) as file:
+        for chunk in response.iter_bytes():
+            file.write(chunk)
 
 
 def _offered_name(disposition: str | None) -> str | None:

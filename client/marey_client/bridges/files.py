@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from marey_client.bridges.version import (
     VersionToExport,
     version_to_export,
 )
-from marey_client.downloads import download
+from marey_client.downloads import download_to
 from marey_client.errors import CannotExport, RequestFailed
 from marey_schemas.datasets.exports import SIDECAR, ExportedClip
 from marey_schemas.datasets.layouts import Layout
@@ -75,33 +74,27 @@ class MotionFiles:
     ) -> None:
         """Write each clip to the file below `folder` with its name, and call `add` with the clips in order."""
         total, done = len(self.version.clips), 0
-        scratch = folder / ".downloads"
         with ThreadPoolExecutor(EXPORTS_AT_ONCE, thread_name_prefix="marey-export") as pool:
             for group in self.version.described(pool):
                 files = names[done : done + len(group)]
-                places = [scratch / str(done + place) for place in range(len(group))]
-                digests = pool.map(self._write_one, group, [folder / name for name in files], places)
+                digests = pool.map(self._write_one, group, [folder / name for name in files])
                 for one, name, digest in zip(group, files, digests, strict=True):
                     add(one.clip.model_copy(update={"file": name, "digest": digest}))
                     done += 1
                     on_progress("writing files", done, total)
-        shutil.rmtree(scratch)
 
-    def _write_one(self, one: DescribedClip, target: Path, scratch: Path) -> str:
-        """Write a clip to `target` by way of an empty folder `scratch`; return the digest of the file."""
+    def _write_one(self, one: DescribedClip, target: Path) -> str:
+        """Write a clip to `target`; return the digest of the file."""
         query: dict[str, str | int | None] = {"format": self.format, "revision": one.entry.revision, "unit": self.unit}
         if self.allow_expired_consent is not None and one.entry.item in self.version.ended:
             query |= {"allow_expired_consent": "true", "consent_reason": self.allow_expired_consent}
         dataset = self.version.dataset
         url = f"{dataset.project_url}/{one.entry.kind.plural}/{one.entry.item}/export"
         try:
-            written = download(dataset.transport, url, scratch, params=query, name="file")
+            download_to(dataset.transport, url, target, params=query)
         except RequestFailed as error:
             error.add_note(f"the clip is {one.entry.path}")
             raise
-        target.parent.mkdir(parents=True, exist_ok=True)
-        written.rename(target)
-        scratch.rmdir()
         return digest_of_file(target)
 
 
