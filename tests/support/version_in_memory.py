@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from marey_client.bridges.version import DescribedClip, VersionToExport
-from marey_client.handles.datasets import DatasetHandle
+from marey_client.handles.versions import DatasetHandle
 from marey_client.transport import Transport
 from marey_motion import documents
 from marey_motion.clip import Clip

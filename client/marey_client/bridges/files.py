@@ -15,6 +15,7 @@ from marey_client.bridges.version import (
     EXPORTS_AT_ONCE,
     DatasetToExport,
     DescribedClip,
+    ExportOptions,
     VersionToExport,
     version_to_export,
 )
@@ -22,11 +23,20 @@ from marey_client.downloads import download_to
 from marey_client.errors import CannotExport, RequestFailed
 from marey_schemas.datasets.exports import SIDECAR, ExportedClip
 from marey_schemas.datasets.layouts import Layout
-from marey_schemas.formats import DEFAULT_UNIT, WHOLE_FORMATS, format_named
+from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, WHOLE_FORMATS, format_named
 
 if TYPE_CHECKING:
     from marey_client.progress import OnProgress
     from marey_schemas.datasets.commits import Commit
+
+
+class FileExportOptions(ExportOptions, total=False):
+    """Options of exports to motion files."""
+
+    format: str
+    """Name of the format of the files; default: `DEFAULT_FORMAT`."""
+    unit: str | None
+    """Unit of lengths in the files; None: that of the format, or `DEFAULT_UNIT` if it has several."""
 
 
 class ExportedVersion(NamedTuple):
@@ -102,10 +112,11 @@ def prepare_files(
     dataset: DatasetToExport,
     version: str,
     target: Path,
-    path: str,
-    format: str,  # noqa: A002
-    unit: str | None,
-    allow_expired_consent: str | None,
+    *,
+    path: str = "",
+    format: str = DEFAULT_FORMAT,  # noqa: A002
+    unit: str | None = None,
+    allow_expired_consent: str | None = None,
 ) -> MotionFiles:
     """Check what an export to files needs, and read the entries of the version below `path`.
 

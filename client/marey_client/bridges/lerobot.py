@@ -93,7 +93,12 @@ class CommonRig(NamedTuple):
 
 
 def prepare_lerobot(
-    dataset: DatasetToExport, version: str, target: Path, path: str, allow_expired_consent: str | None
+    dataset: DatasetToExport,
+    version: str,
+    target: Path,
+    *,
+    path: str = "",
+    allow_expired_consent: str | None = None,
 ) -> VersionToExport:
     """Check what an export to LeRobot needs, and read the entries of the version below `path`.
 

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypedDict
 
 from marey_client.archives.contents import read_documents, request_contents
 from marey_client.archives.writing import DatasetReader, check_consents
@@ -43,6 +43,15 @@ class DatasetToExport(DatasetReader, Protocol):
 
     def find_ref(self, name: str) -> Ref | None:
         """Return the branch or tag with a name, or None."""
+
+
+class ExportOptions(TypedDict, total=False):
+    """Options of every export of a version."""
+
+    path: str
+    """Folder of entries to which the export is limited; default: all entries."""
+    allow_expired_consent: str | None
+    """Reason why clips are exported although their consent has ended; None: they are refused."""
 
 
 class DescribedClip(NamedTuple):

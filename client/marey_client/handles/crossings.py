@@ -10,8 +10,8 @@ import numpy as np
 
 from marey_client.errors import CannotBisect, Invalid, JobUnsuccessful
 from marey_client.handles.bisections import Bisection, VersionRange, VersionTest, bisect
-from marey_client.handles.datasets import DatasetHandle
 from marey_client.handles.evaluations import EvaluationHandle, trial_rows
+from marey_client.handles.versions import DatasetHandle
 from marey_client.jobs import Jobs, OnProgress
 from marey_client.project_items import ProjectItems
 from marey_client.requests import evaluate_request

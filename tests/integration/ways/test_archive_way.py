@@ -17,7 +17,7 @@ from tests.support.command_line import CommandLine
 from marey_client.archives import contents, receiving, writing
 from marey_client.errors import RequestFailed
 from marey_client.handles.clips import ClipHandle
-from marey_client.handles.datasets import DatasetHandle
+from marey_client.handles.versions import DatasetHandle
 from marey_client.project import ProjectHandle
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait

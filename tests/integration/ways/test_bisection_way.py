@@ -18,7 +18,7 @@ from tests.support.evaluation_takes import write_walks
 from marey_client import Marey
 from marey_client.errors import CannotBisect
 from marey_client.handles.crossings import Limit
-from marey_client.handles.datasets import DatasetHandle
+from marey_client.handles.versions import DatasetHandle
 from marey_client.project import ProjectHandle
 from marey_schemas.datasets.commits import Commit, EntryChange, MoveEntry, RemoveEntry
 from marey_schemas.items import LOOP_TAG

@@ -19,7 +19,7 @@ from tests.support.version_in_memory import tree
 from marey_client.blobs import digest_of_file
 from marey_client.errors import CannotExport, Conflict, FolderNotEmpty
 from marey_client.handles.clips import ClipHandle
-from marey_client.handles.datasets import DatasetHandle
+from marey_client.handles.versions import DatasetHandle
 from marey_client.jobs import Jobs
 from marey_client.marey import Marey
 from marey_client.project import ProjectHandle

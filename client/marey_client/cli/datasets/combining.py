@@ -16,7 +16,7 @@ from marey_schemas.wording import counted
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from marey_client.handles.datasets import DatasetHandle, PickOptions
+    from marey_client.handles.versions import DatasetHandle, PickOptions
     from marey_schemas.datasets.merges import EntryConflict, MergeAnswer, Resolution
 
 Into = Annotated[str, typer.Option(help="Branch that gets the changes.")]

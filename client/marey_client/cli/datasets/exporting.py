@@ -17,7 +17,7 @@ from marey_schemas.wording import counted, one_of
 
 if TYPE_CHECKING:
     from marey_client.bridges.files import ExportedVersion
-    from marey_client.handles.datasets import DatasetHandle
+    from marey_client.handles.versions import DatasetHandle
     from marey_client.progress import OnProgress
 
 RENAMED_SHOWN = 5

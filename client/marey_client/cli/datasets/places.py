@@ -9,7 +9,8 @@ import typer
 from marey_client.cli.terminal.failures import WrongUsage
 
 if TYPE_CHECKING:
-    from marey_client.handles.datasets import DatasetHandle, ImportedVersion
+    from marey_client.handles.datasets import ImportedVersion
+    from marey_client.handles.versions import DatasetHandle
     from marey_client.marey import Marey
 
 SHOWN_DIGITS = 12

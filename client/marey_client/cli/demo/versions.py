@@ -11,8 +11,8 @@ from typing import Any
 from marey_client import embedded
 from marey_client.errors import Invalid, NotFound
 from marey_client.handles.clips import ClipHandle
-from marey_client.handles.datasets import DatasetHandle
 from marey_client.handles.skeletons import SkeletonHandle
+from marey_client.handles.versions import DatasetHandle
 from marey_client.jobs import Jobs
 from marey_client.project import ProjectHandle
 from marey_schemas.datasets.commits import MOST_CHANGES, PutEntry
