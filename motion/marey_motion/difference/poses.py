@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -78,8 +79,7 @@ def rotation_changes_deg(before: Poses, after: Poses, pairs: AnyInts) -> NDArray
     (n, J) float32    degrees from 0 to 180
     """
     angles = np.empty((len(pairs), before.rotations.shape[1]), dtype=np.float32)
-    for start in range(0, len(pairs), BLOCK):
-        rows = slice(start, start + BLOCK)
+    for rows in _blocks(pairs):
         half_chords = np.minimum(_chords(before, after, pairs[rows]) / 2.0, 1.0)
         angles[rows] = np.degrees(4.0 * np.arcsin(half_chords))
     return angles
@@ -102,8 +102,7 @@ def frame_costs(before: Poses, after: Poses, pairs: AnyInts) -> Floats:
     (n,) float64    from 0 for equal frames to 1
     """
     costs = np.empty(len(pairs))
-    for start in range(0, len(pairs), BLOCK):
-        rows = slice(start, start + BLOCK)
+    for rows in _blocks(pairs):
         joints = np.minimum(_chords(before, after, pairs[rows]) / _FAR_CHORD, 1.0)
         steps = after.roots[pairs[rows, 1]] - before.roots[pairs[rows, 0]]
         root = np.minimum(np.sqrt(np.einsum("fc,fc->f", steps, steps)) / FAR_M, 1.0)
@@ -125,8 +124,7 @@ def time_offsets(before: Poses, after: Poses, pairs: AnyInts) -> tuple[Floats, F
     weights : (n,) float64    reliability of each offset: the squared speed in `before`, 0 where nothing moves
     """
     offsets, weights = np.zeros(len(pairs)), np.zeros(len(pairs))
-    for start in range(0, len(pairs), BLOCK):
-        rows = slice(start, start + BLOCK)
+    for rows in _blocks(pairs):
         here = pairs[rows, 0]
         earlier, later = np.maximum(here - 1, 0), np.minimum(here + 1, before.frame_count - 1)
         velocity = _steps(before, before, earlier, later) / np.maximum(later - earlier, 1)[:, None, None]
@@ -134,6 +132,11 @@ def time_offsets(before: Poses, after: Poses, pairs: AnyInts) -> tuple[Floats, F
         weights[rows] = np.einsum("fjc,fjc->f", velocity, velocity)
         offsets[rows] = np.einsum("fjc,fjc->f", velocity, distance)
     return np.divide(offsets, weights, out=np.zeros_like(offsets), where=weights > 0.0), weights
+
+
+def _blocks(pairs: AnyInts) -> Iterator[slice]:
+    """Yield slices of `BLOCK` pairs each, so that the arrays of intermediate results stay small."""
+    return (slice(start, start + BLOCK) for start in range(0, len(pairs), BLOCK))
 
 
 def _steps(first: Poses, second: Poses, rows: AnyInts, others: AnyInts) -> NDArray[np.float32]:
