@@ -24,15 +24,6 @@ from marey_schemas.queue.jobs import JobCreate
 class EvaluationHandle(ReportedHandle):
     """Handle of an evaluation."""
 
-    @property
-    def verdict(self) -> str:
-        """The quality of the clips, as a sentence."""
-        return str(self.item.summary["verdict"])
-
-    def summary(self) -> dict[str, Any]:
-        """Return the verdict and the headline numbers; the names end in their units."""
-        return dict(self.item.summary)
-
     def document(self, *, revision: int | None = None) -> dict[str, Any]:
         """Return the evaluation without the records of single ticks: options, provenance, metrics, usage, coverage.
 

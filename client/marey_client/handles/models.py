@@ -41,15 +41,6 @@ class Samples:
 class ModelHandle(SearchableHandle):
     """Handle of a model."""
 
-    @property
-    def verdict(self) -> str:
-        """The quality of the model, as one or two sentences."""
-        return str(self.item.summary["verdict"])
-
-    def summary(self) -> dict[str, Any]:
-        """Return the verdict and the headline numbers; the names end in their units."""
-        return dict(self.item.summary)
-
     def document(self, *, revision: int | None = None) -> dict[str, Any]:
         """Return the whole model, with numpy arrays: functions, mixture, options, examples and training report."""
         return self.part("model", revision=revision)

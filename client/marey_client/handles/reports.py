@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from marey_client.downloads import safe_file_name, saved_atomically
 from marey_client.items import ItemHandle
@@ -11,7 +12,16 @@ from marey_schemas.documents.reports import StoredFigure
 
 
 class ReportedHandle(ItemHandle):
-    """Handle of an item that may have a part `report`."""
+    """Handle of an evaluation or a model: an item with a verdict that may have a part `report`."""
+
+    @property
+    def verdict(self) -> str:
+        """The quality of the evaluated clips or of the model, as one or two sentences."""
+        return str(self.item.summary["verdict"])
+
+    def summary(self) -> dict[str, Any]:
+        """Return the verdict and the headline numbers; the names end in their units."""
+        return dict(self.item.summary)
 
     def figures(self) -> tuple[StoredFigure, ...]:
         """Return the figures of the report."""
