@@ -3,12 +3,12 @@
 from typing import Any
 
 import pytest
-from tests.support.rest_server import owner, server
+from tests.support.rest_server import owner, server, worker
 from tests.support.webhook_receiver import open_receiver
 
 from marey_server.http.validation import decode_body
 
-__all__ = ["open_receiver", "owner", "server"]
+__all__ = ["open_receiver", "owner", "server", "worker"]
 
 
 @pytest.fixture

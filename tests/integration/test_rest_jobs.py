@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -27,23 +26,7 @@ from marey_server.store.transaction import Transaction
 BLOCKS = "application/msgpack; arrays=blocks"
 
 
-@pytest.fixture
-def server(database: Database, tmp_path: Path, test_kinds: None) -> Iterator[Server]:
-    """A server that knows the kinds of jobs that the tests of the queue declare."""
-    with running(database, tmp_path) as one:
-        yield one
-
-
-@pytest.fixture
-def owner(server: Server) -> httpx.Client:
-    """The client of the user who submits jobs."""
-    return server.client(server.make_project())
-
-
-@pytest.fixture
-def worker(server: Server) -> httpx.Client:
-    """The client of the user who runs jobs."""
-    return server.client(server.make_user("wanda", administrator=True, scopes=("work",)))
+pytestmark = pytest.mark.usefixtures("test_kinds")
 
 
 def ok(response: httpx.Response, status: int = 200) -> Any:

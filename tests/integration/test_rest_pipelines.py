@@ -2,34 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from tests.support.rest_server import Server, running
+from tests.support.rest_server import Server
 
-from marey_server.store.database.connections import Database
-
-
-@pytest.fixture
-def server(database: Database, tmp_path: Path, test_kinds: None) -> Iterator[Server]:
-    """A server that knows the kinds of jobs that the tests of the queue declare."""
-    with running(database, tmp_path) as one:
-        yield one
-
-
-@pytest.fixture
-def owner(server: Server) -> httpx.Client:
-    """The client of the user who submits jobs."""
-    return server.client(server.make_project())
-
-
-@pytest.fixture
-def worker(server: Server) -> httpx.Client:
-    """The client of the user who runs jobs."""
-    return server.client(server.make_user("wanda", administrator=True, scopes=("work",)))
+pytestmark = pytest.mark.usefixtures("test_kinds")
 
 
 CHAIN: dict[str, Any] = {

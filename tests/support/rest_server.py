@@ -138,3 +138,9 @@ def server(database: Database, tmp_path: Path) -> Iterator[Server]:
 def owner(server: Server) -> httpx.Client:
     """The client of the owner of the project `lab`."""
     return server.client(server.make_project())
+
+
+@pytest.fixture
+def worker(server: Server) -> httpx.Client:
+    """The client of the user who runs jobs."""
+    return server.client(server.make_user("wanda", administrator=True, scopes=("work",)))
