@@ -18,6 +18,7 @@ from marey_server.store.blobs import Spool
 from marey_server.store.documents import PreparedDocument, prepare_document
 from marey_server.store.items import Draft, ItemFilters, Published
 from marey_server.store.projects import ProjectRow
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:  # numeric modules take a second to load, so they are loaded only for imports
@@ -215,6 +216,7 @@ def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> l
     A file that cannot be stored is refused and does not affect others.
     """
     row = projects.require(tx, project)
+    hold_off_purges(tx, row.id)
     entries: list[ImportEntry] = []
     for together in _runs(files):
         try:

@@ -15,6 +15,7 @@ from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
 from marey_server.store.projects import ProjectRow
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import collection, item
 from marey_server.store.transaction import Transaction
@@ -222,6 +223,7 @@ def restore_collection(
     Raises `ConflictProblem` if another folder has its path now.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     gone = _find(tx, project_row, collection_id, collection.c.deleted_us.is_not(None), lock=True)
     ensure(tx, project_row, gone.path.rpartition("/")[0])
     with taken(_path_taken(gone.path)):

@@ -1,16 +1,26 @@
-"""Exclusion of purges during commits: a commit never records the content of an item that a purge deletes meanwhile.
+"""Exclusion of purges from the writes that they could break: writes that refer to items, or publish content of items.
+
+Such a write reads items and then stores something that refers to them: a revision, an input of a job, a commit. Between
+the two, another request could delete and purge the items. So each of these writes holds off the purges of its project
+first, before it reads items and before it locks any row; many such writes run side by side. A purge waits until those
+that have begun have ended, and the others wait until it has ended. Since neither of the two waits for this lock while
+it holds a row that the other needs, they never wait for each other in a circle.
 
 A commit is prepared in one transaction and recorded in a later one. It remembers the last purge of the project when it
-is prepared. Recording fails if another purge has followed, and lets no purge begin before its own end.
+is prepared. Recording fails if another purge has followed.
+
+On SQLite, where writes run one after another, only the last paragraph applies.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from sqlalchemy import func, select
 
 from marey_server.errors import ConflictProblem
-from marey_server.store.tables import item
-from marey_server.store.transaction import Transaction
+from marey_server.store.tables import item, job
+from marey_server.store.transaction import IN_LIST, Transaction
 
 
 def last_purge(tx: Transaction, project_id: str) -> int:
@@ -19,9 +29,31 @@ def last_purge(tx: Transaction, project_id: str) -> int:
     return int(tx.execute(statement).scalar() or 0)
 
 
-def hold_off_purges(tx: Transaction, project_id: str) -> None:
-    """Let no purge of the project begin before the end of this write; several writes may do this at the same time."""
-    tx.lock(f"purge:{project_id}", shared=True)
+def hold_off_purges(tx: Transaction, *project_ids: str) -> None:
+    """Let no purge of these projects begin before the end of this write; several writes may do this at the same time.
+
+    Must be called before the write reads items or locks rows.
+    """
+    for project_id in sorted(set(project_ids)):
+        tx.lock(f"purge:{project_id}", shared=True)
+
+
+def hold_off_purges_of_jobs(tx: Transaction, job_ids: Iterable[str]) -> None:
+    """Do what `hold_off_purges` does, for the projects of jobs that this write is going to end.
+
+    The end of a job can publish results, and pin them as inputs of jobs that have waited for it.
+    """
+    if not tx.is_postgres:
+        return
+    if tx.principal.project_id is not None:  # of the attempt whose job ends
+        hold_off_purges(tx, tx.principal.project_id)
+        return
+    wanted = sorted(set(job_ids))
+    found: set[str] = set()
+    for start in range(0, len(wanted), IN_LIST):
+        some = job.c.id.in_(wanted[start : start + IN_LIST])
+        found.update(tx.execute(select(job.c.project_id).where(some).distinct()).scalars())
+    hold_off_purges(tx, *found)
 
 
 def require_no_purge_since(tx: Transaction, project_id: str, last: int) -> None:
@@ -29,13 +61,13 @@ def require_no_purge_since(tx: Transaction, project_id: str, last: int) -> None:
     hold_off_purges(tx, project_id)
     if last_purge(tx, project_id) != last:
         raise ConflictProblem(
-            "Items of the project were purged while the version was computed; send the request again.",
+            "Items of the project were purged while the request was prepared; send the request again.",
             code="purged-meanwhile",
         )
 
 
 def begin_purge(tx: Transaction, project_id: str) -> int:
-    """Wait for all commits that are being recorded, exclude others, and return the time of this purge.
+    """Wait for the writes that hold off purges, let no other begin, and return the time of this purge.
 
     Each purge of a project has a later time than the one before it.
     """

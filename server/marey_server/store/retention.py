@@ -16,6 +16,7 @@ from marey_server.store import events
 from marey_server.store.database.clock import DAY_US
 from marey_server.store.database.connections import Database
 from marey_server.store.garbage import BATCH
+from marey_server.store.purge_lock import hold_off_purges_of_jobs
 from marey_server.store.tables import (
     attempt,
     dataset_commit,
@@ -186,6 +187,7 @@ def _made_something(job_id: ColumnElement[str]) -> ColumnElement[bool]:
 
 def _delete_tasks(tx: Transaction, parent: str) -> int:
     """Delete some tasks of an old job, and return how many."""
+    hold_off_purges_of_jobs(tx, [parent])  # which change the same rows, in another order
     some = list(tx.execute(select(job.c.id).where(job.c.parent_id == parent).limit(BATCH)).scalars())
     tx.execute(delete(job_dependency).where(job_dependency.c.job_id == parent, job_dependency.c.on_job_id.in_(some)))
     return _delete_jobs(tx, some)
@@ -193,6 +195,7 @@ def _delete_tasks(tx: Transaction, parent: str) -> int:
 
 def _delete_if_unused(tx: Transaction, job_id: str) -> int:
     """Delete an old job, unless a job that depends on it was submitted in the meantime; return 1 or 0."""
+    hold_off_purges_of_jobs(tx, [job_id])
     used = select(job_dependency.c.job_id).where(job_dependency.c.on_job_id == job_id).limit(1)
     return 0 if tx.execute(used).first() else _delete_jobs(tx, [job_id])
 

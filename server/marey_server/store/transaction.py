@@ -77,6 +77,7 @@ class Transaction:
         self._now_us: int | None = None
         self._after_commit: list[Callable[[], None]] = []
         self._has_emitted = False
+        self._locks: set[tuple[str, bool]] = set()
 
     @property
     def now_us(self) -> int:
@@ -128,10 +129,13 @@ class Transaction:
 
         On SQLite it does nothing, because there is only one writer at a time.
         """
-        if self.is_postgres:
-            functions = sqlalchemy.func
-            acquire = functions.pg_advisory_xact_lock_shared if shared else functions.pg_advisory_xact_lock
-            self.execute(sqlalchemy.select(acquire(functions.hashtextextended(name, 0))))
+        if not self.is_postgres or (name, shared) in self._locks:
+            return
+        functions = sqlalchemy.func
+        acquire = functions.pg_advisory_xact_lock_shared if shared else functions.pg_advisory_xact_lock
+        self.execute(sqlalchemy.select(acquire(functions.hashtextextended(name, 0))))
+        if not self.connection.in_nested_transaction():  # whose rollback would release the lock
+            self._locks.add((name, shared))
 
     def emit(self, kind: OrdinaryEventKind, subject: str, *, project_id: str | None = None, **body: Any) -> None:
         """Record an event, which becomes visible when the transaction commits."""

@@ -587,7 +587,7 @@ def test_a_commit_that_was_computed_before_a_purge_is_not_recorded_after_it(hous
     prepared = house.read(datasets.prepare_commit, "lab", "gaits", request)
     house.delete(walk)
     house.purge(item=walk)
-    with pytest.raises(ConflictProblem, match="purged while the version was computed"):
+    with pytest.raises(ConflictProblem, match="purged while the request was prepared"):
         house.write(datasets.record_commit, "lab", "gaits", prepared)
     assert house.gaits.head() is None
     assert house.faults() == []

@@ -81,7 +81,7 @@ class ReceivedContents(Resource):
         """
         local = await self.look_up(datasets.find_local, project, body.revisions)
         drafts = await self.compute(datasets.prepare_revisions, body.revisions, local)
-        return await self.answer(datasets.store_revisions, project, dataset, drafts)
+        return await self.answer(datasets.store_revisions, project, dataset, drafts, local)
 
 
 class ReceivedCommits(Resource):

@@ -23,6 +23,7 @@ from marey_server.store.datasets.naming import find_dataset, resolve
 from marey_server.store.items import Draft, StoredDocument
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.projects import ProjectRow
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import collection, dataset, item
 from marey_server.store.transaction import Transaction
 from marey_versions.compared import ComparedEntry, compare_entries
@@ -41,6 +42,7 @@ def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest
     if another request changes the folder. Raises `InvalidProblem` if too many entries differ.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     found = find_dataset(tx, project_row, name)
     digest = resolve(tx, found.id, request.version)
     state = read_folder(tx, project_row, found)

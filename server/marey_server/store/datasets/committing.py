@@ -36,7 +36,7 @@ from marey_server.store.datasets.protection import Mover, require_move
 from marey_server.store.datasets.revisions import store_combined
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.projects import ProjectRow
-from marey_server.store.purge_lock import last_purge, require_no_purge_since
+from marey_server.store.purge_lock import hold_off_purges, last_purge, require_no_purge_since
 from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, fast_forward, item, user
 from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.merging import CombinedEntry
@@ -119,6 +119,7 @@ def record_commit(
     of `require_move`.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     found = find_dataset(tx, project_row, name)
     if found.id != prepared.dataset_id:
         raise branch_moved(prepared.branch, None)

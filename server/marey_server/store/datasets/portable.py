@@ -16,6 +16,7 @@ from marey_server.store.datasets.naming import find_dataset
 from marey_server.store.items.consents import find_ended_with, record_override, require_consent
 from marey_server.store.items.reading import MOST_BYTES_AT_ONCE
 from marey_server.store.items.revisions import read_part_digests
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import document, item
 from marey_server.store.transaction import Transaction
 from marey_versions.records import RevisionKey, portable_document, references_in
@@ -32,6 +33,7 @@ def check_export(tx: Transaction, project: str, name: str, request: ExportCheck)
     project_row = projects.require(tx, project, at_least=role)
     if request.allow_expired_consent:
         projects.require_scope(tx, project, "write")
+        hold_off_purges(tx, project_row.id)  # because the record names clips
     found = find_dataset(tx, project_row, name)
     ended = find_ended_with(tx, project_row.id, request.contents)
     if not request.allow_expired_consent:

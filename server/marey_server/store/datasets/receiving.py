@@ -27,7 +27,7 @@ from marey_server.store.documents import PreparedDocument
 from marey_server.store.items import Draft, StoredDocument
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.projects import ProjectRow
-from marey_server.store.purge_lock import last_purge, require_no_purge_since
+from marey_server.store.purge_lock import hold_off_purges, last_purge, require_no_purge_since
 from marey_server.store.tables import dataset_commit
 from marey_server.store.transaction import Transaction
 from marey_versions.records import CommitRecord, RevisionKey, contents_in, key_of, local_document, revision_content
@@ -47,17 +47,20 @@ class LocalRevisions:
     held: Mapping[str, RevisionKey]
     documents: Mapping[str, Mapping[str, str]]
     """Digest of the document of each part."""
+    last_purge: int
+    """Time of the last purge of the project before they were found."""
 
 
 def find_local(tx: Transaction, project: str, received: Sequence[ReceivedRevision]) -> LocalRevisions:
     """Find the revisions that a request contains or refers to. Raises `ConflictProblem` if the project lacks one."""
     project_row = projects.require(tx, project)
+    last = last_purge(tx, project_row.id)
     wanted = {content for one in received for content in contents_in(one.parts)}
     found = revisions_with(tx, project_row.id, wanted | {one.content for one in received})
     require_contents(wanted - found.keys())
     parts = read_part_digests(tx, set(found.values()))
     held = {content: RevisionKey(*key) for content, key in found.items()}
-    return LocalRevisions(held, {content: parts[key] for content, key in held.items()})
+    return LocalRevisions(held, {content: parts[key] for content, key in held.items()}, last)
 
 
 def prepare_revisions(received: Sequence[ReceivedRevision], local: LocalRevisions) -> dict[str, Draft]:
@@ -90,13 +93,17 @@ def _stored(one: ReceivedRevision, part: str, content: str, local: LocalRevision
     return digest
 
 
-def store_revisions(tx: Transaction, project: str, name: str, drafts: Mapping[str, Draft]) -> StoredRevisions:
-    """Store received revisions; `drafts` maps the content digest of each to its draft.
+def store_revisions(
+    tx: Transaction, project: str, name: str, drafts: Mapping[str, Draft], local: LocalRevisions
+) -> StoredRevisions:
+    """Store received revisions; `drafts` maps the content digest of each to its draft, made with `local`.
 
     If a revision is the content of a dataset entry, its item is hidden. Raises `InvalidProblem` if the content digest
-    of a stored revision is not the one that the request gives.
+    of a stored revision is not the one that the request gives, and `ConflictProblem` if items were purged since the
+    drafts were made.
     """
     project_row = projects.require(tx, project)
+    require_no_purge_since(tx, project_row.id, local.last_purge)
     folder = find_dataset(tx, project_row, name).path or ""
     placed = {
         content: replace(draft, collection=folder) if draft.hidden else draft for content, draft in drafts.items()
@@ -155,6 +162,7 @@ def record_receipt(
     branch has other commits or items were purged since the receipt was prepared, and the errors of `require_move`.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     found = find_dataset(tx, project_row, name)
     digest = prepared.record.digest
     if not _is_known(tx, found, digest):

@@ -27,6 +27,7 @@ from marey_server.store.items.revisions import (
     write_revisions,
 )
 from marey_server.store.projects import ProjectRow
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.quotas import Held
 from marey_server.store.revs import ExpectedRev, change_row, is_expected, moved_on
 from marey_server.store.tables import item, item_tag
@@ -60,6 +61,7 @@ def prepare_part(kind: Kind, part: str, tree: Any) -> PreparedDocument:
 def create_item(tx: Transaction, project: str, kind: Kind, request: ItemCreate) -> Item:
     """Create an item. Raises `ConflictProblem` if the name is taken in its collection."""
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     draft = Draft(
         name_in_batch="", kind=kind, item_name=request.name, parts=request.parts, collection=request.collection,
         tags=request.tags, reuse="new", message=request.message,
@@ -84,6 +86,7 @@ def put_part(
     Raises `PreconditionFailedProblem` if the item is no longer at `expected_rev`.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     found = find_item(tx, project_row, kind, item_id)
     prepared = prepare_part(kind, part, content)
     digest = documents.store_document(tx, prepared)
@@ -138,6 +141,7 @@ def revert_item(
     `expected_rev`.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     found = find_item(tx, project_row, kind, item_id)
     if not is_expected(found.rev, expected_rev):
         raise moved_on(found.rev)
@@ -188,6 +192,7 @@ def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, exp
     purged.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     gone = find_item(tx, project_row, kind, item_id, deleted=True)
     collection_id = collections.ensure(tx, project_row, gone.path)
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_not(None), item.c.purged_us.is_(None))

@@ -19,6 +19,7 @@ from marey_server.errors import ConflictProblem
 from marey_server.store import projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.items.reading import find_item
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import collection, item, revision
 from marey_server.store.transaction import Transaction, in_lists
 
@@ -101,6 +102,7 @@ def permit_export(tx: Transaction, project: str, kind: Kind, item_id: str, overr
     """
     project_row = projects.require(tx, project, at_least=Role.MAINTAINER)
     projects.require_scope(tx, project, "write")
+    hold_off_purges(tx, project_row.id)  # because the record names clips
     find_item(tx, project_row, kind, item_id)
     ended = find_ended_consents(tx, [item_id])
     if ended:

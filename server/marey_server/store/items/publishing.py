@@ -24,6 +24,7 @@ from marey_server.store.items.drafts import Draft, Published, StoredDocument
 from marey_server.store.items.revisions import NewRevision, read_part_digests, write_head, write_revisions
 from marey_server.store.items.summaries import summarise
 from marey_server.store.projects import ProjectRow
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.quotas import Held
 from marey_server.store.tables import item, item_tag, lineage, revision_part
 from marey_server.store.transaction import Transaction
@@ -60,6 +61,7 @@ def publish(
     if len(by_name) != len(drafts):
         twice = Counter(draft.name_in_batch for draft in drafts).most_common(1)[0][0]
         raise InvalidProblem(f"Two results in the request have the name {twice!r}.", code="duplicate-output")
+    hold_off_purges(tx, project_row.id)
     publication = _Publication(tx, project_row, author_id, job_id, refer_to_deleted)
     for together in _in_turns(_load_parts(tx, drafts)):
         publication.add(together)

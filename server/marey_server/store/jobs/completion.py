@@ -38,6 +38,7 @@ from marey_server.store.jobs.fencing import (
 )
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.jobs.propagation import propagate_ends
+from marey_server.store.purge_lock import hold_off_purges_of_jobs
 from marey_server.store.tables import attempt, job, staged_output
 from marey_server.store.transaction import Transaction
 
@@ -52,6 +53,7 @@ def complete(tx: Transaction, job_id: str, fence: int, request: CompleteRequest)
     if the attempt does not hold the job, or has ended it with another `write_id`.
     """
     require_attempt(tx.principal, job_id, fence)
+    hold_off_purges_of_jobs(tx, [job_id])
     place = (job_id, fence)
     ended = _complete(tx, {place: request})
     if place not in ended:
@@ -65,6 +67,7 @@ def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> li
     """Complete many jobs of one worker in one transaction; each is accepted or refused separately."""
     requests = {(one.job, one.fence): one for one in reversed(completions)}
     own = _claimed_by_caller(tx, requests)
+    hold_off_purges_of_jobs(tx, (job_id for job_id, _ in own))
     publishing = {place for place in own if any(staging.named_blobs(requests[place].result))} | _staged(tx, own)
     ended = _complete(tx, {place: requests[place] for place in own - publishing})
     refused: dict[_Place, ApiProblem] = {}
@@ -274,6 +277,7 @@ def fail(
     Raises `LeaseLostProblem` if the attempt does not hold the job, or has ended with another `write_id`.
     """
     require_attempt(tx.principal, job_id, fence)
+    hold_off_purges_of_jobs(tx, [job_id])
     earlier = stored_answer(tx, job_id, fence, request.write_id)
     if earlier is not None:
         if earlier["state"] == JobState.SUCCEEDED:

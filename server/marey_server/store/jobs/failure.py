@@ -16,6 +16,7 @@ from marey_server.store.jobs.events import emit_job_events, wake_workers
 from marey_server.store.jobs.fencing import AUTHOR_MAY_RUN, held, lease_lost
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.propagation import propagate_ends
+from marey_server.store.purge_lock import hold_off_purges_of_jobs
 from marey_server.store.tables import job
 from marey_server.store.transaction import Transaction
 
@@ -149,6 +150,7 @@ def apply_outcome(
 
 def end_for_lost_author(tx: Transaction, job_id: str, fence: int) -> None:
     """End a job whose author may no longer run it, if the attempt still holds the job."""
+    hold_off_purges_of_jobs(tx, [job_id])
     condition = and_(held(job_id, fence), not_(AUTHOR_MAY_RUN))
     row = tx.execute(select(*ENDING_COLUMNS).where(condition).with_for_update()).one_or_none()
     if row is not None:

@@ -23,6 +23,7 @@ from marey_server.store.jobs.logs import MOST_READ_BYTES, LogPage, read_log
 from marey_server.store.jobs.policy import DEFAULT_POLICY, QueuePolicy
 from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.projects import ProjectRow
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import attempt, job, user
 from marey_server.store.transaction import Transaction
 
@@ -161,6 +162,7 @@ def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLIC
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "cancel")
+    hold_off_purges(tx, project.id)
     of_job = job.c.parent_id == job_id
     tasks = _cancel(tx, of_job, policy) if row.size is not None else ()
     whole = _cancel(tx, job.c.id == job_id, policy)

@@ -17,6 +17,7 @@ from marey_server.store.jobs.fencing import QUEUED, RUNNING, held
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.jobs.queue import claim
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import job
 from marey_server.store.transaction import Transaction
 
@@ -73,16 +74,14 @@ def reap_page(
     reclaimed does not prevent the others from being reclaimed.
     """
     overdue = and_(job.c.state == RUNNING, job.c.lease_expires_us <= tx.now_us)
-    statement = (
-        select(*ENDING_COLUMNS)
-        .where(overdue)
-        .order_by(job.c.lease_expires_us, job.c.id)
-        .limit(limit)
-        .with_for_update(skip_locked=True)
-    )
+    statement = select(*ENDING_COLUMNS).where(overdue).order_by(job.c.lease_expires_us, job.c.id).limit(limit)
     if after is not None:
         statement = statement.where(tuple_(job.c.lease_expires_us, job.c.id) > after)
-    rows = tx.execute(statement).all()
+    if tx.is_postgres:
+        projects = set(tx.execute(statement.with_only_columns(job.c.project_id)).scalars())
+        hold_off_purges(tx, *projects)
+        statement = statement.where(job.c.project_id.in_(projects))
+    rows = tx.execute(statement.with_for_update(skip_locked=True)).all()
     taken = sum(_take_back(tx, row, policy) for row in rows)
     last = rows[-1] if len(rows) == limit else None
     return ReapedPage(taken, None if last is None else (last.lease_expires_us, last.id))

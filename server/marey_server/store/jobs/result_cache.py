@@ -26,6 +26,7 @@ from marey_server.store.jobs.endings import Ended, end_jobs
 from marey_server.store.jobs.events import wake_workers
 from marey_server.store.jobs.fencing import QUEUED, RUNNING, WAITING
 from marey_server.store.jobs.inputs import Pin, PinnedInputs
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import job, job_dependency, revision_part, staged_output
 from marey_server.store.transaction import Transaction, in_lists
 
@@ -210,15 +211,19 @@ def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
 def share_waiting(tx: Transaction) -> list[Ended]:
     """Give at most `SHARED_AT_ONCE` waiting jobs the results that now exist; return the jobs that have ended."""
     source = job.alias("source")
-    rows = tx.execute(
-        select(job.c.id)
+    statement = (
+        select(job.c.id, job.c.project_id)
         .join(source, source.c.id == job.c.cached_from)
         .where(job.c.state == WAITING, job.c.cached_from.is_not(None), source.c.state == "succeeded")
         .order_by(job.c.id)
         .limit(SHARED_AT_ONCE)
-        .with_for_update(of=job, skip_locked=True)
-    ).all()
-    return share(tx, rows)
+    )
+    projects = {row.project_id for row in tx.execute(statement)}
+    if not projects:
+        return []
+    hold_off_purges(tx, *projects)
+    chosen = statement.where(job.c.project_id.in_(projects)).with_for_update(of=job, skip_locked=True)
+    return share(tx, tx.execute(chosen).all())
 
 
 def _share_one(tx: Transaction, job_id: str) -> list[Ended]:

@@ -19,6 +19,7 @@ from marey_server.store.jobs.layout import Submission, request_of
 from marey_server.store.jobs.reading import find_job, require_own
 from marey_server.store.jobs.submission import lock_jobs, submit_checked
 from marey_server.store.projects import ProjectRow
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import Transaction, in_lists
 
@@ -36,6 +37,7 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "retry")
+    hold_off_purges(tx, project.id)  # before the inputs of the jobs are read
     if row.state not in UNSUCCESSFUL:
         raise ConflictProblem(
             f"Only a failed or cancelled job can be retried; this one is {row.state}.", code="not-failed"

@@ -38,6 +38,7 @@ from marey_server.store.jobs.layout import NewJob, Submission, lay_out, new_row
 from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.jobs.result_places import find_clash
 from marey_server.store.projects import ProjectRow, require
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.quotas import require_room
 from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import Transaction, in_lists
@@ -58,6 +59,7 @@ def submit(tx: Transaction, project: str, requests: Sequence[JobCreate]) -> list
     Raises `InvalidProblem` with a pointer to each fault, and the errors of `projects.require`.
     """
     row = require(tx, project)
+    hold_off_purges(tx, row.id)
     many = len(requests) > 1
     return submit_at(tx, row, {f"/jobs/{index}" if many else "": one for index, one in enumerate(requests)})
 
@@ -263,6 +265,7 @@ def submit_pipeline(tx: Transaction, project: str, pipeline: PipelineCreate) -> 
     Raises `InvalidProblem` with a pointer to each fault, and the errors of `projects.require`.
     """
     row = require(tx, project)
+    hold_off_purges(tx, row.id)
     try:
         order = order_steps(pipeline)
     except PipelineError as error:

@@ -34,6 +34,7 @@ from marey_server.store.datasets.proposals.opening import (
 from marey_server.store.datasets.proposals.requirements import checks_of, find_missing, shown_review, verdicts_of
 from marey_server.store.datasets.protection import Mover, require_move, rule_of
 from marey_server.store.projects import ProjectRow
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import member, proposal_comment, user
 from marey_server.store.transaction import Transaction
 
@@ -166,6 +167,7 @@ def merge_proposal(
     has moved since the merge was prepared, and the errors of `require_move`.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     found = find_dataset(tx, project_row, name)
     row = lock_open(tx, found.id, number)
     require_newest(tx, row, request.commit)

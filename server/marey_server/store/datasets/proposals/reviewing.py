@@ -17,6 +17,7 @@ from marey_server.store.datasets.proposals.accepting import PreparedAcceptance, 
 from marey_server.store.datasets.proposals.discussing import next_number
 from marey_server.store.datasets.proposals.opening import find_proposal, lock_open, require_newest, touch
 from marey_server.store.datasets.proposals.requirements import checks_of, select_reviews, shown_review
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import job, proposal_check, proposal_review
 from marey_server.store.transaction import Transaction
 
@@ -29,6 +30,7 @@ def add_review(
     Raises `ConflictProblem` if the proposal has ended, or if its newest commit is another one.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)  # for `merge_if_green`
     found = find_dataset(tx, project_row, name)
     row = lock_open(tx, found.id, number)
     require_newest(tx, row, request.commit)
@@ -67,6 +69,7 @@ def report_check(
     `NotFoundProblem` if the project has no such job.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)  # for `merge_if_green`
     found = find_dataset(tx, project_row, name)
     row = lock_open(tx, found.id, number)
     require_newest(tx, row, request.commit)

@@ -1,0 +1,471 @@
+"""Purges beside other writes: in whichever order they commit, nothing refers to what was purged.
+
+Either the purge names what holds the item, or the other request is refused with an error that says why.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import TimeoutError as StillRunning
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+from tests.support.committing_desk import CommittingDesk
+from tests.support.interleaving import HEAD_START_S, Step, interleave
+from tests.support.queue_desk import Desk, document, output
+from tests.support.store_fixtures import WRITE, motion_tree, requiring, skeleton_tree
+
+from marey_schemas.datasets.commits import CommitCreate, PutEntry
+from marey_schemas.datasets.naming import RefCreate, RefKind
+from marey_schemas.datasets.proposals import ProposalCreate, ProposalMerge
+from marey_schemas.items import ItemCreate
+from marey_schemas.kinds import Kind
+from marey_schemas.purges import PurgeAnswer, PurgeRequest
+from marey_schemas.queue.jobs import JobCreate
+from marey_schemas.queue.worker_protocol import CompleteRequest, FailRequest, Lease
+from marey_server.access.principal import SYSTEM, Principal
+from marey_server.errors import ApiProblem, ConflictProblem, GoneProblem, NotFoundProblem
+from marey_server.store import collections, datasets, events, fsck, items, projects, purging, quotas
+from marey_server.store.database.connections import Database
+from marey_server.store.datasets import proposals
+from marey_server.store.items.drafts import Draft
+from marey_server.store.items.publishing import publish
+from marey_server.store.jobs import completion, reading, reaper, result_cache, submission
+from marey_server.store.jobs.policy import QueuePolicy
+from marey_server.store.jobs.retrying import retry_job
+from marey_server.store.transaction import Transaction
+
+pytestmark = pytest.mark.every_database
+
+Act = Callable[[Transaction], Any]
+ORDERS = pytest.mark.parametrize("order", ["purge first", "purge second"])
+
+
+@dataclass
+class Scene:
+    """Project in which one item is purged while another request runs."""
+
+    desk: Desk
+    gaits: CommittingDesk
+    other: Database
+
+    def add(self, name: str, **facts: Any) -> str:
+        """Create a study, and return its id."""
+        draft = Draft("d", Kind.STUDY, name, {"study": document(name=name, **facts)}, "raw")
+        return self.desk.publish(draft)[0].item
+
+    def write(self, function: Any, *args: Any, **kwargs: Any) -> Any:
+        return self.desk.database.write(self.desk.user, requiring(WRITE, function), *args, **kwargs)
+
+    def delete(self, item: str) -> None:
+        kind = Kind(item.partition("_")[0])
+        self.write(items.delete_item, "lab", kind, item, expected_rev=None)
+
+    def of_user(self, function: Any, *args: Any, **kwargs: Any) -> Act:
+        """Return the function as a request of the user that may write."""
+        return lambda tx: requiring(WRITE, function)(tx, *args, **kwargs)
+
+    def purge_of(self, item: str) -> Act:
+        """Prepare the purge of a deleted item, and return its write."""
+        request = PurgeRequest(item=item)
+        prepared = self.desk.database.read(self.desk.user, requiring(WRITE, purging.prepare_purge), "lab", request)
+        return self.of_user(purging.record_purge, "lab", request, prepared)
+
+    def race(self, order: str, act: Act, purge: Act, who: Principal | None = None) -> tuple[Any, Any]:
+        """Run both interleaved; return the results or errors of the act and of the purge.
+
+        Each must run only once: a transaction that was part of a deadlock runs again.
+        """
+        runs: list[str] = []
+
+        def counted(name: str, action: Act) -> Act:
+            def run(tx: Transaction) -> Any:
+                runs.append(name)
+                return action(tx)
+
+            return run
+
+        step = Step(self.desk.database, who or self.desk.user, counted("act", act))
+        purging_ = Step(self.other, self.desk.user, counted("purge", purge))
+        if order == "purge first":
+            purged, done = interleave(purging_, step)
+        else:
+            done, purged = interleave(step, purging_)
+        assert sorted(runs) == ["act", "purge"], "two transactions waited for each other"
+        return done, purged
+
+    def race_half_way(self, act: Act, purge: Act) -> tuple[Any, Any]:
+        """Let `act` begin when the purge has locked the items, and has deleted nothing yet; return both results."""
+        paused, may_go_on = threading.Event(), threading.Event()
+        runs: list[str] = []
+
+        def forget_later(*args: Any) -> None:
+            paused.set()
+            may_go_on.wait(20)
+            forget(*args)
+
+        def run_purge(tx: Transaction) -> Any:
+            runs.append("purge")
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(events, "forget_names", forget_later)
+                return purge(tx)
+
+        def run_act(tx: Transaction) -> Any:
+            runs.append("act")
+            return act(tx)
+
+        forget = events.forget_names
+        with ThreadPoolExecutor(2) as pool:
+            purging_ = pool.submit(self.other.write, self.desk.user, run_purge)
+            assert paused.wait(20)
+            acting = pool.submit(self.desk.database.write, self.desk.user, run_act)
+            with contextlib.suppress(StillRunning):
+                acting.exception(HEAD_START_S)
+            may_go_on.set()
+            outcomes = [future.exception(60) or future.result() for future in (acting, purging_)]
+        assert sorted(runs) == ["act", "purge"], "two transactions waited for each other"
+        return outcomes[0], outcomes[1]
+
+    def race_after_deletion(
+        self, item: str, act: Act, who: Principal | None = None, *, while_publishing: bool = False
+    ) -> tuple[Any, Any]:
+        """Let others delete and purge `item` while `act` has read it and has not committed yet.
+
+        On SQLite, where there is no such moment, they do this after `act`. With `while_publishing`, they delete it
+        before `act` counts what it has added to the project; from then on, deletions wait for `act`.
+        """
+
+        def delete_and_hold(*args: Any) -> None:
+            self.delete(item)
+            hold(*args)
+
+        def act_beside_deletion(tx: Transaction) -> Any:
+            with pytest.MonkeyPatch.context() as patch:
+                if while_publishing:
+                    patch.setattr(quotas, "hold", delete_and_hold)
+                done = act(tx)
+            if not while_publishing:
+                self.delete(item)
+            return done
+
+        def purge(tx: Transaction) -> Any:
+            request = PurgeRequest(item=item)
+            return recording(tx, "lab", request, preparation(tx, "lab", request))
+
+        hold = quotas.hold
+        preparation, recording = requiring(WRITE, purging.prepare_purge), requiring(WRITE, purging.record_purge)
+        principal, database = who or self.desk.user, self.desk.database
+        if not database.is_sqlite:
+            step = Step(database, principal, act_beside_deletion)
+            return interleave(step, Step(self.other, self.desk.user, purge))
+        done = database.write(principal, act)
+        self.delete(item)
+        try:
+            return done, self.other.write(self.desk.user, purge)
+        except ApiProblem as error:
+            return done, error
+
+    def complete(self, lease: Lease) -> Act:
+        request = CompleteRequest(write_id=self.desk.write_id())
+        return lambda tx: completion.complete(tx, lease.job, lease.fence, request)
+
+    def assert_sound(self) -> None:
+        assert list(fsck.check_store(self.desk.database)) == []
+
+
+@pytest.fixture
+def scene(desk: Desk, gaits: CommittingDesk, open_database: Callable[[], Database]) -> Scene:
+    return Scene(desk, gaits, open_database())
+
+
+def require_held_by(purged: Any, what: str) -> None:
+    """Check that a purge was refused, and that the refusal names what holds the item."""
+    assert isinstance(purged, ConflictProblem), purged
+    assert purged.error_code == "still-held"
+    assert what in purged.detail
+
+
+def require_purged(purged: Any, item: str) -> None:
+    assert isinstance(purged, PurgeAnswer), purged
+    assert [one.item for one in purged.purged] == [item]
+
+
+# -- restored items ---------------------------------------------------------------------------------------------------
+
+
+@ORDERS
+def test_an_item_is_restored_or_purged(scene: Scene, order: str) -> None:
+    thing = scene.add("thing")
+    scene.delete(thing)
+    restore = scene.of_user(items.restore_item, "lab", Kind.STUDY, thing)
+    done, purged = scene.race(order, restore, scene.purge_of(thing))
+    if order == "purge first":
+        assert isinstance(done, GoneProblem)
+        require_purged(purged, thing)
+    else:
+        assert done.id == thing
+        assert isinstance(purged, ConflictProblem)
+        assert purged.error_code == "not-deleted"
+    scene.assert_sound()
+
+
+def test_a_folder_is_not_restored_while_half_of_a_purge_is_done(scene: Scene) -> None:
+    """The purge locks the item before the folder, and the restoration locks the folder before the item."""
+    thing = scene.add("thing")
+    folders = scene.desk.database.read(scene.desk.user, collections.list_collections, "lab").items
+    (raw,) = [one.id for one in folders if one.path == "raw"]
+    scene.write(collections.delete_collection, "lab", raw, expected_rev=None)
+    restore = scene.of_user(collections.restore_collection, "lab", raw)
+    done, purged = scene.race_half_way(restore, scene.purge_of(thing))
+    assert isinstance(done, NotFoundProblem)
+    require_purged(purged, thing)
+    scene.assert_sound()
+
+
+@ORDERS
+def test_a_folder_is_restored_with_its_items_or_these_are_purged(scene: Scene, order: str) -> None:
+    thing = scene.add("thing")
+    folders = scene.desk.database.read(scene.desk.user, collections.list_collections, "lab").items
+    (raw,) = [one.id for one in folders if one.path == "raw"]
+    scene.write(collections.delete_collection, "lab", raw, expected_rev=None)
+    restore = scene.of_user(collections.restore_collection, "lab", raw)
+    done, purged = scene.race(order, restore, scene.purge_of(thing))
+    if order == "purge first":
+        assert isinstance(done, NotFoundProblem)
+        require_purged(purged, thing)
+    else:
+        assert done.path == "raw"
+        assert isinstance(purged, ConflictProblem)
+    scene.assert_sound()
+
+
+# -- imported items ---------------------------------------------------------------------------------------------------
+
+
+def clip_of(rig: str, name: str = "walk") -> ItemCreate:
+    return ItemCreate(name=name, parts={"motion": motion_tree({"item": rig, "revision": 1})})
+
+
+def test_a_clip_that_is_imported_holds_its_skeleton(scene: Scene) -> None:
+    (rig,) = scene.desk.publish(Draft("r", Kind.SKELETON, "rig", {"hierarchy": skeleton_tree()}))
+    create = scene.of_user(items.create_item, "lab", Kind.CLIP, clip_of(rig.item))
+    _done, purged = scene.race_after_deletion(rig.item, create, while_publishing=True)
+    require_held_by(purged, "the clip walk")
+    scene.assert_sound()
+
+
+@ORDERS
+def test_an_import_does_not_share_a_skeleton_that_is_being_purged(scene: Scene, order: str) -> None:
+    """The import finds a skeleton with equal content, which is deleted and purged before the import commits."""
+    tree = skeleton_tree()
+    (rig,) = scene.desk.publish(Draft("r", Kind.SKELETON, "rig", {"hierarchy": tree}))
+
+    def share(tx: Transaction) -> Any:
+        skeleton = Draft("r", Kind.SKELETON, "rig", {"hierarchy": tree}, reuse="by_content")
+        clip = Draft("c", Kind.CLIP, "walk", {"motion": motion_tree({"output": "r"})}, "raw")
+        return publish(tx, projects.require(tx, "lab"), [skeleton, clip], author_id=tx.principal.user_id)
+
+    if order == "purge second":
+        done, purged = scene.race_after_deletion(rig.item, share, while_publishing=True)
+        assert done[0].item == rig.item
+        require_held_by(purged, "the clip raw/walk")
+    else:
+        scene.delete(rig.item)
+        done, purged = scene.race(order, share, scene.purge_of(rig.item))
+        assert done[0].item != rig.item
+        require_purged(purged, rig.item)
+    scene.assert_sound()
+
+
+def test_a_new_revision_of_an_item_that_is_deleted_meanwhile_goes_with_it(scene: Scene) -> None:
+    thing = scene.add("thing")
+    revise = scene.of_user(items.put_part, "lab", Kind.STUDY, thing, "study", document(n=2), expected_rev=None)
+    scene.write(revise)
+    scene.delete(thing)
+    revised, purged = scene.race("purge first", revise, scene.purge_of(thing))
+    assert isinstance(revised, NotFoundProblem)
+    require_purged(purged, thing)
+    scene.assert_sound()
+
+
+# -- jobs -------------------------------------------------------------------------------------------------------------
+
+
+def square_of(*things: str, **fields: Any) -> JobCreate:
+    return JobCreate.model_validate(
+        {"kind": "square", "inputs": {"things": [{"item": one} for one in things]}} | fields
+    )
+
+
+def test_a_job_that_is_submitted_while_its_input_is_deleted_holds_it(scene: Scene) -> None:
+    thing = scene.add("thing")
+    submit = scene.of_user(submission.submit, "lab", [square_of(thing)])
+    (made,), purged = scene.race_after_deletion(thing, submit)
+    require_held_by(purged, f"the queued job {made.id}")
+    scene.desk.complete(scene.desk.claim(job=made.id))
+    scene.assert_sound()
+
+
+@ORDERS
+def test_a_job_that_is_retried_holds_its_input_or_is_refused(scene: Scene, order: str) -> None:
+    thing = scene.add("thing")
+    (failed,) = scene.desk.submit_many(square_of(thing))
+    scene.desk.fail(scene.desk.claim(), retryable=False)
+    scene.delete(thing)
+    done, purged = scene.race(order, lambda tx: retry_job(tx, failed), scene.purge_of(thing))
+    if order == "purge first":
+        assert isinstance(done, ConflictProblem)
+        assert done.error_code == "input-purged"
+        require_purged(purged, thing)
+    else:
+        require_held_by(purged, f"the queued job {done.id}")
+    scene.assert_sound()
+
+
+@ORDERS
+def test_a_job_that_ends_while_its_input_is_purged_ends_once(scene: Scene, order: str) -> None:
+    thing = scene.add("thing")
+    (job,) = scene.desk.submit_many(square_of(thing))
+    lease = scene.desk.claim()
+    scene.desk.stage(lease, "square", sources={"things": ({"item": thing, "revision": 1},)})
+    scene.delete(thing)
+    done, purged = scene.race(order, scene.complete(lease), scene.purge_of(thing), scene.desk.attempt(lease))
+    assert done.state == "succeeded"
+    if order == "purge first":
+        require_held_by(purged, f"the running job {job}")
+    else:
+        require_purged(purged, thing)
+        assert scene.desk.job(job).inputs["things"][0]["purged"]
+    scene.assert_sound()
+
+
+def test_a_late_input_that_is_deleted_while_it_is_pinned_is_held(scene: Scene) -> None:
+    """A job completes, which pins an item that it reuses as the input of another job; others delete this item."""
+    thing = scene.add("thing")
+    (maker,) = scene.desk.submit_many(JobCreate(kind="sum", into="raw"))
+    (reader,) = scene.desk.submit_many(
+        JobCreate.model_validate({"kind": "square", "inputs": {"things": [{"job": maker}]}})
+    )
+    lease = scene.desk.claim(job=maker)
+    same = output("thing", facts={}, reuse="by_content")
+    scene.desk.stage_outputs(lease, same)
+    _done, purged = scene.race_after_deletion(thing, scene.complete(lease), scene.desk.attempt(lease))
+    assert [one.item for one in scene.desk.outputs(maker)] == [thing]
+    require_held_by(purged, f"the queued job {reader}")
+    scene.assert_sound()
+
+
+@ORDERS
+def test_a_cached_result_is_shared_or_its_item_is_purged(scene: Scene, order: str) -> None:
+    source = scene.add("source")
+    (first,) = scene.desk.submit_many(square_of(source, into="made"))
+    lease = scene.desk.claim()
+    scene.desk.stage(lease, "square", sources={"things": ({"item": source, "revision": 1},)})
+    scene.desk.complete(lease)
+    (made,) = scene.desk.outputs(first)
+    scene.delete(made.item)
+    submit = scene.of_user(submission.submit, "lab", [square_of(source, into="again")])
+    done, purged = scene.race(order, submit, scene.purge_of(made.item))
+    require_purged(purged, made.item)
+    (job,) = done
+    assert scene.desk.job(job.id).cached_from == (None if order == "purge first" else first)
+    if order == "purge second":
+        (copy,) = scene.desk.outputs(job.id)
+        assert scene.desk.database.read(scene.desk.user, items.read_item, "lab", Kind.STUDY, copy.item).name == "square"
+    scene.assert_sound()
+
+
+def test_a_job_that_awaits_a_purged_result_is_queued_once(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The server shares results while a purge, half of which is done, deletes the result that it would share."""
+    source = scene.add("source")
+    (first,) = scene.desk.submit_many(square_of(source, into="made"))
+    lease = scene.desk.claim()
+    scene.desk.stage(lease, "square", sources={"things": ({"item": source, "revision": 1},)})
+    scene.desk.complete(lease)
+    (made,) = scene.desk.outputs(first)
+    with monkeypatch.context() as patch:
+        patch.setattr(result_cache, "SHARED_AT_ONCE", 0)
+        (waiting,) = scene.desk.submit_many(square_of(source, into="again"))
+    scene.delete(made.item)
+    shared, purged = scene.race_half_way(reaper.share_waiting, scene.purge_of(made.item))
+    assert shared == 0
+    require_purged(purged, made.item)
+    assert scene.desk.state(waiting) == "queued"
+    scene.assert_sound()
+
+
+@ORDERS
+@pytest.mark.parametrize("ends", ["cancel", "fail", "reap", "share"])
+def test_a_job_whose_result_others_await_ends_beside_a_purge(scene: Scene, order: str, ends: str) -> None:
+    """Each end of a job can publish, or pin inputs of others; none of them and the purge wait for each other."""
+    thing, kept = scene.add("thing"), scene.add("kept", n=2)
+    (job,) = scene.desk.submit_many(square_of(kept, max_attempts=1))
+    lease = scene.desk.claim()
+    (behind,) = scene.desk.submit_many(JobCreate(kind="errand", after=(job,)))
+    scene.delete(thing)
+    scene.desk.clock.advance(3600)
+    fail = FailRequest(write_id="write-last", code="x", retryable=False)
+    acts: dict[str, tuple[Act, Any]] = {
+        "cancel": (lambda tx: reading.cancel_job(tx, behind), scene.desk.user),
+        "fail": (lambda tx: completion.fail(tx, lease.job, lease.fence, fail), scene.desk.attempt(lease)),
+        "reap": (lambda tx: reaper.reap_page(tx, QueuePolicy(max_unstarted=0)), SYSTEM),
+        "share": (reaper.share_waiting, SYSTEM),
+    }
+    done, purged = scene.race(order, acts[ends][0], scene.purge_of(thing), acts[ends][1])
+    assert not isinstance(done, ApiProblem), done
+    require_purged(purged, thing)
+    assert scene.desk.state(behind) == {"cancel": "cancelled", "share": "waiting"}.get(ends, "failed")
+    scene.assert_sound()
+
+
+# -- versions ---------------------------------------------------------------------------------------------------------
+
+
+@ORDERS
+def test_a_commit_holds_its_items_or_is_refused(scene: Scene, order: str) -> None:
+    thing = scene.add("thing")
+    request = CommitCreate(message="m", changes=(PutEntry(path="thing", item=thing),))
+    prepared = scene.gaits.read(datasets.prepare_commit, "lab", "gaits", request)
+    scene.delete(thing)
+    commit = scene.of_user(datasets.record_commit, "lab", "gaits", prepared)
+    done, purged = scene.race(order, commit, scene.purge_of(thing))
+    if order == "purge first":
+        assert isinstance(done, ConflictProblem)
+        assert done.error_code == "purged-meanwhile"
+        require_purged(purged, thing)
+    else:
+        require_held_by(purged, "the dataset gaits (branch main; 1 commit)")
+    scene.assert_sound()
+
+
+def test_a_job_that_commits_an_item_which_others_delete_holds_it(scene: Scene) -> None:
+    thing = scene.add("thing")
+    job = scene.gaits.submit("sum", into="raw")
+    lease = scene.desk.claim(job=job)
+    scene.desk.stage_outputs(lease, output("thing", reuse="by_content"))
+    done, purged = scene.race_after_deletion(thing, scene.complete(lease), scene.desk.attempt(lease))
+    assert done.commit is not None
+    require_held_by(purged, "the dataset gaits (branch main; 1 commit)")
+    scene.assert_sound()
+
+
+@ORDERS
+def test_a_merge_of_a_proposal_and_a_purge_do_not_hinder_each_other(scene: Scene, order: str) -> None:
+    kept, thing = scene.add("kept"), scene.add("thing")
+    scene.gaits.change(PutEntry(path="kept", item=kept))
+    scene.write(datasets.create_ref, "lab", "gaits", RefCreate(name="more", kind=RefKind.BRANCH, at="main"))
+    scene.gaits.change(PutEntry(path="thing", item=thing), branch="more")
+    scene.write(proposals.open_proposal, "lab", "gaits", ProposalCreate(title="t", source="more", target="main"))
+    scene.delete(thing)
+    head = scene.gaits.head("more")
+    request = ProposalMerge(commit=head)
+    prepared = scene.gaits.read(proposals.prepare_acceptance, "lab", "gaits", 1, request)
+    merge = scene.of_user(proposals.merge_proposal, "lab", "gaits", 1, request, prepared)
+    done, purged = scene.race(order, merge, scene.purge_of(thing))
+    assert done.state == "merged"
+    require_held_by(purged, "the dataset gaits")
+    scene.assert_sound()
