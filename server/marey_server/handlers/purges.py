@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from marey_schemas.purges import PurgeAnswer, PurgeRequest
 from marey_server.http.declarations import Access, writes
-from marey_server.http.reply import Rendered
+from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store import purging
 
@@ -24,6 +24,8 @@ class ProjectPurges(Resource):
         the holders in `context`. Garbage collection frees the bytes later. One request examines a limited number of
         items; send `next` of the answer as `after` to continue.
         """
+        if body.preview:
+            return await self.render_document(Reply(await self.look_up(purging.preview_purge, project, body)))
         prepared = await self.look_up(purging.prepare_purge, project, body)
         return await self.answer(purging.record_purge, project, body, prepared)
 

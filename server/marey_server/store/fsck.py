@@ -31,6 +31,7 @@ from marey_server.store.datasets.history import revisions_with
 from marey_server.store.documents import items_named_in
 from marey_server.store.events import newest_number
 from marey_server.store.items.summaries import summarise
+from marey_server.store.jobs.inputs import NamingJob
 from marey_server.store.tables import (
     blob,
     collection,
@@ -43,6 +44,8 @@ from marey_server.store.tables import (
     document_item,
     item,
     item_tag,
+    job,
+    job_item,
     project,
     proposal,
     revision,
@@ -88,6 +91,7 @@ def check_store(
         ("uploads", upload, _check_upload),
         ("tree chunks", tree_chunk, _check_chunk),
         ("datasets", dataset, _check_dataset),
+        ("jobs", job, _check_job),
         ("webhooks", webhook, _check_webhook),
         ("projects", project, partial(_check_holding, owner=item.c.project_id)),
         ("users", user, partial(_check_holding, owner=item.c.creator_id)),
@@ -354,6 +358,16 @@ def _is_consistent(one: Row[Any], branches: set[str]) -> bool:
         followed = {one.target} if one.head is not None else {one.target, one.source}
         return followed <= branches and one.ended_us is None and one.merged is None
     return None not in (one.head, one.ended_us) and (one.merged is not None) == (one.state == ProposalState.MERGED)
+
+
+def _check_job(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
+    """Return a fault if a job names items that are not recorded, so that a purge would not find it."""
+    naming = NamingJob(row.id, row.inputs, {} if row.parent_id is not None else row.params, row.outputs or ())
+    recorded = set(tx.execute(select(job_item.c.item_id).where(job_item.c.job_id == row.id)).scalars())
+    return [
+        StoreDefect("job-reference", row.id, f"it names the item {one}, which is not recorded")
+        for one in sorted(naming.items() - recorded)
+    ]
 
 
 def _check_webhook(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:

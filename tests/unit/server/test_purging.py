@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import pytest
-from sqlalchemy import func, select
+from sqlalchemy import event, func, select
 from tests.support.committing_desk import CommittingDesk
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.queue_desk import Desk, document
@@ -76,6 +77,9 @@ class House:
 
     def purge(self, **request: Any) -> PurgeAnswer:
         wanted = PurgeRequest.model_validate(request)
+        if wanted.preview:
+            shown: PurgeAnswer = self.read(purging.preview_purge, "lab", wanted)
+            return shown
         prepared = self.read(purging.prepare_purge, "lab", wanted)
         answer: PurgeAnswer = self.write(purging.record_purge, "lab", wanted, prepared)
         return answer
@@ -619,6 +623,61 @@ def test_a_job_that_was_submitted_after_the_preparation_holds_its_input(house: H
     house.delete(thing)
     with pytest.raises(ConflictProblem, match="the queued job"):
         house.write(purging.record_purge, "lab", request, prepared)
+
+
+def test_a_job_that_named_an_item_after_the_preparation_loses_its_name_too(house: House) -> None:
+    thing = house.add(NAME)
+    request = PurgeRequest(item=thing)
+    house.delete(thing)
+    prepared = house.read(purging.prepare_purge, "lab", request)
+    house.write(items.restore_item, "lab", Kind.STUDY, thing)
+    job, result = run(house.desk, thing, "result")
+    house.delete(thing)
+    house.write(purging.record_purge, "lab", request, prepared)
+    assert house.desk.job(job).inputs["things"][0]["purged"]
+    house.collect()
+    assert NAME not in texts_of_database(house)
+    assert house.read(items.read_item, "lab", Kind.STUDY, result).name == "result"
+    assert house.faults() == []
+
+
+def test_jobs_are_found_by_the_items_that_they_name(house: House) -> None:
+    """The preview of a purge reads neither all jobs nor all items of the project."""
+    if not house.desk.database.is_sqlite:
+        pytest.skip("the plans of SQLite are examined")
+    thing = house.add("thing")
+    job = house.desk.submit("square", inputs={"things": ({"item": thing},)})
+    house.delete(thing)
+    seen: list[tuple[str, Any]] = []
+
+    def examine(tx: Transaction) -> PurgeAnswer:
+        def note(_connection: object, _cursor: object, statement: str, parameters: Any, *_: object) -> None:
+            seen.append((statement, parameters))
+
+        event.listen(tx.connection, "before_cursor_execute", note)
+        shown: PurgeAnswer = purging.preview_purge(tx, "lab", PurgeRequest(collection=""))
+        event.remove(tx.connection, "before_cursor_execute", note)
+        steps = [
+            row[3]
+            for statement, parameters in seen
+            for row in tx.connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", parameters)
+        ]
+        assert [step for step in steps if re.match(r"SCAN (job|item|revision|document)\b", step)] == []
+        assert [step for step in steps if "ix_job_listing" in step or "ix_item_listing" in step] == []
+        assert any("ix_item_deleted" in step for step in steps)
+        return shown
+
+    assert [one.holders for one in house.read(examine).refused] == [
+        (JobHolder(job=job, kind="square", state="queued"),)
+    ]
+
+
+def test_fsck_finds_a_job_whose_items_are_not_recorded(house: House) -> None:
+    from marey_server.store.tables import job_item
+
+    job = house.desk.submit("square", inputs={"things": ({"item": house.add("thing")},)})
+    house.write(lambda tx: tx.execute(job_item.delete()))
+    assert [(fault.code, fault.subject) for fault in house.faults()] == [("job-reference", job)]
 
 
 def test_chunks_are_read_once_however_many_versions_share_them(house: House, monkeypatch: pytest.MonkeyPatch) -> None:

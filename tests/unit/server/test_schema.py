@@ -8,9 +8,11 @@ from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from sqlalchemy import Connection, quoted_name
+from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import Lab
 
 from marey_schemas.kinds import Kind
+from marey_server.access.principal import SYSTEM
 from marey_server.store import fsck, items
 from marey_server.store.database import schema
 from marey_server.store.database.connections import Database
@@ -115,6 +117,30 @@ def test_an_upgrade_records_the_references_of_stored_documents(lab: Lab, databas
     rows = lab.read(lambda tx: tx.execute(sqlalchemy.select(table)).all())
     assert {row.document_digest for row in rows} == {clip.parts["motion"].document for clip in clips}
     assert {row.item_id for row in rows} == {rig.id}
+
+
+def test_an_upgrade_records_the_items_that_jobs_name(desk: Desk, database_url: str) -> None:
+    things = desk.things(3)
+    parent = desk.submit("square", inputs={"things": tuple({"item": one} for one in things)}, into="out")
+    desk.submit("errand")
+    lease = desk.claim()
+    desk.stage(lease, "half")
+    desk.complete(lease)
+
+    def recorded(tx: Transaction) -> set[tuple[str, str]]:
+        rows = tx.execute(sqlalchemy.select(metadata.tables["job_item"]))
+        return {(row.job_id, row.item_id) for row in rows}
+
+    before = desk.database.read(SYSTEM, recorded)
+    made = desk.outputs(parent)[0].item
+    assert {item for _, item in before} == {*things, made}
+    assert (lease.job, made) in before
+    with desk.database.engine.begin() as connection:
+        config = schema._config()
+        config.attributes["connection"] = connection
+        command.downgrade(config, "0022")
+    schema.upgrade_schema(database_url)
+    assert desk.database.read(SYSTEM, recorded) == before
 
 
 def test_an_upgrade_that_fails_leaves_the_database_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,6 +36,7 @@ from marey_server.store.jobs.fencing import (
     require_attempt,
     stored_answer,
 )
+from marey_server.store.jobs.inputs import NamingJob, record_named_items
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.purge_lock import hold_off_purges_of_jobs
@@ -192,6 +193,7 @@ _RECORD = Prepared(
 def _record(tx: Transaction, records: Sequence[dict[str, Any]]) -> None:
     """Store the results of the jobs that this transaction completed."""
     tx.run_each(_RECORD, records)
+    record_named_items(tx, (NamingJob(one["of_job"], outputs=one["its_outputs"]) for one in records))
 
 
 def _pass_fault_points(tx: Transaction) -> None:

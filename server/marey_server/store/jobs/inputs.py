@@ -1,12 +1,14 @@
-"""Resolution of inputs that a submission names to the exact revisions that the job reads."""
+"""Resolution of inputs that a submission names to the exact revisions that the job reads, and items that jobs name."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from sqlalchemy import ColumnElement, bindparam, func, or_, select
 
+from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
 from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.jobs import (
@@ -22,8 +24,9 @@ from marey_schemas.wording import counted
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.store import datasets
 from marey_server.store.database.prepared import Prepared
+from marey_server.store.ids import ids_in
 from marey_server.store.projects import ProjectRow
-from marey_server.store.tables import collection, item
+from marey_server.store.tables import collection, item, job_item
 from marey_server.store.transaction import Transaction, in_lists
 
 MOST_INPUTS = 100_000
@@ -258,3 +261,41 @@ def _escaped(name: str) -> str:
 
 def _error(pointer: str, code: str, detail: str) -> FieldError:
     return FieldError(pointer=pointer, code=code, detail=detail)
+
+
+# -- items that jobs name ---------------------------------------------------------------------------------------------
+
+_KINDS = frozenset(kind.value for kind in Kind)
+
+
+class NamingJob(NamedTuple):
+    """Job, and what it names: its inputs, parameters and outputs, in the form in which its row stores them."""
+
+    id: str
+    inputs: Mapping[str, Any] = {}
+    params: Mapping[str, Any] = {}
+    """Parameters; empty for a task, because its parent job has the same."""
+    outputs: Sequence[Mapping[str, Any]] = ()
+
+    def items(self) -> set[str]:
+        """Return the ids of the items that the job names.
+
+        An input that was split among tasks, or whose items do not exist yet, names none.
+        """
+        found = {one["item"] for one in self.outputs}
+        for pins in self.inputs.values():
+            if isinstance(pins, list):
+                found.update(pin["item"] for pin in pins if "item" in pin)
+        if self.params:
+            found.update(one for one in ids_in(json.dumps(self.params)) if one.partition("_")[0] in _KINDS)
+        return found
+
+
+def record_named_items(tx: Transaction, jobs: Iterable[NamingJob]) -> None:
+    """Record the items that jobs name, so that a purge finds the jobs by an index; what is recorded already stays.
+
+    Every write that stores inputs, parameters or outputs in the row of a job must call this.
+    """
+    rows = [{"job_id": one.id, "item_id": item} for one in jobs for item in sorted(one.items())]
+    for some in in_lists(rows):
+        tx.execute(tx.insert_or_ignore(job_item), some)

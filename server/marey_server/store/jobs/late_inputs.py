@@ -20,7 +20,7 @@ from marey_server.store.jobs import commits, layout, result_cache
 from marey_server.store.jobs.endings import Ended, end_jobs, failure_document
 from marey_server.store.jobs.events import emit_job_events, wake_workers
 from marey_server.store.jobs.fencing import WAITING
-from marey_server.store.jobs.inputs import MOST_INPUTS, Pin, PinnedInputs, items_by_id, pin
+from marey_server.store.jobs.inputs import MOST_INPUTS, Pin, PinnedInputs, items_by_id, pin, record_named_items
 from marey_server.store.jobs.layout import NewJob, Submission
 from marey_server.store.jobs.result_places import find_clash
 from marey_server.store.tables import job
@@ -113,6 +113,7 @@ def _write(tx: Transaction, heads: Sequence[NewJob], tasks: Sequence[NewJob]) ->
         )
     for some in in_lists(tasks):
         tx.execute(insert(job), [layout.new_row(tx, one) for one in some])
+    record_named_items(tx, map(layout.naming, (*heads, *tasks)))
     emit_job_events(tx, "job.bound", [(one.project_id, one.id, {"tasks": one.size or 1}) for one in heads])
 
 

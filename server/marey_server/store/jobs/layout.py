@@ -15,7 +15,7 @@ from marey_server.store.ids import new_id
 from marey_server.store.jobs import result_cache
 from marey_server.store.jobs.commits import Target
 from marey_server.store.jobs.endings import Ended
-from marey_server.store.jobs.inputs import PinnedInputs, items_by_id
+from marey_server.store.jobs.inputs import NamingJob, PinnedInputs, items_by_id
 from marey_server.store.transaction import Transaction
 
 
@@ -227,3 +227,8 @@ def layout_columns(tx: Transaction, one: NewJob) -> dict[str, Any]:
         "cache_key": one.cache_key,
         "started_us": tx.now_us if one.state == "running" else None,
     }
+
+
+def naming(one: NewJob) -> NamingJob:
+    """Return a new job with the inputs and parameters in which it names items."""
+    return NamingJob(one.id, one.pins, {} if one.parent_id is not None else one.submission.params)

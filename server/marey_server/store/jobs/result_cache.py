@@ -25,7 +25,7 @@ from marey_server.store.jobs import commits, exports, staging
 from marey_server.store.jobs.endings import Ended, end_jobs
 from marey_server.store.jobs.events import wake_workers
 from marey_server.store.jobs.fencing import QUEUED, RUNNING, WAITING
-from marey_server.store.jobs.inputs import Pin, PinnedInputs
+from marey_server.store.jobs.inputs import NamingJob, Pin, PinnedInputs, record_named_items
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import job, job_dependency, revision_part, staged_output
 from marey_server.store.transaction import Transaction, in_lists
@@ -273,6 +273,7 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     made = commits.publish_outputs(tx, row, staging.with_inputs(drafts, row.source_inputs, row.inputs))
     if made.failure is not None:
         return end_jobs(tx, waits, "failed", dependencies_left=0, failure=made.failure)
+    record_named_items(tx, [NamingJob(row.id, outputs=made.outputs)])
     return end_jobs(
         tx,
         waits,

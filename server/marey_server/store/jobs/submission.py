@@ -31,10 +31,10 @@ from marey_server.store.jobs.documents import document_of_new, job_documents
 from marey_server.store.jobs.endings import dependency_failure
 from marey_server.store.jobs.events import emit_job_events, wake_workers
 from marey_server.store.jobs.exports import record_permission
-from marey_server.store.jobs.inputs import FoundItem, find_items, late_inputs, pin_inputs
+from marey_server.store.jobs.inputs import FoundItem, find_items, late_inputs, pin_inputs, record_named_items
 from marey_server.store.jobs.labels import labels_key
 from marey_server.store.jobs.late_inputs import pin_late_inputs
-from marey_server.store.jobs.layout import NewJob, Submission, lay_out, new_row
+from marey_server.store.jobs.layout import NewJob, Submission, lay_out, naming, new_row
 from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.jobs.result_places import find_clash
 from marey_server.store.projects import ProjectRow, require
@@ -102,6 +102,7 @@ def submit_checked(
     require_room(tx, "user_jobs", sum(not JobState(one.state).terminal for one in everything))
     rows = {one.id: new_row(tx, one) for one in everything}
     tx.run_each(_INSERT_JOB, list(rows.values()))
+    record_named_items(tx, map(naming, everything))
     _insert_dependencies(tx, submissions, upstream)
     for one in heads:
         staging.keep_named_blobs(tx, one.id, set(staging.named_blobs(one.submission.params)))

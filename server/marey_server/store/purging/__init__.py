@@ -5,6 +5,6 @@ that something still needs is not purged; `holders` says what holds it.
 """
 
 from marey_server.store.purging.candidates import PreparedPurge, prepare_purge
-from marey_server.store.purging.recording import record_purge
+from marey_server.store.purging.recording import preview_purge, record_purge
 
-__all__ = ["PreparedPurge", "prepare_purge", "record_purge"]
+__all__ = ["PreparedPurge", "prepare_purge", "preview_purge", "record_purge"]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, and_, case, or_, select
+from sqlalchemy import Row, and_, select
 
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import MOST_PURGED, PurgeRequest
@@ -16,7 +16,6 @@ from marey_server.store.database.clock import DAY_US
 from marey_server.store.items.listing import ItemFilters, conditions_of
 from marey_server.store.items.reading import item_rows
 from marey_server.store.projects import ProjectRow
-from marey_server.store.purging.naming_jobs import jobs_naming
 from marey_server.store.purging.versions import VersionSearch
 from marey_server.store.tables import item, revision, revision_part
 from marey_server.store.transaction import Transaction
@@ -29,9 +28,7 @@ _ORDER = (
     Kind.PROCESSED, Kind.CLIP, Kind.SKELETON,
 )  # fmt: skip
 """Kinds in the order of a purge: documents refer to items of kinds that come later, and so do not hold them."""
-_RANKS = {kind: rank for rank, kind in enumerate(_ORDER)}
-assert _RANKS.keys() == set(Kind), "every kind needs a place in the order of a purge"
-_RANK = case({kind.value: rank for kind, rank in _RANKS.items()}, value=item.c.kind)
+assert set(_ORDER) == set(Kind), "every kind needs a place in the order of a purge"
 
 
 @dataclass(frozen=True)
@@ -40,14 +37,12 @@ class PreparedPurge:
 
     ids: tuple[str, ...]
     search: VersionSearch
-    jobs: tuple[str, ...]
-    """Ids of the jobs, ended or not, that name one of the items, and of their parent jobs."""
     next: str | None = None
     """Last of the items, if there are more."""
 
 
 def prepare_purge(tx: Transaction, project: str, request: PurgeRequest) -> PreparedPurge:
-    """Choose the next items of a purge, and search all versions and jobs of the project for them.
+    """Choose the next items of a purge, and search all versions of the project for them.
 
     Raises `BadRequestProblem` for a malformed query, and `ForbiddenProblem` if the caller lacks the scope `read`.
     """
@@ -65,33 +60,38 @@ def prepare_purge(tx: Transaction, project: str, request: PurgeRequest) -> Prepa
     _, parts = contents_of(tx, ids)
     search = VersionSearch(project_row.id, parts)
     search.update(tx)
-    naming = list(jobs_naming(tx, project_row.id, ids)) if ids else []
-    jobs = {one.id for one in naming} | {one.parent for one in naming if one.parent is not None}
-    return PreparedPurge(ids, search, tuple(sorted(jobs)), ids[-1] if len(rows) > len(chosen) else None)
+    return PreparedPurge(ids, search, ids[-1] if len(rows) > len(chosen) else None)
 
 
-def _candidates(tx: Transaction, project_row: ProjectRow, request: PurgeRequest) -> Sequence[Row[Any]]:
+def _candidates(tx: Transaction, project_row: ProjectRow, request: PurgeRequest) -> list[Row[Any]]:
+    """Return the next deleted items that a request selects, and one more; each kind is read from an index."""
     filters = ItemFilters(collection=request.collection or None, path=request.path, query=request.query, deleted=True)
-    kinds = tuple(Kind) if request.kind is None else (request.kind,)
-    statement = item_rows().where(*conditions_of(project_row.id, filters, *kinds))
-    if request.item is not None:
-        statement = statement.where(item.c.id == request.item)
-    if request.older_than_days is not None:
-        statement = statement.where(item.c.deleted_us <= tx.now_us - request.older_than_days * DAY_US)
-    if request.after is not None:
-        statement = statement.where(_behind(request.after))
-    return tx.execute(statement.order_by(_RANK, item.c.id.desc()).limit(MOST_PURGED + 1)).all()
+    last = None if request.after is None else _kind_of(request.after)
+    rows: list[Row[Any]] = []
+    for kind in _ORDER if last is None else _ORDER[_ORDER.index(last) :]:
+        if request.kind not in (None, kind):
+            continue
+        statement = item_rows().where(*conditions_of(project_row.id, filters, kind))
+        if request.item is not None:
+            statement = statement.where(item.c.id == request.item)
+        if request.older_than_days is not None:
+            statement = statement.where(item.c.deleted_us <= tx.now_us - request.older_than_days * DAY_US)
+        if kind is last:
+            statement = statement.where(item.c.id < request.after)
+        rows += tx.execute(statement.order_by(item.c.id.desc()).limit(MOST_PURGED + 1 - len(rows))).all()
+        if len(rows) > MOST_PURGED:
+            break
+    return rows
 
 
-def _behind(last: str) -> ColumnElement[bool]:
-    """Return the condition for items that come after an item in the order of a purge; newer items come first."""
+def _kind_of(last: str) -> Kind:
+    """Return the kind of the last item of the previous request; newer items of a kind come first."""
     try:
-        rank = _RANKS[Kind(last.partition("_")[0])]
+        return Kind(last.partition("_")[0])
     except ValueError:
         raise BadRequestProblem(
             f"`after` is {last!r}, but must be the value of `next` in the last answer.", code="bad-cursor"
         ) from None
-    return or_(rank < _RANK, and_(_RANK.in_([rank]), item.c.id < last))
 
 
 def contents_of(tx: Transaction, ids: Sequence[str]) -> tuple[dict[str, frozenset[str]], dict[str, frozenset[str]]]:

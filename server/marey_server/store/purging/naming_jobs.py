@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, field
 
-from sqlalchemy import Text, cast, func, or_, select
+from sqlalchemy import func, select
 
-from marey_server.store.ids import ids_in
 from marey_server.store.jobs.reading import UNFINISHED
-from marey_server.store.tables import job
+from marey_server.store.tables import job, job_item
 from marey_server.store.transaction import Transaction
 
 
 @dataclass(frozen=True, slots=True)
-class NamingJob:
+class JobNaming:
     """Job that names items."""
 
     id: str
@@ -22,34 +21,32 @@ class NamingJob:
     kind: str
     state: str
     """State of the job, or of its parent job if it is a task."""
-    named: frozenset[str]
+    named: set[str] = field(default_factory=set)
     """Ids of items in its inputs, parameters and results."""
 
 
 def jobs_naming(
     tx: Transaction, project_id: str, items: Collection[str], *, unfinished: bool = False
-) -> Iterator[NamingJob]:
-    """Yield the jobs of a project that name one of `items`.
+) -> list[JobNaming]:
+    """Return the jobs of a project that name one of `items`, by id.
 
-    With `unfinished`, only those are searched that have not ended, or whose parent job has not ended.
-    The texts of all jobs of the project are searched, because ids can be anywhere in parameters.
+    With `unfinished`, only those are returned that have not ended, or whose parent job has not ended.
     """
     parent = job.alias("parent")
+    columns = (job_item.c.item_id, job.c.id, job.c.project_id, job.c.parent_id, job.c.kind)
     statement = (
-        select(
-            job.c.id, job.c.parent_id, job.c.kind, func.coalesce(parent.c.state, job.c.state).label("state"),
-            (cast(job.c.inputs, Text) + cast(job.c.params, Text) + func.coalesce(cast(job.c.outputs, Text), "")).label(
-                "text"
-            ),
-        )
+        select(*columns, job.c.state, func.coalesce(parent.c.state, job.c.state).label("whole"))
+        .join(job, job.c.id == job_item.c.job_id)
         .outerjoin(parent, parent.c.id == job.c.parent_id)
-        .where(job.c.project_id == project_id)
-        .order_by(job.c.id)
-        .execution_options(yield_per=10)
-    )  # fmt: skip
-    if unfinished:
-        statement = statement.where(or_(job.c.state.in_(UNFINISHED), parent.c.state.in_(UNFINISHED)))
-    wanted = frozenset(items)
-    for row in tx.execute(statement):
-        if named := wanted.intersection(ids_in(row.text)):
-            yield NamingJob(row.id, row.parent_id, row.kind, row.state, named)
+        .where(job_item.c.item_id.in_(items))
+        .order_by(job_item.c.job_id)
+    )
+    found: dict[str, JobNaming] = {}
+    for row in tx.execute(statement) if items else ():
+        if row.project_id != project_id:  # no condition of the query, which SQLite would answer by reading all jobs
+            continue
+        if unfinished and row.state not in UNFINISHED and row.whole not in UNFINISHED:
+            continue
+        one = found.setdefault(row.id, JobNaming(row.id, row.parent_id, row.kind, row.whole))
+        one.named.add(row.item_id)
+    return list(found.values())

@@ -1,8 +1,9 @@
-"""The write of a purge: erases those of the prepared items that nothing holds now, and names what holds the others."""
+"""Purges and their previews: erases those of the prepared items that nothing holds, and names what holds the others."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Row, select
@@ -15,9 +16,10 @@ from marey_server.store import projects
 from marey_server.store.items.reading import item_rows, was_purged
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import begin_purge
-from marey_server.store.purging.candidates import PreparedPurge, contents_of
+from marey_server.store.purging.candidates import PreparedPurge, contents_of, prepare_purge
 from marey_server.store.purging.erasing import erase, freed_by
 from marey_server.store.purging.holders import FoundHolders, find_holders
+from marey_server.store.purging.naming_jobs import jobs_naming
 from marey_server.store.purging.versions import VersionSearch
 from marey_server.store.tables import item
 from marey_server.store.transaction import Transaction
@@ -26,46 +28,83 @@ STILL_HELD = "still-held"
 """Code of the error for an item that something still needs; `context.holders` says what."""
 
 
+def preview_purge(tx: Transaction, project: str, request: PurgeRequest) -> PurgeAnswer:
+    """Return what a purge would delete and what it would refuse; this reads, and changes nothing.
+
+    Raises the errors of `prepare_purge`, and those of `record_purge` for a single item, except if something holds it.
+    """
+    prepared = prepare_purge(tx, project, request)
+    project_row = projects.require(tx, project)
+    found = _examine(tx, project_row, request, prepared)
+    return _answer(tx, project_row, request, prepared, found)
+
+
 def record_purge(tx: Transaction, project: str, request: PurgeRequest, prepared: PreparedPurge) -> PurgeAnswer:
-    """Purge the prepared items that nothing holds, all in this transaction; with `preview`, only say which.
+    """Purge the prepared items that nothing holds, all in this transaction.
 
     Items that were restored since they were chosen are left out. If the request names a single item, raises
     `ConflictProblem` if something holds it or it is not deleted, `GoneProblem` if it was purged already, and
     `NotFoundProblem` if it does not exist.
     """
+    assert not request.preview, "a preview is a read"
     project_row = projects.require(tx, project)
-    at_us = 0 if request.preview else begin_purge(tx, project_row.id)
-    rows = _lock(tx, project_row, prepared)
+    at_us = begin_purge(tx, project_row.id)
+    found = _examine(tx, project_row, request, prepared)
+    if request.item is not None and found.refused:
+        raise _still_held(found.refused[0])
+    answer = _answer(tx, project_row, request, prepared, found)
+    if found.free:
+        erase(tx, project_row, found.free, found.jobs, at_us)
+        faults.point("purge.before_commit")
+        tx.after_commit(lambda: faults.point("purge.after_commit"))
+    return answer
+
+
+@dataclass(frozen=True)
+class _Examined:
+    """Prepared items that are still deleted: those that can be purged, and those that something holds."""
+
+    free: Sequence[Row[Any]]
+    refused: tuple[HeldItem, ...]
+    jobs: Sequence[str]
+    """Ids of the jobs that name an item that can be purged, all of which have ended, and of their parent jobs."""
+
+
+def _examine(tx: Transaction, project_row: ProjectRow, request: PurgeRequest, prepared: PreparedPurge) -> _Examined:
+    rows = _lock(tx, project_row, prepared, preview=request.preview)
     if request.item is not None and not rows:
         raise _not_deleted(tx, project_row, request.item)
     held = find_holders(tx, project_row.id, rows, _versions(tx, project_row, prepared, rows))
-    refused = tuple(_refused(rows[item_id], held[item_id]) for item_id in prepared.ids if item_id in held)
-    if request.item is not None and refused and not request.preview:
-        raise _still_held(refused[0])
     free = [row for item_id, row in rows.items() if item_id not in held]
-    freed_bytes = freed_by(tx, project_row.id, [row.id for row in free], frozenset(prepared.jobs))
-    if free and not request.preview:
-        erase(tx, project_row, free, prepared.jobs, at_us)
-        faults.point("purge.before_commit")
-        tx.after_commit(lambda: faults.point("purge.after_commit"))
+    naming = jobs_naming(tx, project_row.id, [row.id for row in free])
+    jobs = {one.id for one in naming} | {one.parent for one in naming if one.parent is not None}
+    refused = tuple(_refused(rows[item_id], held[item_id]) for item_id in prepared.ids if item_id in held)
+    return _Examined(free, refused, sorted(jobs))
+
+
+def _answer(
+    tx: Transaction, project_row: ProjectRow, request: PurgeRequest, prepared: PreparedPurge, found: _Examined
+) -> PurgeAnswer:
+    """Return the answer to a request, before anything is deleted."""
     return PurgeAnswer(
         preview=request.preview,
-        purged=tuple(_purged(row, named=request.preview) for row in free),
-        refused=refused,
-        freed_bytes=freed_bytes,
+        purged=tuple(_purged(row, named=request.preview) for row in found.free),
+        refused=found.refused,
+        freed_bytes=freed_by(tx, project_row.id, [row.id for row in found.free], frozenset(found.jobs)),
         next=prepared.next,
     )
 
 
-def _lock(tx: Transaction, project_row: ProjectRow, prepared: PreparedPurge) -> dict[str, Row[Any]]:
-    """Return the rows of the prepared items that are still deleted, in their order, and lock them."""
+def _lock(tx: Transaction, project_row: ProjectRow, prepared: PreparedPurge, *, preview: bool) -> dict[str, Row[Any]]:
+    """Return the rows of the prepared items that are still deleted, in their order; lock them, except for a preview."""
     statement = item_rows().where(
         item.c.id.in_(prepared.ids),
         item.c.project_id == project_row.id,
         item.c.deleted_us.is_not(None),
         item.c.purged_us.is_(None),
     )
-    found = {row.id: row for row in tx.execute(statement.order_by(item.c.id).with_for_update(of=item))}
+    statement = statement.order_by(item.c.id)
+    found = {row.id: row for row in tx.execute(statement if preview else statement.with_for_update(of=item))}
     return {item_id: found[item_id] for item_id in prepared.ids if item_id in found}
 
 

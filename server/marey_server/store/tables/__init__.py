@@ -42,6 +42,7 @@ from marey_server.store.tables.queue import (
     job,
     job_blob,
     job_dependency,
+    job_item,
     job_log,
     staged_output,
 )
@@ -83,6 +84,7 @@ __all__ = [
     "job",
     "job_blob",
     "job_dependency",
+    "job_item",
     "job_log",
     "leader",
     "lineage",

@@ -18,6 +18,7 @@ collection = Table(
 )
 
 _PURGED = text("purged_us IS NOT NULL")
+_RESTORABLE = text("deleted_us IS NOT NULL AND purged_us IS NULL")
 
 item = Table(
     "item",
@@ -41,6 +42,7 @@ item = Table(
     Column("rev", Integer, nullable=False, default=1),
     unique_alive("item", "collection_id", "kind", "name"),
     Index("ix_item_purged", "project_id", "purged_us", sqlite_where=_PURGED, postgresql_where=_PURGED),
+    Index("ix_item_deleted", "project_id", "kind", "id", sqlite_where=_RESTORABLE, postgresql_where=_RESTORABLE),
     Index("ix_item_listing", "project_id", "kind", "id"),
     Index("ix_item_by_name", "project_id", "kind", "name", "id"),
     Index("ix_item_by_creation", "project_id", "kind", "created_us", "id"),

@@ -178,6 +178,13 @@ job_blob = Table(  # blobs that a job's parameters or result name
     Column("blob_digest", DIGEST, ForeignKey("blob.digest"), primary_key=True, index=True),
 )
 
+job_item = Table(  # items that a job names as inputs, as outputs, or in its parameters
+    "job_item",
+    metadata,
+    Column("job_id", ID, ForeignKey("job.id"), primary_key=True),
+    Column("item_id", ID, primary_key=True, index=True),
+)
+
 staged_output = Table(
     "staged_output",
     metadata,
