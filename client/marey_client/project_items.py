@@ -23,7 +23,7 @@ from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
 from marey_schemas.kinds import Kind
-from marey_schemas.purges import PurgeAnswer, PurgeRequest
+from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, PurgeAnswer, PurgeRequest
 from marey_schemas.queue.jobs import ItemInput
 
 
@@ -94,6 +94,15 @@ class ProjectItems:
         purged. Raises `Conflict` if `item` names a single item that something needs.
         """
         return purge_items(self.transport, self.name, PurgeRequest.model_validate(conditions))
+
+    def purge_dataset(self, name: str, *, preview: bool = False) -> DatasetPurgeAnswer:
+        """Delete a deleted dataset for good: versions, branches, tags and proposals. For owners of the project.
+
+        `name` is the name or the id of the dataset. With `preview`, nothing changes, and the answer says what cites the
+        versions. Raises `Conflict` if something cites them.
+        """
+        request = DatasetPurgeRequest(dataset=name, preview=preview)
+        return self.transport.post(DatasetPurgeAnswer, f"/projects/{self.name}/dataset-purges", request)
 
     def edited_rigs(self, clips: Iterable[Item]) -> tuple[ItemInput, ...]:
         """Return the skeletons of `clips` whose joint mapping may have been edited: those with several revisions."""

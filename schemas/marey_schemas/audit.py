@@ -30,6 +30,7 @@ AUDIT_WORDS: Mapping[AuditKind, str] = {
     "item.purged": "purged the item",
     "consent.overridden": "allowed an export after the end of the consent for",
     "dataset.deleted": "deleted the dataset",
+    "dataset.purged": "purged the dataset",
     "branch.deleted": "deleted a branch of the dataset",
     "branch.reset": "reset a branch of the dataset",
     "branch.protected": "protected a branch of the dataset",

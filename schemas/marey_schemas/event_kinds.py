@@ -26,6 +26,7 @@ ProjectAuditKind = Literal[
     "item.purged",
     "consent.overridden",
     "dataset.deleted",
+    "dataset.purged",
     "branch.deleted",
     "branch.reset",
     "branch.protected",

@@ -119,6 +119,34 @@ class PurgeAnswer(Answer):
     next: str | None = Field(None, description="Send it as `after` to examine further items; null: there are none.")
 
 
+class DatasetPurgeRequest(Request):
+    """Request to delete a deleted dataset for good, with its versions, branches, tags and proposals."""
+
+    dataset: str = Field(
+        min_length=1,
+        max_length=64,
+        description="Id of a deleted dataset, or its name; of several with this name, the one that was deleted last.",
+    )
+    preview: bool = Field(False, description="Answer what the purge would do, but change nothing.")
+
+
+class DatasetPurgeAnswer(Answer):
+    """Outcome of the purge of a dataset, or of its preview."""
+
+    preview: bool
+    dataset: str = Field(description="Id of the dataset.")
+    name: str
+    commits: int = Field(description="Number of its versions.")
+    proposals: int = Field(description="Number of its proposals.")
+    holders: tuple[Annotated[ItemHolder | JobHolder, Field(discriminator="type")], ...] = Field(
+        description=f"What cites a version of the dataset and prevents the purge, at most {MOST_HOLDERS}: items that "
+        "jobs made from a version, and jobs that have not ended."
+    )
+    others: int = Field(0, description="Number of further holders that are not listed.")
+    freed_bytes: int = Field(description="Bytes of the trees of entries that no other version has.")
+    same_name: int = Field(description="Number of other deleted datasets of the project that have the same name.")
+
+
 def words_of(holder: Holder) -> str:
     """Describe a holder in a few words, such as "the clip raw/walk (clip_…)"."""
     if isinstance(holder, ItemHolder):

@@ -21,10 +21,10 @@ from tests.support.store_fixtures import WRITE, motion_tree, requiring, skeleton
 
 from marey_schemas.datasets.commits import CommitCreate, PutEntry
 from marey_schemas.datasets.naming import RefCreate, RefKind
-from marey_schemas.datasets.proposals import ProposalCreate, ProposalMerge
+from marey_schemas.datasets.proposals import CommentCreate, ProposalCreate, ProposalMerge
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
-from marey_schemas.purges import PurgeAnswer, PurgeRequest
+from marey_schemas.purges import DatasetPurgeRequest, PurgeAnswer, PurgeRequest
 from marey_schemas.queue.jobs import JobCreate
 from marey_schemas.queue.worker_protocol import CompleteRequest, FailRequest, Lease
 from marey_server.access.principal import SYSTEM, Principal
@@ -468,4 +468,51 @@ def test_a_merge_of_a_proposal_and_a_purge_do_not_hinder_each_other(scene: Scene
     done, purged = scene.race(order, merge, scene.purge_of(thing))
     assert done.state == "merged"
     require_held_by(purged, "the dataset gaits")
+    scene.assert_sound()
+
+
+@pytest.mark.parametrize("does", ["tag", "comment", "commit"])
+def test_what_is_added_to_a_dataset_while_it_is_deleted_is_purged_with_it(scene: Scene, does: str) -> None:
+    """Others delete and purge the dataset when the request has found it and has not committed yet."""
+    thing = scene.add("thing")
+    scene.gaits.change(PutEntry(path="kept", item=scene.add("kept", n=2)))
+    scene.write(datasets.create_ref, "lab", "gaits", RefCreate(name="more", kind=RefKind.BRANCH, at="main"))
+    scene.gaits.change(PutEntry(path="thing", item=thing), branch="more")
+    scene.write(proposals.open_proposal, "lab", "gaits", ProposalCreate(title="t", source="more", target="main"))
+    again = CommitCreate(message="m", changes=(PutEntry(path="again", item=thing),))
+    prepared_commit = scene.gaits.read(datasets.prepare_commit, "lab", "gaits", again)
+    acts = {
+        "tag": scene.of_user(datasets.create_ref, "lab", "gaits", RefCreate(name="v", kind=RefKind.TAG, at="main")),
+        "comment": scene.of_user(proposals.add_comment, "lab", "gaits", 1, CommentCreate(text="hello")),
+        "commit": scene.of_user(datasets.record_commit, "lab", "gaits", prepared_commit),
+    }
+    request = DatasetPurgeRequest(dataset="gaits")
+
+    def delete() -> None:
+        scene.write(datasets.delete_dataset, "lab", "gaits", expected_rev=None)
+
+    def act(tx: Transaction) -> Any:
+        done = acts[does](tx)
+        if tx.is_postgres:
+            delete()
+        return done
+
+    def purge(tx: Transaction) -> Any:
+        if not tx.is_postgres:
+            requiring(WRITE, datasets.delete_dataset)(tx, "lab", "gaits", expected_rev=None)
+        return purge_again(tx)
+
+    def purge_again(tx: Transaction) -> Any:
+        prepared = requiring(WRITE, purging.prepare_dataset_purge)(tx, "lab", request)
+        return requiring(WRITE, purging.record_dataset_purge)(tx, "lab", request, prepared)
+
+    done, purged = interleave(
+        Step(scene.desk.database, scene.desk.user, act), Step(scene.other, scene.desk.user, purge)
+    )
+    assert not isinstance(done, ApiProblem), done
+    if does == "commit" and not scene.desk.database.is_sqlite:  # the purge was prepared without this commit
+        assert isinstance(purged, ConflictProblem)
+        assert purged.error_code == "purged-meanwhile"
+        purged = scene.desk.database.write(scene.desk.user, purge_again)
+    assert (purged.name, purged.commits) == ("gaits", 3 if does == "commit" else 2)
     scene.assert_sound()

@@ -172,6 +172,7 @@ def change_datasets(story: Story) -> None:
     story.send(owner, "DELETE", f"{GAITS}/refs/spare", None, ("branch.deleted", *gaits))
     story.send(owner, "DELETE", f"{GAITS}/refs/v1", None, ("tag.deleted", *gaits))
     story.send(owner, "DELETE", GAITS, None, ("dataset.deleted", *gaits))
+    story.send(owner, "POST", f"{LAB}/dataset-purges", {"dataset": "gaits"}, ("dataset.purged", *gaits))
 
 
 def change_webhooks(story: Story) -> None:

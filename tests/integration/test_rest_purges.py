@@ -196,3 +196,34 @@ def test_an_item_that_is_not_deleted_is_refused_and_stays(lab: Lab, owner: httpx
     answer = purge(owner, item=clip)
     assert (answer.status_code, answer.json()["code"]) == (409, "not-deleted")
     assert lab.read(items.read_item, "lab", Kind.CLIP, clip).parts
+
+
+def test_the_purge_of_a_dataset_is_for_owners_and_names_what_cites_it(
+    server: Server, lab: Lab, owner: httpx.Client
+) -> None:
+    path = "/projects/lab/dataset-purges"
+    clip = lab.add_clip(lab.add_skeleton())
+    owner.post("/projects/lab/datasets", json={"name": "gaits"}).raise_for_status()
+    changes = [{"change": "put", "path": "walk", "item": clip.id}]
+    made = owner.post("/projects/lab/datasets/gaits/commits", json={"message": "m", "changes": changes})
+    assert made.status_code == 201, made.text
+    assert owner.post(path, json={"dataset": "gaits"}).json()["code"] == "not-deleted"
+    inputs = {"clips": [{"dataset": "gaits", "version": "main"}]}
+    job = owner.post("/projects/lab/jobs", json={"kind": "export", "inputs": inputs})
+    assert job.status_code == 202, job.text
+    assert owner.delete("/projects/lab/datasets/gaits", headers={"If-Match": "*"}).status_code == 204
+    refused = owner.post(path, json={"dataset": "gaits"})
+    assert (refused.status_code, refused.json()["code"]) == (409, "still-held")
+    assert refused.json()["context"]["holders"] == [
+        {"type": "job", "job": job.json()["id"], "kind": "export", "state": "queued"}
+    ]
+    shown = owner.post(path, json={"dataset": "gaits", "preview": True}).json()
+    assert (shown["commits"], shown["holders"]) == (1, refused.json()["context"]["holders"])
+    maintainer = server.client(server.make_token(str(lab.maintainer.user_id), "m", scopes=USER_SCOPES))
+    assert maintainer.post(path, json={"dataset": "gaits"}).status_code == 403
+    stranger = server.client(server.make_token(str(lab.stranger.user_id), "s", scopes=USER_SCOPES))
+    assert stranger.post(path, json={"dataset": "gaits"}).status_code == 404
+    assert owner.post(f"/jobs/{job.json()['id']}/cancel").is_success
+    answer = owner.post(path, json={"dataset": "gaits"})
+    assert (answer.status_code, answer.json()["holders"]) == (200, [])
+    assert list(fsck.check_store(lab.database)) == []

@@ -47,6 +47,10 @@ def purge(
         int | None,
         typer.Option("--older-than", min=0, help="Purge only items that were removed at least this many days ago."),
     ] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option("--dataset", help="Name or id of a deleted dataset of the project, to purge instead of items."),
+    ] = None,
     preview: Annotated[
         bool, typer.Option("--preview", help="List what the command would delete and what it would refuse.")
     ] = False,
@@ -56,14 +60,19 @@ def purge(
     """Delete removed items for good: content, history, name and tags. Nothing can restore them.
 
     Garbage collection then frees the bytes that nothing else needs. Items that something still needs, such as a version
-    of a dataset, are refused: the command says what holds them, purges the others, and ends with exit status 1. Only
-    owners of the project may purge.
+    of a dataset, are refused: the command says what holds them, purges the others, and ends with exit status 1. With
+    `--dataset`, a deleted dataset is purged: its versions, branches, tags and proposals, but not its items. Only owners
+    of the project may purge.
     """
     from marey_client.handles.purges import combined, purge_items, purge_step_by_step
 
     addresses = addresses_in_one_project(places)
     with connect(context) as marey:
         project = marey.project(addresses[0].project)
+        if dataset is not None:
+            if len(places) != 1 or addresses[0].path or kind or query or older_than is not None:
+                raise WrongUsage("with --dataset, give only the project of the dataset")
+            return _purge_dataset(project, dataset, preview=preview, yes=yes, as_json=as_json)
         requests = [_request(project, place, kind, query, older_than) for place in places]
         previews = [one.model_copy(update={"preview": True}) for one in requests]
         expected = combined([purge_items(project.transport, project.name, one) for one in previews])
@@ -86,6 +95,28 @@ def purge(
                 done = sum(len(one.purged) + len(one.refused) for one in answers)
                 advance("items examined", done, len(expected.purged) + len(expected.refused))
         return _report(project.name, combined(answers), as_json)
+
+
+def _purge_dataset(project: ProjectHandle, name: str, *, preview: bool, yes: bool, as_json: bool) -> None:
+    """Purge a deleted dataset, or print what the purge would do. Raises `Refused` if something cites a version."""
+    answer = project.purge_dataset(name, preview=True)
+    if not answer.holders and not preview:
+        if not yes:
+            what = f"{counted(answer.commits, 'version')} and {counted(answer.proposals, 'proposal')}"
+            question = f"delete the dataset {answer.name} with {what} for good? Nothing can restore what is purged."
+            ask(question, otherwise="nothing was purged")
+        answer = project.purge_dataset(answer.dataset)
+    if as_json:
+        print_json(answer)
+    if answer.holders:
+        from marey_schemas.purges import words_of
+
+        more = f" and {answer.others:,} more" if answer.others else ""
+        print_message(f"{answer.name} is cited by {', '.join(map(words_of, answer.holders))}{more}")
+        raise Refused
+    done = "would be purged" if answer.preview else "was purged for good"
+    further = f"; {counted(answer.same_name, 'other deleted dataset')} with this name" if answer.same_name else ""
+    print_message(f"{answer.name} ({answer.dataset}) {done}: {_size(answer.freed_bytes)} of versions{further}")
 
 
 def _named(project: str, items: Sequence[PurgedItem]) -> str:

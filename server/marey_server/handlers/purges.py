@@ -1,8 +1,8 @@
-"""Resource of purges, which delete deleted items for good."""
+"""Resources of purges, which delete deleted items and datasets for good."""
 
 from __future__ import annotations
 
-from marey_schemas.purges import PurgeAnswer, PurgeRequest
+from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, PurgeAnswer, PurgeRequest
 from marey_server.http.declarations import Access, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
@@ -30,4 +30,24 @@ class ProjectPurges(Resource):
         return await self.answer(purging.record_purge, project, body, prepared)
 
 
-RESOURCES: tuple[type[Resource], ...] = (ProjectPurges,)
+class DatasetPurges(Resource):
+    """Purges of deleted datasets."""
+
+    path = "/projects/{project}/dataset-purges"
+    tag = "ProjectDatasets"
+
+    @writes(access=Access.OWNER, body=DatasetPurgeRequest, answer=DatasetPurgeAnswer, idempotency="key")
+    async def post(self, project: str, body: DatasetPurgeRequest) -> Rendered:
+        """Purge a deleted dataset: delete its versions, branches, tags and proposals for good, or preview this.
+
+        If an item that a job made from a version, or a job that has not ended, cites a version, the answer is 409
+        (`still-held`), with the holders in `context`. The items of the versions are not deleted; the deleted ones among
+        them can be purged afterwards.
+        """
+        if body.preview:
+            return await self.render_document(Reply(await self.look_up(purging.preview_dataset_purge, project, body)))
+        prepared = await self.look_up(purging.prepare_dataset_purge, project, body)
+        return await self.answer(purging.record_dataset_purge, project, body, prepared)
+
+
+RESOURCES: tuple[type[Resource], ...] = (ProjectPurges, DatasetPurges)

@@ -191,6 +191,23 @@ def test_what_still_holds_an_item_is_told_and_the_others_are_purged(run: Command
     assert clips(lab) == ["raw/a", "raw/b", "raw/c"]
 
 
+def test_a_deleted_dataset_is_purged_after_a_yes_and_releases_its_items(run: Command, lab: ProjectHandle) -> None:
+    run("dataset", "create", "lab/gaits", "--folder", "raw")
+    run("dataset", "commit", "lab/gaits", "-m", "first")
+    purge = ("purge", "lab", "--dataset", "gaits")
+    assert "is not deleted; delete it first" in run(*purge, status=1).stderr
+    lab.dataset("gaits").delete()
+    assert re.search(r"gaits \(dataset_\w+\) would be purged: \d+", run(*purge, "--preview").stderr)
+    assert "nothing was purged" in run(*purge, terminal="n\n", status=1).stderr
+    assert "give only the project" in run("purge", "lab/raw", "--dataset", "gaits", status=2).stderr
+    asked = run(*purge, terminal="y\n").stderr
+    assert "delete the dataset gaits with 1 version and 0 proposals for good?" in asked
+    assert "was purged for good" in asked
+    assert "no deleted dataset" in run(*purge, "--yes", status=1).stderr
+    run("rm", "lab/raw/a", "--yes")
+    assert "1 item purged for good" in run("purge", "lab/raw/a", "--yes").stderr
+
+
 def test_of_a_folder_and_a_removed_item_of_one_name_the_address_says_which(run: Command, lab: ProjectHandle) -> None:
     lab.collections.create("raw/a")
     item = next(lab.clips.list(path="raw/a")).id

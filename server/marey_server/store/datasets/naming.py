@@ -23,6 +23,7 @@ from marey_server.store.datasets.protection import (
 )
 from marey_server.store.ids import new_id
 from marey_server.store.projects import ProjectRow
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import collection, commit_parent, dataset, dataset_commit, dataset_ref
 from marey_server.store.transaction import Transaction
@@ -111,6 +112,7 @@ def delete_dataset(tx: Transaction, project: str, name: str, *, expected_rev: Ex
     Raises `ConflictProblem` if it has a protected branch.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     row = find_dataset(tx, project_row, name)
     lock_refs(tx, row.id)
     require_no_protected_branch(tx, row.id)
@@ -173,6 +175,7 @@ def read_ref(tx: Transaction, project: str, name: str, ref: str) -> Ref:
 def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> Ref:
     """Create a branch or a tag at a version. Raises `ConflictProblem` if another branch or tag has the name."""
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     row = find_dataset(tx, project_row, name)
     digest = resolve(tx, row.id, request.at)
     held = tx.execute(select(func.count()).where(dataset_ref.c.dataset_id == row.id)).scalar_one()
@@ -195,6 +198,7 @@ def move_branch(
     `ConflictProblem` if the branch is protected.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     row = find_dataset(tx, project_row, name)
     digest = resolve(tx, row.id, request.at)
     which = (dataset_ref.c.dataset_id == row.id, dataset_ref.c.name == branch)
@@ -221,6 +225,7 @@ def delete_ref(tx: Transaction, project: str, name: str, ref: str, *, expected_r
     Raises `ConflictProblem` if the branch is protected, or is the source or target of an open proposal.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     row = find_dataset(tx, project_row, name)
     lock_refs(tx, row.id)
     if ref == MAIN:
@@ -243,6 +248,7 @@ def protect_branch(
     Raises `InvalidProblem` for a tag, and for a branch without commits, into which nothing can be merged.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     row = find_dataset(tx, project_row, name)
     lock_refs(tx, row.id)
     which = (dataset_ref.c.dataset_id == row.id, dataset_ref.c.name == branch)

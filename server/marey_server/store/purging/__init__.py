@@ -6,5 +6,18 @@ that something still needs is not purged; `holders` says what holds it.
 
 from marey_server.store.purging.candidates import PreparedPurge, prepare_purge
 from marey_server.store.purging.recording import preview_purge, record_purge
+from marey_server.store.purging.whole_datasets import (
+    prepare_dataset_purge,
+    preview_dataset_purge,
+    record_dataset_purge,
+)
 
-__all__ = ["PreparedPurge", "prepare_purge", "preview_purge", "record_purge"]
+__all__ = [
+    "PreparedPurge",
+    "prepare_dataset_purge",
+    "prepare_purge",
+    "preview_dataset_purge",
+    "preview_purge",
+    "record_dataset_purge",
+    "record_purge",
+]

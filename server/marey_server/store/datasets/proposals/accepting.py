@@ -227,7 +227,9 @@ def _record(
 
 def withdraw_merge(tx: Transaction, project: str, name: str, number: int) -> Proposal:
     """Cancel the request (`when_green`) to merge a proposal automatically; the proposal stays open."""
-    found = find_dataset(tx, projects.require(tx, project), name)
+    project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
+    found = find_dataset(tx, project_row, name)
     row = lock_open(tx, found.id, number)
     if is_waiting(row):
         touch(tx, row, when_green_id=None, when_green_head=None)

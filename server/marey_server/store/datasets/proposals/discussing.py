@@ -16,6 +16,7 @@ from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.history import tree_of
 from marey_server.store.datasets.naming import find_dataset
 from marey_server.store.datasets.proposals.opening import find_proposal, lock_open, touch
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import proposal_comment, user
 from marey_server.store.transaction import Transaction
 from marey_versions.records import key_of
@@ -32,6 +33,7 @@ def add_comment(tx: Transaction, project: str, name: str, number: int, request: 
     proposal has ended or has too many comments.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     found = find_dataset(tx, project_row, name)
     row = lock_open(tx, found.id, number)
     if request.path is not None and request.kind is not None:

@@ -17,6 +17,7 @@ from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.datasets.committing import head_of
 from marey_server.store.datasets.naming import find_dataset, find_ref, lock_refs, resolve
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import dataset_ref, proposal, user
 from marey_server.store.transaction import Transaction
 
@@ -125,6 +126,7 @@ def open_proposal(tx: Transaction, project: str, name: str, request: ProposalCre
     `ConflictProblem` if the dataset has too many open proposals.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     found = find_dataset(tx, project_row, name)
     lock_refs(tx, found.id)
     if request.source == request.target:
@@ -161,6 +163,7 @@ def close_proposal(tx: Transaction, project: str, name: str, number: int) -> Pro
     Raises `ForbiddenProblem` for others, and `ConflictProblem` if the proposal is merged or closed already.
     """
     project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
     found = find_dataset(tx, project_row, name)
     row = lock_open(tx, found.id, number)
     if row.author_id != tx.principal.user_id and not roles.includes(project_row.role, Role.MAINTAINER):

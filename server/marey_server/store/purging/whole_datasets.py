@@ -1,0 +1,257 @@
+"""Purges of deleted datasets: their versions, branches, tags and proposals are deleted for good.
+
+A dataset is held by what cites one of its commits: unfinished jobs, and items that jobs made from a version. So the
+lineage of a result always leads to the version from which it was made. A commit that another dataset of the project
+has, too, stays readable there, and does not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Row, and_, delete, exists, func, select
+
+from marey_schemas.kinds import Kind
+from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, ItemHolder, JobHolder, words_of
+from marey_schemas.queue.jobs import JobState, commits_of
+from marey_server import faults
+from marey_server.errors import ConflictProblem, NotFoundProblem
+from marey_server.store import projects
+from marey_server.store.datasets.chunks import StoredChunks
+from marey_server.store.jobs.reading import UNFINISHED
+from marey_server.store.projects import ProjectRow
+from marey_server.store.purge_lock import begin_purge
+from marey_server.store.purging.holders import FoundHolders
+from marey_server.store.purging.recording import STILL_HELD
+from marey_server.store.tables import (
+    collection,
+    commit_parent,
+    dataset,
+    dataset_commit,
+    dataset_ref,
+    fast_forward,
+    item,
+    job,
+    proposal,
+    proposal_check,
+    proposal_comment,
+    proposal_review,
+    revision,
+    tree_chunk,
+)
+from marey_server.store.transaction import IN_LIST, Transaction
+from marey_versions.tree.chunks import Branch, decode_trusted
+
+_OF_DATASETS = (
+    proposal_check, proposal_review, proposal_comment, proposal, dataset_ref, fast_forward, commit_parent,
+    dataset_commit,
+)  # fmt: skip
+"""Tables with rows of datasets, in an order in which they can be deleted."""
+
+
+@dataclass(frozen=True)
+class PreparedDatasetPurge:
+    """Deleted dataset, and what was found about it before its purge."""
+
+    id: str
+    commits: frozenset[str]
+    """Commits that no other dataset of the project has."""
+    citing: frozenset[str]
+    """Jobs that read one of these commits; while it is deleted, only their retries can be added."""
+    chunks: Mapping[str, int]
+    """Chunks of its trees that no other tree has, with the times at which they were stored last."""
+    freed_bytes: int
+
+
+def preview_dataset_purge(tx: Transaction, project: str, request: DatasetPurgeRequest) -> DatasetPurgeAnswer:
+    """Return what the purge of a deleted dataset would delete, and what holds the dataset; this only reads.
+
+    Raises the errors of `prepare_dataset_purge`.
+    """
+    prepared = prepare_dataset_purge(tx, project, request)
+    return _answer(tx, projects.require(tx, project), request, prepared)
+
+
+def prepare_dataset_purge(tx: Transaction, project: str, request: DatasetPurgeRequest) -> PreparedDatasetPurge:
+    """Find a deleted dataset, the jobs that read its versions, and the chunks that only its versions have.
+
+    This reads all jobs of the project and all trees of the server once. Raises `NotFoundProblem`, `ConflictProblem` if
+    the dataset is not deleted, and `ForbiddenProblem` if the caller lacks the scope `read`.
+    """
+    project_row = projects.require(tx, project)
+    projects.require_scope(tx, project, "read")  # because the answer shows names
+    row = _find(tx, project_row, request.dataset)
+    own = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id == row.id)
+    others = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id != row.id)
+    store = StoredChunks(tx)
+    needed = _below(store, set(tx.execute(others).scalars()), known=())
+    going = sorted(_below(store, set(tx.execute(own).scalars()), known=needed) - needed)
+    chunks: dict[str, int] = {}
+    size_bytes = 0
+    stored = select(tree_chunk.c.digest, tree_chunk.c.created_us, func.length(tree_chunk.c.data).label("size"))
+    for start in range(0, len(going), IN_LIST):
+        for found in tx.execute(stored.where(tree_chunk.c.digest.in_(going[start : start + IN_LIST]))):
+            chunks[found.digest] = found.created_us
+            size_bytes += found.size
+    commits = _own_commits(tx, project_row, row.id)
+    return PreparedDatasetPurge(row.id, commits, _citing(tx, project_row, commits), chunks, size_bytes)
+
+
+def record_dataset_purge(
+    tx: Transaction, project: str, request: DatasetPurgeRequest, prepared: PreparedDatasetPurge
+) -> DatasetPurgeAnswer:
+    """Delete a deleted dataset for good. Raises `ConflictProblem` if something holds it, and `NotFoundProblem`."""
+    assert not request.preview, "a preview is a read"
+    project_row = projects.require(tx, project)
+    begin_purge(tx, project_row.id)
+    if _own_commits(tx, project_row, prepared.id) != prepared.commits:
+        raise ConflictProblem(
+            "Versions were added or purged while this purge was prepared; send the request again.",
+            code="purged-meanwhile",
+        )
+    answer = _answer(tx, project_row, request, prepared)
+    if answer.holders:
+        raise _still_held(answer)
+    for table in _OF_DATASETS:
+        tx.execute(delete(table).where(table.c.dataset_id == prepared.id))
+    tx.execute(delete(dataset).where(dataset.c.id == prepared.id))
+    _delete_chunks(tx, prepared.chunks)
+    tx.audit("dataset.purged", prepared.id, about=answer.name, project_id=project_row.id, name=answer.name)
+    faults.point("dataset_purge.before_commit")
+    return answer
+
+
+def _find(tx: Transaction, project_row: ProjectRow, name: str) -> Row[Any]:
+    """Return the row of the deleted dataset with this id, or of the one with this name that was deleted last."""
+    named = select(dataset).where(
+        dataset.c.project_id == project_row.id, (dataset.c.id == name) | (dataset.c.name == name)
+    )
+    deleted = named.where(dataset.c.deleted_us.is_not(None)).order_by(dataset.c.deleted_us.desc(), dataset.c.id.desc())
+    row = tx.execute(deleted.limit(1)).first()
+    if row is None and tx.execute(named.limit(1)).first() is not None:
+        raise ConflictProblem(f"The dataset {name!r} is not deleted; delete it first.", code="not-deleted")
+    if row is None:
+        raise NotFoundProblem(f"There is no deleted dataset {name!r} in this project.", code="no-dataset")
+    return row
+
+
+def _answer(
+    tx: Transaction, project_row: ProjectRow, request: DatasetPurgeRequest, prepared: PreparedDatasetPurge
+) -> DatasetPurgeAnswer:
+    row = _find(tx, project_row, prepared.id)
+    others = (dataset.c.project_id == project_row.id, dataset.c.name == row.name, dataset.c.id != row.id)
+    held = _holders(tx, _with_retries(tx, prepared.citing))
+    return DatasetPurgeAnswer(
+        preview=request.preview, dataset=row.id, name=row.name, commits=_count(tx, dataset_commit, row.id),
+        proposals=_count(tx, proposal, row.id), holders=tuple(held.holders), others=held.others,
+        freed_bytes=prepared.freed_bytes,
+        same_name=tx.execute(select(func.count()).where(*others, dataset.c.deleted_us.is_not(None))).scalar_one(),
+    )  # fmt: skip
+
+
+def _count(tx: Transaction, table: Any, dataset_id: str) -> int:
+    return int(tx.execute(select(func.count()).where(table.c.dataset_id == dataset_id)).scalar_one())
+
+
+# -- what cites it ----------------------------------------------------------------------------------------------------
+
+
+def _own_commits(tx: Transaction, project_row: ProjectRow, dataset_id: str) -> frozenset[str]:
+    """Return the commits of a dataset that no other dataset of the project has."""
+    elsewhere = dataset_commit.alias("elsewhere")
+    other = exists().where(
+        elsewhere.c.digest == dataset_commit.c.digest,
+        elsewhere.c.dataset_id != dataset_id,
+        elsewhere.c.dataset_id == dataset.c.id,
+        dataset.c.project_id == project_row.id,
+    )
+    own = select(dataset_commit.c.digest).where(dataset_commit.c.dataset_id == dataset_id, ~other)
+    return frozenset(tx.execute(own).scalars())
+
+
+def _citing(tx: Transaction, project_row: ProjectRow, commits: frozenset[str]) -> frozenset[str]:
+    """Return the jobs of the project whose inputs were taken from `commits`."""
+    if not commits:
+        return frozenset()
+    jobs = select(job.c.id, job.c.inputs).where(job.c.project_id == project_row.id).execution_options(yield_per=10)
+    return frozenset(row.id for row in tx.execute(jobs) if not commits.isdisjoint(commits_of(row.inputs)))
+
+
+def _with_retries(tx: Transaction, citing: Iterable[str]) -> set[str]:
+    """Return jobs, their retries, and the tasks of both."""
+    found = set(citing)
+    ahead = sorted(found)
+    while ahead:
+        some, ahead = ahead[:IN_LIST], ahead[IN_LIST:]
+        further = set(tx.execute(select(job.c.id).where(job.c.retry_of.in_(some))).scalars())
+        further |= set(tx.execute(select(job.c.id).where(job.c.parent_id.in_(some))).scalars())
+        ahead += sorted(further - found)
+        found |= further
+    return found
+
+
+def _holders(tx: Transaction, citing: Collection[str]) -> FoundHolders:
+    """Return the citing jobs that have not ended, and the items that citing jobs made and that were not purged."""
+    held = FoundHolders()
+    ordered = sorted(citing)
+    for start in range(0, len(ordered), IN_LIST):
+        some = ordered[start : start + IN_LIST]
+        jobs = select(job.c.id, job.c.kind, job.c.state).where(
+            job.c.id.in_(some), job.c.state.in_(UNFINISHED), job.c.parent_id.is_(None)
+        )
+        for row in tx.execute(jobs.order_by(job.c.id)):
+            held.add(JobHolder(job=row.id, kind=row.kind, state=JobState(row.state)))
+        made = (
+            select(item.c.id, item.c.kind, item.c.name, item.c.deleted_us, collection.c.path)
+            .join(collection, collection.c.id == item.c.collection_id)
+            .where(item.c.purged_us.is_(None))
+            .where(exists().where(and_(revision.c.item_id == item.c.id, revision.c.job_id.in_(some))))
+        )
+        for row in tx.execute(made.order_by(item.c.id)):
+            path = f"{row.path}/{row.name}".lstrip("/")
+            held.add(ItemHolder(item=row.id, kind=Kind(row.kind), path=path, deleted=row.deleted_us is not None))
+    return held
+
+
+def _still_held(answer: DatasetPurgeAnswer) -> ConflictProblem:
+    more = f" and {answer.others:,} more" if answer.others else ""
+    return ConflictProblem(
+        f"The dataset {answer.name!r} cannot be purged, because one of its versions is cited by "
+        f"{', '.join(map(words_of, answer.holders))}{more}.",
+        code=STILL_HELD,
+        context=answer.model_dump(mode="json"),
+    )
+
+
+# -- chunks -----------------------------------------------------------------------------------------------------------
+
+
+def _below(store: StoredChunks, roots: Collection[str], known: Collection[str]) -> set[str]:
+    """Return the digests of chunks, and of all chunks below them, without those in `known` and what is below these."""
+    found: set[str] = set()
+    waiting = set(roots).difference(known)
+    while waiting:
+        batch = [waiting.pop() for _ in range(min(len(waiting), IN_LIST))]
+        found.update(batch)
+        for digest, data in store.load(batch).items():
+            chunk = decode_trusted(digest, data)
+            if isinstance(chunk, Branch):
+                waiting |= {child.digest for child in chunk.children}.difference(found, known)
+    return found
+
+
+def _delete_chunks(tx: Transaction, chunks: Mapping[str, int]) -> None:
+    """Delete chunks, apart from those that another write has stored again since the purge was prepared.
+
+    Each write that makes a tree stores the chunks of its own again, which changes their times. Chunks that it takes
+    over from an older tree are chunks of that tree, too, and so they are not deleted.
+    """
+    digests = sorted(chunks)
+    for start in range(0, len(digests), IN_LIST):
+        some = digests[start : start + IN_LIST]
+        locked = select(tree_chunk.c.digest, tree_chunk.c.created_us).where(tree_chunk.c.digest.in_(some))
+        rows = tx.execute(locked.order_by(tree_chunk.c.digest).with_for_update()).all()
+        gone = [row.digest for row in rows if row.created_us == chunks[row.digest]]
+        tx.execute(delete(tree_chunk).where(tree_chunk.c.digest.in_(gone)))
