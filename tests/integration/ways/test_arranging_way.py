@@ -196,7 +196,7 @@ def test_a_deleted_dataset_is_purged_after_a_yes_and_releases_its_items(run: Com
     run("dataset", "commit", "lab/gaits", "-m", "first")
     purge = ("purge", "lab", "--dataset", "gaits")
     assert "is not deleted; delete it first" in run(*purge, status=1).stderr
-    lab.dataset("gaits").delete()
+    lab.datasets.at("gaits").delete()
     assert re.search(r"gaits \(dataset_\w+\) would be purged: \d+", run(*purge, "--preview").stderr)
     assert "nothing was purged" in run(*purge, terminal="n\n", status=1).stderr
     assert "give only the project" in run("purge", "lab/raw", "--dataset", "gaits", status=2).stderr
