@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from sqlalchemy import ColumnElement, bindparam, func, or_, select
+from sqlalchemy import ColumnElement, bindparam, func, insert, or_, select
 
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
@@ -291,11 +291,18 @@ class NamingJob(NamedTuple):
         return found
 
 
-def record_named_items(tx: Transaction, jobs: Iterable[NamingJob]) -> None:
+_INSERT = Prepared(insert(job_item))
+
+
+def record_named_items(tx: Transaction, jobs: Iterable[NamingJob], *, new: bool = False) -> None:
     """Record the items that jobs name, so that a purge finds the jobs by an index; what is recorded already stays.
 
-    Every write that stores inputs, parameters or outputs in the row of a job must call this.
+    Every write that stores inputs, parameters or outputs in the row of a job must call this. `new` says that the jobs
+    were inserted by this write, so that nothing of them is recorded yet.
     """
     rows = [{"job_id": one.id, "item_id": item} for one in jobs for item in sorted(one.items())]
+    if new and rows:
+        tx.run_each(_INSERT, rows)
+        return
     for some in in_lists(rows):
         tx.execute(tx.insert_or_ignore(job_item), some)

@@ -102,7 +102,7 @@ def submit_checked(
     require_room(tx, "user_jobs", sum(not JobState(one.state).terminal for one in everything))
     rows = {one.id: new_row(tx, one) for one in everything}
     tx.run_each(_INSERT_JOB, list(rows.values()))
-    record_named_items(tx, map(naming, everything))
+    record_named_items(tx, map(naming, everything), new=True)
     _insert_dependencies(tx, submissions, upstream)
     for one in heads:
         staging.keep_named_blobs(tx, one.id, set(staging.named_blobs(one.submission.params)))
