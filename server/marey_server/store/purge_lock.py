@@ -20,7 +20,7 @@ from sqlalchemy import func, select
 
 from marey_server.errors import ConflictProblem
 from marey_server.store.tables import item, job
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 
 def last_purge(tx: Transaction, project_id: str) -> int:
@@ -50,9 +50,8 @@ def hold_off_purges_of_jobs(tx: Transaction, job_ids: Iterable[str]) -> None:
         return
     wanted = sorted(set(job_ids))
     found: set[str] = set()
-    for start in range(0, len(wanted), IN_LIST):
-        some = job.c.id.in_(wanted[start : start + IN_LIST])
-        found.update(tx.execute(select(job.c.project_id).where(some).distinct()).scalars())
+    for some in in_lists(wanted):
+        found.update(tx.execute(select(job.c.project_id).where(job.c.id.in_(some)).distinct()).scalars())
     hold_off_purges(tx, *found)
 
 

@@ -41,7 +41,7 @@ from marey_server.store.tables import (
     revision,
     tree_chunk,
 )
-from marey_server.store.transaction import IN_LIST, Transaction
+from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.tree.chunks import Branch, decode_trusted
 
 _OF_DATASETS = (
@@ -91,8 +91,8 @@ def prepare_dataset_purge(tx: Transaction, project: str, request: DatasetPurgeRe
     chunks: dict[str, int] = {}
     size_bytes = 0
     stored = select(tree_chunk.c.digest, tree_chunk.c.created_us, func.length(tree_chunk.c.data).label("size"))
-    for start in range(0, len(going), IN_LIST):
-        for found in tx.execute(stored.where(tree_chunk.c.digest.in_(going[start : start + IN_LIST]))):
+    for some in in_lists(going):
+        for found in tx.execute(stored.where(tree_chunk.c.digest.in_(some))):
             chunks[found.digest] = found.created_us
             size_bytes += found.size
     commits = _own_commits(tx, project_row, row.id)
@@ -182,13 +182,14 @@ def _citing(tx: Transaction, project_row: ProjectRow, commits: frozenset[str]) -
 def _with_retries(tx: Transaction, citing: Iterable[str]) -> set[str]:
     """Return jobs, their retries, and the tasks of both."""
     found = set(citing)
-    ahead = sorted(found)
+    ahead = found
     while ahead:
-        some, ahead = ahead[:IN_LIST], ahead[IN_LIST:]
-        further = set(tx.execute(select(job.c.id).where(job.c.retry_of.in_(some))).scalars())
-        further |= set(tx.execute(select(job.c.id).where(job.c.parent_id.in_(some))).scalars())
-        ahead += sorted(further - found)
-        found |= further
+        further: set[str] = set()
+        for some in in_lists(sorted(ahead)):
+            further.update(tx.execute(select(job.c.id).where(job.c.retry_of.in_(some))).scalars())
+            further.update(tx.execute(select(job.c.id).where(job.c.parent_id.in_(some))).scalars())
+        ahead = further - found
+        found = found | further
     return found
 
 
@@ -196,8 +197,7 @@ def _holders(tx: Transaction, citing: Collection[str]) -> FoundHolders:
     """Return the citing jobs that have not ended, and the items that citing jobs made and that were not purged."""
     held = FoundHolders()
     ordered = sorted(citing)
-    for start in range(0, len(ordered), IN_LIST):
-        some = ordered[start : start + IN_LIST]
+    for some in in_lists(ordered):
         jobs = select(job.c.id, job.c.kind, job.c.state).where(
             job.c.id.in_(some), job.c.state.in_(UNFINISHED), job.c.parent_id.is_(None)
         )
@@ -233,7 +233,8 @@ def _below(store: StoredChunks, roots: Collection[str], known: Collection[str]) 
     found: set[str] = set()
     waiting = set(roots).difference(known)
     while waiting:
-        batch = [waiting.pop() for _ in range(min(len(waiting), IN_LIST))]
+        batch = next(in_lists(waiting))
+        waiting.difference_update(batch)
         found.update(batch)
         for digest, data in store.load(batch).items():
             chunk = decode_trusted(digest, data)
@@ -249,8 +250,7 @@ def _delete_chunks(tx: Transaction, chunks: Mapping[str, int]) -> None:
     over from an older tree are chunks of that tree, too, and so they are not deleted.
     """
     digests = sorted(chunks)
-    for start in range(0, len(digests), IN_LIST):
-        some = digests[start : start + IN_LIST]
+    for some in in_lists(digests):
         locked = select(tree_chunk.c.digest, tree_chunk.c.created_us).where(tree_chunk.c.digest.in_(some))
         rows = tx.execute(locked.order_by(tree_chunk.c.digest).with_for_update()).all()
         gone = [row.digest for row in rows if row.created_us == chunks[row.digest]]
