@@ -96,13 +96,15 @@ class _Import:
         require_base(self.archive, self.dataset.has)
         history = self.archive.history()
         changes = {digest: self.archive.changes(digest) for digest, _ in history}
+        # All at first, because a document may refer to a revision that only a later commit has as an entry.
+        put = {digest: self._put(changes[digest]) for digest, _ in history}
         known = self._known(history)
         for digest in known & changes.keys():
-            self._note(self._put(changes[digest]))
+            self._note(put[digest])
         for done, (digest, record) in enumerate(history):
             self.on_progress("sending versions", done, len(history))
             if digest not in known:
-                self._ensure(self._put(changes[digest]))
+                self._ensure(put[digest])
                 self._send_commit(record, changes[digest], None)
         head = self.archive.manifest.commit
         if begins is not None:
@@ -124,7 +126,8 @@ class _Import:
         for key, (value, unchanged) in changes.items():
             if value is not None:
                 path, kind = path_and_kind(key)
-                self.homes.update({value["parts"][part]: content for part, content in unchanged.items()})
+                for part, content in unchanged.items():
+                    self.homes.setdefault(value["parts"][part], content)
                 found.append(revision_content(kind, value["parts"]))
                 self.revisions.setdefault(found[-1], _Revision(kind, value["parts"], path))
         return found
@@ -134,12 +137,18 @@ class _Import:
     def _ensure(self, contents: Iterable[str]) -> None:
         """Send those of the revisions that the project lacks; each is sent after the revisions to which it refers."""
         missing = self._missing(sorted(set(contents) - self.held))
-        documents = {digest for one in missing for digest in self._revision(one).parts.values()} - self.homes.keys()
-        referred = {content for digest in documents for content in contents_in(self._document(digest))}
-        if further := referred - self.held - set(missing):
+        referred = {content: self._references(content) for content in missing}
+        if further := set[str]().union(*referred.values()) - self.held - referred.keys():
             self._ensure(further)
-        for together in self._batches(missing):
-            self._send(together)
+        while waiting := [content for content in missing if content not in self.held]:
+            ready = [content for content in waiting if referred[content] <= self.held]
+            for together in self._batches(ready or waiting):
+                self._send(together)
+
+    def _references(self, content: str) -> set[str]:
+        """Return the revisions to which a revision refers; those of documents that the project has are left out."""
+        documents = [digest for digest in self._revision(content).parts.values() if not self._is_stored(digest)]
+        return {one for digest in documents for one in contents_in(self._document(digest))}
 
     def _missing(self, contents: list[str]) -> list[str]:
         """Return those of the revisions that the project lacks, and note that it has the others."""
@@ -162,6 +171,15 @@ class _Import:
             self.revisions[content] = _Revision(found["kind"], found["parts"], None)
         return self.revisions[content]
 
+    def _is_stored(self, document: str) -> bool:
+        """Return whether the project has a document, so that a reference to its home is enough.
+
+        If its home was not sent yet, the archive has the document, unless the home belongs to an earlier version, which
+        the dataset has.
+        """
+        member = ArchiveMember(MemberKind.DOCUMENT, document)
+        return document in self.homes and (self.homes[document] in self.held or member not in self.archive.members)
+
     def _document(self, digest: str) -> Any:
         return self.archive.tree(MemberKind.DOCUMENT, digest)
 
@@ -179,7 +197,7 @@ class _Import:
             yield batch
 
     def _size_bytes(self, document: str) -> int:
-        if document in self.homes:
+        if self._is_stored(document):
             return 0
         arrays, _ = references_of("", self._document(document))
         members = [ArchiveMember(MemberKind.ARRAY, leaf["content"]) for leaf in arrays.values()]
@@ -200,7 +218,7 @@ class _Import:
 
         The reference is used if the project has the document already.
         """
-        if digest in self.homes:
+        if self._is_stored(digest):
             return {"content": self.homes[digest]}
         tree = self._document(digest)
         self._send_files(set(references_of(str(tree.get("schema")), tree)[1].values()))

@@ -80,7 +80,7 @@ class ReceivedRevision(Request):
 
 
 class ReceivedRevisions(Request):
-    """Revisions from an archive or another server, each after the revisions that it refers to."""
+    """Revisions from an archive or another server; the project must have the revisions to which they refer."""
 
     revisions: tuple[ReceivedRevision, ...] = Field(min_length=1, max_length=MOST_CONTENTS)
 

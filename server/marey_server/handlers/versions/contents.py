@@ -74,7 +74,7 @@ class ReceivedContents(Resource):
     async def post(self, project: str, dataset: str, body: ReceivedRevisions) -> Rendered:
         """Store revisions from an archive or another server, so that received commits can refer to them.
 
-        A revision must come after the revisions that it refers to; a reference gives the content digest of a revision.
+        The project must have the revisions to which they refer; a reference gives the content digest of a revision.
         The server creates an item for each revision. The item of a revision that an entry has is deleted at once; a
         checkout of a version with the entry restores it. The other items are created in the folder `imported`. Because
         quotas do not count deleted items, only maintainers may send this request.

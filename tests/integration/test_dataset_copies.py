@@ -1,0 +1,97 @@
+"""Copies of versions to another project: documents may refer to content that other entries, or later versions, have."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.support.rest_server import Server
+from tests.support.store_fixtures import motion_tree, skeleton_tree
+
+from marey_client import Marey
+from marey_client.handles.datasets import DatasetHandle
+from marey_client.items import ItemHandle
+from marey_client.project import ProjectHandle
+from marey_schemas.access import ProjectCreate
+from marey_schemas.datasets.commits import Commit, PutEntry
+
+
+@pytest.fixture
+def marey(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Marey]:
+    """The client of the owner of `lab` and of the empty project `partner`."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    with Marey(server.address, server.make_project()) as client:
+        client.create_project(ProjectCreate(name="partner"))
+        yield client
+
+
+@pytest.fixture
+def lab(marey: Marey) -> ProjectHandle:
+    return marey.project("lab")
+
+
+@pytest.fixture
+def partner(marey: Marey) -> ProjectHandle:
+    return marey.project("partner")
+
+
+@pytest.fixture
+def gaits(lab: ProjectHandle) -> DatasetHandle:
+    return lab.datasets.create("gaits")
+
+
+def make_rig(lab: ProjectHandle) -> ItemHandle:
+    return lab.skeletons.create("rig", {"hierarchy": skeleton_tree(2)})
+
+
+def make_clip(lab: ProjectHandle, rig: ItemHandle) -> ItemHandle:
+    info = {"schema": "marey/clip-info@1", "comment": "first"}
+    return lab.clips.create("walk", {"motion": motion_tree(rig.item, joints=2), "info": info})
+
+
+def label(lab: ProjectHandle, clip: ItemHandle) -> ItemHandle:
+    layer = {"schema": "marey/annotation@1", "clip": {"item": clip.id, "revision": clip.item.revision}}
+    return lab.annotations.create("labels", {"annotation": layer})
+
+
+def commit(gaits: DatasetHandle, **items: ItemHandle) -> Commit:
+    return gaits.commit("m", changes=[PutEntry(path=path, item=one.id) for path, one in items.items()])
+
+
+def assert_copied(partner: ProjectHandle, gaits: DatasetHandle, made: Commit) -> None:
+    """Copy the branch `main`, and check that the other project has the version with the content of each entry."""
+    moved = partner.datasets.pull(gaits, "gaits")
+    assert moved.moved
+    assert moved.commit == made
+    found = {one.path: (one.parts, one.item is None) for one in partner.datasets.at("gaits").entries()}
+    assert found == {one.path: (one.parts, False) for one in gaits.entries()}
+
+
+def test_a_skeleton_its_clip_and_the_labels_of_the_clip_may_be_entries_of_one_version(
+    lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle
+) -> None:
+    rig = make_rig(lab)
+    clip = make_clip(lab, rig)
+    assert_copied(partner, gaits, commit(gaits, labels=label(lab, clip), rig=rig, walk=clip))
+
+
+def test_a_clip_may_refer_to_a_skeleton_that_a_later_version_adds(
+    lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle
+) -> None:
+    rig = make_rig(lab)
+    commit(gaits, walk=make_clip(lab, rig))
+    assert_copied(partner, gaits, commit(gaits, rig=rig))
+
+
+@pytest.mark.parametrize("earlier_copy", [True, False])
+def test_labels_may_refer_to_a_revision_of_a_clip_that_a_later_version_adds(
+    lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle, earlier_copy: bool
+) -> None:
+    clip = make_clip(lab, make_rig(lab))
+    first = commit(gaits, walk=clip)
+    if earlier_copy:
+        assert_copied(partner, gaits, first)
+    clip.put_part("info", {"schema": "marey/clip-info@1", "comment": "second"})
+    commit(gaits, labels=label(lab, clip))
+    assert_copied(partner, gaits, commit(gaits, walk=clip))
