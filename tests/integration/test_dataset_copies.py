@@ -10,10 +10,11 @@ from tests.support.rest_server import Server
 from tests.support.store_fixtures import motion_tree, skeleton_tree
 
 from marey_client import Marey
+from marey_client.blobs import Blobs
 from marey_client.handles.datasets import DatasetHandle
 from marey_client.items import ItemHandle
 from marey_client.project import ProjectHandle
-from marey_schemas.access import ProjectCreate
+from marey_schemas.access import ProjectCreate, Role
 from marey_schemas.datasets.commits import Commit, PutEntry
 
 
@@ -95,3 +96,22 @@ def test_labels_may_refer_to_a_revision_of_a_clip_that_a_later_version_adds(
     clip.put_part("info", {"schema": "marey/clip-info@1", "comment": "second"})
     commit(gaits, labels=label(lab, clip))
     assert_copied(partner, gaits, commit(gaits, walk=clip))
+
+
+def test_a_file_that_a_version_needs_is_copied_although_its_clip_is_deleted(
+    server: Server, lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle
+) -> None:
+    """Another user has uploaded the file, and only a deleted clip refers to it."""
+    with Marey(server.address, server.make_user("ben")) as ben:
+        lab.members.put("ben", Role.CONTRIBUTOR)
+        file = ben.blobs.put(b"HIERARCHY")
+        info = {"schema": "marey/clip-info@1", "source": {"file": file, "file_name": "walk.bvh"}}
+        motion = motion_tree(make_rig(lab).item, joints=2)
+        clip = ben.project("lab").clips.create("walk", {"motion": motion, "info": info}).id
+    lab.clips.get(clip).delete()
+    owner = Blobs(lab.transport)
+    assert owner.missing(file) == {file}
+    commit(gaits, walk=lab.clips.restore(clip))
+    lab.clips.get(clip).delete()
+    assert owner.fetch(file) == b"HIERARCHY"
+    assert partner.datasets.pull(gaits, "gaits").moved

@@ -9,7 +9,7 @@ from operator import itemgetter
 from types import TracebackType
 from typing import Any, Self
 
-from sqlalchemy import ColumnElement, Select, Table, or_, select, update
+from sqlalchemy import ColumnElement, Select, Table, and_, or_, select, update
 
 from marey_schemas.access import Scope
 from marey_schemas.problems import FieldError
@@ -35,6 +35,7 @@ from marey_server.store.tables import (
     job,
     job_blob,
     project,
+    revision,
     revision_part,
 )
 from marey_server.store.transaction import Transaction, in_lists
@@ -357,12 +358,14 @@ def _referenced(tx: Transaction, digests: Iterable[str]) -> set[str]:
     if tx.principal.kind == "attempt":
         return reach.reachable_blobs(tx, digests)
     visible = is_visible(tx.principal)
+    of_revision = and_(revision.c.item_id == revision_part.c.item_id, revision.c.number == revision_part.c.number)
     by_document = (
         select(document_blob.c.blob_digest)
         .join(revision_part, revision_part.c.document_digest == document_blob.c.document_digest)
+        .join(revision, of_revision)
         .join(item, item.c.id == revision_part.c.item_id)
         .join(project, project.c.id == item.c.project_id)
-        .where(item.c.deleted_us.is_(None), visible)
+        .where(or_(item.c.deleted_us.is_(None), revision.c.content.is_not(None)), visible)  # versions keep content
         .distinct()
     )
     by_job = (
