@@ -15,7 +15,8 @@ from marey_client.handles.datasets import DatasetHandle
 from marey_client.items import ItemHandle
 from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate, Role
-from marey_schemas.datasets.commits import Commit, PutEntry
+from marey_schemas.datasets.commits import Commit, PutEntry, RemoveEntry
+from marey_schemas.kinds import Kind
 
 
 @pytest.fixture
@@ -96,6 +97,21 @@ def test_labels_may_refer_to_a_revision_of_a_clip_that_a_later_version_adds(
     clip.put_part("info", {"schema": "marey/clip-info@1", "comment": "second"})
     commit(gaits, labels=label(lab, clip))
     assert_copied(partner, gaits, commit(gaits, walk=clip))
+
+
+def test_a_checkout_creates_labels_of_a_deleted_clip(lab: ProjectHandle) -> None:
+    """The clip is no entry of the version, but its content is kept."""
+    gaits = lab.datasets.create("gaits", collection="gaits")
+    clip = make_clip(lab, make_rig(lab))
+    labels = label(lab, clip)
+    first = commit(gaits, labels=labels)
+    clip.delete()
+    gaits.check_out(first.digest)
+    (made,) = lab.annotations.list(collection="gaits")
+    assert made.id != labels.id
+    assert made.part("annotation")["clip"] == {"item": clip.id, "revision": 1}
+    gaits.commit("none", changes=[RemoveEntry(path="labels", kind=Kind.ANNOTATION)])
+    assert gaits.check_out().removed == 1
 
 
 def test_a_file_that_a_version_needs_is_copied_although_its_clip_is_deleted(

@@ -170,7 +170,7 @@ class _Checkout:
             parts={part: StoredDocument(digest) for part, digest in parts.items()}, reuse="new",
             message=self._message,
         )  # fmt: skip
-        items.publish(self.tx, self.project, [draft], author_id=self.tx.principal.user_id)
+        items.publish(self.tx, self.project, [draft], author_id=self.tx.principal.user_id, refer_to_deleted=True)
 
     def _can_restore(self, kind: Kind, item_id: str) -> bool:
         """Return whether an item is deleted and no other item has taken its former folder and name."""
