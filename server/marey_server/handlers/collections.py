@@ -85,7 +85,7 @@ class CollectionRestoration(Resource):
     path = "/projects/{project}/collections/{collection}/restore"
     tag = "ProjectCollections"
 
-    @writes(access=Access.MAINTAINER, answer=Collection, etag=True)
+    @writes(access=Access.MAINTAINER, answer=Collection, etag=True, idempotency="key")
     async def post(self, project: str, collection: str) -> Rendered:
         """Restore a folder with the contents that were deleted along with it."""
         return await self.answer(collections.restore_collection, project, collection)

@@ -158,7 +158,7 @@ class ItemRestoration(Resource):
     path = "/projects/{project}/{kind}/{item}/restore"
     tag = "ItemsOfKind"
 
-    @writes(access=Access.MAINTAINER, answer=Item, etag=True)
+    @writes(access=Access.MAINTAINER, answer=Item, etag=True, idempotency="key")
     async def post(self, project: str, kind: str, item: str) -> Rendered:
         """Restore a deleted item."""
         return await self.answer(items.restore_item, project, kind_of(kind), item)
@@ -170,7 +170,14 @@ class ItemReversion(Resource):
     path = "/projects/{project}/{kind}/{item}/revert"
     tag = "ItemsOfKind"
 
-    @writes(access=Access.CONTRIBUTOR, body=ItemRevert, answer=Item, precondition="required", etag=True)
+    @writes(
+        access=Access.CONTRIBUTOR,
+        body=ItemRevert,
+        answer=Item,
+        precondition="required",
+        etag=True,
+        idempotency="key",
+    )
     async def post(self, project: str, kind: str, item: str, body: ItemRevert) -> Rendered:
         """Create a revision with the content of an earlier revision; name, folder and tags do not change."""
         expected_rev = self.precondition.expected_rev

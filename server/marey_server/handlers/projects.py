@@ -82,7 +82,7 @@ class ProjectRestoration(Resource):
     path = "/projects/{project}/restore"
     tag = "Projects"
 
-    @writes(access=Access.OWNER, answer=Project, etag=True)
+    @writes(access=Access.OWNER, answer=Project, etag=True, idempotency="key")
     async def post(self, project: str) -> Rendered:
         """Restore the project of this name that was deleted last."""
         return await self.answer(projects.restore_project, project)
