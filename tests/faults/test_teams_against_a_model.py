@@ -1,0 +1,142 @@
+"""Several users of two servers, compared with a model. Answers are lost, and servers die between any two steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis.errors import Flaky
+from sqlalchemy import update
+from tests.support.database_fixtures import copied_sqlite
+from tests.support.teams.hosts import local_hosts, mortal_hosts
+from tests.support.teams.machine import Diverged, run_programs
+from tests.support.teams.model import PARTNER, STUDIO
+from tests.support.teams.world import World
+from tests.support.tiers import examples, is_soak, steps
+
+from marey_server.store import garbage
+from marey_server.store.database.connections import Database
+from marey_server.store.datasets import committing, merging
+from marey_server.store.purging.versions import VersionSearch
+from marey_server.store.tables import dataset_ref
+from marey_server.store.transaction import Transaction
+from marey_versions.merging import MergedEntries, merge_entries
+
+pytestmark = pytest.mark.timeout(3600)
+
+Databases = dict[str, tuple[str, Database]]
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep the archives of running copies in a folder of the test."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def databases(database_url: str, sqlite_template: Path, tmp_path: Path) -> Iterator[Databases]:
+    """The databases of two servers, with their addresses; the second one is always SQLite."""
+    folder = tmp_path / "partner-database"
+    folder.mkdir()
+    urls = {STUDIO: database_url, PARTNER: copied_sqlite(sqlite_template, folder)}
+    opened = {name: (url, Database(url)) for name, url in urls.items()}
+    yield opened
+    for _, database in opened.values():
+        database.close()
+
+
+EXPECTED = (
+    "(deaths", "(lost answers)", "(repeated writes)", "ArchiveAndImport", "CheckOut", "CherryPick", "CollectGarbage",
+    "CommitChanges", "CommitFolder", "Copy", "CreateAnnotation", "CreateBranch", "CreateClip", "CreateTag",
+    "DeleteItem", "DeleteRef", "Merge", "merge-conflicts", "Resolved", "Purge", "still-held", "Rename", "Reset",
+    "RestoreItem", "Revert", "Revise", "UploadFile", "overtaken",
+)  # fmt: skip
+"""Texts in the names of operations and events that a long run must contain, or it would not show much."""
+
+
+@pytest.mark.every_database
+def test_nothing_that_several_users_do_on_two_servers_diverges_from_the_model(
+    databases: Databases, tmp_path: Path
+) -> None:
+    with mortal_hosts(databases, tmp_path) as hosts:
+        world = World(hosts)
+        try:
+            run_programs(world, examples(10 if is_soak() else 2), steps(40))
+        finally:
+            world.close()
+            print(dict(sorted(world.counts.items())))
+    assert world.counts["CommitChanges"] > 0
+    if is_soak():
+        assert not [text for text in EXPECTED if not any(text in label for label in world.counts)]
+
+
+# -- faults that the model finds --------------------------------------------------------------------------------------
+
+
+def drop_their_side(patch: pytest.MonkeyPatch) -> None:
+    """Let merges ignore what their side has changed."""
+    patch.setattr(merging, "merge_entries", lambda ours, _theirs, take, merge: merge_entries(ours, [], take, merge))
+
+
+def move_whatever_the_head_is(patch: pytest.MonkeyPatch) -> None:
+    """Let commits move a branch without a comparison of its newest commit."""
+
+    def move(tx: Transaction, prepared: Any, digest: str, _mover: Any) -> None:
+        which = (dataset_ref.c.dataset_id == prepared.dataset_id, dataset_ref.c.name == prepared.branch)
+        tx.execute(update(dataset_ref).where(*which).values(digest=digest))
+
+    patch.setattr(committing, "move_branch_to", move)
+
+
+def collect_without_grace(patch: pytest.MonkeyPatch) -> None:
+    """Let garbage collection delete files that were uploaded a moment ago."""
+    patch.setattr(garbage, "collect_garbage", partial(garbage.collect_garbage, grace_us=-1))
+
+
+def purge_what_versions_contain(patch: pytest.MonkeyPatch) -> None:
+    """Let purges ignore the versions that contain an item."""
+    patch.setattr(VersionSearch, "holders", lambda _self, _tx, _contents: {})
+
+
+def revert_only_one_entry(patch: pytest.MonkeyPatch) -> None:
+    """Let merges, reverts and cherry-picks forget all changed entries but the first."""
+
+    def merge(ours: Iterable[Any], theirs: Iterable[Any], *options: Any) -> MergedEntries:
+        return merge_entries(ours, list(theirs)[:1], *options)
+
+    patch.setattr(merging, "merge_entries", merge)
+
+
+def forget_write_ids(patch: pytest.MonkeyPatch) -> None:
+    """Let repeated writes be recorded again."""
+    patch.setattr(committing, "recorded_as", lambda _tx, _dataset, _write_id: None)
+
+
+VERSIONS = ("commit", "create_branch", "merge", "revise", "annotate")
+PLANTS: dict[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]] = {
+    drop_their_side: VERSIONS,
+    move_whatever_the_head_is: ("commit", "race"),
+    collect_without_grace: ("upload_file", "collect_garbage"),
+    purge_what_versions_contain: ("commit", "delete_item", "purge_item"),
+    revert_only_one_entry: ("commit", "revert"),
+    forget_write_ids: ("commit", "repeat"),
+}
+"""Faults, and the kinds of steps of the programs that search for each of them."""
+
+
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.__name__)
+@pytest.mark.every_database
+def test_the_model_finds_a_planted_fault(
+    databases: Databases, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plant: Callable[[pytest.MonkeyPatch], None]
+) -> None:
+    with local_hosts(databases, tmp_path) as hosts:
+        world = World(hosts)
+        plant(monkeypatch)
+        with pytest.raises((Diverged, Flaky)):  # flaky: a race that is repeated may end in another way
+            run_programs(world, 20, 60, PLANTS[plant])
+        world.close()
+    assert world.divergences
