@@ -11,7 +11,7 @@ from tests.support.store_fixtures import motion_tree, skeleton_tree
 
 from marey_client import Marey
 from marey_client.blobs import Blobs
-from marey_client.handles.datasets import DatasetHandle
+from marey_client.handles.versions import DatasetHandle
 from marey_client.items import ItemHandle
 from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate, Role

@@ -20,7 +20,7 @@ from tests.support.teams.three_way import changed_entries
 from tests.support.teams.transfers import LISTED
 
 from marey_client.archives.contents import read_documents
-from marey_client.handles.datasets import DatasetHandle
+from marey_client.handles.versions import DatasetHandle
 from marey_schemas.datasets.contents import PartOfContent
 from marey_schemas.datasets.naming import RefKind
 from marey_server.access.principal import SYSTEM

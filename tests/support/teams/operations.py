@@ -15,7 +15,7 @@ from tests.support.teams.three_way import Entry, Key
 
 from marey_client import Marey
 from marey_client.errors import MareyError, RequestFailed
-from marey_client.handles.datasets import DatasetHandle
+from marey_client.handles.versions import DatasetHandle
 from marey_client.project import ProjectHandle
 from marey_schemas.access import Role
 from marey_schemas.datasets.commits import Commit, CommitCreate, EntryChange, MoveEntry, PutEntry, RemoveEntry
