@@ -30,7 +30,7 @@ class ExportedSource(Answer):
 
 
 class ExportedInput(Answer):
-    """Revision of which a job made a clip; the ids are those of the server from which the clip was exported."""
+    """Revision that was an input of the job that made a clip; its ids are those of the server of the export."""
 
     role: str = Field(description="Name of the job input for which the revision was used.")
     kind: str

@@ -74,7 +74,7 @@ class SearchFile(Searcher):
         answer_types=MOTION_MEDIA_TYPES,
     )
     async def post(self, project: str, kind: str, item: str, query: FoundFileQuery, body: SearchRequest) -> Reply:
-        """Return the motion found by a search as one file, with all its steps."""
+        """Return the motion found by a search as one file; if the search has several steps, it contains all of them."""
         models, limits = await self.searched_models(project, kind, item, body), search_answers.search_limits()
         order = SearchFileOrder(request=body, models=models, limits=limits, format=query.format, unit=query.unit)
         file = await self.compute_apart(search_answers.WRITE_SEARCH, order.pack, ComputedFile.unpack)

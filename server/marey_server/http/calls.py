@@ -60,7 +60,7 @@ class Caller:
 
 @dataclass(frozen=True, slots=True)
 class BodyTarget:
-    """Object that a request with a body is for: a project, by its name, or an attempt, by the job's id and the fence.
+    """What a request with a body writes to: a project (its name), or an attempt (the id of the job, and the fence).
 
     The caller needs a role in this project, or the token of this attempt.
     """

@@ -21,9 +21,10 @@ from marey_worker.job_io.skeleton_cache import Rig, read_rigged
 
 
 def run(context: Context, params: TreeParams) -> dict[str, Any]:
-    """Build a tree of a model and stage it as a part of that model, whose other parts are unchanged.
+    """Build a search tree of samples of a model, and stage it as a part of the model; other parts are unchanged.
 
-    Raises `JobRefused` if the result would not be a revision of that model, or if the tree cannot be built.
+    Raises `JobRefused` if the model was moved or renamed while the job waited, if the place of the result is ambiguous,
+    or if the tree cannot be built.
     """
     started = time.monotonic()
     (pin,) = context.inputs["model"]

@@ -179,10 +179,11 @@ def _of_attempts(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
 
 
 def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: PinnedInputs) -> dict[str, StagedDraft]:
-    """Return the drafts of an identical job as drafts of this job.
+    """Return drafts that an identical job has staged, rewritten as drafts of this job.
 
-    In their sources, each revision from the inputs of that job (`theirs`) is replaced by the revision of the same input
-    of this job (`ours`).
+    The two jobs may have read different revisions with the same content. In the sources of each draft, the revision
+    that the other job read (from `theirs`) is replaced by the one at the same position in the inputs of this job
+    (`ours`).
     """
     revisions = {
         (role, their["item"], their["revision"]): our["revision"]
