@@ -138,6 +138,7 @@ def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
         "GET /projects/{project}/webhooks/{webhook}/deliveries/{delivery}": "owner",
         "POST /projects/{project}/webhooks/{webhook}/deliveries/{delivery}/redeliver": "owner",
         "POST /projects/{project}/purges": "owner",
+        "POST /projects/{project}/dataset-purges": "owner",
         "DELETE /projects/{project}/collections/{collection}": "maintainer",
         "POST /projects/{project}/collections/{collection}/restore": "maintainer",
         "DELETE /projects/{project}/datasets/{dataset}": "maintainer",

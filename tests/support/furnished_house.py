@@ -93,6 +93,7 @@ BODIES = {
     "PartsRequest": {"parts": [{"kind": "clip", "item": "item_of_nobody", "revision": 1, "part": "info"}]},
     "ItemChange": {"name": "renamed"},
     "PurgeRequest": {"collection": "", "preview": True},
+    "DatasetPurgeRequest": {"dataset": "deleted", "preview": True},
     "ItemRevert": {"revision": 1},
     "Document": {"schema": "marey/clip-info@1", "comment": CANARY},
     "JobCreate": {"kind": "no-such-kind"},
@@ -254,6 +255,8 @@ def _furnish(owner: Any) -> dict[str, str]:
     assert owner.post(datasets, json={"name": CANARY, "collection": CANARY}).status_code == 201
     assert owner.post(f"{datasets}/{CANARY}/commits", json={"message": CANARY}).status_code == 201
     assert owner.post(f"{datasets}/{CANARY}/refs", json={"name": "spare", "kind": "tag"}).status_code == 201
+    assert owner.post(datasets, json={"name": "deleted"}).status_code == 201
+    assert owner.delete(f"{datasets}/deleted", headers={"If-Match": "*"}).is_success
     proposal = f"{datasets}/{CANARY}/proposals"
     assert owner.post(proposal, json=BODIES["ProposalCreate"]).status_code == 201
     assert owner.post(f"{proposal}/1/comments", json=BODIES["CommentCreate"]).status_code == 201

@@ -43,6 +43,7 @@ def _forget_jobs(tx: Transaction) -> None:
         tables.attempt,
         tables.job_dependency,
         tables.lineage,
+        tables.job_item,
         tables.job,
     ):
         tx.execute(delete(table) if table is not tables.job else delete(table).where(table.c.parent_id.is_not(None)))
