@@ -641,10 +641,9 @@ def test_a_job_that_named_an_item_after_the_preparation_loses_its_name_too(house
     assert house.faults() == []
 
 
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 def test_jobs_are_found_by_the_items_that_they_name(house: House) -> None:
-    """The preview of a purge reads neither all jobs nor all items of the project."""
-    if not house.desk.database.is_sqlite:
-        pytest.skip("the plans of SQLite are examined")
+    """The preview of a purge reads neither all jobs nor all items of the project, as the plans of SQLite show."""
     thing = house.add("thing")
     job = house.desk.submit("square", inputs={"things": ({"item": thing},)})
     house.delete(thing)
