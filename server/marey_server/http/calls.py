@@ -60,7 +60,7 @@ class Caller:
 
 @dataclass(frozen=True, slots=True)
 class BodyTarget:
-    """What a request with a body writes to: a project (its name), or an attempt (the id of the job, and the fence).
+    """Target of a request with a body: a project (its name), or an attempt (the id of the job, and the fence).
 
     The caller needs a role in this project, or the token of this attempt.
     """
