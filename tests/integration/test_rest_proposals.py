@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
+from unittest.mock import AsyncMock
 
 import httpx
 import pytest
@@ -17,8 +18,11 @@ from tests.support.furnished_house import MOTION
 from tests.support.rest_server import Server, running
 
 from marey_server.access.principal import SYSTEM
+from marey_server.process import housekeeping
 from marey_server.store.database.connections import Database
 from marey_server.store.datasets import proposals
+from marey_server.store.datasets.proposals import WaitingMerges
+from marey_server.store.datasets.proposals import waiting as waiting_module
 from marey_server.store.fsck import check_store
 from marey_server.store.tables import job, proposal
 from marey_server.store.transaction import Transaction
@@ -78,9 +82,14 @@ def skeleton(name: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="module", params=BACKENDS)
 def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A server that all tests with one kind of database share; each test has its own project `lab`."""
+    """A server that all tests with one kind of database share; each test has its own project `lab`.
+
+    Its housekeeping merges no waiting proposals, so that tests decide when this happens.
+    """
     folder = tmp_path_factory.mktemp("server")
     with contextlib.ExitStack() as after:
+        patched = after.enter_context(pytest.MonkeyPatch.context())
+        patched.setattr(housekeeping, "_merge_waiting", AsyncMock())
         if request.param == "sqlite":
             url = copied_sqlite(request.getfixturevalue("sqlite_template"), folder)
         else:
@@ -274,6 +283,73 @@ def test_a_proposal_is_merged_when_the_last_thing_arrives(team: Team, server: Se
     assert (merged["state"], merged["ended_by"]) == ("merged", "mia")
     assert ok(team.rita.get(MAIN))["commit"] == merged["merged"]
     assert not list(check_store(server.database))
+
+
+def test_a_waiting_proposal_is_merged_when_its_rule_changes(team: Team, server: Server) -> None:
+    """No request about the proposal tries the merge; housekeeping does, for the user who requested it."""
+    team.protect(approvals=2)
+    team.propose()
+    approve(team.ben, 1)
+    ok(team.ada.post(f"{PROPOSALS}/1/merge", json={"when_green": True}))
+    waiting = WaitingMerges(server.database)
+    assert waiting.attempt() == 0
+    team.protect(approvals=1)
+    assert waiting.attempt() == 1
+    merged = ok(team.rita.get(f"{PROPOSALS}/1"))
+    assert (merged["state"], merged["ended_by"], head(team, "main")) == ("merged", "ada", merged["merged"])
+    assert ok(team.rita.get(f"{GAITS}/commits"))["items"][0]["author"] == "ada"
+    assert waiting.attempt() == 0
+    assert not list(check_store(server.database))
+
+
+def test_a_waiting_proposal_is_merged_when_its_conflict_is_gone(
+    team: Team, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The merge is computed again only after a branch has moved."""
+    ok(team.put("main", "b", 2), 201)
+    team.propose()
+    ok(team.ada.post(f"{PROPOSALS}/1/merge", json={"when_green": True}))
+    waiting, computed, prepare = WaitingMerges(server.database), list[Any](), proposals.prepare_waiting
+
+    def prepare_and_count(*arguments: Any) -> Any:
+        computed.append(arguments)
+        return prepare(*arguments)
+
+    monkeypatch.setattr(waiting_module, "prepare_waiting", prepare_and_count)
+    assert [waiting.attempt() for _ in range(3)] == [0, 0, 0]
+    assert len(computed) == 1
+    ok(team.ada.post(f"{GAITS}/reverts", json={"version": head(team, "main"), "into": "main"}))
+    assert (waiting.attempt(), waiting.attempt()) == (1, 0)
+    assert ok(team.rita.get(f"{PROPOSALS}/1"))["state"] == "merged"
+
+
+@on_sqlite
+def test_a_waiting_proposal_is_not_merged_for_a_user_who_lost_the_right(team: Team, server: Server) -> None:
+    team.protect(approvals=1)
+    team.propose()
+    ok(team.ada.post(f"{PROPOSALS}/1/merge", json={"when_green": True}))
+    ok(team.olga.put(f"{LAB}/members/ada", json={"role": "reader"}))
+    approve(team.ben, 1)
+    waiting = WaitingMerges(server.database)
+    assert waiting.attempt() == 0
+    assert ok(team.rita.get(f"{PROPOSALS}/1"))["state"] == "open"
+    ok(team.olga.put(f"{LAB}/members/ada", json={"role": "contributor"}))
+    assert waiting.attempt() == 1
+
+
+def test_more_proposals_wait_than_one_attempt_examines(
+    team: Team, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(waiting_module, "EXAMINED_AT_ONCE", 2)
+    team.protect(approvals=1)
+    for branch in ("one", "two", "three"):
+        ok(team.ada.post(f"{GAITS}/refs", json={"name": branch, "kind": "branch"}), 201)
+        ok(team.put(branch, branch, 1), 201)
+        ok(team.ada.post(f"{PROPOSALS}/{team.propose(source=branch)}/merge", json={"when_green": True}))
+    waiting = WaitingMerges(server.database)
+    assert waiting.attempt() == 0
+    ok(team.mia.delete(f"{MAIN}/protection", headers=ANY))
+    assert (waiting.attempt(), waiting.attempt(), waiting.attempt()) == (1, 2, 0)
 
 
 @on_sqlite

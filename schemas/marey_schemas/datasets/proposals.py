@@ -104,8 +104,8 @@ class ProposalMerge(Request):
     )
     when_green: bool = Field(
         False,
-        description="If approvals, checks or other requirements are still missing, merge as soon as a review or a "
-        "check meets the last one. A later commit of the proposal cancels this.",
+        description="If approvals, checks or other requirements are still missing, merge as soon as all are met. A "
+        "later commit of the proposal cancels this.",
     )
 
     @model_validator(mode="after")

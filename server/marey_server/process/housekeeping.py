@@ -1,8 +1,9 @@
 """Periodic work of the server.
 
-It reclaims expired leases, shares cached results with waiting jobs, and deletes old or unreferenced data. Only the
-leading process does this work, but concurrent housekeeping would be safe, because every statement repeats its
-conditions. Each kind of work runs in a separate task, so that a failure does not affect the others.
+It reclaims expired leases, shares cached results with waiting jobs, merges waiting proposals, and deletes old or
+unreferenced data. Only the leading process does this work, but concurrent housekeeping would be safe, because every
+statement repeats its conditions. Each kind of work runs in a separate task, so that a failure does not affect the
+others.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ import logging
 import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ApiProblem, UnavailableProblem
 from marey_server.process.services import Services
 from marey_server.store import leader, rate_limits
+from marey_server.store.datasets.proposals import WaitingMerges
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.jobs import reaper
 from marey_server.store.jobs.reaper import StartGrace
@@ -45,9 +48,11 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
     """Run the periodic work while the `async with` block runs; at its end, give up the leadership."""
     holder = secrets.token_hex(8)
     tick_s = min(LONGEST_TICK_S, services.queue_policy.lease_ttl_s / 4)
+    merges = WaitingMerges(services.database)
     chores = (
         (tick_s, tick_s, _reap),
         (tick_s, tick_s, _share_results),
+        (tick_s, tick_s, partial(_merge_waiting, merges=merges)),
         (FORGET_TRIES_EVERY_S, FORGET_TRIES_EVERY_S, _forget_tries),
         (FIRST_GARBAGE_S, GARBAGE_EVERY_S, _collect_garbage),
     )
@@ -124,6 +129,12 @@ async def _share_results(services: Services, holder: str) -> None:
     if await _write(services, _leads, holder):
         while await _write(services, reaper.share_waiting) > 0:
             pass
+
+
+async def _merge_waiting(services: Services, holder: str, merges: WaitingMerges) -> None:
+    """Merge proposals that have waited until nothing is missing any more."""
+    if await _write(services, _leads, holder):
+        await _in_thread(services, merges.attempt)
 
 
 def _leads(tx: Transaction, holder: str) -> bool:

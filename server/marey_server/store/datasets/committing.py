@@ -127,11 +127,11 @@ def record_commit(
     if recorded is not None:
         return read_commit(tx, project, name, recorded)
     require_no_purge_since(tx, project_row.id, prepared.last_purge)
-    mover = mover or Mover(author_of(tx), project_row.role)
+    mover = mover or Mover(author_of(tx), project_row.role, user_id=tx.principal.user_id)
     store_chunks(tx, prepared.chunks)
     store_contents(tx, prepared.contents)
     if prepared.combined:
-        author_id, message = tx.principal.user_id, prepared.message
+        author_id, message = mover.user_id, prepared.message
         store_combined(tx, project_row, found.path, prepared.combined, prepared.documents, message, author_id=author_id)
     digest = prepared.existing or _insert(tx, prepared, mover.name)
     if prepared.existing is not None and prepared.write_id is not None:

@@ -22,12 +22,13 @@ CODE = "branch-protected"
 class Mover:
     """User on whose behalf a branch is moved.
 
-    `by_proposal` is true if the move is the merge of a proposal.
+    `by_proposal` is true if the move is the merge of a proposal. `user_id` is needed where items are created.
     """
 
     name: str
     role: Role
     by_proposal: bool = False
+    user_id: str | None = None
 
 
 def rule_of(ref: Row[Any]) -> Protection | None:

@@ -11,9 +11,11 @@ from marey_server.store.datasets.proposals.accepting import (
 from marey_server.store.datasets.proposals.discussing import add_comment, list_comments
 from marey_server.store.datasets.proposals.opening import close_proposal, list_proposals, open_proposal
 from marey_server.store.datasets.proposals.reviewing import add_review, list_reviews, report_check
+from marey_server.store.datasets.proposals.waiting import WaitingMerges
 
 __all__ = [
     "PreparedAcceptance",
+    "WaitingMerges",
     "add_comment",
     "add_review",
     "close_proposal",

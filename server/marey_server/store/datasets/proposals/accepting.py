@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from sqlalchemy import Row, func, select
 
@@ -53,6 +53,14 @@ class PreparedAcceptance:
     request: MergeRequest
     merge: PreparedMerge | None
     refusal: ApiProblem | None
+
+
+class MergeBasis(NamedTuple):
+    """What the result of a merge depends on: the newest commits of source and target, and the rule of the target."""
+
+    head: str
+    target: str | None
+    rule: Protection | None
 
 
 # -- preparing --------------------------------------------------------------------------------------------------------
@@ -172,7 +180,7 @@ def merge_proposal(
     row = lock_open(tx, found.id, number)
     require_newest(tx, row, request.commit)
     target = _target(tx, row, lock=True)
-    mover = Mover(tx.principal.user_name or "", project_row.role, by_proposal=True)
+    mover = Mover(tx.principal.user_name or "", project_row.role, by_proposal=True, user_id=tx.principal.user_id)
     require_move(target, mover)
     prepared = _require_current(row, prepared)
     missing = _missing(tx, project_row, row, target, prepared)
@@ -238,31 +246,52 @@ def withdraw_merge(tx: Transaction, project: str, name: str, number: int) -> Pro
 
 def merge_if_green(
     tx: Transaction, project: str, name: str, row: Row[Any], prepared: PreparedAcceptance | None
-) -> None:
+) -> bool:
     """Merge a locked proposal if its merge was requested with `when_green` and nothing is missing any more.
 
-    Nothing happens if the user who requested the merge may no longer move the branch. Raises `ConflictProblem` if a
-    branch has moved since the merge was prepared.
+    Returns whether it was merged. It is not if the user who requested the merge may no longer move the branch. Raises
+    `ConflictProblem` if a branch has moved since the merge was prepared.
     """
     if not is_waiting(row):
-        return
-    project_row = projects.require(tx, project)
+        return False
     target = _target(tx, row, lock=True)
-    mover = _waiting_mover(tx, project_row, row, target)
-    rule = rule_of(target)
-    if mover is None or any(find_missing(tx, project_row.id, row, rule)):
-        return
+    mover = _ready_mover(tx, projects.require(tx, project), row, target)
+    if mover is None:
+        return False
     prepared = _require_current(row, prepared)
-    if not any(_obstacles(prepared, rule)):
-        _record(tx, project, name, row, prepared, mover, row.when_green_id)
+    if any(_obstacles(prepared, rule_of(target))):
+        return False
+    _record(tx, project, name, row, prepared, mover, row.when_green_id)
+    return True
+
+
+def merge_basis(tx: Transaction, project_row: ProjectRow, row: Row[Any]) -> MergeBasis | None:
+    """Return what the result of a waiting merge depends on.
+
+    Returns None if the proposal does not wait, if approvals, checks or rights are missing, or if changes are requested.
+    """
+    if not is_waiting(row):
+        return None
+    target = _target(tx, row)
+    if _ready_mover(tx, project_row, row, target) is None:
+        return None
+    return MergeBasis(row.head_now, target.digest, rule_of(target))
+
+
+def _ready_mover(tx: Transaction, project_row: ProjectRow, row: Row[Any], target: Row[Any]) -> Mover | None:
+    """Return the user who requested a merge; None if an approval, a check or a right for it is missing."""
+    if any(find_missing(tx, project_row.id, row, rule_of(target))):
+        return None
+    return _waiting_mover(tx, project_row, row, target)
 
 
 def _waiting_mover(tx: Transaction, project_row: ProjectRow, row: Row[Any], target: Row[Any]) -> Mover | None:
-    """Return the user who asked for the merge, None if that user may no longer move the branch."""
-    held = select(member.c.role).where(member.c.project_id == project_row.id, member.c.user_id == row.when_green_id)
-    role = tx.execute(held).scalar()
+    """Return the user who requested the merge; None if that user may no longer move the branch."""
+    of_member = member.c.project_id == project_row.id, member.c.user_id == row.when_green_id
+    role = tx.execute(select(member.c.role).where(*of_member)).scalar()
     asked = tx.execute(select(user).where(user.c.id == row.when_green_id)).one()
-    mover = Mover(asked.name, Role.OWNER if asked.administrator else Role(role or Role.READER), by_proposal=True)
+    held = Role.OWNER if asked.administrator else Role(role or Role.READER)
+    mover = Mover(asked.name, held, by_proposal=True, user_id=asked.id)
     if asked.disabled or not roles.includes(mover.role, Role.CONTRIBUTOR):
         return None
     try:

@@ -1,0 +1,110 @@
+"""Merges of proposals that wait until nothing is missing any more, as `when_green` requests.
+
+A review or a report of a check tries the merge at once. Other changes can complete a proposal, too: a changed rule, a
+moved target, a new role of the user who requested the merge. So the server examines all waiting proposals regularly.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import NamedTuple
+
+from sqlalchemy import select, tuple_
+
+from marey_schemas.lru import LruCache
+from marey_server.access.principal import SYSTEM
+from marey_server.errors import ApiProblem, UnavailableProblem
+from marey_server.store.database.connections import Database
+from marey_server.store.datasets.proposals.accepting import (
+    MergeBasis,
+    PreparedAcceptance,
+    merge_basis,
+    merge_if_green,
+    prepare_waiting,
+)
+from marey_server.store.datasets.proposals.opening import find_proposal, lock_open
+from marey_server.store.projects import find_by_id
+from marey_server.store.purge_lock import hold_off_purges
+from marey_server.store.tables import dataset, project, proposal
+from marey_server.store.transaction import Transaction
+
+EXAMINED_AT_ONCE = 100
+"""Greatest number of proposals that one call of `WaitingMerges.attempt` examines."""
+OBSTRUCTED_KEPT = 10_000
+"""Greatest number of proposals whose conflicts are remembered."""
+
+log = logging.getLogger(__name__)
+
+
+class _Waiting(NamedTuple):
+    """A proposal whose merge was requested with `when_green`."""
+
+    dataset_id: str
+    number: int
+    dataset: str
+    project_id: str
+    project: str
+
+
+class WaitingMerges:
+    """Attempts to merge waiting proposals, in the order of their datasets and numbers, again and again."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._last = ("", 0)
+        self._obstructed: LruCache[tuple[str, int], MergeBasis] = LruCache(max_entries=OBSTRUCTED_KEPT)
+        """What the merge of a proposal was computed from when it had conflicts; it is not computed again from that."""
+
+    def attempt(self) -> int:
+        """Merge those of the next `EXAMINED_AT_ONCE` waiting proposals that lack nothing; return how many.
+
+        A proposal that another request changes meanwhile is examined again in the next round.
+        """
+        found = self._database.read(SYSTEM, _next_waiting, self._last)
+        merged = sum(map(self._attempt_one, found))
+        self._last = (found[-1].dataset_id, found[-1].number) if len(found) == EXAMINED_AT_ONCE else ("", 0)
+        return merged
+
+    def _attempt_one(self, one: _Waiting) -> bool:
+        key = one.dataset_id, one.number
+        try:
+            basis = self._database.read(SYSTEM, _basis_if_ready, one)
+            if basis is None or basis == self._obstructed.get(key):
+                return False
+            prepared = self._database.read(SYSTEM, prepare_waiting, one.project, one.dataset, one.number)
+            merged = self._database.submit_write(SYSTEM, _merge, one, prepared).result()
+        except UnavailableProblem:
+            raise
+        except ApiProblem as problem:
+            log.info("proposal %d of %s is examined again later: %s", one.number, one.dataset_id, problem.detail)
+            return False
+        if not merged:
+            self._obstructed.put(key, basis)
+        return merged
+
+
+def _next_waiting(tx: Transaction, last: tuple[str, int]) -> list[_Waiting]:
+    columns = proposal.c.dataset_id, proposal.c.number
+    statement = (
+        select(*columns, dataset.c.name, dataset.c.project_id, project.c.name.label("project"))
+        .join(dataset, dataset.c.id == proposal.c.dataset_id)
+        .join(project, project.c.id == dataset.c.project_id)
+        .where(proposal.c.when_green_id.is_not(None), tuple_(*columns) > last)
+        .where(dataset.c.deleted_us.is_(None), project.c.deleted_us.is_(None))
+        .order_by(*columns)
+        .limit(EXAMINED_AT_ONCE)
+    )
+    return [_Waiting._make(row) for row in tx.execute(statement)]
+
+
+def _basis_if_ready(tx: Transaction, one: _Waiting) -> MergeBasis | None:
+    """Return what the merge of a waiting proposal depends on; None if approvals, checks or rights are missing."""
+    row = find_proposal(tx, one.dataset_id, one.number)
+    return merge_basis(tx, find_by_id(tx, one.project_id), row)
+
+
+def _merge(tx: Transaction, one: _Waiting, prepared: PreparedAcceptance | None) -> bool:
+    """Merge a proposal if nothing is missing; return whether it has ended."""
+    hold_off_purges(tx, one.project_id)
+    row = lock_open(tx, one.dataset_id, one.number)
+    return merge_if_green(tx, one.project, one.dataset, row, prepared)
