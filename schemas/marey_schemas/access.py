@@ -2,7 +2,7 @@
 
 from datetime import datetime
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, SecretStr, StringConstraints
 
@@ -241,6 +241,30 @@ class Member(Answer):
     """A user's role in a project."""
 
     user: str
+    role: Role
+    since: datetime
+    rev: int
+
+
+EVERY_MEMBER = "*"
+"""Stands for all members, in place of the name of a user, in the role of a folder."""
+
+
+class FolderRoleChange(Request):
+    """Request to set the role of a member, or of all members, in a folder and everything below it."""
+
+    role: Literal[Role.READER, Role.CONTRIBUTOR, Role.MAINTAINER]
+
+
+class FolderRole(Answer):
+    """Role of a member in a folder and everything below it, which differs from the role in the project."""
+
+    user: str = Field(
+        description="The name of the member; `*` stands for all members without a role of their own in this folder, "
+        "except owners."
+    )
+    folder: str = Field(description="The path of the folder.")
+    collection: str = Field(description="The id of the folder.")
     role: Role
     since: datetime
     rev: int

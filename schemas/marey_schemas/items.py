@@ -5,6 +5,7 @@ from typing import Any
 
 from pydantic import Field
 
+from marey_schemas.access import Role
 from marey_schemas.base import Answer, Request
 from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath, Digest, ItemName, Message, Tag
@@ -30,6 +31,11 @@ class Collection(Answer):
 
     id: str
     path: str
+    role: Role | None = Field(
+        None,
+        description="The caller's role in the folder, by the role in the project and the roles in folders; null for a "
+        "guest of a public project.",
+    )
     created_at: datetime
     updated_at: datetime
     deleted_at: datetime | None = None

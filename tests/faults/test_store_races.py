@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 from tests.support.interleaving import Step, interleave
-from tests.support.store_fixtures import Lab, skeleton_tree
+from tests.support.store_fixtures import ALL_RIGHTS, Lab, skeleton_tree
 
 from marey_schemas.access import MemberChange, Role
 from marey_schemas.kinds import Kind
@@ -64,7 +64,9 @@ def test_two_results_of_one_name_become_two_revisions_and_neither_is_lost(
 
     def publishes(bone_m: float) -> Act:
         draft = Draft("rig", Kind.SKELETON, "rig", {"hierarchy": skeleton_tree(bone_m=bone_m)})
-        return lambda tx: publish(tx, projects.require(tx, "lab"), [draft], author_id=tx.principal.user_id)
+        return lambda tx: publish(
+            tx, projects.require(tx, "lab"), [draft], author_id=tx.principal.user_id, rights=ALL_RIGHTS
+        )
 
     interleave(Step(lab.database, lab.owner, publishes(1)), Step(other, lab.owner, publishes(2)), commit=commit)
     written = [

@@ -139,6 +139,8 @@ def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
         "POST /projects/{project}/webhooks/{webhook}/deliveries/{delivery}/redeliver": "owner",
         "POST /projects/{project}/purges": "owner",
         "POST /projects/{project}/dataset-purges": "owner",
+        "PUT /projects/{project}/collections/{collection}/roles/{user}": "owner",
+        "DELETE /projects/{project}/collections/{collection}/roles/{user}": "owner",
         "DELETE /projects/{project}/collections/{collection}": "maintainer",
         "POST /projects/{project}/collections/{collection}/restore": "maintainer",
         "DELETE /projects/{project}/datasets/{dataset}": "maintainer",

@@ -50,6 +50,7 @@ BODIES = {
     "ProjectChange": {"title": "T"},
     "QuotaChange": {"items": 10**6},
     "MemberChange": {"role": "reader"},
+    "FolderRoleChange": {"role": "contributor"},
     "InvitationCreate": {"role": "reader", "note": CANARY},
     "AccountInvitationCreate": {"project": "lab", "role": "reader", "note": CANARY},
     "InvitationAcceptance": {"code": UNKNOWN_CODE},

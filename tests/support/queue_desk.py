@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from tests.support.database_fixtures import AdjustableClock
+from tests.support.store_fixtures import ALL_RIGHTS
 
 from marey_schemas.access import ProjectCreate, UserCreate
 from marey_schemas.base import Request
@@ -165,7 +166,9 @@ class Desk:
         """Publish drafts as a user, not as a job."""
 
         def act(tx: Transaction) -> list[Published]:
-            return publish(tx, projects.require(tx, self.project), drafts, author_id=self.user.user_id)
+            return publish(
+                tx, projects.require(tx, self.project), drafts, author_id=self.user.user_id, rights=ALL_RIGHTS
+            )
 
         return self.database.write(self.user, act)
 

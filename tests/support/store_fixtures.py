@@ -9,6 +9,7 @@ import pytest
 from marey_schemas.access import MemberChange, ProjectChange, ProjectCreate, Role, UserCreate, Visibility
 from marey_schemas.items import Event, Item, ItemCreate
 from marey_schemas.kinds import Kind
+from marey_server.access.folder_rights import FolderRights
 from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
 from marey_server.access.roles import RequiredRole
 from marey_server.handlers.catalogue import RESOURCES
@@ -16,6 +17,7 @@ from marey_server.store import events, items, members, projects, users
 from marey_server.store.database.connections import Database
 from marey_server.store.transaction import Transaction
 
+ALL_RIGHTS = FolderRights("lab", Role.OWNER)
 ALL_SCOPES = ("read", "write", "jobs", "work", "admin")
 
 

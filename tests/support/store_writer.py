@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from tests.support.store_fixtures import ALL_RIGHTS
+
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import PurgeRequest
 from marey_schemas.queue.worker_protocol import CompleteRequest
@@ -27,7 +29,7 @@ def publish(tx: Transaction) -> Any:
     row = projects.require(tx, "lab")
     trees = [{"n": n, "blob": blobs.digest_of(data)} for n, data in enumerate(FILES)]
     drafts = [items.Draft(f"d{n}", Kind.STUDY, f"study {n}", {"study": tree}, "a/b") for n, tree in enumerate(trees)]
-    return items.publish(tx, row, drafts, author_id=tx.principal.user_id)
+    return items.publish(tx, row, drafts, author_id=tx.principal.user_id, rights=ALL_RIGHTS)
 
 
 def purge(database: Database, who: Principal) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from marey_schemas.access import Role
@@ -17,17 +18,30 @@ def includes(role: Role, required: Role) -> bool:
     return _RANK[role] >= _RANK[required]
 
 
+def least_of(given: Iterable[Role]) -> Role:
+    """Return the role with the fewest rights; `given` must not be empty."""
+    return min(given, key=_RANK.__getitem__)
+
+
+def at_least(required: Role) -> tuple[str, ...]:
+    """Return the names of the roles that allow everything that `required` allows."""
+    return tuple(role.value for role in Role if includes(role, required))
+
+
 @dataclass(frozen=True, slots=True)
 class RequiredRole:
     """Role and scope that an operation requires in a project.
 
     Handlers declare it, the transaction of a request contains it, and `store.projects.require` enforces it. `guests`
-    is false if callers without a role may not perform the operation even in a public project.
+    is false if callers without a role may not perform the operation even in a public project. If `in_folders` is true,
+    members who have the role in one folder only are admitted, too; the function that changes something in a folder then
+    checks the role there (`store.folder_roles.rights`).
     """
 
     role: Role
     scope: str
     guests: bool = True
+    in_folders: bool = False
 
 
 STRICTEST = RequiredRole(Role.OWNER, "write", guests=False)

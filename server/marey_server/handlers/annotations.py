@@ -30,6 +30,7 @@ class AnnotationCommands(Resource):
         precondition="required",
         etag=True,
         idempotency="key",
+        in_folders=True,
     )
     async def post(self, project: str, kind: str, item: str, body: AnnotationChange) -> Rendered:
         """Apply commands to an annotation (kind `annotations`); together they create one new revision.
@@ -69,6 +70,7 @@ class ClipAnnotations(Resource):
         status=201,
         etag=True,
         idempotency="key",
+        in_folders=True,
     )
     async def post(self, project: str, kind: str, item: str, body: AnnotationImport) -> Rendered:
         """Create an annotation of a clip (kind `clips`) from a document of Marey's predecessor.

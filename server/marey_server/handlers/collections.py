@@ -44,6 +44,7 @@ class ProjectCollections(Resource):
         status=201,
         etag=True,
         idempotency="key",
+        in_folders=True,
     )
     async def post(self, project: str, body: CollectionCreate) -> Rendered:
         """Create a folder, and its parent folders if they are missing."""
@@ -66,13 +67,20 @@ class CollectionResource(Resource):
         """Return a folder."""
         return await self.answer(collections.read_collection, project, collection)
 
-    @writes(access=Access.CONTRIBUTOR, body=CollectionChange, answer=Collection, precondition="required", etag=True)
+    @writes(
+        access=Access.CONTRIBUTOR,
+        body=CollectionChange,
+        answer=Collection,
+        precondition="required",
+        etag=True,
+        in_folders=True,
+    )
     async def patch(self, project: str, collection: str, body: CollectionChange) -> Rendered:
         """Rename or move a folder with its contents."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(collections.move_collection, project, collection, body, expected_rev=expected_rev)
 
-    @writes(access=Access.MAINTAINER, precondition="required")
+    @writes(access=Access.MAINTAINER, precondition="required", in_folders=True)
     async def delete(self, project: str, collection: str) -> Rendered:
         """Delete a folder with its contents; it can be restored."""
         expected_rev = self.precondition.expected_rev
@@ -85,7 +93,7 @@ class CollectionRestoration(Resource):
     path = "/projects/{project}/collections/{collection}/restore"
     tag = "ProjectCollections"
 
-    @writes(access=Access.MAINTAINER, answer=Collection, etag=True, idempotency="key")
+    @writes(access=Access.MAINTAINER, answer=Collection, etag=True, idempotency="key", in_folders=True)
     async def post(self, project: str, collection: str) -> Rendered:
         """Restore a folder with the contents that were deleted along with it."""
         return await self.answer(collections.restore_collection, project, collection)

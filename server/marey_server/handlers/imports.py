@@ -116,6 +116,7 @@ class ProjectImports(Resource):
         body=RequestBody(Files, max_bytes=MAX_UPLOAD_BYTES, alternative=ImportRequest, streamed=True),
         answer=ImportAnswer,
         also=((202, Job),),
+        in_folders=True,
     )
     async def post(self, project: str) -> Reply:
         """Import motion files; the answer has one entry for each file, and a faulty file does not affect others.
@@ -133,6 +134,7 @@ class ProjectImports(Resource):
             self.files = await self.look_up(_stored_files, request)
         if not self.files:
             raise BadRequestProblem("The request contains no files; send at least one.", code="no-files")
+        await self.look_up(importing.require_folder, project, options.collection)
         if self._is_large(self.files):
             return await self._submit(project, options)
         async with self.using_children():

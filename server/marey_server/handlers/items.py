@@ -115,6 +115,7 @@ class ItemsOfKind(Resource):
         status=201,
         etag=True,
         idempotency="key",
+        in_folders=True,
     )
     async def post(self, project: str, kind: str, body: ItemCreate) -> Rendered:
         """Create an item from its documents."""
@@ -139,13 +140,15 @@ class ItemResource(Resource):
         """Return an item at its newest revision: name, folder, tags, summary, documents."""
         return await self.answer(items.read_item, project, kind_of(kind), item)
 
-    @writes(access=Access.CONTRIBUTOR, body=ItemChange, answer=Item, precondition="required", etag=True)
+    @writes(
+        access=Access.CONTRIBUTOR, body=ItemChange, answer=Item, precondition="required", etag=True, in_folders=True
+    )
     async def patch(self, project: str, kind: str, item: str, body: ItemChange) -> Rendered:
         """Rename, move or tag an item."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(items.change_item, project, kind_of(kind), item, body, expected_rev=expected_rev)
 
-    @writes(access=Access.MAINTAINER, precondition="required")
+    @writes(access=Access.MAINTAINER, precondition="required", in_folders=True)
     async def delete(self, project: str, kind: str, item: str) -> Rendered:
         """Delete an item; it can be restored."""
         expected_rev = self.precondition.expected_rev
@@ -158,7 +161,7 @@ class ItemRestoration(Resource):
     path = "/projects/{project}/{kind}/{item}/restore"
     tag = "ItemsOfKind"
 
-    @writes(access=Access.MAINTAINER, answer=Item, etag=True, idempotency="key")
+    @writes(access=Access.MAINTAINER, answer=Item, etag=True, idempotency="key", in_folders=True)
     async def post(self, project: str, kind: str, item: str) -> Rendered:
         """Restore a deleted item."""
         return await self.answer(items.restore_item, project, kind_of(kind), item)
@@ -177,6 +180,7 @@ class ItemReversion(Resource):
         precondition="required",
         etag=True,
         idempotency="key",
+        in_folders=True,
     )
     async def post(self, project: str, kind: str, item: str, body: ItemRevert) -> Rendered:
         """Create a revision with the content of an earlier revision; name, folder and tags do not change."""

@@ -90,6 +90,7 @@ class PartResource(Resource):
         answer=Item,
         precondition="required",
         etag=True,
+        in_folders=True,
     )
     async def put(
         self, project: str, kind: str, item: str, part: str, query: PartChange, body: Mapping[str, Any]

@@ -69,15 +69,17 @@ class BodyTarget:
     attempt: tuple[str, int] | None = None
 
 
-Admission = tuple[str, Access, str | None, bool, bool, bool, BodyTarget]
+Admission = tuple[str, Access, str | None, bool, bool, bool, bool, BodyTarget]
 """Hash of a token, an operation's declarations about its callers, and the target of the request."""
 
 
 def admission_of(caller: Caller, target: BodyTarget) -> Admission:
     """Return the properties of a request by which the server decides whether the caller may send the body."""
     operation = caller.operation
-    declared = (operation.access, operation.scope, operation.public, operation.attempts, operation.replays)
-    return hash_secret(caller.token or ""), *declared, target
+    return (
+        hash_secret(caller.token or ""), operation.access, operation.scope, operation.public, operation.attempts,
+        operation.replays, operation.in_folders, target,
+    )  # fmt: skip
 
 
 def require_access(operation: Operation, principal: Principal) -> None:

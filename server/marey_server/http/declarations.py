@@ -107,12 +107,16 @@ class Operation:
     """Whether running attempts of jobs may do this, besides the callers that `access` names."""
     replays: bool
     """Whether an attempt that has ended may send the request again."""
+    in_folders: bool = False
+    """Whether a member with the declared role in one folder of the project may do this there."""
 
     @property
     def required_role(self) -> RequiredRole:
         """The role that the store enforces in every project that this operation uses."""
         role = self.access.role
-        return STRICTEST if role is None else RequiredRole(role, self.scope or "read", guests=self.public)
+        if role is None:
+            return STRICTEST
+        return RequiredRole(role, self.scope or "read", guests=self.public, in_folders=self.in_folders)
 
     @property
     def stores(self) -> bool:
@@ -186,6 +190,7 @@ def writes(
     reserved: bool = False,
     attempts: bool = False,
     replays: bool = False,
+    in_folders: bool = False,
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes something.
 
@@ -196,6 +201,8 @@ def writes(
     idempotency : `key` accepts Idempotency-Key; `nature` means that repeating the request has no further effect
     answer, also, headers, reserved, attempts : as for `reads`
     replays : whether an ended attempt may repeat the request
+    in_folders : whether members who have the role in some folders only may do this there; the function that the method
+        calls must check the role in the folder
     """
     if access is Access.READER:
         raise TypeError("A method that changes a project requires at least the role contributor.")
@@ -203,7 +210,7 @@ def writes(
         access=access, scope=scope, query=query, body=body, answer=answer,
         status=status or (200 if answer else 204), precondition=precondition, idempotency=idempotency,
         etag=etag, also=also, headers=headers, reserved=reserved, attempts=attempts,
-        replays=replays,
+        replays=replays, in_folders=in_folders,
     )  # fmt: skip
 
 
@@ -227,6 +234,7 @@ def _declare(
     reserved: bool = False,
     attempts: bool = False,
     replays: bool = False,
+    in_folders: bool = False,
 ) -> Callable[[Method], Declared]:
     def attach(method: Method) -> Declared:
         @wraps(method)
@@ -238,7 +246,7 @@ def _declare(
         perform.operation = Operation(  # type: ignore[attr-defined]
             method.__name__.upper(), summary.rstrip("."), description.strip(), access, scope, query, taken, answer,
             status, paged, etag, precondition, idempotency, answer_types, also, public, headers, stream, reserved,
-            attempts, replays,
+            attempts, replays, in_folders,
         )  # fmt: skip
         return perform
 

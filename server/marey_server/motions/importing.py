@@ -7,15 +7,18 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from marey_schemas.access import Role
 from marey_schemas.documents.clips import Check
 from marey_schemas.imports import ImportEntry, Refusal, refused_entry
 from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
+from marey_server.access.folder_rights import FolderRoleProblem
 from marey_server.errors import ApiProblem, InvalidProblem
 from marey_server.motions.loading import LOADING
 from marey_server.store import blobs, items, projects
 from marey_server.store.blobs import Spool
 from marey_server.store.documents import PreparedDocument, prepare_document
+from marey_server.store.folder_roles.rights import rights_of_caller, rights_shown
 from marey_server.store.items import Draft, ItemFilters, Published
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
@@ -210,6 +213,11 @@ def _refused(name: str, error: ApiProblem) -> ImportEntry:
     return refused_entry(name, Refusal(code=error.error_code, detail=error.detail))
 
 
+def require_folder(tx: Transaction, project: str, folder: str) -> None:
+    """Raise `ForbiddenProblem` unless the caller may import files into a folder."""
+    rights_shown(tx, projects.require(tx, project)).require(folder, Role.CONTRIBUTOR)
+
+
 def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> list[ImportEntry]:
     """Store the original files and the items read from them; return one entry for each file.
 
@@ -223,7 +231,7 @@ def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> l
             with tx.connection.begin_nested():
                 entries += _publish(tx, row, together)
         except ApiProblem as error:
-            if error.status in REFUSED_ALTOGETHER:
+            if _concerns_request(error):
                 raise
             entries += [_publish_alone(tx, row, file) for file in together]
     return entries
@@ -241,12 +249,17 @@ def _runs(files: Sequence[PreparedImport]) -> Iterator[list[PreparedImport]]:
             yield list(run)
 
 
+def _concerns_request(error: ApiProblem) -> bool:
+    """Return whether an error concerns the whole request; that of a folder concerns only the files in this folder."""
+    return error.status in REFUSED_ALTOGETHER and not isinstance(error, FolderRoleProblem)
+
+
 def _publish_alone(tx: Transaction, row: ProjectRow, file: PreparedImport) -> ImportEntry:
     try:
         with tx.connection.begin_nested():
             return _publish(tx, row, [file])[0]
     except ApiProblem as error:
-        if error.status in REFUSED_ALTOGETHER:
+        if _concerns_request(error):
             raise
         return _refused(file.name, error)
 
@@ -260,7 +273,8 @@ def _publish(tx: Transaction, row: ProjectRow, files: Sequence[PreparedImport]) 
                 if source.content is not None:
                     blobs.put_blob(tx, source.content, expected=source.digest, project_id=row.id)
     every = [draft for some in drafts.values() for draft in some]
-    published = iter(items.publish(tx, row, every, author_id=tx.principal.user_id))
+    rights = rights_of_caller(tx, row)
+    published = iter(items.publish(tx, row, every, author_id=tx.principal.user_id, rights=rights))
     made = {name: list(itertools.islice(published, len(some))) for name, some in drafts.items()}
     return [file.entry or _entry(file, made[file.name]) for file in files]
 

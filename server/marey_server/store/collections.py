@@ -9,10 +9,12 @@ from sqlalchemy import ColumnElement, Row, func, literal, or_, select, update
 
 from marey_schemas.access import Role
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Page
+from marey_server.access.folder_rights import FolderRights
 from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import listing, projects, quotas
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
+from marey_server.store.folder_roles.rights import forget_rights, rights_of_caller, rights_shown
 from marey_server.store.ids import new_id
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
@@ -73,8 +75,9 @@ def at_or_below(path: str) -> ColumnElement[bool]:
 
 
 def read_collection(tx: Transaction, project: str, collection_id: str) -> Collection:
-    """Return a collection as a document."""
-    return _shown(_find(tx, projects.require(tx, project), collection_id, _ALIVE))
+    """Return a collection as a document, with the caller's role in it."""
+    project_row = projects.require(tx, project)
+    return _shown(tx, project_row, _find(tx, project_row, collection_id, _ALIVE))
 
 
 def list_collections(
@@ -100,7 +103,13 @@ def list_collections(
     )
     identity = ["collections", project_row.id, path, deleted]
     rows, next_cursor = listing.read_page(tx, statement, order, identity, cursor, limit)
-    return Page(items=tuple(_shown(row) for row in rows), next_cursor=next_cursor)
+    rights = rights_shown(tx, project_row)
+    return Page(items=tuple(_document(project_row, rights, row) for row in rows), next_cursor=next_cursor)
+
+
+def find_collection(tx: Transaction, project_row: ProjectRow, collection_id: str, *, lock: bool = False) -> Row[Any]:
+    """Return the row of a folder that is not deleted; with `lock`, it is locked. Raises `NotFoundProblem`."""
+    return _find(tx, project_row, collection_id, _ALIVE, lock=lock)
 
 
 def _find(
@@ -120,9 +129,15 @@ def _no_collection(collection_id: str) -> NotFoundProblem:
     return NotFoundProblem(f"The project has no collection {collection_id!r}.", code="no-collection")
 
 
-def _shown(row: Row[Any]) -> Collection:
+def _shown(tx: Transaction, project_row: ProjectRow, row: Row[Any]) -> Collection:
+    return _document(project_row, rights_shown(tx, project_row), row)
+
+
+def _document(project_row: ProjectRow, rights: FolderRights, row: Row[Any]) -> Collection:
+    role = None if project_row.guest else rights.role_in(row.path, row.deleted_us)
     return Collection(
-        id=row.id, path=row.path, created_at=datetime_of(row.created_us), updated_at=datetime_of(row.updated_us),
+        id=row.id, path=row.path, role=role,
+        created_at=datetime_of(row.created_us), updated_at=datetime_of(row.updated_us),
         deleted_at=None if row.deleted_us is None else datetime_of(row.deleted_us), rev=row.rev,
     )  # fmt: skip
 
@@ -133,9 +148,10 @@ def _shown(row: Row[Any]) -> Collection:
 def create_collection(tx: Transaction, project: str, request: CollectionCreate) -> Collection:
     """Create a folder and the folders above it. Raises `ConflictProblem` if it exists."""
     project_row = projects.require(tx, project)
+    rights_of_caller(tx, project_row).require(request.path.rpartition("/")[0], Role.CONTRIBUTOR)
     if _lock(tx, project_row.id, request.path) is not None:
         raise _path_taken(request.path)
-    return _shown(_find(tx, project_row, ensure(tx, project_row, request.path), _ALIVE))
+    return _shown(tx, project_row, _find(tx, project_row, ensure(tx, project_row, request.path), _ALIVE))
 
 
 def _path_taken(path: str) -> ConflictProblem:
@@ -145,10 +161,19 @@ def _path_taken(path: str) -> ConflictProblem:
 def move_collection(
     tx: Transaction, project: str, collection_id: str, request: CollectionChange, *, expected_rev: ExpectedRev
 ) -> Collection:
-    """Rename or move a folder with its contents. Raises `ConflictProblem` if the new path is taken."""
+    """Rename or move a folder with its contents and the roles in it.
+
+    Raises `ConflictProblem` if the new path is taken.
+    """
     project_row = projects.require(tx, project)
+    rights_of_caller(tx, project_row)
     old, new = _find(tx, project_row, collection_id, _ALIVE, lock=True).path, request.path
     _require_no_root(old)
+    inside = _lock_inside(tx, project_row, old)
+    forget_rights(tx)
+    rights = rights_of_caller(tx, project_row)
+    rights.require_entry(old, Role.CONTRIBUTOR)
+    rights.require(new.rpartition("/")[0], Role.CONTRIBUTOR)
     if new.startswith(f"{old}/"):
         raise InvalidProblem(f"The collection {old!r} cannot be moved into itself.", code="into-itself")
     if new != old:
@@ -158,13 +183,14 @@ def move_collection(
             tx, collection, (collection.c.id == collection_id, collection.c.path == old, _ALIVE),
             {"path": new, "updated_us": tx.now_us}, expected_rev=expected_rev, absent=_no_collection(collection_id),
         )  # fmt: skip
-        _move_contents(tx, project_row, old, new)
+        _move_contents(tx, project_row, inside, old, new)
+    forget_rights(tx)
     tx.emit("collection.moved", collection_id, project_id=project_row.id, path=new, was=old)
-    return _shown(row)
+    return _shown(tx, project_row, row)
 
 
-def _move_contents(tx: Transaction, project_row: ProjectRow, old: str, new: str) -> None:
-    for path in _lock_inside(tx, project_row, old):
+def _move_contents(tx: Transaction, project_row: ProjectRow, inside: Sequence[str], old: str, new: str) -> None:
+    for path in inside:
         check_length(new + path[len(old) :])
     tx.execute(
         update(collection)
@@ -194,14 +220,18 @@ def _lock_inside(tx: Transaction, project_row: ProjectRow, path: str) -> Sequenc
 def delete_collection(tx: Transaction, project: str, collection_id: str, *, expected_rev: ExpectedRev) -> None:
     """Hide a folder and its contents; `restore_collection` restores them."""
     project_row = projects.require(tx, project)
+    rights_of_caller(tx, project_row)
     path = _find(tx, project_row, collection_id, _ALIVE, lock=True).path
     _require_no_root(path)
+    _lock_inside(tx, project_row, path)
+    forget_rights(tx)
+    rights_of_caller(tx, project_row).require_entry(path, Role.MAINTAINER)
     change_row(
         tx, collection, (collection.c.id == collection_id, collection.c.path == path, _ALIVE),
         {"deleted_us": tx.now_us, "updated_us": tx.now_us}, expected_rev=expected_rev,
         absent=_no_collection(collection_id),
     )  # fmt: skip
-    _lock_inside(tx, project_row, path)
+    forget_rights(tx)
     below = (collection.c.project_id == project_row.id, at_or_below(path))
     tx.execute(update(collection).where(*below, _ALIVE).values(deleted_us=tx.now_us, rev=collection.c.rev + 1))
     hidden = select(collection.c.id).where(*below, collection.c.deleted_us == tx.now_us)
@@ -218,13 +248,14 @@ def delete_collection(tx: Transaction, project: str, collection_id: str, *, expe
 def restore_collection(
     tx: Transaction, project: str, collection_id: str, *, expected_rev: ExpectedRev = None
 ) -> Collection:
-    """Restore a deleted folder with the contents that were deleted along with it.
+    """Restore a deleted folder with the contents and the roles that were deleted along with it.
 
     Raises `ConflictProblem` if another folder has its path now.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
     gone = _find(tx, project_row, collection_id, collection.c.deleted_us.is_not(None), lock=True)
+    rights_of_caller(tx, project_row).require(gone.path, Role.MAINTAINER, gone.deleted_us)
     ensure(tx, project_row, gone.path.rpartition("/")[0])
     with taken(_path_taken(gone.path)):
         row = change_row(
@@ -235,6 +266,8 @@ def restore_collection(
         together = (collection.c.project_id == project_row.id, at_or_below(gone.path))
         hidden = collection.c.deleted_us == gone.deleted_us
         tx.execute(update(collection).where(*together, hidden).values(deleted_us=None, rev=collection.c.rev + 1))
+    forget_rights(tx)
+    rights_of_caller(tx, project_row).require_entry(gone.path, Role.MAINTAINER)  # with the roles that are restored
     back = tx.execute(
         update(item)
         .where(item.c.collection_id.in_(select(collection.c.id).where(*together, _ALIVE)))
@@ -244,7 +277,7 @@ def restore_collection(
     )
     quotas.hold(tx, project_row.id, quotas.by_creator(back))
     tx.audit("collection.restored", collection_id, about=gone.path, project_id=project_row.id, path=gone.path)
-    return _shown(row)
+    return _shown(tx, project_row, row)
 
 
 def _require_no_root(path: str) -> None:

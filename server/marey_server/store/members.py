@@ -14,7 +14,7 @@ from marey_server.store.database.clock import datetime_of
 from marey_server.store.invitations.validity import withdraw_unauthorised
 from marey_server.store.projects import ProjectRow
 from marey_server.store.revs import ExpectedRev, at_rev, change_row, moved_on
-from marey_server.store.tables import invitation, member, project, user
+from marey_server.store.tables import folder_role, invitation, member, project, user
 from marey_server.store.transaction import Transaction
 
 
@@ -108,7 +108,10 @@ def find_role(tx: Transaction, project_id: str, user_id: str) -> Role | None:
 
 
 def remove_member(tx: Transaction, project_name: str, user_name: str, *, expected_rev: ExpectedRev) -> None:
-    """Remove a member. Raises `ConflictProblem` if the project would lose its last owner."""
+    """Remove a member, with the member's roles in folders.
+
+    Raises `ConflictProblem` if the project would lose its last owner.
+    """
     project_row = lock_project(tx, project_name)
     which = (
         member.c.project_id == project_row.id,
@@ -119,8 +122,14 @@ def remove_member(tx: Transaction, project_name: str, user_name: str, *, expecte
         current = tx.execute(select(member.c.rev).where(*which)).scalar()
         raise _no_member(user_name) if current is None else moved_on(current)
     _require_owner(tx, project_row)
+    _forget_folder_roles(tx, project_row, user_name)
     tx.audit("member.removed", project_row.id, about=user_name, project_id=project_row.id, user=user_name, was=was)
     _withdraw_invitations(tx, project_row, user_name)
+
+
+def _forget_folder_roles(tx: Transaction, project_row: ProjectRow, user_name: str) -> None:
+    mine = folder_role.c.user_id.in_(select(user.c.id).where(user.c.name == user_name))
+    tx.execute(delete(folder_role).where(folder_role.c.project_id == project_row.id, mine))
 
 
 def _withdraw_invitations(tx: Transaction, project_row: ProjectRow, user_name: str) -> None:

@@ -13,6 +13,7 @@ from sqlalchemy import (
     Select,
     and_,
     bindparam,
+    exists,
     false,
     insert,
     literal_column,
@@ -21,7 +22,16 @@ from sqlalchemy import (
     true,
 )
 
-from marey_schemas.access import Project, ProjectChange, ProjectCreate, QuotaChange, QuotasInUse, Role, Visibility
+from marey_schemas.access import (
+    EVERY_MEMBER,
+    Project,
+    ProjectChange,
+    ProjectCreate,
+    QuotaChange,
+    QuotasInUse,
+    Role,
+    Visibility,
+)
 from marey_schemas.items import Page
 from marey_server.access import roles, scopes
 from marey_server.access.principal import Principal
@@ -41,12 +51,12 @@ from marey_server.store.ids import new_id
 from marey_server.store.invitations.validity import withdraw_unauthorised
 from marey_server.store.rate_limits import RateLimit, key_of
 from marey_server.store.revs import ExpectedRev, change_row
-from marey_server.store.tables import invitation, member, project
+from marey_server.store.tables import folder_role, invitation, member, project
 from marey_server.store.transaction import Transaction
 
 _HOUR_US = 3600 * 1_000_000
 
-WRITERS = tuple(role.value for role in Role if roles.includes(role, Role.CONTRIBUTOR))
+WRITERS = roles.at_least(Role.CONTRIBUTOR)
 """Roles of members who may add items and submit jobs."""
 
 SORT_KEYS: dict[str, ColumnElement[Any]] = {
@@ -97,7 +107,8 @@ def require(
     """Return the project `name` if the caller has the role and the scope that the transaction's operation declares.
 
     `at_least` raises the declared role and never lowers it. `deleted=True` looks for the project of this name that was
-    deleted last.
+    deleted last. If the operation declares `in_folders`, a role in some folder suffices; the role in the result is
+    that in the project nevertheless.
 
     Raises `NotFoundProblem` if the caller may not know that the project exists, and `ForbiddenProblem` if the caller
     lacks the role or the scope. An anonymous caller who may get them by signing in gets `UnauthenticatedProblem`
@@ -111,7 +122,8 @@ def require(
     seen = None if row is None else _as_seen(tx.principal, row)
     if seen is None or (seen.guest and deleted):
         raise NotFoundProblem(f"There is no project {name!r} that you may see.", code="no-project")
-    if not roles.includes(seen.role, need) or (seen.guest and not required.guests):
+    enough = roles.includes(seen.role, need) or (required.in_folders and _has_role_in_a_folder(tx, seen, need))
+    if not enough or (seen.guest and not required.guests):
         if tx.principal.kind == "anonymous":
             raise UnauthenticatedProblem(f"Sign in to do this in the project {name!r}.")
         raise ForbiddenProblem(
@@ -120,6 +132,23 @@ def require(
     if not seen.guest:
         require_scope(tx, name, required.scope)
     return seen
+
+
+def _has_role_in_a_folder(tx: Transaction, seen: ProjectRow, need: Role) -> bool:
+    if seen.guest or tx.principal.user_id is None:
+        return False
+    condition = has_role_in_folders(seen.id, tx.principal.user_id, need)
+    return tx.execute(select(literal_column("1")).where(condition)).first() is not None
+
+
+def has_role_in_folders(
+    project_id: str | ColumnElement[Any], user_id: str | ColumnElement[Any] | None, need: Role
+) -> ColumnElement[bool]:
+    """Return the condition that a member of a project has at least a role in one of its folders, by an override."""
+    mine = or_(folder_role.c.user_id == user_id, folder_role.c.user_id == EVERY_MEMBER)
+    enough = folder_role.c.role.in_(roles.at_least(need))
+    of_project = folder_role.c.project_id == project_id
+    return exists().where(of_project, mine, enough).correlate_except(folder_role)
 
 
 def require_scope(tx: Transaction, name: str, scope: str) -> None:
@@ -185,11 +214,16 @@ def is_visible(principal: Principal) -> ColumnElement[bool]:
 
 
 def writable_projects(tx: Transaction, names: Iterable[str]) -> list[str]:
-    """Return the ids of those named projects in which the caller, as a user, has a role that may write."""
+    """Return the ids of those named projects in which the caller, as a user, has a role that may write.
+
+    A role in one folder suffices.
+    """
     statement = select(project.c.id).where(project.c.name.in_(list(names)), project.c.deleted_us.is_(None))
     if not tx.principal.administrator:
+        me = tx.principal.user_id
+        in_folder = has_role_in_folders(project.c.id, me, Role.CONTRIBUTOR)
         statement = statement.join(member, member.c.project_id == project.c.id)
-        statement = statement.where(member.c.user_id == tx.principal.user_id, member.c.role.in_(WRITERS))
+        statement = statement.where(member.c.user_id == me, or_(member.c.role.in_(WRITERS), in_folder))
     return list(tx.execute(statement.order_by(project.c.id)).scalars())
 
 

@@ -12,6 +12,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 
 from marey_schemas.event_kinds import AuditKind, OrdinaryEventKind
 from marey_schemas.sizes import batched
+from marey_server.access.folder_rights import FolderRights
 from marey_server.access.principal import Principal
 from marey_server.access.roles import STRICTEST
 from marey_server.store import tables
@@ -71,6 +72,8 @@ class Transaction:
         """Role and scope that the request's operation declares; `projects.require` enforces them."""
         self.blobs = blobs
         self.quotas = quotas
+        self.folder_rights: dict[tuple[str, str | None], FolderRights] = {}
+        """Rights that this transaction has read, by project and user; see `store.folder_roles.rights`."""
         self.shared_outputs = 0
         """Number of cached results that this transaction has published."""
         self._clock = clock

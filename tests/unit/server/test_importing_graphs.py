@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 from tests.support.predecessor_models import imported
-from tests.support.store_fixtures import Lab
+from tests.support.store_fixtures import ALL_RIGHTS, Lab
 
 from marey_motion.formats.predecessor.graph import GraphNode, PredecessorGraph
 from marey_motion.importing.items import ImportedGraph
@@ -34,7 +34,7 @@ def add_models(lab: Lab, parts: tuple[Mapping[str, Any], dict[str, Any]], *paths
 
     def run(tx: Transaction) -> list[Published]:
         project_row = projects.require(tx, "lab")
-        return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id)
+        return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id, rights=ALL_RIGHTS)
 
     return {one.name: one.item for one in lab.write(run)}
 

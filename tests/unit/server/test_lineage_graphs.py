@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tests.support.store_fixtures import Lab
+from tests.support.store_fixtures import ALL_RIGHTS, Lab
 from tests.support.tiers import examples
 
 from marey_schemas.kinds import Kind
@@ -31,7 +31,9 @@ def study(lab: Lab, name: str, *sources: Published, role: str = "of", content: o
     )  # fmt: skip
 
     def publish(tx: Transaction) -> list[Published]:
-        return items.publish(tx, projects.require(tx, lab.name), [draft], author_id=tx.principal.user_id)
+        return items.publish(
+            tx, projects.require(tx, lab.name), [draft], author_id=tx.principal.user_id, rights=ALL_RIGHTS
+        )
 
     made: list[Published] = lab.write(publish)
     return made[0]

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sqlalchemy import Connection, event
 from tests.support.predecessor_models import imported
-from tests.support.store_fixtures import Lab, motion_tree, skeleton_tree
+from tests.support.store_fixtures import ALL_RIGHTS, Lab, motion_tree, skeleton_tree
 from tests.support.tiers import examples
 
 from marey_schemas.items import Staleness
@@ -25,7 +25,7 @@ from marey_server.store.transaction import Transaction
 def publish(lab: Lab, *drafts: Any, **kwargs: Any) -> list[Published]:
     def run(tx: Transaction) -> list[Published]:
         project_row = projects.require(tx, "lab")
-        return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id, **kwargs)
+        return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id, rights=ALL_RIGHTS, **kwargs)
 
     return lab.write(run)
 
@@ -297,7 +297,7 @@ def test_many_publishers_of_one_skeleton_make_one(lab: Lab) -> None:
     def run(tx: Transaction, number: int) -> list[Published]:
         project_row = projects.require(tx, "lab")
         drafts = [rig_draft(), clip_draft(f"walk {number}", seed=number)]
-        return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id)
+        return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id, rights=ALL_RIGHTS)
 
     futures = [lab.database.submit_write(lab.owner, run, number) for number in range(8)]
     assert len({future.result(60)[0].item for future in futures}) == 1
@@ -320,7 +320,9 @@ def test_many_publishers_of_one_name_make_its_revisions(lab: Lab) -> None:
 
     def run(tx: Transaction, number: int) -> Published:
         project_row = projects.require(tx, "lab")
-        return items.publish(tx, project_row, [rig_draft(), clip_draft(seed=number)], author_id=tx.principal.user_id)[1]
+        return items.publish(
+            tx, project_row, [rig_draft(), clip_draft(seed=number)], author_id=tx.principal.user_id, rights=ALL_RIGHTS
+        )[1]
 
     futures = [lab.database.submit_write(lab.owner, run, number) for number in range(8)]
     assert sorted(future.result(60).revision for future in futures) == list(range(1, 9))

@@ -13,7 +13,7 @@ from sqlalchemy import event, func, select
 from tests.support.committing_desk import CommittingDesk
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.queue_desk import Desk, document
-from tests.support.store_fixtures import WRITE, motion_tree, requiring, skeleton_tree
+from tests.support.store_fixtures import ALL_RIGHTS, WRITE, motion_tree, requiring, skeleton_tree
 
 from marey_schemas.datasets.commits import PutEntry, RemoveEntry
 from marey_schemas.datasets.naming import RefCreate, RefKind
@@ -359,7 +359,9 @@ def test_items_of_another_project_hold_nothing(house: House, desk: Desk) -> None
 
     def refer(tx: Transaction) -> None:
         draft = Draft("d", Kind.STUDY, "s", {"study": document(of={"item": target, "revision": 1})})
-        items.publish(tx, store_projects.require(tx, "other"), [draft], author_id=tx.principal.user_id)
+        items.publish(
+            tx, store_projects.require(tx, "other"), [draft], author_id=tx.principal.user_id, rights=ALL_RIGHTS
+        )
 
     desk.database.write(desk.user, refer)
     house.delete(target)

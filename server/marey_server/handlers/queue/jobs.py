@@ -116,6 +116,7 @@ class ProjectJobs(Resource):
         status=202,
         idempotency="key",
         headers=("Prefer",),
+        in_folders=True,
     )
     async def post(self, project: str, body: JobCreate) -> Rendered | Reply:
         """Submit a job. Inputs are pinned to their newest revisions; a job with many inputs is divided into tasks.
@@ -149,6 +150,7 @@ class ProjectJobBatch(Resource):
         answer=JobList,
         status=202,
         idempotency="key",
+        in_folders=True,
     )
     async def post(self, project: str, body: JobBatch) -> Rendered:
         """Submit many jobs; if one of them is not valid, no job is submitted."""
@@ -286,7 +288,7 @@ class JobCancellation(Resource):
     path = "/jobs/{job}/cancel"
     tag = "Jobs"
 
-    @writes(access=Access.CONTRIBUTOR, scope="jobs", answer=Job)
+    @writes(access=Access.CONTRIBUTOR, scope="jobs", answer=Job, in_folders=True)
     async def post(self, job: str) -> Rendered:
         """Cancel a job and its tasks: at once if no worker runs it, otherwise as soon as the worker has stopped."""
         return await self.answer(reading.cancel_job, job, self.services.queue_policy)
@@ -298,7 +300,7 @@ class JobRetry(Resource):
     path = "/jobs/{job}/retry"
     tag = "Jobs"
 
-    @writes(access=Access.CONTRIBUTOR, scope="jobs", answer=Job, status=202, idempotency="key")
+    @writes(access=Access.CONTRIBUTOR, scope="jobs", answer=Job, status=202, idempotency="key", in_folders=True)
     async def post(self, job: str) -> Rendered:
         """Submit a failed or cancelled job again with the same inputs; the answer is the new job.
 

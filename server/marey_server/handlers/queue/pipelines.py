@@ -23,6 +23,7 @@ class ProjectPipelines(Resource):
         answer=Pipeline,
         status=202,
         idempotency="key",
+        in_folders=True,
     )
     async def post(self, project: str, body: PipelineCreate) -> Rendered:
         """Submit several jobs, some of which read outputs of others; if one job is not valid, no job is submitted.

@@ -9,6 +9,7 @@ from typing import Any
 
 from sqlalchemy import Row, exists, select, update
 
+from marey_schemas.access import Role
 from marey_schemas.datasets.commits import MOST_CHANGES
 from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest
 from marey_schemas.items import ItemChange
@@ -20,6 +21,7 @@ from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.folders import FolderState, read_folder
 from marey_server.store.datasets.history import revisions_with, tree_of
 from marey_server.store.datasets.naming import find_dataset, resolve
+from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.items import Draft, StoredDocument
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.projects import ProjectRow
@@ -38,12 +40,14 @@ def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest
     An item whose entry has moved or changed keeps its id. For an entry of the version that the folder lacks, its
     deleted item is restored if possible; otherwise a new item is created.
 
-    Raises `ConflictProblem` if the folder has changes that no commit has recorded and that are not to be discarded, or
-    if another request changes the folder. Raises `InvalidProblem` if too many entries differ.
+    Raises `ForbiddenProblem` unless the caller is a maintainer in all folders of the dataset, `ConflictProblem` if the
+    folder has changes that no commit has recorded and that are not to be discarded, or if another request changes the
+    folder. Raises `InvalidProblem` if too many entries differ.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
     found = find_dataset(tx, project_row, name)
+    rights_of_caller(tx, project_row).require_below(found.path or "", Role.MAINTAINER)
     digest = resolve(tx, found.id, request.version)
     state = read_folder(tx, project_row, found)
     store = StoredChunks(tx)
@@ -170,7 +174,10 @@ class _Checkout:
             parts={part: StoredDocument(digest) for part, digest in parts.items()}, reuse="new",
             message=self._message,
         )  # fmt: skip
-        items.publish(self.tx, self.project, [draft], author_id=self.tx.principal.user_id, refer_to_deleted=True)
+        items.publish(
+            self.tx, self.project, [draft], author_id=self.tx.principal.user_id,
+            rights=rights_of_caller(self.tx, self.project), refer_to_deleted=True,
+        )  # fmt: skip
 
     def _can_restore(self, kind: Kind, item_id: str) -> bool:
         """Return whether an item is deleted and no other item has taken its former folder and name."""

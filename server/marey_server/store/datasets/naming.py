@@ -7,6 +7,7 @@ from typing import Any
 
 from sqlalchemy import CTE, Row, delete, func, insert, literal_column, null, select
 
+from marey_schemas.access import Role
 from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind, RefMove
 from marey_schemas.datasets.protection import ProtectionRule
 from marey_schemas.event_kinds import AuditKind, OrdinaryEventKind
@@ -21,6 +22,7 @@ from marey_server.store.datasets.protection import (
     require_reset,
     rule_of,
 )
+from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.ids import new_id
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
@@ -72,6 +74,8 @@ def create_dataset(tx: Transaction, project: str, request: DatasetCreate) -> Dat
     project_row = projects.require(tx, project)
     held = tx.execute(select(func.count()).where(dataset.c.project_id == project_row.id, _ALIVE)).scalar_one()
     _require_room(held, MOST_DATASETS, "datasets in a project", "too-many-datasets")
+    if request.collection is not None:
+        rights_of_caller(tx, project_row).require(request.collection, Role.CONTRIBUTOR)
     folder = None if request.collection is None else collections.ensure(tx, project_row, request.collection)
     dataset_id = new_id("dataset")
     row = {

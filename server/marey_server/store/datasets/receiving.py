@@ -24,6 +24,7 @@ from marey_server.store.datasets.naming import find_dataset
 from marey_server.store.datasets.protection import Mover
 from marey_server.store.datasets.revisions import item_name, publish_contents, require_contents
 from marey_server.store.documents import PreparedDocument
+from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.items import Draft, StoredDocument
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.projects import ProjectRow
@@ -108,7 +109,8 @@ def store_revisions(
     placed = {
         content: replace(draft, collection=folder) if draft.hidden else draft for content, draft in drafts.items()
     }
-    added = publish_contents(tx, project_row, placed, author_id=tx.principal.user_id)
+    rights = rights_of_caller(tx, project_row)
+    added = publish_contents(tx, project_row, placed, author_id=tx.principal.user_id, rights=rights)
     return StoredRevisions(added=added)
 
 

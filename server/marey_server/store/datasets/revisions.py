@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted
+from marey_server.access.folder_rights import FolderRights
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import items
 from marey_server.store.datasets.contents import find_contents_of, store_contents
@@ -50,16 +51,19 @@ def publish_contents(
     drafts: Mapping[str, Draft],
     *,
     author_id: str | None,
+    rights: FolderRights | None = None,
     job_id: str | None = None,
 ) -> int:
     """Publish drafts by their content digests; return how many were new.
 
-    Drafts whose content the project has already are left out. Raises `InvalidProblem` if the content digest of a
-    revision is not the one under which `drafts` has it.
+    Drafts whose content the project has already are left out. `rights` are needed as for `publish`. Raises
+    `InvalidProblem` if the content digest of a revision is not the one under which `drafts` has it.
     """
     held = revisions_with(tx, project_row.id, drafts)
     lacking = [draft for content, draft in drafts.items() if content not in held]
-    made = items.publish(tx, project_row, lacking, author_id=author_id, job_id=job_id, refer_to_deleted=True)
+    made = items.publish(
+        tx, project_row, lacking, author_id=author_id, rights=rights, job_id=job_id, refer_to_deleted=True
+    )  # fmt: skip
     keys = {one.name: RevisionKey(one.item, one.revision) for one in made}
     contents = find_contents_of(tx, keys.values())
     for content, key in keys.items():

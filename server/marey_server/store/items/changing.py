@@ -7,6 +7,7 @@ from typing import Any
 
 from sqlalchemy import delete, insert
 
+from marey_schemas.access import Role
 from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import FieldError
@@ -14,6 +15,7 @@ from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import collections, documents, projects, quotas
 from marey_server.store.database.violations import taken
 from marey_server.store.documents import PreparedDocument
+from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.items.drafts import Draft
 from marey_server.store.items.history import no_revision
 from marey_server.store.items.publishing import publish
@@ -66,7 +68,8 @@ def create_item(tx: Transaction, project: str, kind: Kind, request: ItemCreate) 
         name_in_batch="", kind=kind, item_name=request.name, parts=request.parts, collection=request.collection,
         tags=request.tags, reuse="new", message=request.message,
     )  # fmt: skip
-    made = publish(tx, project_row, [draft], author_id=tx.principal.user_id)[0]
+    rights = rights_of_caller(tx, project_row)
+    made = publish(tx, project_row, [draft], author_id=tx.principal.user_id, rights=rights)[0]
     return _shown(tx, project_row, kind, made.item)
 
 
@@ -87,7 +90,7 @@ def put_part(
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
-    found = find_item(tx, project_row, kind, item_id)
+    found = _find_to_change(tx, project_row, kind, item_id)
     prepared = prepare_part(kind, part, content)
     digest = documents.store_document(tx, prepared)
     ReferenceCheck(tx, project_row).require(kind, {part: prepared.body})
@@ -105,7 +108,7 @@ def put_part(
             shown = _shown(tx, project_row, kind, item_id)
             tx.emit("item.revised", **event_of_item(project_row, shown), revision=shown.revision, job=None)
             return shown
-        found = find_item(tx, project_row, kind, item_id)
+        found = _find_to_change(tx, project_row, kind, item_id)
     raise moved_on(found.rev)
 
 
@@ -117,7 +120,7 @@ def set_parts(
     The documents are stored already. They must come from the server itself, because the caller's access to them is not
     checked. Raises `PreconditionFailedProblem` if another request changes the item.
     """
-    found = find_item(tx, project_row, kind, item_id)
+    found = _find_to_change(tx, project_row, kind, item_id)
     before = read_part_digests(tx, [(item_id, found.head)])[item_id, found.head]
     if before == parts:
         return
@@ -142,7 +145,7 @@ def revert_item(
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
-    found = find_item(tx, project_row, kind, item_id)
+    found = _find_to_change(tx, project_row, kind, item_id)
     if not is_expected(found.rev, expected_rev):
         raise moved_on(found.rev)
     parts = read_part_digests(tx, [(item_id, request.revision)])[item_id, request.revision]
@@ -157,14 +160,17 @@ def change_item(
 ) -> Item:
     """Rename, move or tag an item. Raises `ConflictProblem` if the name is taken at its new place."""
     project_row = projects.require(tx, project)
+    rights = rights_of_caller(tx, project_row)
+    found = _find_to_change(tx, project_row, kind, item_id)
     values: dict[str, Any] = {"updated_us": tx.now_us}
     if request.name is not None:
         values |= {"name": request.name, "name_folded": request.name.casefold()}
     if request.collection is not None:
+        rights.require(request.collection, Role.CONTRIBUTOR)
         values["collection_id"] = collections.ensure(tx, project_row, request.collection)
-    which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_(None))
+    which = (*_in_folder(project_row, kind, found), item.c.deleted_us.is_(None))
     with taken(ConflictProblem(f"There is already a {kind} with this name in the collection.", code="name-taken")):
-        change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))
+        change_row(tx, item, which, values, expected_rev=expected_rev, absent=_moved_away(kind, item_id))
     if request.tags is not None:
         tx.execute(delete(item_tag).where(item_tag.c.item_id == item_id))
         if request.tags:
@@ -177,9 +183,10 @@ def change_item(
 def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev) -> None:
     """Hide an item; it can be restored. References to its revisions stay valid."""
     project_row = projects.require(tx, project)
-    which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_(None))
-    gone = _shown(tx, project_row, kind, item_id)
-    absent = no_item(kind, item_id)
+    found = _find_to_change(tx, project_row, kind, item_id, Role.MAINTAINER)
+    which = (*_in_folder(project_row, kind, found), item.c.deleted_us.is_(None))
+    gone = shown_items(tx, [found])[0]
+    absent = _moved_away(kind, item_id)
     row = change_row(tx, item, which, {"deleted_us": tx.now_us}, expected_rev=expected_rev, absent=absent)
     quotas.release(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
     tx.audit("item.deleted", about=gone.name, **event_of_item(project_row, gone))
@@ -194,6 +201,7 @@ def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, exp
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
     gone = find_item(tx, project_row, kind, item_id, deleted=True)
+    rights_of_caller(tx, project_row).require(gone.path, Role.MAINTAINER, gone.folder_deleted_us)
     collection_id = collections.ensure(tx, project_row, gone.path)
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_not(None), item.c.purged_us.is_(None))
     values = {"deleted_us": None, "updated_us": tx.now_us, "collection_id": collection_id}
@@ -203,6 +211,30 @@ def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, exp
     shown = _shown(tx, project_row, kind, item_id)
     tx.audit("item.restored", about=shown.name, **event_of_item(project_row, shown))
     return shown
+
+
+def _find_to_change(
+    tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, needed: Role = Role.CONTRIBUTOR
+) -> Any:
+    """Return the row of an item whose folder the caller may write to.
+
+    Raises `NotFoundProblem` if there is no such item, and `ForbiddenProblem` if the caller's role in its folder is
+    lower than `needed`.
+    """
+    found = find_item(tx, project_row, kind, item_id)
+    rights_of_caller(tx, project_row).require(found.path, needed)
+    return found
+
+
+def _in_folder(project_row: ProjectRow, kind: Kind, found: Any) -> tuple[Any, ...]:
+    """Return the condition that an item is still in the folder in which the caller's role was checked."""
+    return *_this(project_row, kind, found.id), item.c.collection_id == found.collection_id
+
+
+def _moved_away(kind: Kind, item_id: str) -> ConflictProblem:
+    return ConflictProblem(
+        f"Another request moved or deleted the {kind} {item_id!r} at the same time; try again.", code="contended"
+    )
 
 
 def _this(project_row: ProjectRow, kind: Kind, item_id: str) -> tuple[Any, ...]:

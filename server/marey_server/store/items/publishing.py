@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter, defaultdict
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sqlalchemy import Row, and_, insert, select
 
+from marey_schemas.access import Role
 from marey_schemas.documents.clips import with_earlier_facts
 from marey_schemas.event_kinds import OrdinaryEventKind
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.sizes import batched
 from marey_server import faults
+from marey_server.access.folder_rights import FolderRights
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import collections, documents, quotas
 from marey_server.store.documents import PreparedDocument
@@ -44,6 +46,7 @@ def publish(
     drafts: Sequence[Draft],
     *,
     author_id: str | None,
+    rights: FolderRights | None,
     job_id: str | None = None,
     refer_to_deleted: bool = False,
 ) -> list[Published]:
@@ -62,13 +65,22 @@ def publish(
         twice = Counter(draft.name_in_batch for draft in drafts).most_common(1)[0][0]
         raise InvalidProblem(f"Two results in the request have the name {twice!r}.", code="duplicate-output")
     hold_off_purges(tx, project_row.id)
-    publication = _Publication(tx, project_row, author_id, job_id, refer_to_deleted)
+    require_places((draft for draft in drafts if draft.reuse != "by_content"), rights)
+    publication = _Publication(tx, project_row, author_id, rights, job_id, refer_to_deleted)
     for together in _in_turns(_load_parts(tx, drafts)):
         publication.add(together)
     quotas.hold(tx, project_row.id, publication.added)
     faults.point("publish.before_commit")
     tx.after_commit(lambda: faults.point("publish.after_commit"))
     return [publication.done[draft.name_in_batch] for draft in drafts]
+
+
+def require_places(drafts: Iterable[Draft], rights: FolderRights | None) -> None:
+    """Raise `ForbiddenProblem` unless `rights` allow to write to the folders of all drafts that are not hidden."""
+    for folder in sorted({draft.collection for draft in drafts if not draft.hidden}):
+        if rights is None:
+            raise TypeError("drafts that are not hidden are published with the rights of a user")
+        rights.require(folder, Role.CONTRIBUTOR)
 
 
 @dataclass(frozen=True)
@@ -175,6 +187,7 @@ class _Publication:
     tx: Transaction
     project: ProjectRow
     author_id: str | None
+    rights: FolderRights | None
     job_id: str | None
     refer_to_deleted: bool
     done: dict[str, Published] = field(default_factory=dict)
@@ -314,6 +327,7 @@ class _Publication:
         """
         if not new:
             return
+        require_places((one.draft for one in new), self.rights)
         for one in new:
             if None in one.required:
                 lacking = _required(kind)[one.required.index(None)]

@@ -57,7 +57,11 @@ _THIS_ITEM = (
     item.c.kind == bindparam("kind"),
 )
 _ITEM = Prepared(item_rows().where(*_THIS_ITEM, item.c.deleted_us.is_(None)))
-_DELETED_ITEM = item_rows().where(*_THIS_ITEM, item.c.deleted_us.is_not(None))
+_DELETED_ITEM = (
+    item_rows()
+    .add_columns(collection.c.deleted_us.label("folder_deleted_us"))
+    .where(*_THIS_ITEM, item.c.deleted_us.is_not(None))
+)
 _TAGS = Prepared(
     select(item_tag.c.item_id, item_tag.c.tag).where(item_tag.c.item_id.in_(bindparam("items", expanding=True)))
 )

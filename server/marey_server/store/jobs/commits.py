@@ -1,7 +1,8 @@
 """Commits of the outputs of jobs: checks at submission, and the commit in the transaction that ends the job.
 
 A job commits once: tasks of a fan-out publish their outputs, and their parent job commits these when it ends. If the
-commit is not allowed any more, the job fails and publishes nothing, as if its author had lost access.
+commit is not allowed any more, the job fails and publishes nothing. It also does so if its author may not write to the
+folders of its outputs any more.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from marey_schemas.queue.commits import MOST_COMMITTED, JobCommit, OutputsCommit
 from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.jobs import FailureReason
 from marey_server.access import roles, scopes
+from marey_server.access.folder_rights import FolderRoleProblem
 from marey_server.errors import AUTHOR_LOST, ApiProblem, ForbiddenProblem, InvalidProblem, NotFoundProblem
 from marey_server.store.datasets.committing import author_of
 from marey_server.store.datasets.contents import find_contents_of, store_contents
@@ -58,6 +60,12 @@ def check_target(
             f"A job that commits its outputs needs a token with the scopes 'jobs' and 'write' in the project "
             f"{project.name!r}.",
             code="insufficient-scope",
+        )
+    if not roles.includes(project.role, Role.CONTRIBUTOR):  # the caller may have this role in some folders only
+        raise ForbiddenProblem(
+            f"A job that commits its outputs requires at least the role {Role.CONTRIBUTOR.value} in the project "
+            f"{project.name!r}.",
+            code="insufficient-role",
         )
     kinds = kinds_made_by(kind)
     if not kinds:
@@ -148,7 +156,8 @@ def _joined(*names: str) -> str:
 class PublishedOutputs:
     """Published outputs of a job, and the values of the columns that its commit determines.
 
-    If `failure` is set, nothing was published, because the commit is not allowed.
+    If `failure` is set, nothing was published, because the author may not write to a folder of the outputs any more, or
+    the commit is not allowed.
     """
 
     outputs: list[dict[str, Any]] = field(default_factory=list)
@@ -177,20 +186,26 @@ JOB_COLUMNS = (
 def publish_outputs(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> PublishedOutputs:
     """Publish the drafts of a job, and commit them if the request for the job asks for a commit.
 
-    A task only publishes its drafts, which its parent job commits later. If the commit is refused, nothing is
-    published, and the result contains the failure. `row` has the columns `JOB_COLUMNS`.
+    A task only publishes its drafts, which its parent job commits later. If the commit is refused, or the author of the
+    job may not write to a folder of the outputs any more, nothing is published, and the result contains the failure.
+    `row` has the columns `JOB_COLUMNS`.
     """
-    if row.commit_to is None:
-        return PublishedOutputs(staging.publish_drafts(tx, row, drafts))
-    if row.parent_id is not None:
-        return PublishedOutputs(_publish_entries(tx, row, drafts))
-    hold_off_purges(tx, row.project_id)
+    if row.commit_to is None and not drafts:
+        return PublishedOutputs()
+    if row.commit_to is not None and row.parent_id is None:
+        hold_off_purges(tx, row.project_id)
     try:
         with tx.connection.begin_nested():
+            if row.commit_to is None:
+                return PublishedOutputs(staging.publish_drafts(tx, row, drafts))
             outputs = _publish_entries(tx, row, drafts)
-            return PublishedOutputs(outputs, _commit(tx, row, outputs))
+            return PublishedOutputs(outputs, {} if row.parent_id is not None else _commit(tx, row, outputs))
     except _CommitRefused as error:
         return PublishedOutputs(failure=error.failure)
+    except FolderRoleProblem as error:
+        folder = error.context["folder"]
+        detail = f"The results cannot be published: the author of the job may not write to the folder {folder!r} any more."
+        return PublishedOutputs(failure=failure_document(FailureReason.ERROR, AUTHOR_LOST, detail))
 
 
 def commit_tasks(tx: Transaction, row: Any) -> PublishedOutputs:

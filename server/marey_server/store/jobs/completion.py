@@ -119,7 +119,7 @@ def _complete(
         request = requests[row.id, row.fence]
         published = commits.publish_outputs(tx, row, staged.get((row.id, row.fence), {}))
         if published.failure is not None:
-            done[row.id, row.fence] = _fail_for_commit(tx, row, published.failure)
+            done[row.id, row.fence] = _fail_unpublished(tx, row, published.failure)
             continue
         outputs = published.outputs
         of_attempt = Principal("attempt", job_id=row.id, fence=row.fence, project_id=row.project_id)
@@ -168,8 +168,8 @@ def _complete(
     return done
 
 
-def _fail_for_commit(tx: Transaction, row: Any, failure: dict[str, Any]) -> tuple[Ended, CompleteAnswer]:
-    """Record that a job failed because its outputs may not be committed; return the ended job and the answer.
+def _fail_unpublished(tx: Transaction, row: Any, failure: dict[str, Any]) -> tuple[Ended, CompleteAnswer]:
+    """Record that a job failed because its outputs may not be published or committed; return the job and the answer.
 
     No output of the job was published.
     """

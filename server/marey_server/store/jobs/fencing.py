@@ -24,9 +24,10 @@ from sqlalchemy import (
     update,
 )
 
+from marey_schemas.access import Role
 from marey_server.access.principal import Principal
 from marey_server.errors import LeaseLostProblem, NotFoundProblem
-from marey_server.store.projects import WRITERS
+from marey_server.store.projects import WRITERS, has_role_in_folders
 from marey_server.store.tables import attempt, job, member, user
 from marey_server.store.transaction import Transaction
 
@@ -68,12 +69,18 @@ because the answer to the claim may have been lost."""
 
 _MAY_WRITE = or_(
     user.c.administrator.is_(True),
-    exists().where(member.c.project_id == job.c.project_id, member.c.user_id == user.c.id, member.c.role.in_(WRITERS)),
+    exists().where(
+        member.c.project_id == job.c.project_id,
+        member.c.user_id == user.c.id,
+        or_(member.c.role.in_(WRITERS), has_role_in_folders(job.c.project_id, user.c.id, Role.CONTRIBUTOR)),
+    ),
 )
 AUTHOR_MAY_RUN: ColumnElement[bool] = or_(
     job.c.author_id.is_(None), exists().where(user.c.id == job.c.author_id, user.c.disabled.is_(False), _MAY_WRITE)
 )
-"""The condition that the author of a job still has a role that may submit jobs, or that the job has no author."""
+"""The condition that the author of a job still has a role that may submit jobs, or that the job has no author.
+
+The role in one folder suffices; the transaction that publishes results checks the role in their folders."""
 
 
 def require_attempt(principal: Principal, job_id: str, fence: int) -> None:

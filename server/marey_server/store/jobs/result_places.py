@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from marey_schemas.queue.job_kinds import KindDeclaration
+from marey_schemas.queue.job_params import ImportParams
 from marey_server.errors import InvalidProblem
 from marey_server.store import collections
 from marey_server.store.jobs.inputs import Pin, PinnedInputs
@@ -38,6 +39,18 @@ def find_clash(kind: KindDeclaration, params: Any, pins: PinnedInputs, into: str
         return None
     found = _same_name(pins.get(kind.named_after, [])) or _over_another_input(kind, params, pins, into)
     return None if found is None else Clash(f"/inputs/{kind.named_after}", *found)
+
+
+def result_folders(kind: KindDeclaration, params: Mapping[str, Any], pins: PinnedInputs, into: str) -> list[str]:
+    """Return the folders of a job's results, as far as they are known before the job runs; at least one.
+
+    When the results are published, their real folders are checked again.
+    """
+    named = pins.get(kind.named_after or "", ())
+    if named and not any("job" in pin for pin in named):
+        in_place = kind.in_place is not None and params.get(kind.in_place)
+        return sorted({pin["collection"] if in_place else _path(into, _folder(pin)) for pin in named})
+    return [_path(into, params.get("collection", "") if issubclass(kind.params, ImportParams) else "")]
 
 
 def _too_long(kind: KindDeclaration, pins: PinnedInputs, into: str) -> tuple[str, str] | None:

@@ -19,6 +19,7 @@ from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import blobs, documents
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.documents import PreparedDocument
+from marey_server.store.folder_roles.rights import rights_of_author
 from marey_server.store.items.drafts import Draft, StoredDocument
 from marey_server.store.items.publishing import publish
 from marey_server.store.jobs.fencing import hold, require_attempt
@@ -203,17 +204,20 @@ def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: P
 
 
 def publish_drafts(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> list[dict[str, Any]]:
-    """Publish the drafts of a job; return the published outputs.
+    """Publish the drafts of a job with the present rights of its author; return the published outputs.
 
-    `row` has the columns `id`, `project_id`, `into_path`, `author_id` and `message` of the job.
+    Raises `ForbiddenProblem` if the author may not write to a folder of the results. `row` has the columns `id`,
+    `project_id`, `into_path`, `author_id` and `message` of the job.
     """
     if not drafts:
         return []
+    project = find_by_id(tx, row.project_id)
     published = publish(
         tx,
-        find_by_id(tx, row.project_id),
+        project,
         [_draft(name, draft, row) for name, draft in drafts.items()],
         author_id=row.author_id,
+        rights=rights_of_author(tx, project, row.author_id),
         job_id=row.id,
     )
     return [

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 from sqlalchemy import insert, select
 
+from marey_schemas.access import Role
 from marey_schemas.problems import FieldError
 from marey_schemas.queue.job_kinds import MOST_TASKS, KindDeclaration, UnknownKindError, find_kind
 from marey_schemas.queue.jobs import Job, JobCreate, JobState
@@ -25,6 +26,7 @@ from marey_server import faults
 from marey_server.errors import InvalidProblem
 from marey_server.field_errors import field_errors, json_pointer
 from marey_server.store.database.prepared import Prepared
+from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.ids import new_id
 from marey_server.store.jobs import commits, result_cache, staging
 from marey_server.store.jobs.documents import document_of_new, job_documents
@@ -36,7 +38,7 @@ from marey_server.store.jobs.labels import labels_key
 from marey_server.store.jobs.late_inputs import pin_late_inputs
 from marey_server.store.jobs.layout import NewJob, Submission, lay_out, naming, new_row
 from marey_server.store.jobs.propagation import propagate_ends
-from marey_server.store.jobs.result_places import find_clash
+from marey_server.store.jobs.result_places import find_clash, result_folders
 from marey_server.store.projects import ProjectRow, require
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.quotas import require_room
@@ -92,9 +94,13 @@ def submit_checked(
     """Insert the rows of checked jobs and queue those without unfinished dependencies.
 
     `upstream` maps the jobs that they depend on to their states; these jobs must be locked. A dependency among the
-    submissions counts as waiting. Raises `ForbiddenProblem` for an export that requires a higher role of the caller.
+    submissions counts as waiting. Raises `ForbiddenProblem` for an export that requires a higher role of the caller,
+    and for results in a folder to which the caller may not write.
     """
+    rights = rights_of_caller(tx, project)
     for submitted in submissions:
+        for folder in result_folders(submitted.kind, submitted.params, submitted.pins, submitted.request.into):
+            rights.require(folder, Role.CONTRIBUTOR)
         record_permission(tx, project, submitted.id, submitted.kind, submitted.params, submitted.pins)
     heads = [_head(project, one, upstream) for one in submissions]
     tasks, sources = lay_out(tx, [one for one in heads if not one.unbound])

@@ -22,6 +22,7 @@ from marey_server.store.tables import (
     dataset,
     document,
     document_blob,
+    folder_role,
     item,
     item_tag,
     job,
@@ -64,7 +65,10 @@ def _drop_empty_folders(tx: Transaction, project_id: str, paths: Collection[str]
     used = exists().where(dataset.c.collection_id == collection.c.id)
     empty = sorted({path for path in _with_ancestors(paths) if not _is_within(holding, path)})
     for some in in_lists(empty):
-        dropping = delete(collection).where(*deleted, ~used, collection.c.path.in_(some)).returning(collection.c.id)
+        these = (*deleted, ~used, collection.c.path.in_(some))
+        dropped = select(collection.c.id).where(*these)
+        tx.execute(delete(folder_role).where(folder_role.c.collection_id.in_(dropped)))
+        dropping = delete(collection).where(*these).returning(collection.c.id)
         events.forget_names(tx, tx.execute(dropping).scalars().all(), "path", "was")
 
 

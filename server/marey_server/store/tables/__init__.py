@@ -1,6 +1,7 @@
 """Tables of the database, for SQLite and Postgres. Times are integer microseconds since the epoch, UTC, named `_us`."""
 
 from marey_server.store.tables.access import (
+    folder_role,
     holding,
     invitation,
     invitation_use,
@@ -75,6 +76,7 @@ __all__ = [
     "document_item",
     "event",
     "fast_forward",
+    "folder_role",
     "holding",
     "idempotency_key",
     "invitation",

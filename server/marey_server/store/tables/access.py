@@ -101,3 +101,14 @@ member = Table(
     Column("since_us", Micros, nullable=False),
     Column("rev", Integer, nullable=False, default=1),
 )
+
+folder_role = Table(  # roles in folders, which differ from the role in the project
+    "folder_role",
+    metadata,
+    Column("project_id", ID, ForeignKey("project.id"), primary_key=True),
+    Column("user_id", ID, primary_key=True),  # or `EVERY_MEMBER` of marey_schemas.access
+    Column("collection_id", ID, ForeignKey("collection.id"), primary_key=True, index=True),
+    Column("role", String(16), nullable=False),
+    Column("since_us", Micros, nullable=False),
+    Column("rev", Integer, nullable=False, default=1),
+)

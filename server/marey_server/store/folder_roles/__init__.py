@@ -1,0 +1,1 @@
+"""Roles of members in folders of a project: what owners set, and the rights that follow."""

@@ -1,0 +1,101 @@
+"""Rights in the folders of a project: of the caller, and of the author of a job.
+
+Every function that changes something in a folder checks these rights. They are read once per transaction. The
+transaction then holds a lock until its end, so that nobody changes the roles in folders in the meantime.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import Row, and_, bindparam, or_, select
+
+from marey_schemas.access import EVERY_MEMBER, Role
+from marey_server.access.folder_rights import FolderRights, FolderState
+from marey_server.store.database.prepared import Prepared
+from marey_server.store.projects import ProjectRow
+from marey_server.store.tables import collection, folder_role, member, user
+from marey_server.store.transaction import Transaction
+
+_OVERRIDES = Prepared(
+    select(collection.c.path, collection.c.deleted_us, folder_role.c.user_id, folder_role.c.role)
+    .join(collection, collection.c.id == folder_role.c.collection_id)
+    .where(
+        folder_role.c.project_id == bindparam("project_id"),
+        or_(folder_role.c.user_id == bindparam("user_id"), folder_role.c.user_id == bindparam("every_member")),
+    )
+)
+_AUTHOR = Prepared(
+    select(user.c.administrator, user.c.disabled, member.c.role)
+    .select_from(
+        user.outerjoin(member, and_(member.c.user_id == user.c.id, member.c.project_id == bindparam("project_id")))
+    )
+    .where(user.c.id == bindparam("user_id"))
+)
+
+
+def lock_name(project_id: str) -> str:
+    """Return the name of the lock on the roles in the folders of a project: shared to write, exclusive to change."""
+    return f"folder-roles:{project_id}"
+
+
+def rights_of_caller(tx: Transaction, project: ProjectRow) -> FolderRights:
+    """Return the caller's rights in the folders of a project, which stay the same until the transaction ends."""
+    return _kept(tx, project, tx.principal.user_id, project.role)
+
+
+def rights_shown(tx: Transaction, project: ProjectRow) -> FolderRights:
+    """Return the caller's rights in the folders of a project, to be shown; they may change at any time."""
+    if not _has_overrides(tx.principal.user_id, project.role) or project.guest:
+        return FolderRights(project.name, project.role)
+    return tx.folder_rights.get((project.id, tx.principal.user_id)) or _read(tx, project, project.role)
+
+
+def rights_of_author(tx: Transaction, project: ProjectRow, author_id: str | None) -> FolderRights:
+    """Return the present rights of the author of a job; a job of the server itself has no author and may write."""
+    if author_id is None:
+        return FolderRights(project.name, Role.OWNER)
+    known = tx.folder_rights.get((project.id, author_id))
+    if known is not None:
+        return known
+    found = tx.first(_AUTHOR, {"project_id": project.id, "user_id": author_id})
+    if found is None or found.disabled:
+        return FolderRights(project.name, Role.READER)
+    if found.administrator:
+        return FolderRights(project.name, Role.OWNER)
+    if found.role is None:
+        return FolderRights(project.name, Role.READER)
+    return _kept(tx, project, author_id, Role(found.role))
+
+
+def forget_rights(tx: Transaction) -> None:
+    """Read the rights again when they are needed next, because this transaction has changed folders or roles."""
+    tx.folder_rights.clear()
+
+
+def _has_overrides(user_id: str | None, role: Role) -> bool:
+    """Return whether overrides can concern a user: not owners, and not attempts, which have no user."""
+    return user_id is not None and role is not Role.OWNER
+
+
+def _kept(tx: Transaction, project: ProjectRow, user_id: str | None, role: Role) -> FolderRights:
+    if not _has_overrides(user_id, role):
+        return FolderRights(project.name, role)
+    key = (project.id, user_id)
+    if key not in tx.folder_rights:
+        tx.lock(lock_name(project.id), shared=True)  # in a statement of its own, because the next one reads after it
+        tx.folder_rights[key] = _read(tx, project, role, user_id)
+    return tx.folder_rights[key]
+
+
+def _read(tx: Transaction, project: ProjectRow, role: Role, user_id: str | None = None) -> FolderRights:
+    which = {"project_id": project.id, "user_id": user_id or tx.principal.user_id, "every_member": EVERY_MEMBER}
+    return FolderRights(project.name, role, _by_state(tx.run(_OVERRIDES, which)))
+
+
+def _by_state(rows: Sequence[Row[Any]]) -> Mapping[FolderState, Mapping[str, Role]]:
+    found: dict[FolderState, dict[str, Role]] = {}
+    for row in sorted(rows, key=lambda row: row.user_id != EVERY_MEMBER):  # a role of one's own replaces it
+        found.setdefault(row.deleted_us, {})[row.path] = Role(row.role)
+    return found
