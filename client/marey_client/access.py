@@ -13,6 +13,8 @@ from marey_client.paging import pages
 from marey_client.transport import Transport, as_json, read_model
 from marey_schemas.access import (
     EndTokens,
+    FolderRole,
+    FolderRoleChange,
     Me,
     Member,
     MemberChange,
@@ -27,6 +29,7 @@ from marey_schemas.access import (
     UserChange,
     UserCreate,
 )
+from marey_schemas.items import Collection
 
 ANY_STATE = {"If-Match": "*"}
 """Header of a request that applies a change whatever the present state of the resource is."""
@@ -157,6 +160,44 @@ class Members:
             ),
         )
 
+    @property
+    def in_folders(self) -> FolderRoles:
+        """The roles of members in folders, which differ from their roles in the project."""
+        return FolderRoles(self.transport, self.project)
+
     def remove(self, user: str) -> None:
-        """Remove a user from the project."""
+        """Remove a user from the project, with the user's roles in folders."""
         self.transport.send("DELETE", f"/projects/{self.project}/members/{user}", headers=ANY_STATE, repeatable=False)
+
+
+@dataclass(frozen=True)
+class FolderRoles:
+    """Roles of members in folders of a project, and in everything below these folders.
+
+    The name `*` (`marey_schemas.access.EVERY_MEMBER`) stands for all members without a role of their own in the folder.
+    """
+
+    transport: Transport
+    project: str
+
+    def list(self, folder: str = "", *, user: str | None = None) -> Iterator[FolderRole]:
+        """List the roles in a folder and the folders below it, by path; with `user`, only those of one member."""
+        params = {"folder": folder or None, "user": user}
+        return pages(self.transport, FolderRole, f"/projects/{self.project}/folder-roles", params)
+
+    def put(self, folder: Collection, user: str, role: Role) -> FolderRole:
+        """Set the role of a member in a folder: reader, contributor or maintainer."""
+        change = FolderRoleChange.model_validate({"role": role})
+        return read_model(
+            FolderRole,
+            self.transport.send(
+                "PUT", self._url(folder, user), content=as_json(change), headers=ANY_STATE, repeatable=True
+            ),
+        )
+
+    def remove(self, folder: Collection, user: str) -> None:
+        """Remove the role of a member in a folder; the roles in the folders above it then count."""
+        self.transport.send("DELETE", self._url(folder, user), headers=ANY_STATE, repeatable=False)
+
+    def _url(self, folder: Collection, user: str) -> str:
+        return f"/projects/{self.project}/collections/{folder.id}/roles/{user}"

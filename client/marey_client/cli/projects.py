@@ -6,16 +6,21 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.terminal.failures import ANONYMOUS_HINT
-from marey_client.cli.terminal.invocation import AsJson, ProjectName, UserName, connect
+from marey_client.cli.terminal.failures import ANONYMOUS_HINT, WrongUsage
+from marey_client.cli.terminal.invocation import AsJson, ProjectName, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 
 if TYPE_CHECKING:
+    from marey_client.project import ProjectHandle
     from marey_schemas.access import QuotaChange, QuotasInUse
+    from marey_schemas.items import Collection
 
 project = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage projects.")
 member = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage the members of a project.")
 
+MemberName = Annotated[
+    str, typer.Argument(help="Name of the user; with `--folder`, '*' stands for all members except owners.")
+]
 ItemLimit = Annotated[int | None, typer.Option("--items", min=0, help="Set the maximum number of items.")]
 ByteLimit = Annotated[
     int | None, typer.Option("--stored-bytes", min=0, help="Set the maximum total size of all revisions, in bytes.")
@@ -153,10 +158,25 @@ def restore_project(context: typer.Context, name: ProjectName) -> None:
 
 
 @member.command("ls")
-def list_members(context: typer.Context, project_name: ProjectName, as_json: AsJson = False) -> None:
-    """Show the members of a project."""
+def list_members(
+    context: typer.Context,
+    project_name: ProjectName,
+    folder: Annotated[
+        str | None,
+        typer.Option(help="Show only the roles in this folder and the folders below it; / shows those in all folders."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show the members of a project and their roles, or their roles in folders."""
     with connect(context) as marey:
-        members = list(marey.project(project_name).members.list())
+        found = marey.project(project_name).members
+        if folder is not None:
+            roles = list(found.in_folders.list(folder.strip("/")))
+            if as_json:
+                return print_json(roles)
+            rows = [(one.folder, one.user, one.role, one.since.date()) for one in roles]
+            return print_table(("folder", "user", "role", "since"), rows)
+        members = list(found.list())
     if as_json:
         return print_json(members)
     return print_table(("user", "role", "since"), [(one.user, one.role, one.since.date()) for one in members])
@@ -166,21 +186,63 @@ def list_members(context: typer.Context, project_name: ProjectName, as_json: AsJ
 def put_member(
     context: typer.Context,
     project_name: ProjectName,
-    user: UserName,
+    user: MemberName,
     role: Annotated[str, typer.Argument(help="Role: reader, contributor, maintainer or owner.")],
+    folder: Annotated[
+        str | None,
+        typer.Option(
+            help="Give the role only in this folder and everything below it: reader, contributor or maintainer. It may "
+            "be higher or lower than the role in the project."
+        ),
+    ] = None,
 ) -> None:
-    """Give a user a role in a project."""
-    from marey_schemas.access import MemberChange
+    """Give a user a role in a project, or give a member another role in a folder."""
+    from marey_schemas.access import FolderRoleChange, MemberChange
 
-    wanted = MemberChange.model_validate({"role": role}).role
+    wanted = (MemberChange if folder is None else FolderRoleChange).model_validate({"role": role}).role
     with connect(context) as marey:
-        marey.project(project_name).members.put(user, wanted)
-    print_message(f"{user} is {wanted} of {project_name}")
+        project_handle = marey.project(project_name)
+        if folder is None:
+            project_handle.members.put(user, wanted)
+        else:
+            project_handle.members.in_folders.put(_folder(project_handle, folder), user, wanted)
+    print_message(f"{_named(user)} {wanted} {_place(project_name, folder)}")
 
 
 @member.command("remove")
-def remove_member(context: typer.Context, project_name: ProjectName, user: UserName) -> None:
-    """Remove a user from a project."""
+def remove_member(
+    context: typer.Context,
+    project_name: ProjectName,
+    user: MemberName,
+    folder: Annotated[
+        str | None, typer.Option(help="Remove only the role in this folder; the member stays in the project.")
+    ] = None,
+) -> None:
+    """Remove a user from a project, or remove the role of a member in a folder."""
     with connect(context) as marey:
-        marey.project(project_name).members.remove(user)
-    print_message(f"{user} is no longer a member of {project_name}")
+        project_handle = marey.project(project_name)
+        if folder is None:
+            project_handle.members.remove(user)
+        else:
+            project_handle.members.in_folders.remove(_folder(project_handle, folder), user)
+    if folder is None:
+        return print_message(f"{user} is no longer a member of {project_name}")
+    return print_message(f"the role in {project_name}/{folder.strip('/')} is removed")
+
+
+def _folder(project_handle: ProjectHandle, path: str) -> Collection:
+    """Return a folder of a project. Raises `WrongUsage` if there is none with this path."""
+    found = project_handle.collections.at(path.strip("/")) if path.strip("/") else None
+    if found is None:
+        raise WrongUsage(
+            f"there is no folder {path!r} in {project_handle.name}; `marey ls {project_handle.name}` lists the folders"
+        )
+    return found
+
+
+def _named(user: str) -> str:
+    return "all members are" if user == "*" else f"{user} is"
+
+
+def _place(project_name: str, folder: str | None) -> str:
+    return f"of {project_name}" if folder is None else f"in {project_name}/{folder.strip('/')}"

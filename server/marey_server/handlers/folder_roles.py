@@ -24,7 +24,7 @@ class FolderRolesQuery(PageQuery):
     )
 
 
-class FolderRoles(Resource):
+class ProjectFolderRoles(Resource):
     """Roles in folders of a project."""
 
     path = "/projects/{project}/folder-roles"
@@ -80,4 +80,4 @@ class FolderRoleResource(Resource):
         return await self.answer(managing.remove_folder_role, project, collection, user, expected_rev=expected_rev)
 
 
-RESOURCES: tuple[type[Resource], ...] = (FolderRoles, FolderRoleResource)
+RESOURCES: tuple[type[Resource], ...] = (ProjectFolderRoles, FolderRoleResource)

@@ -204,7 +204,7 @@ def publish_outputs(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]
         return PublishedOutputs(failure=error.failure)
     except FolderRoleProblem as error:
         folder = error.context["folder"]
-        detail = f"The results cannot be published: the author of the job may not write to the folder {folder!r} any more."
+        detail = f"The author of the job may not write to the folder {folder!r} of the results any more."
         return PublishedOutputs(failure=failure_document(FailureReason.ERROR, AUTHOR_LOST, detail))
 
 
