@@ -10,6 +10,7 @@ from typing import Any
 import httpx
 import pytest
 from tests.support.furnished_house import HIERARCHY, MOTION, MULTIPART, ROUTES
+from tests.support.motion_files import AMC, ASF
 from tests.support.rest_server import Server
 
 from marey_schemas.access import Role
@@ -234,3 +235,23 @@ def test_a_token_for_a_project_uploads_for_a_member_with_one_folder(house: Studi
     gone = house.owner.delete(f"{FOLDERS}/{house.folders['team']}/roles/raised", headers=ANY)
     assert gone.status_code == 204
     assert bound.put(f"/blobs/{digest}", content=b"x").status_code == 403
+
+
+def test_a_new_skeleton_needs_a_role_in_the_folder_of_skeletons(house: Studio) -> None:
+    def send() -> dict[str, Any]:
+        files = [("files", (f"walk.{kind}", text.encode())) for kind, text in (("asf", ASF), ("amc", AMC))]
+        answer = house.members["raised"].post("/projects/lab/imports", data={"collection": "team"}, files=files)
+        assert answer.status_code == 200, answer.text
+        return next(dict(one) for one in answer.json()["entries"] if one["status"] != "companion")
+
+    refused = send()
+    assert (refused["status"], refused["error"]["code"]) == ("failed", "insufficient-role")
+    assert "'skeletons'" in refused["error"]["detail"]
+    skeletons = house.make("collections", {"path": "skeletons"})
+    put = house.owner.put(f"{FOLDERS}/{skeletons}/roles/raised", json={"role": "contributor"})
+    assert put.status_code == 200
+    made = send()
+    assert made["status"] == "created"
+    assert house.owner.get(f"{CLIPS}/{made['item']}").json()["collection"] == "team"
+    assert house.owner.delete(f"{FOLDERS}/{skeletons}/roles/raised", headers=ANY).status_code == 204
+    assert send()["status"] == "unchanged"
