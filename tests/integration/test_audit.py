@@ -160,6 +160,15 @@ def invite(story: Story) -> None:
     story.send(ben, "POST", "/invitations/accept", {"code": created["code"]}, *accepted)
 
 
+def change_folder_roles(story: Story) -> None:
+    owner, everybody = story.owner, ("olga", "*", "lab")
+    [folder] = [one for one in owner.get(f"{LAB}/collections").json()["items"] if one["path"] == "raw"]
+    path = f"{LAB}/collections/{folder['id']}/roles/*"
+    story.send(owner, "PUT", path, {"role": "reader"}, ("folder_role.added", *everybody))
+    story.send(owner, "PUT", path, {"role": "contributor"}, ("folder_role.changed", *everybody))
+    story.send(owner, "DELETE", path, None, ("folder_role.removed", *everybody))
+
+
 def change_datasets(story: Story) -> None:
     owner, gaits = story.owner, ("olga", "gaits", "lab")
     story.send(owner, "POST", f"{LAB}/datasets", {"name": "gaits", "collection": "raw"})
@@ -201,8 +210,8 @@ def _stored_secrets(story: Story) -> list[str]:
 
 
 CHAPTERS = (
-    change_users_and_tokens, change_projects_and_members, delete_and_restore, purge, invite, change_datasets,
-    change_webhooks,
+    change_users_and_tokens, change_projects_and_members, delete_and_restore, purge, invite, change_folder_roles,
+    change_datasets, change_webhooks,
 )  # fmt: skip
 
 
