@@ -7,8 +7,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tests.support.store_fixtures import ALL_RIGHTS
-
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import PurgeRequest
 from marey_schemas.queue.worker_protocol import CompleteRequest
@@ -16,6 +14,7 @@ from marey_server.access.principal import Principal
 from marey_server.store import blobs, garbage, items, projects, purging
 from marey_server.store.blob_backings import DirectoryBlobs
 from marey_server.store.database.connections import Database
+from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.jobs import completion
 from marey_server.store.transaction import Transaction
 
@@ -29,7 +28,7 @@ def publish(tx: Transaction) -> Any:
     row = projects.require(tx, "lab")
     trees = [{"n": n, "blob": blobs.digest_of(data)} for n, data in enumerate(FILES)]
     drafts = [items.Draft(f"d{n}", Kind.STUDY, f"study {n}", {"study": tree}, "a/b") for n, tree in enumerate(trees)]
-    return items.publish(tx, row, drafts, author_id=tx.principal.user_id, rights=ALL_RIGHTS)
+    return items.publish(tx, row, drafts, author_id=tx.principal.user_id, rights=rights_of_caller(tx, row))
 
 
 def purge(database: Database, who: Principal) -> None:
