@@ -17,7 +17,7 @@ import pytest
 from tests.support.committing_desk import CommittingDesk
 from tests.support.interleaving import HEAD_START_S, Step, interleave
 from tests.support.queue_desk import Desk, document, output
-from tests.support.store_fixtures import WRITE, motion_tree, requiring, skeleton_tree
+from tests.support.store_fixtures import ALL_RIGHTS, WRITE, motion_tree, requiring, skeleton_tree
 
 from marey_schemas.datasets.commits import CommitCreate, PutEntry
 from marey_schemas.datasets.naming import RefCreate, RefKind
@@ -267,7 +267,8 @@ def test_an_import_does_not_share_a_skeleton_that_is_being_purged(scene: Scene, 
     def share(tx: Transaction) -> Any:
         skeleton = Draft("r", Kind.SKELETON, "rig", {"hierarchy": tree}, reuse="by_content")
         clip = Draft("c", Kind.CLIP, "walk", {"motion": motion_tree({"output": "r"})}, "raw")
-        return publish(tx, projects.require(tx, "lab"), [skeleton, clip], author_id=tx.principal.user_id)
+        row = projects.require(tx, "lab")
+        return publish(tx, row, [skeleton, clip], author_id=tx.principal.user_id, rights=ALL_RIGHTS)
 
     if order == "purge second":
         done, purged = scene.race_after_deletion(rig.item, share, while_publishing=True)

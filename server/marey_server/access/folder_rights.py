@@ -70,6 +70,15 @@ class FolderRights:
         self.require(path.rpartition("/")[0], needed)
         self.require_below(path, needed)
 
+    def require_restoration(self, path: str, deleted_us: FolderState) -> None:
+        """Raise `FolderRoleProblem` unless an item of the folder `path`, deleted at `deleted_us`, may be restored.
+
+        If the folder is deleted, the item is restored into a folder without the roles of the deleted one. So the role
+        must suffice in both.
+        """
+        for state in (deleted_us, None):
+            self.require(path, Role.MAINTAINER, state)
+
     def _refusal(self, path: str, needed: Role, held: Role) -> FolderRoleProblem:
         context = {"folder": path, "role": held.value}
         if not self.overrides:

@@ -225,6 +225,7 @@ def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> l
     """
     row = projects.require(tx, project)
     hold_off_purges(tx, row.id)
+    rights_of_caller(tx, row)  # here, because a rollback below would release their lock
     entries: list[ImportEntry] = []
     for together in _runs(files):
         try:

@@ -15,6 +15,7 @@ from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest
 from marey_schemas.items import ItemChange
 from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted
+from marey_server.access.folder_rights import FolderRoleProblem
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import items, projects
 from marey_server.store.datasets.chunks import StoredChunks
@@ -180,14 +181,18 @@ class _Checkout:
         )  # fmt: skip
 
     def _can_restore(self, kind: Kind, item_id: str) -> bool:
-        """Return whether an item is deleted and no other item has taken its former folder and name."""
+        """Return whether an item is deleted, may be restored, and no other item has its former folder and name."""
         former = (
-            select(item.c.name, collection.c.path)
+            select(item.c.name, collection.c.path, collection.c.deleted_us)
             .join(collection, collection.c.id == item.c.collection_id)
             .where(item.c.id == item_id, item.c.deleted_us.is_not(None))
         )
         row = self.tx.execute(former).first()
         if row is None:
+            return False
+        try:
+            rights_of_caller(self.tx, self.project).require_restoration(row.path, row.deleted_us)
+        except FolderRoleProblem:
             return False
         there = (
             exists()

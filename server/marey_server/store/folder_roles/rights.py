@@ -1,7 +1,8 @@
 """Rights in the folders of a project: of the caller, and of the author of a job.
 
-Every function that changes something in a folder checks these rights. They are read once per transaction. The
-transaction then holds a lock until its end, so that nobody changes the roles in folders in the meantime.
+Every function that changes something in a folder checks these rights. They are read once per transaction, or once in
+each part of it that may be rolled back. The transaction then holds a lock until its end, or until the rollback of this
+part, so that nobody changes the roles in folders in the meantime.
 """
 
 from __future__ import annotations
@@ -83,10 +84,14 @@ def _kept(tx: Transaction, project: ProjectRow, user_id: str | None, role: Role)
     if not _has_overrides(user_id, role):
         return FolderRights(project.name, role)
     key = (project.id, user_id)
-    if key not in tx.folder_rights:
-        tx.lock(lock_name(project.id), shared=True)  # in a statement of its own, because the next one reads after it
-        tx.folder_rights[key] = _read(tx, project, role, user_id)
-    return tx.folder_rights[key]
+    known = tx.folder_rights.get(key)
+    if known is not None:
+        return known
+    tx.lock(lock_name(project.id), shared=True)  # in a statement of its own, because the next one reads after it
+    found = _read(tx, project, role, user_id)
+    if not tx.connection.in_nested_transaction():  # whose rollback would release the lock
+        tx.folder_rights[key] = found
+    return found
 
 
 def _read(tx: Transaction, project: ProjectRow, role: Role, user_id: str | None = None) -> FolderRights:

@@ -201,7 +201,7 @@ def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, exp
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
     gone = find_item(tx, project_row, kind, item_id, deleted=True)
-    rights_of_caller(tx, project_row).require(gone.path, Role.MAINTAINER, gone.folder_deleted_us)
+    rights_of_caller(tx, project_row).require_restoration(gone.path, gone.folder_deleted_us)
     collection_id = collections.ensure(tx, project_row, gone.path)
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_not(None), item.c.purged_us.is_(None))
     values = {"deleted_us": None, "updated_us": tx.now_us, "collection_id": collection_id}

@@ -60,16 +60,17 @@ def _drop_empty_folders(tx: Transaction, project_id: str, paths: Collection[str]
     Folders that a dataset needs remain.
     """
     deleted = (collection.c.project_id == project_id, collection.c.deleted_us.is_not(None))
+    used = exists().where(dataset.c.collection_id == collection.c.id)
+    found: dict[str, str] = {}  # before the items, because others may delete folders with items at these paths
+    for some in in_lists(sorted(set(_with_ancestors(paths)))):
+        there = select(collection.c.id, collection.c.path).where(*deleted, ~used, collection.c.path.in_(some))
+        found.update((row.id, row.path) for row in tx.execute(there))
     with_items = select(collection.c.path).where(*deleted, exists().where(item.c.collection_id == collection.c.id))
     holding = sorted(tx.execute(with_items).scalars())
-    used = exists().where(dataset.c.collection_id == collection.c.id)
-    empty = sorted({path for path in _with_ancestors(paths) if not _is_within(holding, path)})
-    for some in in_lists(empty):
-        these = (*deleted, ~used, collection.c.path.in_(some))
-        dropped = select(collection.c.id).where(*these)
-        tx.execute(delete(folder_role).where(folder_role.c.collection_id.in_(dropped)))
-        dropping = delete(collection).where(*these).returning(collection.c.id)
-        events.forget_names(tx, tx.execute(dropping).scalars().all(), "path", "was")
+    for empty in in_lists(sorted(one for one, path in found.items() if not _is_within(holding, path))):
+        tx.execute(delete(folder_role).where(folder_role.c.collection_id.in_(empty)))
+        tx.execute(delete(collection).where(collection.c.id.in_(empty)))
+        events.forget_names(tx, empty, "path", "was")
 
 
 def _with_ancestors(paths: Iterable[str]) -> Iterator[str]:
