@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 
 import pytest
-from tests.support.interleaving import Step, interleave
-from tests.support.store_fixtures import Lab, skeleton_tree
+from tests.support.interleaving import Abandoned, Step, interleave
+from tests.support.store_fixtures import Lab, requiring, skeleton_tree
 
+from marey_schemas.access import EVERY_MEMBER, FolderRoleChange, Role
 from marey_schemas.items import CollectionChange, CollectionCreate, ItemCreate
 from marey_schemas.kinds import Kind
+from marey_server.access.roles import RequiredRole
 from marey_server.errors import ApiProblem
-from marey_server.store import collections, items
+from marey_server.store import collections, items, projects
 from marey_server.store.database.connections import Database
+from marey_server.store.folder_roles import managing
+from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.items import ItemFilters
 from marey_server.store.transaction import Transaction
 
@@ -92,3 +97,26 @@ def test_what_is_put_into_a_folder_while_it_moves_goes_along_or_stands_in_a_new_
     require_whole_trees(lab)
     if first == "put":
         assert places(lab) == [f"{below.replace('old', 'new')}/rig"]
+
+
+def test_rights_that_were_read_before_a_rollback_to_a_savepoint_are_read_again(lab: Lab, other: Database) -> None:
+    """The rollback releases the lock that keeps the roles in folders as they are, so another request may set one."""
+    protected = make(lab, "a")["a"]
+    change = FolderRoleChange.model_validate({"role": "reader"})
+    put = requiring(RequiredRole(Role.OWNER, "write"), managing.put_folder_role)
+
+    def protect() -> None:
+        other.write(lab.owner, put, "lab", protected, EVERY_MEMBER, change)
+
+    def role_after_rollback(tx: Transaction) -> Role:
+        row = projects.require(tx, "lab")
+        with contextlib.suppress(Abandoned), tx.connection.begin_nested():
+            assert rights_of_caller(tx, row).role_in("a") is (Role.CONTRIBUTOR if tx.is_postgres else Role.READER)
+            raise Abandoned
+        if tx.is_postgres:
+            protect()
+        return rights_of_caller(tx, row).role_in("a")
+
+    if lab.database.is_sqlite:  # on which no other request can write meanwhile
+        protect()
+    assert lab.write(role_after_rollback, who=lab.contributor) is Role.READER

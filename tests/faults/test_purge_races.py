@@ -19,6 +19,7 @@ from tests.support.interleaving import HEAD_START_S, Step, interleave
 from tests.support.queue_desk import Desk, document, output
 from tests.support.store_fixtures import ALL_RIGHTS, WRITE, motion_tree, requiring, skeleton_tree
 
+from marey_schemas.access import EVERY_MEMBER, FolderRoleChange
 from marey_schemas.datasets.commits import CommitCreate, PutEntry
 from marey_schemas.datasets.naming import RefCreate, RefKind
 from marey_schemas.datasets.proposals import CommentCreate, ProposalCreate, ProposalMerge
@@ -32,11 +33,13 @@ from marey_server.errors import ApiProblem, ConflictProblem, GoneProblem, NotFou
 from marey_server.store import collections, datasets, events, fsck, items, projects, purging, quotas
 from marey_server.store.database.connections import Database
 from marey_server.store.datasets import proposals
+from marey_server.store.folder_roles import managing
 from marey_server.store.items.drafts import Draft
 from marey_server.store.items.publishing import publish
 from marey_server.store.jobs import completion, reading, reaper, result_cache, submission
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.retrying import retry_job
+from marey_server.store.purging import erasing
 from marey_server.store.transaction import Transaction
 
 pytestmark = pytest.mark.every_database
@@ -60,6 +63,11 @@ class Scene:
 
     def write(self, function: Any, *args: Any, **kwargs: Any) -> Any:
         return self.desk.database.write(self.desk.user, requiring(WRITE, function), *args, **kwargs)
+
+    def folders(self, path: str) -> list[str]:
+        """Return the ids of the folders with this path that are not deleted."""
+        page = self.desk.database.read(self.desk.user, collections.list_collections, "lab", path=path)
+        return [one.id for one in page.items if one.path == path]
 
     def delete(self, item: str) -> None:
         kind = Kind(item.partition("_")[0])
@@ -98,27 +106,32 @@ class Scene:
         assert sorted(runs) == ["act", "purge"], "two transactions waited for each other"
         return done, purged
 
-    def race_half_way(self, act: Act, purge: Act) -> tuple[Any, Any]:
-        """Let `act` begin when the purge has locked the items, and has deleted nothing yet; return both results."""
+    def race_half_way(
+        self, act: Act, purge: Act, *, before: tuple[Any, str] = (events, "forget_names")
+    ) -> tuple[Any, Any]:
+        """Let `act` begin before the purge calls a function of a module; return both results.
+
+        By default, the purge has then locked the items, and has deleted nothing yet.
+        """
         paused, may_go_on = threading.Event(), threading.Event()
         runs: list[str] = []
 
-        def forget_later(*args: Any) -> None:
+        def go_on_later(*args: Any) -> Any:
             paused.set()
             may_go_on.wait(20)
-            forget(*args)
+            return function(*args)
 
         def run_purge(tx: Transaction) -> Any:
             runs.append("purge")
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(events, "forget_names", forget_later)
+                patch.setattr(*before, go_on_later)
                 return purge(tx)
 
         def run_act(tx: Transaction) -> Any:
             runs.append("act")
             return act(tx)
 
-        forget = events.forget_names
+        function = getattr(*before)
         with ThreadPoolExecutor(2) as pool:
             purging_ = pool.submit(self.other.write, self.desk.user, run_purge)
             assert paused.wait(20)
@@ -216,8 +229,7 @@ def test_an_item_is_restored_or_purged(scene: Scene, order: str) -> None:
 def test_a_folder_is_not_restored_while_half_of_a_purge_is_done(scene: Scene) -> None:
     """The purge locks the item before the folder, and the restoration locks the folder before the item."""
     thing = scene.add("thing")
-    folders = scene.desk.database.read(scene.desk.user, collections.list_collections, "lab").items
-    (raw,) = [one.id for one in folders if one.path == "raw"]
+    (raw,) = scene.folders("raw")
     scene.write(collections.delete_collection, "lab", raw, expected_rev=None)
     restore = scene.of_user(collections.restore_collection, "lab", raw)
     done, purged = scene.race_half_way(restore, scene.purge_of(thing))
@@ -226,11 +238,32 @@ def test_a_folder_is_not_restored_while_half_of_a_purge_is_done(scene: Scene) ->
     scene.assert_sound()
 
 
+def test_a_folder_that_is_deleted_during_a_purge_keeps_its_items_and_roles(scene: Scene) -> None:
+    """Deletions do not wait for purges; the new folder has the path of the one that the purge removes."""
+    thing = scene.add("thing")
+    (raw,) = scene.folders("raw")
+    scene.write(collections.delete_collection, "lab", raw, expected_rev=None)
+    purge = scene.purge_of(thing)
+    kept = scene.add("kept")
+    (again,) = scene.folders("raw")
+    change = FolderRoleChange.model_validate({"role": "reader"})
+    scene.write(managing.put_folder_role, "lab", again, EVERY_MEMBER, change)
+    delete = scene.of_user(collections.delete_collection, "lab", again, expected_rev=None)
+    done, purged = scene.race_half_way(delete, purge, before=(erasing, "_is_within"))
+    assert done is None
+    require_purged(purged, thing)
+    scene.write(collections.restore_collection, "lab", again)
+    found = scene.desk.database.read(scene.desk.user, items.read_item, "lab", Kind.STUDY, kept)
+    assert found.collection == "raw"
+    roles = scene.desk.database.read(scene.desk.user, managing.list_folder_roles, "lab").items
+    assert [(one.folder, one.role) for one in roles] == [("raw", "reader")]
+    scene.assert_sound()
+
+
 @ORDERS
 def test_a_folder_is_restored_with_its_items_or_these_are_purged(scene: Scene, order: str) -> None:
     thing = scene.add("thing")
-    folders = scene.desk.database.read(scene.desk.user, collections.list_collections, "lab").items
-    (raw,) = [one.id for one in folders if one.path == "raw"]
+    (raw,) = scene.folders("raw")
     scene.write(collections.delete_collection, "lab", raw, expected_rev=None)
     restore = scene.of_user(collections.restore_collection, "lab", raw)
     done, purged = scene.race(order, restore, scene.purge_of(thing))

@@ -14,7 +14,7 @@ from marey_schemas.access import EVERY_MEMBER, FolderRoleChange, MemberChange, P
 from marey_schemas.datasets.commits import CommitCreate
 from marey_schemas.datasets.merges import CheckoutRequest
 from marey_schemas.datasets.naming import DatasetCreate
-from marey_schemas.items import Collection, CollectionCreate, ItemCreate
+from marey_schemas.items import Collection, CollectionCreate, ItemChange, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import PurgeRequest
 from marey_schemas.queue.commits import OutputsCommit
@@ -32,7 +32,7 @@ from marey_server.errors import (
 from marey_server.store import collections, datasets, items, members, projects, purging, users
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.folder_roles import managing, rights
-from marey_server.store.items import Draft
+from marey_server.store.items import Draft, ItemFilters
 from marey_server.store.jobs import reading, retrying, submission
 from marey_server.store.tables import collection, folder_role
 from marey_server.store.transaction import Transaction
@@ -55,6 +55,14 @@ def change(role: str) -> FolderRoleChange:
 def make_folder(lab: Lab, path: str) -> Collection:
     made: Collection = lab.write(collections.create_collection, "lab", CollectionCreate(path=path))
     return made
+
+
+def folder_at(lab: Lab, path: str) -> Collection:
+    """Return the folder with this path that is not deleted."""
+    page = lab.read(collections.list_collections, "lab", path=path)
+    (found,) = [one for one in page.items if one.path == path]
+    assert isinstance(found, Collection)
+    return found
 
 
 def put(lab: Lab, folder: Collection, user: str, role: str, **kwargs: Any) -> Any:
@@ -221,6 +229,25 @@ def test_one_query_reads_the_roles_for_many_items(lab: Lab, monkeypatch: pytest.
     assert len(asked) == 1
 
 
+# -- restoring items --------------------------------------------------------------------------------------------------
+
+
+def test_an_item_is_restored_only_with_the_role_at_its_future_place(lab: Lab) -> None:
+    """The role in a deleted folder does not count for the new folder with the same path."""
+    delete = declared("DELETE", "/projects/{project}/collections/{collection}")
+    restore = declared("POST", "/projects/{project}/{kind}/{item}/restore")
+    rig = create(lab, lab.owner, "a/b", "rig")
+    put(lab, folder_at(lab, "a/b"), name_of(lab.maintainer), "maintainer")
+    put(lab, folder_at(lab, "a"), EVERY_MEMBER, "contributor")
+    lab.write(collections.delete_collection, "lab", folder_at(lab, "a/b").id, expected_rev=None, required=delete)
+    with pytest.raises(ForbiddenProblem) as refused:
+        lab.write(items.restore_item, "lab", Kind.SKELETON, rig.id, who=lab.maintainer, required=restore)
+    assert refused.value.context == {"folder": "a/b", "role": "contributor"}
+    put(lab, folder_at(lab, "a"), EVERY_MEMBER, "maintainer")
+    back = lab.write(items.restore_item, "lab", Kind.SKELETON, rig.id, who=lab.maintainer, required=restore)
+    assert back.collection == "a/b"
+
+
 # -- jobs -------------------------------------------------------------------------------------------------------------
 
 
@@ -357,3 +384,22 @@ def test_a_checkout_needs_the_role_in_all_folders_of_the_dataset(lab: Lab) -> No
     put(lab, done, EVERY_MEMBER, "reader")
     with pytest.raises(ForbiddenProblem):
         lab.write(datasets.create_dataset, "lab", DatasetCreate(name="e", collection="data/done"), who=lab.maintainer)
+
+
+def test_a_checkout_creates_an_item_that_the_caller_may_not_restore_elsewhere(lab: Lab) -> None:
+    checkout = declared("POST", "/projects/{project}/datasets/{dataset}/checkout")
+    maintain = declared("DELETE", "/projects/{project}/{kind}/{item}")
+    rig = create(lab, lab.owner, "data", "rig")
+    lab.write(datasets.create_dataset, "lab", DatasetCreate(name="d", collection="data"))
+    prepared = lab.read(datasets.prepare_commit, "lab", "d", CommitCreate(message="m"), required=CREATE_ITEM)
+    lab.write(datasets.record_commit, "lab", "d", prepared)
+    which = ("lab", Kind.SKELETON, rig.id)
+    lab.write(items.change_item, *which, ItemChange(collection="elsewhere"), expected_rev=None, required=maintain)
+    lab.write(items.delete_item, *which, expected_rev=None, required=maintain)
+    put(lab, folder_at(lab, "elsewhere"), EVERY_MEMBER, "contributor")
+    request = CheckoutRequest(version="main", discard=True)
+    answer = lab.write(datasets.check_out, "lab", "d", request, who=lab.maintainer, required=checkout)
+    assert answer.added == 1
+    (made,) = lab.read(items.list_items, "lab", Kind.SKELETON, ItemFilters()).items
+    assert (made.collection, made.name) == ("data", "rig")
+    assert made.id != rig.id
