@@ -30,7 +30,8 @@ from marey_server.store.database.connections import Database
 from marey_server.store.datasets import outputs
 from marey_server.store.datasets.naming import find_ref
 from marey_server.store.fsck import check_store
-from marey_server.store.jobs import completion
+from marey_server.store.jobs import completion, fan_out
+from marey_server.store.jobs.finishing import commit_deferred
 from marey_server.store.tables import dataset_ref
 from marey_server.store.transaction import Transaction
 
@@ -75,7 +76,12 @@ def seen(gaits: CommittingDesk, job_id: str, branch: str = "main") -> Seen:
 
 def dies_when_it_completes(desk: Desk, url: str, lease: Lease, fault: str) -> bool:
     """Complete an attempt in a process that is killed at a fault point; return whether it was killed there."""
-    arguments = [url, desk.user.user_id, "ann", f"complete {lease.job} {lease.fence}", ""]
+    return dies(desk, url, f"complete {lease.job} {lease.fence}", fault)
+
+
+def dies(desk: Desk, url: str, work: str, fault: str) -> bool:
+    """Do some work in a process that is killed at a fault point; return whether it was killed there."""
+    arguments = [url, desk.user.user_id, "ann", work, ""]
     done = subprocess.run(
         [sys.executable, store_writer.__file__, *map(str, arguments)],
         env={**os.environ, "MAREY_FAULT": f"{fault}:kill"}, capture_output=True, timeout=60,
@@ -114,6 +120,33 @@ def test_a_server_that_dies_at_a_completion_leaves_all_or_nothing(
     answers = [gaits.desk.complete(leases[-1], write_id=write_id) for _ in range(2)]
     assert seen(gaits, made, branch) == after
     assert [one.commit for one in answers] == [None if way == "fan-out" else gaits.head(branch)] * 2
+    assert list(check_store(gaits.desk.database)) == []
+
+
+PLACES = [
+    "deferred_commit.after_chunks",
+    "job_commit.after_commit",
+    "job_commit.after_move",
+    "deferred_commit.before_commit",
+]
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_server_that_dies_during_a_large_commit_repeats_it(
+    gaits: CommittingDesk, database_url: str, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    monkeypatch.setattr(fan_out, "MOST_AT_END", 3)
+    things = tuple(ItemInput(item=one) for one in gaits.desk.things(4))
+    made = gaits.submit("square", into="made", inputs={"things": things})
+    for number, lease in enumerate(gaits.desk.claim_many()):
+        gaits.desk.stage(lease, f"a{number}", f"b{number}")
+        gaits.desk.complete(lease)
+    before = Seen("running", 4, 8, 0, 0, False)
+    assert seen(gaits, made) == before
+    assert dies(gaits.desk, database_url, "commit-deferred", place)
+    assert seen(gaits, made) == before
+    assert commit_deferred(gaits.desk.database) == 1
+    assert seen(gaits, made) == Seen("succeeded", 4, 8, 1, 4, True)
     assert list(check_store(gaits.desk.database)) == []
 
 

@@ -1,6 +1,6 @@
 """A process that writes to a database, for tests that kill it: `store_writer.py URL USER_ID USER_NAME WORK FOLDER`.
 
-The work `complete JOB FENCE` completes an attempt.
+The work `complete JOB FENCE` completes an attempt, `commit-deferred` commits the outputs of jobs with many outputs.
 """
 
 import sys
@@ -16,6 +16,7 @@ from marey_server.store.blob_backings import DirectoryBlobs
 from marey_server.store.database.connections import Database
 from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.jobs import completion
+from marey_server.store.jobs.finishing import commit_deferred
 from marey_server.store.transaction import Transaction
 
 LARGE_FILES = [bytes([number]) * 2**20 for number in range(12)]
@@ -62,6 +63,8 @@ def main(url: str, user_id: str, user_name: str, work: str, folder: str) -> None
         attempt = Principal("attempt", job_id=job_id, fence=int(fence), scopes=("read",))
         request = CompleteRequest(write_id=f"write-{job_id}-{fence}")
         database.write(attempt, completion.complete, job_id, int(fence), request)
+    elif work == "commit-deferred":
+        commit_deferred(database)
     else:
         garbage.collect_garbage(database, grace_us=-1)
     database.close()

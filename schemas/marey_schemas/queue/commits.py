@@ -11,8 +11,10 @@ from marey_schemas.base import Answer, Options, Request
 from marey_schemas.datasets.naming import MAIN, DatasetName, RefName
 from marey_schemas.names import CollectionPath, Message
 
-MOST_COMMITTED = 10_000
-"""Greatest number of entries that the commit of one job adds, changes or removes."""
+MOST_COMMITTED = 200_000
+"""Greatest number of entries that the commit of one job adds, changes or removes. It limits the memory needed."""
+MOST_COMMITTED_AT_ONCE = 10_000
+"""Greatest number of outputs that are committed in the transaction that publishes them, while other writers wait."""
 MOST_LISTED = 100
 """Greatest number of paths that a conflict lists."""
 

@@ -1,9 +1,9 @@
 """Periodic work of the server.
 
-It reclaims expired leases, shares cached results with waiting jobs, merges waiting proposals, and deletes old or
-unreferenced data. Only the leading process does this work, but concurrent housekeeping would be safe, because every
-statement repeats its conditions. Each kind of work runs in a separate task, so that a failure does not affect the
-others.
+It reclaims expired leases, shares cached results with waiting jobs, commits the outputs of jobs that made many, merges
+waiting proposals, and deletes old or unreferenced data. Only the leading process does this work, but concurrent
+housekeeping would be safe, because every statement repeats its conditions. Each kind of work runs in a separate task, so
+that a failure does not affect the others.
 """
 
 from __future__ import annotations
@@ -23,9 +23,11 @@ from marey_server.store import leader, rate_limits
 from marey_server.store.datasets.proposals import WaitingMerges
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.jobs import reaper
+from marey_server.store.jobs.finishing import commit_deferred
 from marey_server.store.jobs.reaper import StartGrace
 from marey_server.store.retention import retire
 from marey_server.store.transaction import Transaction
+from marey_server.store.wakeups import OUTPUTS_TO_COMMIT, wakeups
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -53,6 +55,7 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
         (tick_s, tick_s, _reap),
         (tick_s, tick_s, _share_results),
         (tick_s, tick_s, partial(_merge_waiting, merges=merges)),
+        (0.0, 0.0, partial(_commit_outputs, longest_wait_s=tick_s)),
         (FORGET_TRIES_EVERY_S, FORGET_TRIES_EVERY_S, _forget_tries),
         (FIRST_GARBAGE_S, GARBAGE_EVERY_S, _collect_garbage),
     )
@@ -135,6 +138,14 @@ async def _merge_waiting(services: Services, holder: str, merges: WaitingMerges)
     """Merge proposals that have waited until nothing is missing any more."""
     if await _write(services, _leads, holder):
         await _in_thread(services, merges.attempt)
+
+
+async def _commit_outputs(services: Services, holder: str, *, longest_wait_s: float) -> None:
+    """Wait until jobs have many outputs to commit, or for `longest_wait_s`; then commit these and end the jobs."""
+    with wakeups.listen([OUTPUTS_TO_COMMIT]) as listener:
+        await listener.wait(longest_wait_s)
+    if await _write(services, _leads, holder):
+        await _in_thread(services, commit_deferred, services.database)
 
 
 def _leads(tx: Transaction, holder: str) -> bool:

@@ -13,6 +13,9 @@ from contextlib import contextmanager
 COMMITTED_EVENTS = "committed events"
 """Topic that is announced whenever a transaction with events was committed, in this process or in another."""
 
+OUTPUTS_TO_COMMIT = "outputs to commit"
+"""Topic that is announced when the tasks of a job have ended and the server must commit their many outputs."""
+
 NUMBERED_EVENTS = "numbered events"
 """Topic that is announced when events can be read that have not been announced before."""
 

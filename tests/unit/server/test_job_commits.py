@@ -501,7 +501,7 @@ def test_outputs_of_one_name_are_numbered(gaits: CommittingDesk) -> None:
 def test_a_commit_of_too_many_outputs_is_recorded_as_a_conflict(
     gaits: CommittingDesk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(commits, "MOST_COMMITTED", 2)
+    monkeypatch.setattr(commits, "MOST_COMMITTED_AT_ONCE", 2)
     made = gaits.submit(into="made")
     gaits.work("a", "b", "c")
     found = gaits.job(made)

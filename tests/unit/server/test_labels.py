@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from marey_server.access.labels import MOST_LABELS, keys_within, labels_key
 from marey_server.errors import InvalidProblem
-from marey_server.store.jobs.labels import MOST_LABELS, keys_within, labels_key
 
 names = st.text(min_size=1, max_size=8)
 label_sets = st.dictionaries(names, st.text(max_size=8), max_size=4)

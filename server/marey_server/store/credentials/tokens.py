@@ -12,6 +12,7 @@ from marey_schemas.items import Page
 from marey_schemas.problems import FieldError
 from marey_schemas.wording import counted
 from marey_server.access import scopes
+from marey_server.access.labels import first_outside, labels_key
 from marey_server.access.principal import Principal
 from marey_server.access.roles import is_administrator, require_administrator
 from marey_server.access.secret_tokens import (
@@ -34,7 +35,6 @@ from marey_server.store.database.clock import DAY_US, datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.ids import new_id
 from marey_server.store.jobs.fencing import AUTHOR_MAY_RUN, RUNNING, lease_lost
-from marey_server.store.jobs.labels import first_outside, labels_key
 from marey_server.store.quotas import require_room
 from marey_server.store.tables import attempt, job, token, user
 from marey_server.store.transaction import Transaction

@@ -7,9 +7,9 @@ folders of its outputs any more.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import count
+from itertools import count, islice
 from typing import Any
 
 from sqlalchemy import and_, select
@@ -18,7 +18,7 @@ from marey_schemas.access import Role
 from marey_schemas.datasets.naming import RefKind
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
-from marey_schemas.queue.commits import MOST_COMMITTED, JobCommit, OutputsCommit
+from marey_schemas.queue.commits import MOST_COMMITTED, MOST_COMMITTED_AT_ONCE, JobCommit, OutputsCommit
 from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.jobs import FailureReason
 from marey_server.access import roles, scopes
@@ -28,7 +28,8 @@ from marey_server.store.datasets.committing import author_of
 from marey_server.store.datasets.contents import find_contents_of, store_contents
 from marey_server.store.datasets.folders import tags_of
 from marey_server.store.datasets.naming import find_dataset, find_ref, is_tag
-from marey_server.store.datasets.outputs import CommittedOutputs, OutputEntries, commit_outputs, too_many_changes
+from marey_server.store.datasets.output_plans import OutputEntries, PlannedCommit, too_many_changes
+from marey_server.store.datasets.outputs import CommittedOutputs, commit_outputs, commit_planned
 from marey_server.store.datasets.protection import Mover, require_move
 from marey_server.store.jobs import staging
 from marey_server.store.jobs.endings import failure_document
@@ -36,7 +37,7 @@ from marey_server.store.jobs.staging import StagedDraft
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import job, member, user
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.records import DatasetEntry, RevisionKey, key_of
 
 Target = dict[str, Any]
@@ -216,12 +217,40 @@ def commit_tasks(tx: Transaction, row: Any) -> PublishedOutputs:
     if row.commit_to is None:
         return PublishedOutputs()
     hold_off_purges(tx, row.project_id)
-    tasks = select(job.c.outputs).where(job.c.parent_id == row.id).order_by(job.c.position)
-    outputs = [one for of_task in tx.execute(tasks).scalars() for one in of_task or ()]
     try:
-        return PublishedOutputs([], _commit(tx, row, outputs))
+        return PublishedOutputs([], _commit(tx, row, list(_outputs_of_tasks(tx, row.id))))
     except _CommitRefused as error:
         return PublishedOutputs(failure=error.failure)
+
+
+def entries_of_tasks(tx: Transaction, row: Any) -> OutputEntries:
+    """Return the outputs of all tasks of a parent job as entries. `row` has the columns `JOB_COLUMNS`.
+
+    At most one entry more than a commit may have is returned.
+    """
+    return _entries_of(tx, row, islice(_outputs_of_tasks(tx, row.id), MOST_COMMITTED + 1))
+
+
+def commit_planned_tasks(
+    tx: Transaction, row: Any, wanted: OutputEntries, planned: PlannedCommit | None
+) -> PublishedOutputs | None:
+    """Commit the outputs `wanted` of a parent job as planned by an earlier transaction.
+
+    Returns None if the commit must be planned again. `row` has the columns `JOB_COLUMNS`.
+    """
+    try:
+        with tx.connection.begin_nested():
+            made = commit_planned(tx, wanted, _mover(tx, row), planned)
+    except ApiProblem as error:
+        return PublishedOutputs(failure=_CommitRefused(row.commit_to, error).failure)
+    return None if made is None else PublishedOutputs([], _columns(made))
+
+
+def _outputs_of_tasks(tx: Transaction, parent_id: str) -> Iterable[Mapping[str, Any]]:
+    """Return the outputs of all tasks of a parent job, in the order of the tasks."""
+    tasks = select(job.c.outputs).where(job.c.parent_id == parent_id).order_by(job.c.position)
+    for of_task in tx.execute(tasks.execution_options(yield_per=10)).scalars():
+        yield from of_task or ()
 
 
 class _CommitRefused(Exception):
@@ -255,28 +284,30 @@ def _commit(tx: Transaction, row: Any, outputs: Sequence[Mapping[str, Any]]) -> 
     """Commit outputs on behalf of the job's author; return the columns of the job that record the commit."""
     if not outputs:
         return {}
-    if len(outputs) > MOST_COMMITTED:
-        made = CommittedOutputs(conflict=too_many_changes())
-    else:
-        target: Target = row.commit_to
-        try:
-            made = commit_outputs(tx, _entries_of(tx, row, outputs), _mover(tx, row))
-        except ApiProblem as error:
-            raise _CommitRefused(target, error) from None
+    if len(outputs) > MOST_COMMITTED_AT_ONCE:
+        return _columns(CommittedOutputs(conflict=too_many_changes(MOST_COMMITTED_AT_ONCE, "changes")))
+    try:
+        return _columns(commit_outputs(tx, _entries_of(tx, row, outputs), _mover(tx, row)))
+    except ApiProblem as error:
+        raise _CommitRefused(row.commit_to, error) from None
+
+
+def _columns(made: CommittedOutputs) -> dict[str, Any]:
     conflict = None if made.conflict is None else made.conflict.model_dump(mode="json")
     return {"committed": made.digest, **({} if conflict is None else {"publish_conflict": conflict})}
 
 
-def _entries_of(tx: Transaction, row: Any, outputs: Sequence[Mapping[str, Any]]) -> OutputEntries:
+def _entries_of(tx: Transaction, row: Any, outputs: Iterable[Mapping[str, Any]]) -> OutputEntries:
     target: Target = row.commit_to
-    contents = find_contents_of(tx, map(_revision, outputs))
-    tags = tags_of(tx, sorted({one["item"] for one in outputs}))
     entries: dict[str, DatasetEntry] = {}
     revisions: dict[str, RevisionKey] = {}
-    for one in outputs:
-        path = _free_path(one, revisions)
-        entry = DatasetEntry(path, one["kind"], contents.parts[_revision(one)], tags.get(one["item"], ()))
-        entries[entry.key], revisions[entry.key] = entry, _revision(one)
+    for some in in_lists(outputs):
+        contents = find_contents_of(tx, map(_revision, some))
+        tags = tags_of(tx, sorted({one["item"] for one in some}))
+        for one in some:
+            path = _free_path(one, revisions)
+            entry = DatasetEntry(path, one["kind"], contents.parts[_revision(one)], tags.get(one["item"], ()))
+            entries[entry.key], revisions[entry.key] = entry, _revision(one)
     return OutputEntries(
         dataset_id=target["dataset_id"], project_id=row.project_id, branch=target["branch"], base=target["base"],
         entries=entries, revisions=revisions, message=_message(row), job_id=row.id, author_id=row.author_id,

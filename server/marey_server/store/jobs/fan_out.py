@@ -1,29 +1,47 @@
-"""End of fan-outs: combines the results of tasks, or queues the parent job so that a worker combines them."""
+"""End of fan-outs: combines the results of tasks, or queues the parent job so that a worker combines them.
+
+To commit many outputs takes seconds, so the transaction that ends the last task does not do it, because other writers
+would wait. The parent job stays in the state `running`, without unfinished tasks, until `finishing` has ended it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
-from sqlalchemy import and_, delete, select, update
+from sqlalchemy import ColumnElement, and_, delete, not_, select, update
 
 from marey_schemas.queue.jobs import FailureReason
 from marey_server.store.jobs import commits
 from marey_server.store.jobs.endings import Ended, end_jobs, failure_document
 from marey_server.store.jobs.events import wake_workers
 from marey_server.store.jobs.fencing import RUNNING
-from marey_server.store.tables import job, job_blob, staged_output
+from marey_server.store.tables import dataset_commit, job, job_blob, staged_output
 from marey_server.store.transaction import Transaction
+from marey_server.store.wakeups import OUTPUTS_TO_COMMIT, wakeups
 
 MOST_GATHERED = 1000
 """Greatest number of entries in a list of a combined result, such as its refusals."""
+MOST_AT_END = 1_000
+"""Greatest number of entries that the transaction that ends the last task commits itself."""
+
+DEFERRED: ColumnElement[bool] = and_(
+    job.c.state == RUNNING,
+    job.c.lease_expires_us.is_(None),
+    job.c.size.is_not(None),
+    not_(job.c.gathers),
+    job.c.dependencies_left == 0,
+    job.c.commit_to.is_not(None),
+)
+"""Condition for jobs whose outputs are still to be committed, although all their tasks have ended."""
 
 
 def gather(tx: Transaction, parent_id: str) -> list[Ended]:
     """End a parent job whose tasks have all ended; return the jobs that ended.
 
     If all tasks succeeded, the parent job succeeds. If a worker must combine the results of the tasks, the parent job
-    is queued instead, and nothing is returned. If a task failed, the parent job fails; if cancellation was requested
+    is queued instead, and nothing is returned. Nothing is returned either if the server must first prepare the commit
+    of many outputs (`finishing`). If a task failed, the parent job fails; if cancellation was requested
     before, it is cancelled.
     """
     columns = (*commits.JOB_COLUMNS, job.c.gathers, job.c.cancel_requested_us)
@@ -51,10 +69,34 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
         return []
     if not succeeded or head.gathers:
         return end_jobs(tx, running, "cancelled", result=result)
+    if _is_large(tx, head, result):
+        _defer(tx, running, result)
+        return []
     made = commits.commit_tasks(tx, head)
     if made.failure is not None:
         return end_jobs(tx, running, "failed", failure=made.failure, result=result)
     return end_jobs(tx, running, "succeeded", result=result, **made.columns)
+
+
+def _is_large(tx: Transaction, head: Any, result: Mapping[str, Any]) -> bool:
+    """Return whether the commit of a parent job has many entries. `head` has `commit_to`, `result` the outputs' number.
+
+    A job that replaces a folder may remove all entries of the version from which it started.
+    """
+    if head.commit_to is None:
+        return False
+    count = result.get("outputs", 0)
+    target = head.commit_to
+    if target["replace"] and target["base"] is not None:
+        of_base = (dataset_commit.c.dataset_id == target["dataset_id"], dataset_commit.c.digest == target["base"])
+        count += tx.execute(select(dataset_commit.c.entries).where(*of_base)).scalar() or 0
+    return bool(count > MOST_AT_END)
+
+
+def _defer(tx: Transaction, running: ColumnElement[bool], result: Mapping[str, Any]) -> None:
+    """Store the combined result of the tasks of a parent job, and let the server commit the outputs."""
+    tx.execute(update(job).where(running).values(result=result, dependencies_left=0, rev=job.c.rev + 1))
+    tx.after_commit(lambda: wakeups.announce([OUTPUTS_TO_COMMIT]))
 
 
 def release_tasks(tx: Transaction, gathered: Collection[str]) -> None:

@@ -36,6 +36,7 @@ from marey_schemas.queue.worker_protocol import (
     PinnedInput,
 )
 from marey_server import faults
+from marey_server.access.labels import first_outside, keys_within
 from marey_server.access.principal import Principal
 from marey_server.access.secret_tokens import IssuedToken, derive_attempt_token, issue_attempt_token
 from marey_server.errors import ForbiddenProblem, InvalidProblem, LeaseLostProblem
@@ -54,7 +55,6 @@ from marey_server.store.jobs.fencing import (
     lease_lost,
     require_attempt,
 )
-from marey_server.store.jobs.labels import first_outside, keys_within
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.tables import attempt, job, member, project
 from marey_server.store.transaction import Transaction

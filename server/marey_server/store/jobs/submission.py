@@ -23,6 +23,7 @@ from marey_schemas.queue.pipelines import (
     order_steps,
 )
 from marey_server import faults
+from marey_server.access.labels import labels_key
 from marey_server.errors import InvalidProblem
 from marey_server.field_errors import field_errors, json_pointer
 from marey_server.store.database.prepared import Prepared
@@ -34,7 +35,6 @@ from marey_server.store.jobs.endings import dependency_failure
 from marey_server.store.jobs.events import emit_job_events, wake_workers
 from marey_server.store.jobs.exports import record_permission
 from marey_server.store.jobs.inputs import FoundItem, find_items, late_inputs, pin_inputs, record_named_items
-from marey_server.store.jobs.labels import labels_key
 from marey_server.store.jobs.late_inputs import pin_late_inputs
 from marey_server.store.jobs.layout import NewJob, Submission, lay_out, naming, new_row
 from marey_server.store.jobs.propagation import propagate_ends

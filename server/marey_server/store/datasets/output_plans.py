@@ -1,0 +1,243 @@
+"""Plans of commits of the outputs of jobs: the outputs are merged with what others have committed; nothing is written.
+
+A plan is computed in the transaction that records it, or, for many outputs, in a read before. If others have moved the
+branch since that read, `follow` adds their changes to the plan, unless they concern the same entries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import islice
+
+from sqlalchemy import select
+
+from marey_schemas.queue.commits import MOST_LISTED, CommitConflict
+from marey_schemas.wording import counted
+from marey_server.store.datasets.annotations import MOST_MERGED_BY_JOB, AnnotationMerger
+from marey_server.store.datasets.chunks import StoredChunks
+from marey_server.store.datasets.history import tree_of
+from marey_server.store.documents import PreparedDocument
+from marey_server.store.tables import collection, dataset, item
+from marey_server.store.transaction import Transaction, in_lists
+from marey_versions.compared import ComparedEntry
+from marey_versions.merging import MergedEntries, merge_entries
+from marey_versions.records import DatasetEntry, RevisionKey, entry_of, path_and_kind
+from marey_versions.tree.building import build
+from marey_versions.tree.chunks import Value
+from marey_versions.tree.difference import difference
+from marey_versions.tree.editing import change
+from marey_versions.tree.reading import ChunkReader, Tree
+
+LONGEST_PATH = 1280
+"""Greatest number of characters in the path of an entry."""
+MOST_COMBINED = 10_000
+"""Greatest number of entries with changes of the job and of others; each gets a new revision in the final write."""
+MOST_FOLLOWED = 1_000
+"""Greatest number of changes of others that are added to a plan while the branch is locked."""
+
+
+@dataclass(frozen=True)
+class OutputEntries:
+    """Outputs of a job as entries of a dataset, and the branch that receives them."""
+
+    dataset_id: str
+    project_id: str
+    branch: str
+    base: str | None
+    """Newest commit of the branch when the inputs of the job were fixed."""
+    entries: Mapping[str, DatasetEntry]
+    """The entries by key."""
+    revisions: Mapping[str, RevisionKey]
+    """The revisions from which the entries were made, by key."""
+    message: str
+    job_id: str
+    author_id: str | None
+    """Author of the job."""
+    replaced: str | None = None
+    """Folder whose other entries are removed; None: nothing is removed."""
+    kinds: Collection[str] = ()
+    """Kinds of the entries that are removed."""
+
+
+@dataclass(frozen=True)
+class PlannedCommit:
+    """Commit of the outputs of a job, computed but not recorded."""
+
+    head: str | None
+    """Newest commit of the branch when the plan was computed."""
+    refused: CommitConflict | None = None
+    """Reason why no commit can have the outputs; then the fields below are empty."""
+    head_tree: str = ""
+    """Tree of the commit `head`."""
+    tree: str = ""
+    """Tree with the outputs; if there are conflicts, it is based on the commit from which the job started."""
+    count: int = 0
+    """Number of entries of `tree`."""
+    chunks: Mapping[str, bytes] = field(default_factory=dict)
+    """Chunks of `tree` that may not be stored yet, by digest."""
+    merged: MergedEntries = field(default_factory=MergedEntries)
+    documents: Mapping[str, PreparedDocument] = field(default_factory=dict)
+    """Documents of annotations that were merged, by content digest."""
+    keys: Collection[str] = ()
+    """Keys of all entries that the job makes or removes."""
+    in_folder: bool = False
+    """Whether the dataset's folder contains the changes already."""
+
+
+def plan_outputs(tx: Transaction, wanted: OutputEntries, head: str | None, most: int) -> PlannedCommit:
+    """Compute the commit of the outputs of a job to a branch whose newest commit is `head`.
+
+    It adds, changes and removes at most `most` entries; otherwise, it is refused.
+    """
+    store = StoredChunks(tx)
+    reader = ChunkReader(store)
+    base, head_tree = (
+        build(store, []) if one is None else tree_of(tx, wanted.dataset_id, one) for one in (wanted.base, head)
+    )
+    entries = _with_removals(Tree(reader, base), wanted, most)
+    if (refused := _unfit(entries, most)) is not None:
+        return PlannedCommit(head, refused)
+    annotations = AnnotationMerger(tx, wanted.project_id, MOST_MERGED_BY_JOB)
+    merged = _merged(reader, base, head_tree, entries, annotations)
+    if len(merged.combined) > MOST_COMBINED:
+        return PlannedCommit(head, too_many_changes(MOST_COMBINED, "combines its changes with those of others in"))
+    tree = change(store, base, _values(entries)) if merged.conflicts else change(store, head_tree, merged.changes)
+    in_folder = not merged.conflicts and _is_in_folder(tx, wanted, head, merged.changes)
+    return PlannedCommit(
+        head, None, head_tree, tree, len(Tree(store, tree)), store.new, merged, annotations.documents, entries.keys(),
+        in_folder,
+    )  # fmt: skip
+
+
+def follow(tx: Transaction, wanted: OutputEntries, planned: PlannedCommit, head: str | None) -> PlannedCommit | None:
+    """Return a plan for the commit `head`, to which others have moved the branch since the plan was computed.
+
+    The chunks of `planned` must be stored. Returns None if the plan must be computed again, because the others have
+    changed the same entries as the job, or too many entries.
+    """
+    if planned.head == head or planned.merged.conflicts:  # the commit to a branch of its own stays as it is
+        return planned
+    if planned.refused is not None or head is None:
+        return None
+    store = StoredChunks(tx)
+    store.save(planned.chunks)  # spares reading most of them again
+    head_tree = tree_of(tx, wanted.dataset_id, head)
+    others: dict[str, Value | None] = {}
+    for one in difference(store, planned.head_tree, head_tree):
+        if one.key in planned.keys or len(others) == MOST_FOLLOWED:
+            return None
+        others[one.key] = one.after
+    tree = change(store, planned.tree, others)
+    return replace(
+        planned, head=head, head_tree=head_tree, tree=tree, count=len(Tree(store, tree)),
+        chunks={digest: data for digest, data in store.new.items() if digest not in planned.chunks},
+    )  # fmt: skip
+
+
+# -- entries ----------------------------------------------------------------------------------------------------------
+
+
+def _with_removals(base: Tree, wanted: OutputEntries, most: int) -> dict[str, DatasetEntry | None]:
+    """Return the outputs of a job as entries by key, and None for each entry that the job removes.
+
+    A job that replaces the content of a folder removes the other entries of its kinds in this folder of `base`. The
+    result has at most one entry more than `most`, unless there are more outputs.
+    """
+    entries: dict[str, DatasetEntry | None] = dict(wanted.entries)
+    if wanted.replaced is not None and entries:
+        inside = (key for key, _ in base.entries(prefix=f"{wanted.replaced}/"))
+        others = (key for key in inside if key not in wanted.entries and path_and_kind(key)[1] in wanted.kinds)
+        entries.update(dict.fromkeys(islice(others, max(0, most + 1 - len(entries)))))
+    return entries
+
+
+def _values(entries: Mapping[str, DatasetEntry | None]) -> dict[str, Value | None]:
+    return {key: None if one is None else one.value for key, one in entries.items()}
+
+
+def _unfit(entries: Mapping[str, DatasetEntry | None], most: int) -> CommitConflict | None:
+    """Return the reason why no commit can have these entries, or None."""
+    if len(entries) > most:
+        return too_many_changes(most, "changes")
+    long = [path_and_kind(key)[0] for key in entries if len(key.partition("\t")[0]) > LONGEST_PATH]
+    if long:
+        detail = f"{counted(len(long), 'output')} would have a path of more than {LONGEST_PATH} characters."
+        return CommitConflict(code="path-too-long", detail=detail, paths=tuple(long[:MOST_LISTED]), count=len(long))
+    return None
+
+
+def too_many_changes(most: int, verb: str) -> CommitConflict:
+    """Return the conflict of a job whose commit would have more than `most` changes; `verb` says what it does."""
+    return CommitConflict(
+        code="too-many-changes",
+        detail=f"Such a commit {verb} at most {most:,} entries. The outputs are in the project; commit them by a "
+        "request.",
+    )
+
+
+def _merged(
+    reader: ChunkReader,
+    base: str,
+    head: str,
+    entries: Mapping[str, DatasetEntry | None],
+    annotations: AnnotationMerger,
+) -> MergedEntries:
+    """Merge the entries of a job, part by part, with the changes of other commits.
+
+    Other commits have changed the tree `base` to the tree `head`. Only changes at the paths of these entries count.
+    """
+    before = {key: entry_of(key, value) for key, value in Tree(reader, base).get_several(entries).items()}
+    if base == head:
+        now = before
+    else:
+        now = {key: entry_of(key, value) for key, value in Tree(reader, head).get_several(entries).items()}
+    others = [_compared(before.get(key), now.get(key)) for key in entries if before.get(key) != now.get(key)]
+    own = [_compared(before.get(key), one) for key, one in entries.items() if before.get(key) != one]
+    return merge_entries(others, own, {}, annotations.merge)
+
+
+def _compared(before: DatasetEntry | None, after: DatasetEntry | None) -> ComparedEntry:
+    return ComparedEntry(before, after)
+
+
+# -- the folder -------------------------------------------------------------------------------------------------------
+
+
+def _is_in_folder(
+    tx: Transaction, wanted: OutputEntries, head: str | None, changes: Mapping[str, Value | None]
+) -> bool:
+    """Return whether the dataset's folder contains a commit's changes already, so that it counts as checked out.
+
+    This is so if the commit before, `head`, was checked out in the folder, and each entry in `changes` is the newest
+    revision of an item at its path in the folder.
+    """
+    followed = (dataset.c.id == wanted.dataset_id, dataset.c.folder_commit.is_not_distinct_from(head))
+    folder = tx.execute(FOLDER.where(*followed)).scalar()
+    if folder is None:
+        return False
+    expected: dict[str, tuple[str, int]] = {}
+    for key, value in changes.items():
+        if value is None or value != wanted.entries[key].value:
+            return False
+        path = "/".join(filter(None, (folder, path_and_kind(key)[0])))
+        expected[wanted.revisions[key].item] = (path, wanted.revisions[key].revision)
+    if len(expected) != len(changes):
+        return False
+    ids = sorted(expected)
+    for some in in_lists(ids):
+        statement = (
+            select(item.c.id, item.c.head, item.c.name, collection.c.path)
+            .join(collection, collection.c.id == item.c.collection_id)
+            .where(item.c.id.in_(some), item.c.deleted_us.is_(None))
+        )
+        rows = tx.execute(statement).all()
+        if len(rows) != len(some):
+            return False
+        if any(expected[row.id] != ("/".join(filter(None, (row.path, row.name))), row.head) for row in rows):
+            return False
+    return True
+
+
+FOLDER = select(collection.c.path).join(dataset, dataset.c.collection_id == collection.c.id)
+"""Path of the folder of a dataset."""

@@ -1,0 +1,131 @@
+"""Commits of the many outputs of parent jobs, without letting other writers wait.
+
+A read plans the commit. Several short writes store the chunks of its tree. A last write ends the job and moves the
+branch. What others have committed since the read is added to the plan in that last write, unless it concerns the same
+entries; then the commit is planned again. If the server stops in between, nothing but chunks has been stored, and the
+next server begins again.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from sqlalchemy import select
+
+from marey_schemas.queue.commits import MOST_COMMITTED
+from marey_server import faults
+from marey_server.access.principal import SYSTEM
+from marey_server.errors import ApiProblem, UnavailableProblem
+from marey_server.store.database.connections import Database
+from marey_server.store.datasets.chunks import store_chunks
+from marey_server.store.datasets.naming import find_ref
+from marey_server.store.datasets.output_plans import OutputEntries, PlannedCommit, plan_outputs
+from marey_server.store.jobs import commits
+from marey_server.store.jobs.endings import end_jobs
+from marey_server.store.jobs.fan_out import DEFERRED
+from marey_server.store.jobs.propagation import propagate_ends
+from marey_server.store.purge_lock import last_purge, require_no_purge_since
+from marey_server.store.tables import dataset, job
+from marey_server.store.transaction import Transaction
+
+CHUNKS_AT_ONCE = 500
+"""Number of chunks that one write stores, so that it is short."""
+MOST_PLANS = 5
+"""Number of times that a commit is planned before the next jobs have their turn."""
+
+log = logging.getLogger(__name__)
+
+
+def commit_deferred(database: Database) -> int:
+    """Commit the outputs of jobs whose tasks have all ended, and end these jobs; return how many have ended.
+
+    A job whose commit cannot be computed stays as it is, and does not keep the others from ending.
+    """
+    return sum(_commit_one(database, one) for one in database.read(SYSTEM, _deferred_jobs))
+
+
+def _deferred_jobs(tx: Transaction) -> list[str]:
+    return list(tx.execute(select(job.c.id).where(DEFERRED).order_by(job.c.id)).scalars())
+
+
+def _commit_one(database: Database, job_id: str) -> bool:
+    """Commit the outputs of one job, and end it; return whether it has ended."""
+    try:
+        for _ in range(MOST_PLANS):
+            plan = database.read(SYSTEM, _plan, job_id)
+            if plan is None:
+                return False
+            for chunks in _portions(plan.chunks):
+                database.submit_write(SYSTEM, store_chunks, chunks).result()
+            faults.point("deferred_commit.after_chunks")
+            if database.submit_write(SYSTEM, _end, plan).result():
+                return True
+    except UnavailableProblem:
+        raise
+    except Exception:
+        log.exception("the outputs of %s cannot be committed", job_id)
+    return False
+
+
+def _portions(chunks: Mapping[str, bytes]) -> Iterator[Mapping[str, bytes]]:
+    """Yield the chunks in portions, in the order of their digests, in which all writers lock them."""
+    digests = sorted(chunks)
+    for start in range(0, len(digests), CHUNKS_AT_ONCE):
+        yield {digest: chunks[digest] for digest in digests[start : start + CHUNKS_AT_ONCE]}
+
+
+@dataclass(frozen=True)
+class _JobPlan:
+    """The outputs of a job, and the plan of their commit; None if the branch does not exist any more."""
+
+    job_id: str
+    wanted: OutputEntries
+    commit: PlannedCommit | None
+    last_purge: int
+
+    @property
+    def chunks(self) -> Mapping[str, bytes]:
+        """The chunks to be stored before the job ends."""
+        return {} if self.commit is None else self.commit.chunks
+
+
+_COLUMNS = (*commits.JOB_COLUMNS, job.c.cancel_requested_us)
+
+
+def _plan(tx: Transaction, job_id: str) -> _JobPlan | None:
+    """Plan the commit of a job; None if the job has ended already."""
+    row = tx.execute(select(*_COLUMNS).where(job.c.id == job_id, DEFERRED)).first()
+    if row is None:
+        return None
+    purged = last_purge(tx, row.project_id)
+    wanted = commits.entries_of_tasks(tx, row)
+    exists = select(dataset.c.id).where(dataset.c.id == wanted.dataset_id, dataset.c.deleted_us.is_(None))
+    ref = None if tx.execute(exists).first() is None else find_ref(tx, wanted.dataset_id, wanted.branch)
+    planned = None if ref is None else plan_outputs(tx, wanted, ref.digest, MOST_COMMITTED)
+    return _JobPlan(job_id, wanted, planned, purged)
+
+
+def _end(tx: Transaction, plan: _JobPlan) -> bool:
+    """End a job and commit its outputs as planned; return False if the commit must be planned again."""
+    row = tx.execute(select(*_COLUMNS).where(job.c.id == plan.job_id, DEFERRED).with_for_update()).first()
+    if row is None:  # another process has ended it
+        return True
+    this = job.c.id == row.id
+    if row.cancel_requested_us is not None:
+        propagate_ends(tx, end_jobs(tx, this, "cancelled"))
+        return True
+    try:
+        require_no_purge_since(tx, row.project_id, plan.last_purge)
+    except ApiProblem:
+        return False
+    made = commits.commit_planned_tasks(tx, row, plan.wanted, plan.commit)
+    if made is None:
+        return False
+    if made.failure is not None:
+        propagate_ends(tx, end_jobs(tx, this, "failed", failure=made.failure))
+    else:
+        propagate_ends(tx, end_jobs(tx, this, "succeeded", **made.columns))
+    faults.point("deferred_commit.before_commit")
+    return True
