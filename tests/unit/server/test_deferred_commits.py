@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.support.committing_desk import CommittingDesk
@@ -51,7 +52,7 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], object]
     return arrange
 
 
-def run_tasks(gaits: CommittingDesk, into: str = "made", **fields: object) -> str:
+def run_tasks(gaits: CommittingDesk, into: str = "made", **fields: Any) -> str:
     """Run a job of two tasks, each with two outputs; return its id."""
     things = tuple(ItemInput(item=one) for one in gaits.desk.things(4, "given"))
     made = gaits.submit("square", into=into, inputs={"things": things}, **fields)
