@@ -21,6 +21,7 @@ from typing import Any
 import httpx
 from sqlalchemy import insert, update
 
+from benchmarks.job_commits import measure_end, measure_plain_commit
 from benchmarks.local_server import PROJECT, LocalServer, local_server
 from benchmarks.seeding import fill
 from benchmarks.timing import Row
@@ -49,7 +50,7 @@ def run() -> list[Row]:
     for size in SIZES:
         with local_server(partial(_prepare, size)) as server:
             rows += _rows(server, size)
-    return rows
+    return [*rows, _row_of_job(SIZES[0])]
 
 
 # -- a large dataset --------------------------------------------------------------------------------------------------
@@ -124,6 +125,23 @@ def _rows(server: LocalServer, size: int) -> Iterator[Row]:
         commit(MAIN, SIDE, size // 4)
         merge = partial(client.post, f"{URL}/merges", json={"version": "side"})
         yield _row(f"merge of 2 x {SIDE:,} changes", size, _times(lambda: _ok(merge()), repeats=1), 2000)
+
+
+def _row_of_job(size: int) -> Row:
+    """Measure the commit of the outputs of a job with many outputs, and the plain commit of the same entries."""
+    with tempfile.TemporaryDirectory() as folder:
+        fill(Path(folder), 0)
+        database = open_database(Settings(data=Path(folder)))
+        try:
+            end = measure_end(database, size)
+            plain_s = measure_plain_commit(database)
+        finally:
+            database.close()
+    return Row(
+        "commit of a job's outputs", f"{size:,} entries",
+        f"{size / end.seconds:,.0f} entries/s; other writers wait {end.longest_wait_ms:.0f} ms at most",
+        f"plain commit: {size / plain_s:,.0f} entries/s", plain_s / end.seconds,
+    )  # fmt: skip
 
 
 def _ok(response: httpx.Response) -> Any:
