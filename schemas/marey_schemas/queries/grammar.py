@@ -137,6 +137,18 @@ def parts_of(query: Query) -> tuple[Query, ...]:
     return query.queries if isinstance(query, Junction) and query.word == "and" else (query,)
 
 
+def operands_of(query: Query) -> Iterator[Query]:
+    """Yield the queries that must all be true for the query to be true, also those between brackets.
+
+    None of them is joined by `and`.
+    """
+    for part in parts_of(query):
+        if part is query:
+            yield query
+        else:
+            yield from operands_of(part)
+
+
 @cache
 def _parser() -> Lark:
     from lark import Lark

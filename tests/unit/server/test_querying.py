@@ -4,29 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import date, datetime, timedelta
+from itertools import cycle, repeat
 from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from sqlalchemy import update
-from tests.support.store_fixtures import Lab
+from sqlalchemy import event, update
+from tests.support.store_fixtures import Lab, skeleton_tree
 from tests.support.tiers import examples
 
-from marey_schemas.items import Item
+from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.queries.fields import FIELDS, OPERATORS
 from marey_schemas.queries.grammar import Condition, Negation, Query, parse
 from marey_server.errors import BadRequestProblem
 from marey_server.store import items
 from marey_server.store.database.connections import Database
-from marey_server.store.items import ItemFilters
+from marey_server.store.items import ItemFilters, narrowing
+from marey_server.store.tables import INDEXED_FACTS
 from marey_server.store.tables import item as item_table
+from marey_server.store.transaction import Transaction
 
+LONG = "walks " * 20  # more than an index stores
 INFOS: tuple[dict[str, Any], ...] = (
     {"subject": "02", "action": "Walk, slow", "licence": "CC-BY 4.0", "select": "best", "shoot_day": "2025-02-28"},
     {"subject": "2", "action": "walk", "take": "7b", "shoot_day": "2025-03-01", "consent_until": "2026-01-31"},
     {"action": "Übung 100%", "checks": [{"code": "foot-slide", "message": "m"}], "capture_system": "Vicon_8"},
+    {"action": f"{LONG} there", "subject": "02"},
+    {"action": f"{LONG} back", "subject": "02", "licence": "CC-BY 4.0"},
     {"checks": [{"code": "foot", "message": "m"}, {"code": "gap", "message": "m"}], "select": "no good"},
     {},
 )
@@ -34,7 +40,7 @@ PLACES = ("", "raw", "raw/day 1", "rawer")
 TAGS = ((), ("night",), ("night", "day"))
 TEXTS = (
     "02", "2", "walk", "WALK", "Walk, slow", "%", "_", "Übung", "übung", "raw", "raw/day 1", "take-1", "raw/take-1",
-    "night", "day", "foot-slide", "foot", "gap", ",", '"', "best", "no good", "rig", "RIG", "",
+    "night", "day", "foot-slide", "foot", "gap", ",", '"', "best", "no good", "rig", "RIG", "", f"{LONG} there", LONG,
 )  # fmt: skip
 NUMBERS = ("0", "1", "3", "4.5", "120", "0.025", "1e3")
 DATES = ("2025-02-28", "2025-03-01", "2025-03-01T10:00", "2026-01-31", "1999-12-31", "2999-01-01")
@@ -157,16 +163,20 @@ queries = st.recursive(
 )
 
 
-@given(queries)
-@example('path = "take-4" or path = "raw/take-1" or path = "rawer/take-3"')
-@example('warning = "foot" and not warning = "foot-slide"')
-@example("created >= 2999-01-01 or not updated < 2999-01-01")
+@given(queries, st.sampled_from([0, 3, 1000]))
+@example('path = "take-4" or path = "raw/take-1" or path = "rawer/take-3"', 1000)
+@example('warning = "foot" and not warning = "foot-slide"', 1000)
+@example("created >= 2999-01-01 or not updated < 2999-01-01", 1000)
+@example(f'(action = "{LONG} back" and has licence) and subject = 02', 3)
+@example("subject = 02 and not action ~ walk and tag = night", 1000)
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(150))
-def test_sql_selects_what_the_conditions_say(queried: QueriedLab, text: str) -> None:
+def test_sql_selects_what_the_conditions_say(queried: QueriedLab, text: str, few: int) -> None:
     query = parse(text)
     expected = {clip.id for clip in queried.clips if selects(queried, query, clip)}
     filters = ItemFilters(query=text)
-    found = queried.read(items.list_items, "lab", Kind.CLIP, filters, limit=100, count=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(narrowing, "MOST_ITEMS", few)
+        found = queried.read(items.list_items, "lab", Kind.CLIP, filters, limit=100, count=True)
     assert {clip.id for clip in found.items} == expected
     assert found.count == len(expected)
     explained = queried.read(items.explain_query, "lab", Kind.CLIP, ItemFilters(), text)
@@ -237,3 +247,55 @@ def test_skeletons_of_other_projects_have_no_names_here(queried: QueriedLab, dat
             yield len(queried.read(items.list_items, "lab", Kind.CLIP, ItemFilters(query=text)).items)
 
     assert list(pages()) == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("field", "sort", "few"),
+    [*zip(INDEXED_FACTS, cycle(["-created_at", "name", "-frames"]), repeat(1000)), ("subject", "-created_at", 0)],
+)
+def test_clips_with_a_value_are_found_through_an_index(
+    queried: QueriedLab, monkeypatch: pytest.MonkeyPatch, field: str, sort: str, few: int
+) -> None:
+    if not queried.database.is_sqlite:
+        return  # Postgres reads so few rows without an index
+    monkeypatch.setattr(narrowing, "MOST_ITEMS", few)
+    value = {"subject": "02", "action": "walk", "take": "7b", "licence": '"CC-BY 4.0"'}.get(field, "2025-03-01")
+    statements: list[tuple[str, Any]] = []
+
+    def watch(_: Any, __: Any, statement: str, parameters: Any, *___: Any) -> None:
+        if "FROM item" in statement:
+            statements.append((statement, parameters))
+
+    def list_clips(tx: Transaction) -> list[str]:
+        event.listen(tx.connection, "before_cursor_execute", watch)
+        items.list_items(tx, "lab", Kind.CLIP, ItemFilters(query=f"{field} = {value} and frames > 2"), sort=sort)
+        event.remove(tx.connection, "before_cursor_execute", watch)
+        explained = [tx.connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {one}", given) for one, given in statements]
+        return [" ".join(row.detail for row in rows) for rows in explained]
+
+    plans = queried.read(list_clips)
+    assert len(plans) >= 2, "one statement counts the clips with the value, and one lists the page"
+    for plan in plans[:2]:
+        assert f"ix_item_by_{field}" in plan
+        assert "(project_id=? AND kind=?)" not in plan, "all clips would be read"
+
+
+def test_a_page_of_a_tag_shows_no_items_of_other_projects_and_kinds(queried: QueriedLab, database: Database) -> None:
+    other = Lab(database, "elsewhere")
+    other.add_clip(other.add_skeleton("rig"), "foreign", tags=("night",))
+    rig = ItemCreate(name="tagged", tags=("night",), parts={"hierarchy": skeleton_tree()})
+    queried.write(items.create_item, "lab", Kind.SKELETON, rig)
+    found = queried.read(items.list_items, "lab", Kind.CLIP, ItemFilters(query="tag = night"), limit=100, count=True)
+    assert {clip.id for clip in found.items} == {clip.id for clip in queried.clips if "night" in clip.tags}
+    assert found.count == len(found.items)
+
+
+def test_a_query_finds_a_deleted_clip_only_among_deleted_ones(queried: QueriedLab) -> None:
+    gone = next(clip for clip in queried.clips if clip.summary.get("take") == "7b")
+    queried.write(items.delete_item, "lab", Kind.CLIP, gone.id, expected_rev=gone.rev)
+
+    def finds(deleted: bool) -> bool:
+        filters = ItemFilters(query='take = "7b"', deleted=deleted)
+        return gone.id in {clip.id for clip in queried.read(items.list_items, "lab", Kind.CLIP, filters).items}
+
+    assert (finds(deleted=False), finds(deleted=True)) == (False, True)

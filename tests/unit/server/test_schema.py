@@ -20,6 +20,7 @@ from marey_server.store.tables import metadata
 from marey_server.store.transaction import Transaction
 
 
+@pytest.mark.filterwarnings("ignore:.*expression-based index")
 def test_migrations_make_exactly_the_tables_of_the_code(database: Database) -> None:
     over_expressions = {
         index.name

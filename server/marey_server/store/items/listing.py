@@ -14,6 +14,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.queries.grammar import Query, QueryError, parse, parts_of
 from marey_server.errors import BadRequestProblem, ForbiddenProblem
 from marey_server.store import collections, listing, projects
+from marey_server.store.items import narrowing
 from marey_server.store.items.querying import sql_of
 from marey_server.store.items.reading import item_rows, shown_items
 from marey_server.store.tables import collection, item, item_tag
@@ -84,7 +85,7 @@ def list_items(
     project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if filters.deleted else Role.READER)
     order = listing.parse_order(sort, SORT_KEYS)
     identity = [project_row.id, kind.value, asdict(filters)]
-    conditions = conditions_of(project_row.id, filters, kind)
+    conditions = _fast_conditions(tx, project_row.id, filters, kind)
     total = None
     if count:
         total = tx.execute(select(func.count()).select_from(item).where(*conditions)).scalar_one()
@@ -103,15 +104,32 @@ def _shown(tx: Transaction, rows: Any, fields: Collection[str] | None) -> list[A
     return [found.model_dump(mode="json", include=set(fields)) for found in shown]
 
 
+def _fast_conditions(tx: Transaction, project_id: str, filters: ItemFilters, kind: Kind) -> list[ColumnElement[bool]]:
+    """Return `conditions_of` the filters, in a form in which the database finds the items of the query quickly."""
+    if filters.query is None or filters.deleted:
+        return conditions_of(project_id, filters, kind)
+    query = read_query(filters.query)
+    few, ordered = narrowing.narrow(tx, project_id, kind, query)
+    if few is None:
+        return [*conditions_of(project_id, filters, kind), *([] if ordered is None else [ordered])]
+    # The indexes of the orders begin with project and kind. SQLite prefers them, unless these are not plain columns.
+    place = [item.c.project_id.concat("") == project_id, item.c.kind.concat("") == kind.value]
+    return [few, *place, *_filter_conditions(project_id, filters)]
+
+
 def conditions_of(project_id: str, filters: ItemFilters, *kinds: Kind) -> list[ColumnElement[bool]]:
     """Return the SQL conditions that the items of the given kinds meet if they match `filters`.
 
     Raises `BadRequestProblem` if the query of the filters is malformed.
     """
-    conditions = [
-        item.c.project_id == project_id,
-        item.c.kind.in_([kind.value for kind in kinds]) if len(kinds) > 1 else item.c.kind == kinds[0].value,
-    ]
+    names = [kind.value for kind in kinds]
+    of_kinds = item.c.kind.in_(names) if len(names) > 1 else item.c.kind == names[0]
+    return [item.c.project_id == project_id, of_kinds, *_filter_conditions(project_id, filters)]
+
+
+def _filter_conditions(project_id: str, filters: ItemFilters) -> list[ColumnElement[bool]]:
+    """Return the conditions of the filters alone."""
+    conditions: list[ColumnElement[bool]] = []
     if filters.deleted:
         conditions += [item.c.deleted_us.is_not(None), item.c.purged_us.is_(None)]
     else:

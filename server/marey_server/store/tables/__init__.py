@@ -12,7 +12,7 @@ from marey_server.store.tables.access import (
     user,
 )
 from marey_server.store.tables.blobs import attempt_blob, blob, blob_chunk, blob_holder, upload, upload_chunk
-from marey_server.store.tables.columns import metadata
+from marey_server.store.tables.columns import INDEXED_CHARACTERS, MemberStart, metadata
 from marey_server.store.tables.datasets import (
     commit_parent,
     dataset,
@@ -26,6 +26,7 @@ from marey_server.store.tables.datasets import (
     tree_chunk,
 )
 from marey_server.store.tables.items import (
+    INDEXED_FACTS,
     collection,
     document,
     document_blob,
@@ -58,8 +59,11 @@ from marey_server.store.tables.serving import (
 )
 
 __all__ = [
+    "INDEXED_CHARACTERS",
+    "INDEXED_FACTS",
     "ONE_RUNS_PER_KEY",
     "UNFINISHED",
+    "MemberStart",
     "attempt",
     "attempt_blob",
     "blob",

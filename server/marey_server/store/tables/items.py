@@ -1,8 +1,30 @@
 """Tables of folders, items, their revisions, and the documents of these."""
 
-from sqlalchemy import BigInteger, Column, ForeignKey, ForeignKeyConstraint, Index, Integer, String, Table, Text, text
+from sqlalchemy import (
+    BigInteger,
+    Column,
+    ForeignKey,
+    ForeignKeyConstraint,
+    Index,
+    Integer,
+    String,
+    Table,
+    Text,
+    and_,
+    text,
+)
 
-from marey_server.store.tables.columns import DIGEST, ID, Document, Micros, Name, Path, metadata, unique_alive
+from marey_server.store.tables.columns import (
+    DIGEST,
+    ID,
+    Document,
+    MemberStart,
+    Micros,
+    Name,
+    Path,
+    metadata,
+    unique_alive,
+)
 
 collection = Table(
     "collection",
@@ -49,6 +71,21 @@ item = Table(
     Index("ix_item_by_update", "project_id", "kind", "updated_us", "id"),
     Index("ix_item_by_frames", "project_id", "kind", "frames", "id"),
 )
+
+INDEXED_FACTS = ("subject", "action", "take", "shoot_day", "licence")
+"""Members of summaries with an index. Queries compare others with `=`, too, but these have few different values."""
+
+
+def _add_index(name: str) -> None:
+    """Add the index over a member of summaries; the items with one value are in the order in which lists show them."""
+    start = MemberStart(item.c.summary, name)
+    stated = and_(start.is_not(None), item.c.deleted_us.is_(None))
+    columns = (item.c.project_id, item.c.kind, start, item.c.created_us, item.c.id)
+    Index(f"ix_item_by_{name}", *columns, sqlite_where=stated, postgresql_where=stated)
+
+
+for _fact in INDEXED_FACTS:
+    _add_index(_fact)
 
 item_tag = Table(
     "item_tag",

@@ -1,0 +1,119 @@
+"""Queries over as many clips as the largest public collection of motion has, and the cost of their indexes."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from sqlalchemy import insert, select
+
+from benchmarks.local_server import PROJECT, LocalServer, local_server
+from benchmarks.seeding import fill
+from benchmarks.timing import Row
+from benchmarks.wire import Connection
+from marey_server.access.principal import SYSTEM
+from marey_server.app import open_database
+from marey_server.process.settings import Settings
+from marey_server.store.ids import new_id
+from marey_server.store.tables import item, revision, revision_part
+from marey_server.store.transaction import Transaction
+
+CLIPS = 142_220
+QUERIES = {
+    "a rare value": "subject = 0412 and frames > 120 and not warning = foot-slide",
+    "a rare and a common value": "action = walk and subject = 0412 and select = best",
+    "values of many clips": "action = walk and frames > 120 and not warning = foot-slide",
+    "a value of most clips": 'licence = CC0 and duration > 2 and not select = "no good"',
+    "common values that few clips share": "action = crawl and licence = CC0 and frames > 622",
+    "no clip": "subject = nobody and frames > 120 and not warning = foot-slide",
+    "no value of an index": "duration > 5 and not select = best and not warning = foot-slide",
+}
+"""Queries of three conditions, by what they select."""
+REQUESTS = 30
+GOAL_MS = 50.0
+ROWS_PER_WRITE = 10_000
+
+
+def run() -> list[Row]:
+    """Measure the first page of each query, by name and by time."""
+    with local_server(_prepare) as server, Connection(server.port, server.token) as connection:
+        orders = {"": "", ", by name": "&sort=name"}
+        return [
+            _row(server, connection, f"query for {what}{shown}", f"{quote(query)}{order}")
+            for what, query in QUERIES.items()
+            for shown, order in orders.items()
+        ]
+
+
+# -- clips ------------------------------------------------------------------------------------------------------------
+
+
+def _prepare(data: Path) -> None:
+    fill(data, 1)
+    database = open_database(Settings(data=data))
+    try:
+        for start in range(0, CLIPS, ROWS_PER_WRITE):
+            database.write(SYSTEM, _copy_clips, range(start, min(CLIPS, start + ROWS_PER_WRITE)))
+    finally:
+        database.close()
+
+
+def _copy_clips(tx: Transaction, numbers: range) -> None:
+    """Insert copies of the first clip whose summaries state other facts."""
+    first = tx.execute(select(item).where(item.c.kind == "clip").order_by(item.c.id).limit(1)).one()._mapping
+    parts = tx.execute(select(revision_part).where(revision_part.c.item_id == first["id"])).all()
+    ids = sorted(new_id("clip") for _ in numbers)
+    rows = [
+        {
+            **first, "id": at, "name": f"copy {number:06d}", "name_folded": f"copy {number:06d}",
+            "created_us": first["created_us"] + number, "summary": _summary(first["summary"], number),
+            "frames": 24 + number * 7 % 600,
+        }
+        for at, number in zip(ids, numbers, strict=True)
+    ]  # fmt: skip
+    tx.execute(insert(item), rows)
+    tx.execute(insert(revision), [{"item_id": at, "number": 1, "created_us": tx.now_us} for at in ids])
+    tx.execute(insert(revision_part), [{**part._mapping, "item_id": at} for at in ids for part in parts])
+
+
+def _summary(of_first: dict[str, Any], number: int) -> dict[str, Any]:
+    """Return the summary of a clip: 712 performers with about 200 takes each, who mostly walk."""
+    mixed = number * 2_654_435_761 % 2**32 >> 8  # a fixed value that looks random
+    frames = 24 + number * 7 % 600
+    return {
+        **of_first, "frames": frames, "duration_s": frames / 60, "warnings": ["foot-slide"] if mixed % 9 == 0 else [],
+        "subject": f"{number // 200:04d}", "take": str(number % 200),
+        "action": ("walk", "walk", "walk", "run", "turn", "jump", "reach", "crawl")[mixed % 8],
+        "select": ("best", "good", "good", "good", "no good")[mixed // 8 % 5], "licence": "CC0",
+        "shoot_day": f"2025-{1 + number // 12_000:02d}-{1 + number // 1000 % 12:02d}", "capture_system": "optical",
+    }  # fmt: skip
+
+
+# -- measurements -----------------------------------------------------------------------------------------------------
+
+
+def _row(server: LocalServer, connection: Connection, what: str, query: str) -> Row:
+    request = connection.head("GET", f"/projects/{PROJECT}/clips?limit=50&query={query}")
+    found = len(json.loads(bytes(connection.exchange(request)))["items"])
+    used_s = server.processor_s()
+    median = statistics.median(_latencies_ms(connection, request))
+    used_ms = (server.processor_s() - used_s) / REQUESTS * 1e3
+    return Row(
+        what,
+        f"{CLIPS:,} clips",
+        f"p50 {median:.1f} ms, processor {used_ms:.1f} ms, {found} on the page",
+        goal=f"p50 < {GOAL_MS:.0f} ms",
+        met=median < GOAL_MS,
+    )
+
+
+def _latencies_ms(connection: Connection, request: bytes) -> Iterator[float]:
+    for _ in range(REQUESTS):
+        begun = time.perf_counter()
+        connection.exchange(request)
+        yield (time.perf_counter() - begun) * 1e3
