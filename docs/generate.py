@@ -16,7 +16,7 @@ import marey_server.app  # noqa: F401 - loads every module, and so every class o
 from marey_client.cli.app import app
 from marey_motion.importing import checks
 from marey_schemas.documents.evaluations import HEADLINE_METRICS
-from marey_schemas.queries.fields import FIELDS, OPERATORS
+from marey_schemas.queries.fields import FACET_PREFIX, FIELDS, OPERATORS, declared_facets
 from marey_schemas.queries.grammar import MOST_CHARACTERS, MOST_COMPARED_VALUES, MOST_CONDITIONS
 from marey_schemas.queue.job_kinds import job_kinds
 from marey_server import errors
@@ -101,7 +101,16 @@ query.
 * A query has at most {MOST_CHARACTERS:,} characters, {MOST_CONDITIONS} conditions and {MOST_COMPARED_VALUES} values.
 
 """
-    return NOTE + text + _table(("field", "type", "operators", "meaning"), rows).rstrip() + "\n"
+    text += _table(("field", "type", "operators", "meaning"), rows)
+    text += f"""## Facets
+
+Jobs publish numbers about their inputs, which are called facets; [job kinds](job-kinds.md) declare them. A query
+compares them as numbers: `{FACET_PREFIX}used_frames > 0.5`. A facet belongs to the revision from which it was computed:
+if a clip has a newer revision, every condition on the facet is false, until a job measures the clip again.
+
+"""
+    facets = [(f"`{FACET_PREFIX}{name}`", meaning) for name, meaning in declared_facets().items()]
+    return NOTE + text + _table(("facet", "meaning"), facets).rstrip() + "\n"
 
 
 def settings_page() -> str:
@@ -127,6 +136,11 @@ def job_kinds_page() -> str:
         text += _table(("input", "takes", "meaning"), inputs) if inputs else ""
         schema = kind.params.model_json_schema()
         text += _table(("parameter", "type", "meaning"), list(_properties(schema, schema.get("$defs", {}))))
+        if kind.facets:
+            facets = [(f"`{FACET_PREFIX}{name}`", meaning) for name, meaning in kind.facets.items()]
+            text += "Facets of its inputs, which [queries](queries.md) compare:\n\n" + _table(
+                ("facet", "meaning"), facets
+            )
         if kind.name == "evaluate":
             metrics = [(f"`{name}`", metric.meaning) for name, metric in HEADLINE_METRICS.items()]
             text += "Metrics of the result, as `marey dataset bisect --metric` names them:\n\n"

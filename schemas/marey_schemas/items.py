@@ -123,6 +123,9 @@ class Item(Answer):
         description="Values that lists show and filter by; for clips: frames, frame_rate_hz, duration_s, "
         "skeleton, warnings.",
     )
+    facets: dict[str, float] = Field(
+        default_factory=dict, description="Numbers that jobs published about the newest revision, by name."
+    )
     created_at: datetime
     updated_at: datetime
     deleted_at: datetime | None = None

@@ -87,6 +87,16 @@ SURVEY = KindDeclaration(
     task_count=lambda params: params.number,
     gathering="tests:gather",
 )
+MEASURE = KindDeclaration(
+    name="measure",
+    description="Measures its inputs, and publishes the numbers as facets.",
+    params=Params,
+    implementation="tests:measure",
+    version=1,
+    inputs={"things": InputSpec(kind=Kind.STUDY, many=True)},
+    outputs={"measurement": Kind.STUDY},
+    facets={"usage": "Use of the thing.", "used_frames": "Frames of the thing that are used."},
+)
 RIG = KindDeclaration(
     name="rig",
     description="Makes a skeleton with several parts.",
@@ -103,7 +113,7 @@ LABEL = KindDeclaration(
     version=1,
     outputs={"labels": Kind.ANNOTATION},
 )
-KINDS = {kind.name: kind for kind in (*job_kinds.BUILT_IN, ERRAND, SUM, SQUARE, SURVEY, RIG, LABEL)}
+KINDS = {kind.name: kind for kind in (*job_kinds.BUILT_IN, ERRAND, SUM, SQUARE, SURVEY, MEASURE, RIG, LABEL)}
 
 
 @dataclass

@@ -46,6 +46,13 @@ HEADLINE_METRICS: Mapping[str, HeadlineMetric] = MappingProxyType(
     }
 )
 """Numbers of the headline of an evaluation, by name; names end in their unit."""
+USAGE_FACETS: Mapping[str, str] = MappingProxyType(
+    {
+        "usage": "Share of the time steps of the newest evaluation that show the clip or its mirrored copy, 0 to 1.",
+        "used_frames": "Share of the clip's frames that the trials of the newest evaluation show, 0 to 1.",
+    }
+)
+"""Facets that an evaluation publishes about its clips, by name."""
 
 
 class EvaluationDocument(Request):

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 FieldType = Literal["text", "number", "date"]
+FACET_PREFIX = "facet."
+"""Beginning of the names of facets in queries and lists: `facet.usage > 0.01`."""
 OPERATORS: dict[FieldType, tuple[str, ...]] = {
     "text": ("=", "!=", "~", "in", "has"),
     "number": ("=", "!=", "<", "<=", ">", ">=", "in", "has"),
@@ -45,4 +48,25 @@ FIELDS: dict[str, QueryField] = {
     "capture_system": QueryField("text", "System that recorded the motion."),
     "consent_until": QueryField("date", "Last day of the performer's consent."),
 }
-"""All fields by name."""
+"""All fields by name, except facets."""
+
+
+@cache
+def declared_facets() -> dict[str, str]:
+    """Return the meanings of the facets that the installed job kinds declare, by name."""
+    from marey_schemas.queue.job_kinds import job_kinds  # which takes longer to import than most queries to parse
+
+    return {name: meaning for kind in job_kinds().values() for name, meaning in kind.facets.items()}
+
+
+def find_field(name: str) -> QueryField | None:
+    """Return the field or facet called `name`, or None if there is none."""
+    if not name.startswith(FACET_PREFIX):
+        return FIELDS.get(name)
+    meaning = declared_facets().get(name.removeprefix(FACET_PREFIX))
+    return None if meaning is None else QueryField("number", meaning)
+
+
+def field_names() -> list[str]:
+    """Return the names of all fields and facets."""
+    return [*FIELDS, *(f"{FACET_PREFIX}{name}" for name in declared_facets())]

@@ -13,7 +13,7 @@ from difflib import get_close_matches
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal
 
-from marey_schemas.queries.fields import FIELDS, OPERATORS, QueryField
+from marey_schemas.queries.fields import OPERATORS, QueryField, field_names, find_field
 from marey_schemas.wording import one_of
 
 if TYPE_CHECKING:
@@ -241,10 +241,11 @@ def _column(token: Any) -> int:
 
 def _require_field(token: Any) -> QueryField:
     name = str(token).lower()
-    if name in FIELDS:
-        return FIELDS[name]
-    near = get_close_matches(name, FIELDS, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"the fields are {', '.join(FIELDS)}"
+    if (field := find_field(name)) is not None:
+        return field
+    names = field_names()
+    near = get_close_matches(name, names, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"the fields are {', '.join(names)}"
     raise QueryError(f"there is no field {str(token)!r}; {hint}", _column(token))
 
 

@@ -14,9 +14,11 @@ from typing import Any, Literal
 
 from marey_schemas.base import Request
 from marey_schemas.consents import ConsentOverride
+from marey_schemas.documents.evaluations import USAGE_FACETS
 from marey_schemas.formats import IMPORTED
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.queue import job_params
+from marey_schemas.queue.facets import require_facet_names
 from marey_schemas.queue.jobs import InputSpec, JobKind
 
 ENTRY_POINT_GROUP = "marey.job_kinds"
@@ -53,6 +55,7 @@ class KindDeclaration:
     * `never_cached_without`: inputs without which a job looks up names while it runs.
     * `in_place`: parameter with which results replace their sources, if these are still the newest revisions.
 
+    `facets` contains the meaning of each number that the job publishes about its inputs, by name.
     `named_after` is the input whose items determine the names and relative collections of the results; the parameter
     `suffix` is appended to the names. `unclear_place` is a function of the parameters and a collection; it returns why
     these do not determine the place of the results, or None if they do.
@@ -70,6 +73,7 @@ class KindDeclaration:
     version: int
     outputs: Mapping[str, Kind | Literal["file"]]
     inputs: Mapping[str, InputSpec] = field(default_factory=dict)
+    facets: Mapping[str, str] = field(default_factory=dict)
     fan_out: str | None = None
     batch_size: int = 1
     task_count: Callable[[Any], int] | None = None
@@ -109,6 +113,7 @@ class KindDeclaration:
                     f"job kind {self.name}: input {name!r}: an item of the kind {spec.kind} has no part "
                     f"{sorted(unknown)[0]!r}"
                 )
+        require_facet_names(self.name, self.facets)
         if self.batch_size < 1:
             raise ValueError(f"job kind {self.name}: batch_size must be at least 1, not {self.batch_size}")
         if (self.task_count is None) != (self.gathering is None):
@@ -129,6 +134,7 @@ class KindDeclaration:
             params_schema=_params_schema(self.params),
             inputs=dict(self.inputs),
             outputs=dict(self.outputs),
+            facets=dict(self.facets),
             fan_out=self.fan_out,
             batch_size=self.batch_size,
             gathers=self.gathering is not None,
@@ -212,7 +218,7 @@ EVALUATE = KindDeclaration(
     implementation="marey_worker.kinds.evaluate:run",
     gathering="marey_worker.kinds.evaluate:gather",
     task_count=job_params.count_evaluation_tasks,
-    version=2,
+    version=3,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to evaluate, all of one skeleton."),
         "rig": _RIG,
@@ -223,6 +229,7 @@ EVALUATE = KindDeclaration(
         ),
     },
     outputs={"evaluation": Kind.EVALUATION},
+    facets=USAGE_FACETS,
 )
 
 COMPARE = KindDeclaration(

@@ -62,6 +62,10 @@ class JobKind(Answer):
     params_schema: dict[str, Any]
     inputs: dict[str, InputSpec]
     outputs: dict[str, Kind | Literal["file"]]
+    facets: dict[str, str] = Field(
+        default_factory=dict,
+        description="Numbers that the job publishes about its inputs, and their meanings, by name.",
+    )
     fan_out: str | None = Field(None, description="The input whose items are distributed over many tasks.")
     batch_size: int = Field(1, description="Number of items that each task of a fan-out takes.")
     gathers: bool = Field(

@@ -10,6 +10,7 @@ from marey_schemas.base import Answer, Request
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath, ItemName, Tag
+from marey_schemas.queue.facets import MOST_MEASURED, ItemFacets
 from marey_schemas.queue.jobs import ItemInput, JobOutput, JobState, Progress, Resources
 
 FAULT_VARIABLE = "MAREY_FAULT"
@@ -137,6 +138,11 @@ class StagedOutput(Request):
     parts: dict[str, Any] = Field(min_length=1)
     sources: dict[str, tuple[ItemInput, ...]] = Field(
         default_factory=dict, description="Inputs that this result was made from, by input name."
+    )
+    facets: tuple[ItemFacets, ...] = Field(
+        (),
+        max_length=MOST_MEASURED,
+        description="Numbers about inputs of the job that this result states; they are published together with it.",
     )
     reuse: Literal["by_name", "by_content"] = Field(
         "by_name",

@@ -43,6 +43,7 @@ from marey_server.store.tables import (
     document_blob,
     document_item,
     item,
+    item_facet,
     item_tag,
     job,
     job_item,
@@ -225,7 +226,7 @@ def _check_purged(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     """Return a fault if anything is left of the content, the name or the tags of a purged item."""
     left = [
         table.name
-        for table in (revision_part, item_tag)
+        for table in (revision_part, item_tag, item_facet)
         if tx.execute(select(table).where(table.c.item_id == row.id).limit(1)).first() is not None
     ]
     left += [name for name in ("name", "summary", "stored_bytes") if row._mapping[name]]

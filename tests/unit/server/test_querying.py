@@ -16,12 +16,13 @@ from tests.support.tiers import examples
 
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
-from marey_schemas.queries.fields import FIELDS, OPERATORS
+from marey_schemas.queries.fields import FIELDS, OPERATORS, field_names, find_field
 from marey_schemas.queries.grammar import Condition, Negation, Query, parse
 from marey_server.errors import BadRequestProblem
-from marey_server.store import items
+from marey_server.store import items, projects
 from marey_server.store.database.connections import Database
 from marey_server.store.items import ItemFilters, narrowing
+from marey_server.store.items.facets import publish_facets
 from marey_server.store.tables import INDEXED_FACTS
 from marey_server.store.tables import item as item_table
 from marey_server.store.transaction import Transaction
@@ -65,7 +66,20 @@ class QueriedLab(Lab):
                 info={"schema": "marey/clip-info@1", **info} if info else None,
             )
         self.rigs = {rig.id: rig.name for rig in rigs}
+        self.write(self._measure)
         self.clips: list[Item] = self.read(items.list_items, "lab", Kind.CLIP, limit=100).items
+
+    def _measure(self, tx: Transaction) -> None:
+        """Publish facets of every third clip; revise two of these, and publish facets of one of them again."""
+        project = projects.require(tx, "lab")
+        measured = items.list_items(tx, "lab", Kind.CLIP, sort="name", limit=100).items[::3]
+        for number, clip in enumerate(measured):
+            values = {"usage": number / 2} if number % 2 else {"usage": 1.0, "used_frames": 0.025}
+            publish_facets(tx, "job", project.id, [[[clip.id, 1, values]]])
+        for clip in measured[:2]:
+            info = {"schema": "marey/clip-info@1", "comment": "changed"}
+            items.put_part(tx, "lab", Kind.CLIP, clip.id, "info", info, expected_rev=None)
+        publish_facets(tx, "job", project.id, [[[measured[1].id, 2, {"usage": 4.5}]]])
 
 
 @pytest.fixture
@@ -91,6 +105,8 @@ def values_of(lab: QueriedLab, clip: Item, field: str) -> list[Any]:
         "warning": summary["warnings"],
         "folder": [clip.collection] if clip.collection else [],
     }
+    if field.startswith("facet."):
+        return [value for name, value in clip.facets.items() if field == f"facet.{name}"]
     return known[field] if field in known else [summary[field]] if field in summary else []
 
 
@@ -141,8 +157,9 @@ def quoted(text: str) -> str:
 
 @st.composite
 def conditions(draw: st.DrawFn) -> str:
-    name = draw(st.sampled_from(sorted(FIELDS)))
-    field = FIELDS[name]
+    name = draw(st.sampled_from(field_names()))
+    field = find_field(name)
+    assert field is not None
     operator = draw(st.sampled_from(OPERATORS[field.type]))
     pool = {"text": tuple(map(quoted, TEXTS)), "number": NUMBERS, "date": DATES}[field.type]
     value = st.sampled_from(pool)
@@ -168,6 +185,8 @@ queries = st.recursive(
 @example('warning = "foot" and not warning = "foot-slide"', 1000)
 @example("created >= 2999-01-01 or not updated < 2999-01-01", 1000)
 @example(f'(action = "{LONG} back" and has licence) and subject = 02', 3)
+@example("facet.usage > 0.5 and not facet.used_frames in (1, 0.025)", 3)
+@example("facet.usage != 1 and has facet.usage", 0)
 @example("subject = 02 and not action ~ walk and tag = night", 1000)
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(150))
 def test_sql_selects_what_the_conditions_say(queried: QueriedLab, text: str, few: int) -> None:

@@ -100,6 +100,19 @@ def test_the_headline_counts_the_clips_and_those_that_no_trial_plays() -> None:
     assert list(headline) == list(HEADLINE_METRICS)
 
 
+def test_the_use_of_each_clip_is_published_as_its_facets(project: ProjectInMemory) -> None:
+    evaluate.gather(project, PARAMS, [evaluate.run(project, PARAMS)])
+    (output,) = project.staged
+    usage = output.parts["evaluation"]["usage"]
+    facets = {one.item: one.values for one in output.facets}
+    assert facets.keys() == {pin.item for pin in project.inputs["clips"]}
+    assert {one.revision for one in output.facets} == {1}
+    assert sum(values["usage"] for values in facets.values()) == pytest.approx(sum(usage["share"]))
+    assert all(0 <= values["used_frames"] <= 1 for values in facets.values())
+    assert any(values["used_frames"] > 0 for values in facets.values())
+    assert all((values["usage"] > 0) == (values["used_frames"] > 0) for values in facets.values())
+
+
 @pytest.mark.slow
 def test_the_report_names_its_files_and_figures_of_the_trials_that_were_asked_for(project: ProjectInMemory) -> None:
     wanted = PARAMS.model_copy(update={"report": True, "trial_figures": ("switching v=1 w=50",)})

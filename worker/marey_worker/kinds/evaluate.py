@@ -20,10 +20,11 @@ from marey_schemas.documents.reports import EvaluationReport
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.kinds import Kind
 from marey_schemas.options.evaluation import EvaluationOptions
+from marey_schemas.queue.facets import ItemFacets
 from marey_schemas.queue.job_params import EvaluateParams
-from marey_schemas.queue.worker_protocol import StagedOutput
+from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
-from marey_worker.job_io.matching_clips import read_clips, refusing_motion_errors, wanted_clips
+from marey_worker.job_io.matching_clips import read_clips, refusing_motion_errors, uid_of, wanted_clips
 from marey_worker.job_io.stored_reports import store_report
 
 GATHERING_STEPS = 4
@@ -80,9 +81,8 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     if params.report:
         context.progress(3, GATHERING_STEPS, "writing the report")
         parts["report"] = write_report(context, result, params)
-    context.stage(
-        [StagedOutput(name=params.name, kind=Kind.EVALUATION, item_name=params.name, tags=params.tags, parts=parts)]
-    )
+    output = StagedOutput(name=params.name, kind=Kind.EVALUATION, item_name=params.name, tags=params.tags, parts=parts)
+    context.stage([output.model_copy(update={"facets": facets_of(result, context.inputs["clips"])})])
     simulating_s = round(sum(one["seconds"] for one in results), 4)
     return {"verdict": evaluation["verdict"], **evaluation["headline"], "simulating_s": simulating_s}
 
@@ -122,6 +122,20 @@ def headline_of(result: EvaluationResult) -> Headline:
         if metric.of_trials is not None:
             found[name] = result.suite[metric.of_trials]
     return {name: found[name] for name in HEADLINE_METRICS}
+
+
+def facets_of(result: EvaluationResult, pins: Sequence[PinnedInput]) -> tuple[ItemFacets, ...]:
+    """Return the use of each evaluated clip as its facets; a mirrored copy counts as the clip itself."""
+    used = {source.uid: source for source in sum_by_source(result.clips, result.usage)}
+    return tuple(
+        ItemFacets(
+            item=pin.item,
+            revision=pin.revision,
+            values={"usage": source.share, "used_frames": float((source.popularity > 0).mean())},
+        )
+        for pin in pins
+        if (source := used.get(uid_of(pin))) is not None and len(source.popularity) > 0
+    )
 
 
 def write_report(context: Context, result: EvaluationResult, params: EvaluateParams) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from marey_client.cli.revisions import require_revision
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, QueryText, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
+from marey_schemas.queries.fields import FACET_PREFIX
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -83,7 +84,10 @@ def ls(
     ] = "name",
     columns: Annotated[
         str,
-        typer.Option(help=f"Columns to show beside the name, separated by commas: {', '.join(COLUMNS)}."),
+        typer.Option(
+            help=f"Columns to show beside the name, separated by commas: {', '.join(COLUMNS)}, "
+            f"or {FACET_PREFIX}NAME for a number that a job published."
+        ),
     ] = DEFAULT_COLUMNS,
     deleted: Annotated[bool, typer.Option("--deleted", help="List removed items, in the folder and below.")] = False,
     as_json: AsJson = False,
@@ -115,8 +119,12 @@ def ls(
     ]
     for one in items:
         name = one.path if everywhere else one.name
-        rows.append((name, *(COLUMNS[column](one.item) for column in shown)))
-    return print_table(("name", *shown), rows, right=[column for column in shown if column in FIGURES])
+        rows.append((name, *(_value(one.item, column) for column in shown)))
+    return print_table(
+        ("name", *shown),
+        rows,
+        right=[column for column in shown if column in FIGURES or column.startswith(FACET_PREFIX)],
+    )
 
 
 def _explain(
@@ -141,16 +149,24 @@ def _columns(text: str, *, also: Sequence[str] = ()) -> list[str]:
     """Return the column names in a comma-separated text. Raises `WrongUsage` for an unknown column."""
     names = [name.strip() for name in text.split(",")]
     for name in names:
-        if name not in COLUMNS and name not in also:
-            raise WrongUsage(f"there is no column {name!r}; the columns are {', '.join((*also, *COLUMNS))}")
+        if name not in COLUMNS and name not in also and not name.startswith(FACET_PREFIX):
+            known = ", ".join((*also, *COLUMNS, f"{FACET_PREFIX}NAME"))
+            raise WrongUsage(f"there is no column {name!r}; the columns are {known}")
     return names
+
+
+def _value(item: Item, column: str) -> object:
+    """Return the value of a column for an item; None for a facet that the item does not have."""
+    if column.startswith(FACET_PREFIX):
+        return item.facets.get(column.removeprefix(FACET_PREFIX))
+    return COLUMNS[column](item)
 
 
 def _sorted(items: Sequence[ItemHandle], column: str, *, reverse: bool) -> list[ItemHandle]:
     """Sort items by a column; items without a value come last in either order."""
     if column == "name":
         return list(reversed(items)) if reverse else list(items)
-    values = {one.id: COLUMNS[column](one.item) for one in items}
+    values = {one.id: _value(one.item, column) for one in items}
     with_value = [one for one in items if values[one.id] not in (None, "")]
     without = [one for one in items if values[one.id] in (None, "")]
     return [*sorted(with_value, key=lambda one: values[one.id], reverse=reverse), *without]  # type: ignore[arg-type, return-value]
@@ -251,13 +267,14 @@ def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
     """Yield names and values that describe an item; for a clip also its skeleton, source and warnings."""
     from marey_client.handles.clips import ClipHandle
 
-    yield from item.item.model_dump(mode="json", exclude={"parts", "summary", "rev", "tags"}).items()
+    yield from item.item.model_dump(mode="json", exclude={"parts", "summary", "facets", "rev", "tags"}).items()
     yield "tags", " ".join(item.item.tags)
     for name, value in item.item.summary.items():
         if isinstance(item, ClipHandle) and name == "skeleton":
             yield name, f"{marey.project(item.project).skeletons.get(value).path} ({value})"
         elif name != "warnings":
             yield name, value
+    yield from ((f"{FACET_PREFIX}{name}", value) for name, value in item.item.facets.items())
     for edge in item.staleness().because:
         yield "stale", f"{edge.kind} {edge.name} has newer revisions than {edge.revision}"
     for name, one in item.item.parts.items():

@@ -100,7 +100,7 @@ def _shown(tx: Transaction, rows: Any, fields: Collection[str] | None) -> list[A
         raise BadRequestProblem(
             f"An item has no field {unknown[0]!r}; remove it from the parameter `fields`.", code="bad-fields"
         )
-    shown = shown_items(tx, rows, tags="tags" in fields, parts="parts" in fields)
+    shown = shown_items(tx, rows, **{one: one in fields for one in ("tags", "parts", "facets")})
     return [found.model_dump(mode="json", include=set(fields)) for found in shown]
 
 

@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 from sqlalchemy import ColumnElement, Select, func, null, select
 
 from marey_schemas.kinds import Kind
+from marey_schemas.queries.fields import FACET_PREFIX
 from marey_schemas.queries.grammar import Condition, Query, operands_of
-from marey_server.store.tables import INDEXED_CHARACTERS, INDEXED_FACTS, MemberStart, item, item_tag
+from marey_server.store.items.querying import facet_meets
+from marey_server.store.tables import INDEXED_CHARACTERS, INDEXED_FACTS, MemberStart, item, item_facet, item_tag
 from marey_server.store.transaction import Transaction
 
 MOST_ITEMS = 1000
@@ -49,20 +51,27 @@ def narrow(tx: Transaction, project_id: str, kind: Kind, query: Query) -> Narrow
     fewest, few = MOST_ITEMS + 1, None
     oldest_us, ordered = None, None
     for condition in _indexed(query):
-        found = CANDIDATES[condition.field](condition, project_id, kind)
+        candidates = _with_facet if condition.field.startswith(FACET_PREFIX) else CANDIDATES[condition.field]
+        found = candidates(condition, project_id, kind)
         newest = found.limit(MOST_ITEMS + 1).subquery()
-        number, since_us = tx.execute(select(func.count(), func.min(newest.c.created_us)).select_from(newest)).one()
-        if number < fewest:
-            fewest, few = number, item.c.id.in_(found.order_by(None).with_only_columns(found.selected_columns[0]))
-        elif since_us is not None and (oldest_us is None or since_us < oldest_us):
-            oldest_us, ordered = since_us, _start(condition)
+        counting = select(func.count().label("number"), func.min(newest.c.created_us).label("since_us"))
+        counted = tx.execute(counting.select_from(newest)).one()
+        if counted.number < fewest:
+            fewest, few = (
+                counted.number,
+                item.c.id.in_(found.order_by(None).with_only_columns(found.selected_columns[0])),
+            )
+        elif counted.since_us is not None and (oldest_us is None or counted.since_us < oldest_us):
+            oldest_us, ordered = counted.since_us, _start(condition)
     return Narrowing(few) if few is not None else Narrowing(ordered=ordered)
 
 
 def _indexed(query: Query) -> Iterator[Condition]:
     """Yield the conditions that must be true for the query to be true, and whose items an index finds."""
     for part in operands_of(query):
-        if isinstance(part, Condition) and part.operator == "=" and part.field in CANDIDATES:
+        if isinstance(part, Condition) and (
+            (part.operator == "=" and part.field in CANDIDATES) or part.field.startswith(FACET_PREFIX)
+        ):
             yield part
 
 
@@ -81,6 +90,10 @@ def _with_fact(condition: Condition, project_id: str, kind: Kind) -> Select[Any]
 def _with_tag(condition: Condition, _: str, __: Kind) -> Select[Any]:
     wanted = item_tag.c.tag.in_([str(one) for one in condition.values])
     return select(item_tag.c.item_id, null().label("created_us")).where(wanted)
+
+
+def _with_facet(condition: Condition, _: str, __: Kind) -> Select[Any]:
+    return select(item_facet.c.item_id, null().label("created_us")).where(facet_meets(condition))
 
 
 CANDIDATES: dict[str, Candidates] = {**dict.fromkeys(INDEXED_FACTS, _with_fact), "tag": _with_tag}

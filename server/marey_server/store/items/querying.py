@@ -27,11 +27,11 @@ from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
 from sqlalchemy.sql.functions import FunctionElement
 
-from marey_schemas.queries.fields import FIELDS
+from marey_schemas.queries.fields import FACET_PREFIX, FIELDS
 from marey_schemas.queries.grammar import Condition, Negation, Query
 from marey_server.store import collections
 from marey_server.store.database.clock import DAY_US, micros_of
-from marey_server.store.tables import collection, item, item_tag
+from marey_server.store.tables import collection, item, item_facet, item_tag
 
 Comparison = Callable[[Condition, str], ColumnElement[bool]]
 """Function that returns the SQL of a condition in a project; the SQL is never null."""
@@ -40,7 +40,8 @@ Comparison = Callable[[Condition, str], ColumnElement[bool]]
 def sql_of(query: Query, project_id: str) -> ColumnElement[bool]:
     """Return the SQL condition that is true for the items of a project that a query selects."""
     if isinstance(query, Condition):
-        return COMPARISONS[query.field](query, project_id)
+        compare = _facet if query.field.startswith(FACET_PREFIX) else COMPARISONS[query.field]
+        return compare(query, project_id)
     if isinstance(query, Negation):
         return not_(sql_of(query.query, project_id))
     join = and_ if query.word == "and" else or_
@@ -227,6 +228,17 @@ def _folder(condition: Condition, project_id: str) -> ColumnElement[bool]:
 def _tag(condition: Condition, _: str) -> ColumnElement[bool]:
     own = item_tag.c.item_id == item.c.id
     return exists().where(own, _texts(item_tag.c.tag, condition)).correlate(item)
+
+
+def facet_meets(condition: Condition) -> ColumnElement[bool]:
+    """Return the condition that a row of `item_facet` has the name and a value of a condition on a facet."""
+    named = item_facet.c.name == condition.field.removeprefix(FACET_PREFIX)
+    return and_(named, _numbers(item_facet.c.value, condition))
+
+
+def _facet(condition: Condition, _: str) -> ColumnElement[bool]:
+    own = and_(item_facet.c.item_id == item.c.id, item_facet.c.number == item.c.head)
+    return exists().where(own, facet_meets(condition)).correlate(item)
 
 
 def _warning(condition: Condition, _: str) -> ColumnElement[bool]:

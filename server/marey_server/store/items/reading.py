@@ -6,7 +6,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Row, Select, and_, bindparam, select
+from sqlalchemy import Row, Select, and_, bindparam, select, type_coerce
+from sqlalchemy.types import NullType
 
 from marey_schemas.items import Item, PartPlace, PartSummary
 from marey_schemas.kinds import Kind
@@ -17,7 +18,7 @@ from marey_server.store.database.prepared import Prepared, padded
 from marey_server.store.items.slices import slice_motion
 from marey_server.store.jobs import reach
 from marey_server.store.projects import ProjectRow
-from marey_server.store.tables import collection, document, item, item_tag, revision_part
+from marey_server.store.tables import collection, document, item, item_facet, item_tag, revision_part
 from marey_server.store.transaction import Transaction
 
 
@@ -64,6 +65,12 @@ _DELETED_ITEM = (
 )
 _TAGS = Prepared(
     select(item_tag.c.item_id, item_tag.c.tag).where(item_tag.c.item_id.in_(bindparam("items", expanding=True)))
+)
+_FACETS = Prepared(  # of which drivers return the values as floats, without a conversion
+    select(item_facet.c.item_id, item_facet.c.name, type_coerce(item_facet.c.value, NullType).label("value"))
+    .join(item, and_(item.c.id == item_facet.c.item_id, item.c.head == item_facet.c.number))
+    .where(item_facet.c.item_id.in_(bindparam("items", expanding=True)))
+    .order_by(item_facet.c.item_id, item_facet.c.name)
 )
 _PARTS = Prepared(
     select(
@@ -129,14 +136,18 @@ def was_purged(kind: Kind, item_id: str, purged_us: int) -> GoneProblem:
     )
 
 
-def shown_items(tx: Transaction, rows: Sequence[Row[Any]], *, tags: bool = True, parts: bool = True) -> list[Item]:
-    """Return items as documents; one query reads the tags of all items, and another one their parts."""
+def shown_items(
+    tx: Transaction, rows: Sequence[Row[Any]], *, tags: bool = True, parts: bool = True, facets: bool = True
+) -> list[Item]:
+    """Return items as documents; one query each reads the tags, the parts and the facets of all items."""
     tags_of = read_tags(tx, [row.id for row in rows]) if tags and rows else {}
     parts_of = read_parts(tx, [(row.id, row.head) for row in rows]) if parts and rows else {}
+    facets_of = _read_facets(tx, rows) if facets and rows else {}
     return [
         Item(
             id=row.id, kind=Kind(row.kind), name=row.name, collection=row.path, tags=tags_of.get(row.id, ()),
             revision=row.head, parts=parts_of.get((row.id, row.head), {}), summary=row.summary,
+            facets=facets_of.get(row.id, {}),
             created_at=datetime_of(row.created_us), updated_at=datetime_of(row.updated_us),
             deleted_at=None if row.deleted_us is None else datetime_of(row.deleted_us), rev=row.rev,
         )
@@ -150,6 +161,14 @@ def read_tags(tx: Transaction, item_ids: Collection[str]) -> dict[str, tuple[str
     for row in tx.run(_TAGS, {"items": list(item_ids)}):
         found.setdefault(row.item_id, []).append(row.tag)
     return {item_id: tuple(sorted(tags)) for item_id, tags in found.items()}
+
+
+def _read_facets(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, dict[str, float]]:
+    """Return the facets of the newest revisions of items, sorted by name, by item."""
+    found: dict[str, dict[str, float]] = {}
+    for row in tx.run(_FACETS, {"items": [row.id for row in rows]}):
+        found.setdefault(row.item_id, {})[row.name] = row.value
+    return found
 
 
 def read_parts(

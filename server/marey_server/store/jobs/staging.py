@@ -21,6 +21,7 @@ from marey_server.store.database.prepared import Prepared
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.folder_roles.rights import rights_of_author
 from marey_server.store.items.drafts import Draft, StoredDocument
+from marey_server.store.items.facets import publish_facets, stored_facets, with_revisions
 from marey_server.store.items.publishing import publish
 from marey_server.store.jobs.fencing import hold, require_attempt
 from marey_server.store.jobs.inputs import PinnedInputs
@@ -31,7 +32,8 @@ from marey_server.store.transaction import Transaction, in_lists
 MOST_STAGED = 20_000
 
 StagedDraft = dict[str, Any]
-"""Stored draft: an object with kind, name, collection below `into`, tags, reuse, sources, and digests of the parts."""
+"""Stored draft: an object with kind, name, collection below `into`, tags, reuse, sources, digests of the parts, and
+facets of inputs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +64,8 @@ def stage(tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOu
     the job.
     """
     require_attempt(tx.principal, job_id, fence)
-    pins: PinnedInputs = hold(tx, job_id, fence, job.c.inputs).inputs
+    held = hold(tx, job_id, fence, job.c.inputs, job.c.kind)
+    pins: PinnedInputs = held.inputs
     names = [one.output.name for one in outputs]
     if len(set(names)) != len(names):
         twice = Counter(names).most_common(1)[0][0]
@@ -87,7 +90,7 @@ def stage(tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOu
                 "fence": fence,
                 "name": one.output.name,
                 "position": places[one.output.name],
-                "draft": _staged_draft(one, pins),
+                "draft": _staged_draft(one, held.kind, pins),
             }
         )
     if position >= MOST_STAGED:
@@ -98,8 +101,9 @@ def stage(tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOu
     return position + 1
 
 
-def _staged_draft(prepared: PreparedOutput, pins: PinnedInputs) -> StagedDraft:
+def _staged_draft(prepared: PreparedOutput, kind: str, pins: PinnedInputs) -> StagedDraft:
     output = prepared.output
+    inputs = ((pin["item"], pin["revision"]) for many in pins.values() for pin in many)
     return {
         "kind": output.kind.value,
         "item_name": output.item_name,
@@ -107,6 +111,7 @@ def _staged_draft(prepared: PreparedOutput, pins: PinnedInputs) -> StagedDraft:
         "tags": list(output.tags),
         "reuse": output.reuse,
         "sources": _pinned_sources(output, pins),
+        "facets": stored_facets(output.facets, kind, inputs),
         "parts": {part: content.digest for part, content in prepared.parts.items()},
     }
 
@@ -182,22 +187,24 @@ def _of_attempts(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
 def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: PinnedInputs) -> dict[str, StagedDraft]:
     """Return drafts that an identical job has staged, rewritten as drafts of this job.
 
-    The two jobs may have read different revisions with the same content. In the sources of each draft, the revision
-    that the other job read (from `theirs`) is replaced by the one at the same position in the inputs of this job
-    (`ours`).
+    The two jobs may have read different revisions with the same content. In the sources and facets of each draft, the
+    revision that the other job read (from `theirs`) is replaced by the one at the same position in the inputs of this
+    job (`ours`).
     """
     revisions = {
         (role, their["item"], their["revision"]): our["revision"]
         for role, many in theirs.items()
         for their, our in zip(many, ours[role], strict=True)
     }
+    of_items = {(item, theirs): ours for (_, item, theirs), ours in revisions.items()}
     return {
         name: draft
         | {
+            "facets": with_revisions(draft.get("facets", []), of_items),
             "sources": {
                 role: [[item, revisions[role, item, revision]] for item, revision in pairs]
                 for role, pairs in draft["sources"].items()
-            }
+            },
         }
         for name, draft in drafts.items()
     }
@@ -220,6 +227,7 @@ def publish_drafts(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft])
         rights=rights_of_author(tx, project, row.author_id),
         job_id=row.id,
     )
+    publish_facets(tx, row.id, row.project_id, (draft.get("facets", []) for draft in drafts.values()))
     return [
         {
             "name": one.name,

@@ -24,6 +24,7 @@ from marey_server.store.tables import (
     document_blob,
     folder_role,
     item,
+    item_facet,
     item_tag,
     job,
     job_blob,
@@ -41,6 +42,7 @@ def erase(tx: Transaction, project_row: ProjectRow, rows: Sequence[Row[Any]], jo
     events.forget_clips(tx, project_row.id, frozenset(ids))
     tx.execute(delete(revision_part).where(revision_part.c.item_id.in_(ids)))
     tx.execute(delete(item_tag).where(item_tag.c.item_id.in_(ids)))
+    tx.execute(delete(item_facet).where(item_facet.c.item_id.in_(ids)))
     bare = {"author_id": None, "message": "", "content": None}
     tx.execute(update(revision).where(revision.c.item_id.in_(ids)).values(**bare))
     empty = {

@@ -3,6 +3,7 @@
 from sqlalchemy import (
     BigInteger,
     Column,
+    Double,
     ForeignKey,
     ForeignKeyConstraint,
     Index,
@@ -115,6 +116,19 @@ revision_part = Table(
     Column("document_digest", DIGEST, ForeignKey("document.digest"), nullable=False, index=True),
     Column("content", DIGEST),  # as that of the revision; null if the document's own digest is the same everywhere
     ForeignKeyConstraint(["item_id", "number"], ["revision.item_id", "revision.number"]),
+)
+
+item_facet = Table(  # numbers that jobs published about revisions of their inputs
+    "item_facet",
+    metadata,
+    Column("item_id", ID, primary_key=True),
+    Column("number", Integer, primary_key=True),
+    Column("name", String(64), primary_key=True),
+    Column("value", Double, nullable=False),
+    Column("job_id", ID, nullable=False),  # the newest job that published it
+    Column("published_us", Micros, nullable=False),
+    ForeignKeyConstraint(["item_id", "number"], ["revision.item_id", "revision.number"]),
+    Index("ix_item_facet_name_value", "name", "value", "item_id"),
 )
 
 document = Table(
