@@ -55,7 +55,8 @@ class KindDeclaration:
     * `never_cached_without`: inputs without which a job looks up names while it runs.
     * `in_place`: parameter with which results replace their sources, if these are still the newest revisions.
 
-    `facets` contains the meaning of each number that the job publishes about its inputs, by name.
+    `facets` has the meaning of each number that the job publishes about its inputs, by name.
+
     `named_after` is the input whose items determine the names and relative collections of the results; the parameter
     `suffix` is appended to the names. `unclear_place` is a function of the parameters and a collection; it returns why
     these do not determine the place of the results, or None if they do.
@@ -408,21 +409,8 @@ TREE = KindDeclaration(
 )
 
 BUILT_IN = (
-    IMPORT,
-    RETARGET,
-    EXPORT,
-    EVALUATE,
-    COMPARE,
-    SUGGEST,
-    OPTIMISE,
-    SWEEP,
-    EDIT,
-    ANNOTATE,
-    CUT,
-    ALIGN,
-    MODEL,
-    TREE,
-)
+    IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN, MODEL, TREE,
+)  # fmt: skip
 
 
 class UnknownKindError(LookupError):

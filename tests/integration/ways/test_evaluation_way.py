@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -36,6 +37,13 @@ def test_from_a_folder_of_clips_to_a_verdict_and_a_report(lab: ProjectHandle, ru
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page.startswith("<!DOCTYPE html>")
     assert "walk 1.5 60" in page
+
+    used = list(lab.clips.list(query="facet.usage > 0 and folder = walks", sort="name"))
+    assert sum(one.item.facets["usage"] for one in used) == pytest.approx(1)
+    listed = run("ls", "lab/walks", "--query", "facet.usage > 0", "--columns", "facet.usage", "--sort=-facet.usage")
+    shown = [float(line.split()[-1]) for line in listed.stdout.splitlines() if "walks/walk" in line]
+    assert shown == pytest.approx(sorted((one.item.facets["usage"] for one in used), reverse=True), rel=1e-3)
+    assert re.search(rf"facet\.usage +{used[0].item.facets['usage']}\n", run("show", f"lab/{used[0].path}").stdout)
 
     again = json.loads(run("evaluate", "lab/walks", *grid, "--json").stdout)
     assert again["evaluation"]["revision"] == 1

@@ -58,7 +58,7 @@ def test_the_page_leaves_out_clips_by_rules_and_says_later_why(run: CommandLine,
         (done,) = follow(f"{line} --json")
         return list(json.loads(done.stdout))
 
-    begin, (explore,), *rules, look, change = blocks("sh")
+    begin, (explore,), *rules, look, change, measure = blocks("sh")
     explained, whole_log, log_of_take = (words_of("\n".join(block)) for block in blocks("text"))
     follow(*begin)
     assert words_of(follow(explore)[0].stdout) == explained
@@ -84,3 +84,12 @@ def test_the_page_leaves_out_clips_by_rules_and_says_later_why(run: CommandLine,
     follow(*change)
     assert {one.name for one in lab.clips.list()} == kept | {"take_11"}
     assert lab.datasets.at("walks").at("v5").digest == commits[0]["digest"]
+
+    _, table, explained_use, *_ = follow(*measure)
+    used = {one.name: one.item.facets for one in lab.clips.list()}
+    assert used.keys() < kept | {"take_11"}, "the evaluation shows not all of the clips"
+    assert all(facets["usage"] > 0 for facets in used.values())
+    assert sum(facets["usage"] for facets in used.values()) == pytest.approx(1)
+    assert all(name in table.stdout for name in kept)
+    assert f"{len(used)} of {len(kept) + 1} clips" in explained_use.stderr
+    assert listed("marey dataset log lab/walks")[0]["message"].startswith("Leave out facet.usage = 0")

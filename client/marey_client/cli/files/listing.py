@@ -156,9 +156,10 @@ def _columns(text: str, *, also: Sequence[str] = ()) -> list[str]:
 
 
 def _value(item: Item, column: str) -> object:
-    """Return the value of a column for an item; None for a facet that the item does not have."""
+    """Return the value of a column for an item; of a facet four digits, or None if the item does not have it."""
     if column.startswith(FACET_PREFIX):
-        return item.facets.get(column.removeprefix(FACET_PREFIX))
+        value = item.facets.get(column.removeprefix(FACET_PREFIX))
+        return None if value is None else float(f"{value:.4g}")
     return COLUMNS[column](item)
 
 
