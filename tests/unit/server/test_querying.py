@@ -279,24 +279,39 @@ def test_clips_with_a_value_are_found_through_an_index(
         return  # Postgres reads so few rows without an index
     monkeypatch.setattr(narrowing, "MOST_ITEMS", few)
     value = {"subject": "02", "action": "walk", "take": "7b", "licence": '"CC-BY 4.0"'}.get(field, "2025-03-01")
-    statements: list[tuple[str, Any]] = []
 
-    def watch(_: Any, __: Any, statement: str, parameters: Any, *___: Any) -> None:
-        if "FROM item" in statement:
-            statements.append((statement, parameters))
-
-    def list_clips(tx: Transaction) -> list[str]:
-        event.listen(tx.connection, "before_cursor_execute", watch)
-        items.list_items(tx, "lab", Kind.CLIP, ItemFilters(query=f"{field} = {value} and frames > 2"), sort=sort)
-        event.remove(tx.connection, "before_cursor_execute", watch)
+    def plans(tx: Transaction) -> list[str]:
+        statements = statements_of(tx, f"{field} = {value} and frames > 2", sort)
         explained = [tx.connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {one}", given) for one, given in statements]
         return [" ".join(row.detail for row in rows) for rows in explained]
 
-    plans = queried.read(list_clips)
-    assert len(plans) >= 2, "one statement counts the clips with the value, and one lists the page"
-    for plan in plans[:2]:
+    counting, listing, *_ = queried.read(plans)
+    for plan in (counting, listing):
         assert f"ix_item_by_{field}" in plan
         assert "(project_id=? AND kind=?)" not in plan, "all clips would be read"
+
+
+def test_a_frequent_value_is_looked_up_only_in_the_order_of_its_index(
+    queried: QueriedLab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(narrowing, "MOST_ITEMS", 0)
+    for sort, looked_up in (("-created_at", True), ("created_at", True), ("name", False), ("-updated_at", False)):
+        _, (listing, _), *_ = queried.read(statements_of, "subject = 02", sort)
+        assert ("substr(" in listing) == looked_up
+
+
+def statements_of(tx: Transaction, query: str, sort: str) -> list[tuple[str, Any]]:
+    """Return the statements about items that list the first page of a query, with their parameters."""
+    found: list[tuple[str, Any]] = []
+
+    def watch(_: Any, __: Any, statement: str, parameters: Any, *___: Any) -> None:
+        if "FROM item" in statement:
+            found.append((statement, parameters))
+
+    event.listen(tx.connection, "before_cursor_execute", watch)
+    items.list_items(tx, "lab", Kind.CLIP, ItemFilters(query=query), sort=sort)
+    event.remove(tx.connection, "before_cursor_execute", watch)
+    return found
 
 
 def test_a_page_of_a_tag_shows_no_items_of_other_projects_and_kinds(queried: QueriedLab, database: Database) -> None:

@@ -85,7 +85,7 @@ def list_items(
     project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if filters.deleted else Role.READER)
     order = listing.parse_order(sort, SORT_KEYS)
     identity = [project_row.id, kind.value, asdict(filters)]
-    conditions = _fast_conditions(tx, project_row.id, filters, kind)
+    conditions = _fast_conditions(tx, project_row.id, filters, kind, order)
     total = None
     if count:
         total = tx.execute(select(func.count()).select_from(item).where(*conditions)).scalar_one()
@@ -104,14 +104,17 @@ def _shown(tx: Transaction, rows: Any, fields: Collection[str] | None) -> list[A
     return [found.model_dump(mode="json", include=set(fields)) for found in shown]
 
 
-def _fast_conditions(tx: Transaction, project_id: str, filters: ItemFilters, kind: Kind) -> list[ColumnElement[bool]]:
-    """Return `conditions_of` the filters, in a form in which the database finds the items of the query quickly."""
+def _fast_conditions(
+    tx: Transaction, project_id: str, filters: ItemFilters, kind: Kind, order: listing.Order
+) -> list[ColumnElement[bool]]:
+    """Return `conditions_of` the filters, in a form with which the database finds the items of the query quickly."""
     if filters.query is None or filters.deleted:
         return conditions_of(project_id, filters, kind)
-    query = read_query(filters.query)
-    few, ordered = narrowing.narrow(tx, project_id, kind, query)
+    few, ordered = narrowing.narrow(tx, project_id, kind, read_query(filters.query))
     if few is None:
-        return [*conditions_of(project_id, filters, kind), *([] if ordered is None else [ordered])]
+        # In other orders, Postgres would find and sort all items with the value, although a page has only a few.
+        usable = [] if ordered is None or order.columns[0][0] is not item.c.created_us else [ordered]
+        return [*conditions_of(project_id, filters, kind), *usable]
     # The indexes of the orders begin with project and kind. SQLite prefers them, unless these are not plain columns.
     place = [item.c.project_id.concat("") == project_id, item.c.kind.concat("") == kind.value]
     return [few, *place, *_filter_conditions(project_id, filters)]

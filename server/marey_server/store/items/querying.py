@@ -232,8 +232,12 @@ def _tag(condition: Condition, _: str) -> ColumnElement[bool]:
 
 def facet_meets(condition: Condition) -> ColumnElement[bool]:
     """Return the condition that a row of `item_facet` has the name and a value of a condition on a facet."""
-    named = item_facet.c.name == condition.field.removeprefix(FACET_PREFIX)
-    return and_(named, _numbers(item_facet.c.value, condition))
+    named, value = item_facet.c.name == condition.field.removeprefix(FACET_PREFIX), item_facet.c.value  # never null
+    if condition.operator == "has":
+        return named
+    if condition.operator == "=":
+        return and_(named, value.in_(condition.values))
+    return and_(named, _ordered(value, condition.operator, condition.values[0]))
 
 
 def _facet(condition: Condition, _: str) -> ColumnElement[bool]:
