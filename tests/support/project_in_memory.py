@@ -33,6 +33,7 @@ class ProjectInMemory(Context):
     parts: dict[Any, Any] = field(default_factory=dict)
     blobs: dict[str, bytes] = field(default_factory=dict)
     staged: list[Any] = field(default_factory=list)
+    facets: list[Any] = field(default_factory=list)
     told: list[Any] = field(default_factory=list)
     into: str = ""
 
@@ -66,7 +67,12 @@ class ProjectInMemory(Context):
         return digest
 
     def stage(self, outputs: Sequence[StagedOutput]) -> None:
-        self.staged += StageRequest.model_validate(decode_tree(encode_outputs(outputs), MSGPACK)).outputs
+        self._stage(encode_outputs(outputs))
+
+    def _stage(self, body: bytes) -> None:
+        request = StageRequest.model_validate(decode_tree(body, MSGPACK))
+        self.staged += request.outputs
+        self.facets += request.facets
 
     def log(self, text: str) -> None:
         print(text)

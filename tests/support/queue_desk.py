@@ -1,7 +1,7 @@
 """Project with a queue, and short functions for submitters and workers."""
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -14,6 +14,7 @@ from marey_schemas.access import ProjectCreate, UserCreate
 from marey_schemas.base import Request
 from marey_schemas.kinds import Kind
 from marey_schemas.queue import job_kinds
+from marey_schemas.queue.facets import ItemFacets
 from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.jobs import InputSpec, Job, JobCreate, Progress
 from marey_schemas.queue.worker_protocol import (
@@ -208,10 +209,10 @@ class Desk:
         """Stage a small document under each name; return the number of outputs that the attempt has staged."""
         return self.stage_outputs(lease, *(output(name, **fields) for name in names))
 
-    def stage_outputs(self, lease: Lease, *staged: StagedOutput) -> int:
-        """Stage outputs; return the number of outputs that the attempt has staged."""
+    def stage_outputs(self, lease: Lease, *staged: StagedOutput, facets: Sequence[ItemFacets] = ()) -> int:
+        """Stage outputs and facets; return the number of outputs that the attempt has staged."""
         outputs = [staging.prepare_output(one) for one in staged]
-        return self.database.write(self._attempt_of(lease), staging.stage, lease.job, lease.fence, outputs)
+        return self.database.write(self._attempt_of(lease), staging.stage, lease.job, lease.fence, outputs, facets)
 
     def complete(self, lease: Lease, *, write_id: str | None = None, **fields: Any) -> CompleteAnswer:
         """Complete the attempt, and return the answer."""

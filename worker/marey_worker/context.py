@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.items import Item, PartPlace
 from marey_schemas.kinds import Kind
+from marey_schemas.queue.facets import ItemFacets
 from marey_schemas.queue.jobs import Progress
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput, StageRequest
 from marey_worker.messages import (
@@ -152,7 +153,18 @@ class Context:
         Raises `RequestRefused` if earlier results could not be stored. The method does not wait until results are
         stored. The supervisor waits for the last results of a job while this process runs the next job.
         """
-        body = encode_outputs(outputs)
+        self._stage(encode_outputs(outputs))
+
+    def publish_facets(self, facets: Sequence[ItemFacets]) -> None:
+        """Publish numbers about inputs when the job completes; they replace those of an earlier call.
+
+        Inputs are those of the job, and the clips of evaluations among them. Raises `RequestRefused` like `stage`.
+        """
+        if facets:
+            request = StageRequest(facets=tuple(facets))
+            self._stage(encode_tree(request.model_dump(mode="json"), MSGPACK))
+
+    def _stage(self, body: bytes) -> None:
         while len(self._staging) >= STAGED_AT_ONCE:
             self._value(self._staging.popleft())
         self._staging.append(self._send(lambda request: Stage(request, body)))

@@ -53,6 +53,13 @@ USAGE_FACETS: Mapping[str, str] = MappingProxyType(
     }
 )
 """Facets that an evaluation publishes about its clips, by name."""
+REMOVAL_FACETS: Mapping[str, str] = MappingProxyType(
+    {
+        "removal_harm": "Harm of removing the clip from the evaluated set, in metres, by the newest suggestions; 0 if "
+        "no trial needs the clip, negative if the removal helps."
+    }
+)
+"""Facets that suggestions publish about the clips whose removal they tried, by name."""
 
 
 class EvaluationDocument(Request):

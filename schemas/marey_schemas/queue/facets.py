@@ -17,7 +17,7 @@ from marey_schemas.base import Request
 MOST_FACETS = 16
 """Greatest number of facets that a job kind declares."""
 MOST_MEASURED = 100_000
-"""Greatest number of items about which one result states facets."""
+"""Greatest number of items about which one job publishes facets."""
 
 _NAME_PATTERN = r"^[a-z][a-z0-9_]{0,63}$"
 FacetName = Annotated[str, StringConstraints(pattern=_NAME_PATTERN)]
@@ -25,7 +25,7 @@ FacetValue = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class ItemFacets(Request):
-    """Facets of one input of a job, by name."""
+    """Facets of one item that a job measured, by name."""
 
     item: str = Field(max_length=64)
     revision: int = Field(ge=1, le=(1 << 31) - 1)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from marey_schemas.base import Request
 from marey_schemas.consents import ConsentOverride
-from marey_schemas.documents.evaluations import USAGE_FACETS
+from marey_schemas.documents.evaluations import REMOVAL_FACETS, USAGE_FACETS
 from marey_schemas.formats import IMPORTED
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.queue import job_params
@@ -264,9 +264,10 @@ SUGGEST = KindDeclaration(
     description="Finds the clips of an evaluated set that can be removed, and other clips that would fill its gaps.",
     params=job_params.SuggestParams,
     implementation="marey_worker.kinds.suggest:run",
-    version=1,
+    version=2,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES},
     outputs={"document": "file"},
+    facets=REMOVAL_FACETS,
 )
 
 OPTIMISE = KindDeclaration(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from marey_schemas.base import Answer, Request
 from marey_schemas.documents.references import RevisionRef
@@ -139,11 +139,6 @@ class StagedOutput(Request):
     sources: dict[str, tuple[ItemInput, ...]] = Field(
         default_factory=dict, description="Inputs that this result was made from, by input name."
     )
-    facets: tuple[ItemFacets, ...] = Field(
-        (),
-        max_length=MOST_MEASURED,
-        description="Numbers about inputs of the job that this result states; they are published together with it.",
-    )
     reuse: Literal["by_name", "by_content"] = Field(
         "by_name",
         description="Choice of an existing item for the result. by_name: the item with the same kind, name and "
@@ -153,9 +148,21 @@ class StagedOutput(Request):
 
 
 class StageRequest(Request):
-    """Request to stage results."""
+    """Request to stage results, and numbers about inputs of the job."""
 
-    outputs: tuple[StagedOutput, ...] = Field(min_length=1, max_length=256)
+    outputs: tuple[StagedOutput, ...] = Field((), max_length=256)
+    facets: tuple[ItemFacets, ...] = Field(
+        (),
+        max_length=MOST_MEASURED,
+        description="Numbers about inputs of the job, and about clips of evaluations among the inputs. They replace "
+        "those of an earlier request.",
+    )
+
+    @model_validator(mode="after")
+    def _require_content(self) -> Self:
+        if not self.outputs and not self.facets:
+            raise ValueError("the request contains neither outputs nor facets")
+        return self
 
 
 class CompleteRequest(Request):

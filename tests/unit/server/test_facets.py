@@ -56,7 +56,7 @@ def measure(desk: Desk, things: list[str], *usages: float, number: int = 0) -> s
     """Run a job that publishes the usage of each thing; return its id."""
     job = submit(desk, things, number)
     lease = desk.claim()
-    desk.stage_outputs(lease, output(f"m{number}", facets=tuple(map(measured, things, usages))))
+    desk.stage_outputs(lease, output(f"m{number}"), facets=tuple(map(measured, things, usages)))
     desk.complete(lease)
     return job
 
@@ -66,7 +66,7 @@ def test_a_job_publishes_facets_of_its_inputs_when_it_completes(desk: Desk) -> N
     submit(desk, things)
     lease = desk.claim()
     facets = (measured(things[0], 0.25), measured(things[1], 0.5, used_frames=1.0))
-    desk.stage_outputs(lease, output("m", facets=facets))
+    desk.stage_outputs(lease, output("m"), facets=facets)
     assert selected(desk, "has facet.usage") == []
     desk.complete(lease)
     assert study(desk, things[1]).facets == {"usage": 0.5, "used_frames": 1.0}
@@ -88,13 +88,13 @@ def test_a_facet_belongs_to_the_revision_that_was_measured(desk: Desk) -> None:
     lease = desk.claim()
     desk.publish(Draft("thing0", Kind.STUDY, "thing0", {"study": document(number=10)}, "raw"))
     assert study(desk, thing).revision == 2
-    desk.stage_outputs(lease, output("m", facets=(measured(thing, 0.5),)))
+    desk.stage_outputs(lease, output("m"), facets=(measured(thing, 0.5),))
     desk.complete(lease)
     assert study(desk, thing).facets == {}
     assert selected(desk, "has facet.usage") == []
     submit(desk, [thing], 1)
     lease = desk.claim()
-    desk.stage_outputs(lease, output("m", facets=(measured(thing, 0.75, revision=2),)))
+    desk.stage_outputs(lease, output("m"), facets=(measured(thing, 0.75, revision=2),))
     desk.complete(lease)
     assert study(desk, thing).facets == {"usage": 0.75}
 
@@ -136,10 +136,37 @@ def test_an_attempt_states_only_declared_facets_of_its_inputs(desk: Desk, facets
     submit(desk, [given])
     lease = desk.claim()
     with pytest.raises(InvalidProblem) as refused:
-        desk.stage_outputs(lease, output("m", facets=tuple(facets(given, other))))
+        desk.stage_outputs(lease, output("m"), facets=tuple(facets(given, other)))
     assert refused.value.error_code == code
     desk.complete(lease)
     assert selected(desk, "has facet.usage") == []
+
+
+def test_a_job_with_an_evaluation_states_facets_of_its_clips(desk: Desk) -> None:
+    (own, unnamed, revised), far = desk.things(3), "study_far"
+    desk.publish(Draft("d", Kind.STUDY, "thing2", {"study": document(number=9)}, "raw"))
+    named = [{"item": own, "revision": 1}, {"item": revised, "revision": 2}, {"item": revised, "revision": 3}]
+    odd: list[Any] = [{"item": far, "revision": 1}, {"item": [own]}, None]
+    evaluation = {
+        "schema": "marey/evaluation@1", "verdict": "v", "headline": {}, "clip_set": {"clips": [*named, *odd]},
+    }  # fmt: skip
+    (made,) = desk.publish(Draft("e", Kind.EVALUATION, "e", {"evaluation": evaluation}))
+    job = desk.submit("suggest", inputs={"evaluation": {"item": made.item}}, params={})
+    lease = desk.claim()
+
+    def state(item: str, revision: int) -> None:
+        facets = (ItemFacets(item=item, revision=revision, values={"removal_harm": -0.5}),)
+        desk.stage_outputs(lease, facets=facets)
+
+    for item, revision in ((unnamed, 1), (own, 2), (revised, 1), (revised, 3), (far, 1)):
+        with pytest.raises(InvalidProblem) as refused:
+            state(item, revision)
+        assert refused.value.error_code == "no-facet-input"
+    state(own, 1)
+    state(revised, 2)  # replaces the facets of the earlier request
+    desk.complete(lease)
+    assert (desk.state(job), desk.outputs(job)) == ("succeeded", [])
+    assert selected(desk, "facet.removal_harm < 0") == ["thing2"]
 
 
 def test_an_attempt_that_fails_or_lost_its_lease_publishes_no_facets(desk: Desk) -> None:
@@ -148,7 +175,7 @@ def test_an_attempt_that_fails_or_lost_its_lease_publishes_no_facets(desk: Desk)
 
     def staged() -> Lease:
         lease = desk.claim()
-        desk.stage_outputs(lease, output("m", facets=(measured(thing, 0.5),)))
+        desk.stage_outputs(lease, output("m"), facets=(measured(thing, 0.5),))
         return lease
 
     desk.fail(staged())
@@ -168,7 +195,7 @@ def test_a_purge_deletes_facets_and_no_job_adds_them_afterwards(desk: Desk) -> N
     wanted = PurgeRequest(item=thing)
     write(desk, purging.record_purge, "lab", wanted, read(desk, purging.prepare_purge, "lab", wanted))
     project_id = read(desk, projects.require, "lab").id
-    write(desk, publish_facets, "job_late", project_id, [[[thing, 1, {"usage": 0.9}], [kept, 1, {"usage": 0.7}]]])
+    write(desk, publish_facets, "job_late", project_id, [[thing, 1, {"usage": 0.9}], [kept, 1, {"usage": 0.7}]])
     rows = read(desk, lambda tx: tx.execute(select(item_facet.c.item_id, item_facet.c.value)).all())
     assert [tuple(row) for row in rows] == [(kept, 0.7)]
     assert list(fsck.check_store(desk.database)) == []
@@ -184,7 +211,7 @@ def test_a_query_shows_no_facets_of_another_project(desk: Desk) -> None:
     def add(tx: Any) -> None:
         other = projects.require(tx, "other")
         (made,) = publish(tx, other, [Draft("far", Kind.STUDY, "far", {"study": document(number=1)})], author_id=None)
-        publish_facets(tx, "job_far", other.id, [[[made.item, 1, {"usage": 1.0}], [things[0], 1, {"usage": 1.0}]]])
+        publish_facets(tx, "job_far", other.id, [[made.item, 1, {"usage": 1.0}], [things[0], 1, {"usage": 1.0}]])
 
     desk.database.write(SYSTEM, add)
     assert (selected(desk, "has facet.usage"), selected(desk, "has facet.usage", "other")) == ([], ["far"])

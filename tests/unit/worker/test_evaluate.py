@@ -104,9 +104,9 @@ def test_the_use_of_each_clip_is_published_as_its_facets(project: ProjectInMemor
     evaluate.gather(project, PARAMS, [evaluate.run(project, PARAMS)])
     (output,) = project.staged
     usage = output.parts["evaluation"]["usage"]
-    facets = {one.item: one.values for one in output.facets}
+    facets = {one.item: one.values for one in project.facets}
     assert facets.keys() == {pin.item for pin in project.inputs["clips"]}
-    assert {one.revision for one in output.facets} == {1}
+    assert {one.revision for one in project.facets} == {1}
     assert sum(values["usage"] for values in facets.values()) == pytest.approx(sum(usage["share"]))
     assert all(0 <= values["used_frames"] <= 1 for values in facets.values())
     assert any(values["used_frames"] > 0 for values in facets.values())

@@ -91,6 +91,19 @@ def test_what_can_go_is_named_and_clips_of_other_skeletons_need_to_be_retargeted
     assert result["needing_retarget"] == 1
 
 
+def test_suggestions_publish_the_harm_of_each_removal(project: LoggedProject) -> None:
+    clips = project.inputs["clips"]
+    own = evaluated(project, "first", clips)
+    project.inputs, project.facets = {"evaluation": (own,)}, []
+    document = document_of(project, suggest.run(project, SuggestParams(removals=0)))
+    harms = {one.item: one.values["removal_harm"] for one in project.facets}
+    assert harms[clips[3].item] == 0, "no trial needs this clip"
+    needed = {removal["source"].split("@")[0]: removal["harm"] for removal in document["redundant"]["clips"]}
+    assert needed
+    assert harms == {clips[3].item: 0.0, **needed}
+    assert {one.revision for one in project.facets} == {1}
+
+
 def test_every_step_of_an_optimisation_is_logged_and_kept(project: LoggedProject) -> None:
     clips = project.inputs["clips"]
     own = evaluated(project, "first", clips[1:2])

@@ -184,6 +184,12 @@ def uid_of(pin: PinnedInput) -> str:
     return f"{pin.item}@{pin.revision}"
 
 
+def split_uid(uid: str) -> tuple[str, int]:
+    """Return the item and the revision of a clip from its unique name in a database."""
+    item, _, revision = uid.rpartition("@")
+    return item, int(revision)
+
+
 def read_motions(context: Context, pins: Sequence[PinnedInput]) -> Iterator[tuple[str, MotionDocument]]:
     """Yield the digest of the part `motion` of each clip, and the motion."""
     for done, (pin, tree) in enumerate(context.documents(pins, "motion")):

@@ -81,8 +81,10 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     if params.report:
         context.progress(3, GATHERING_STEPS, "writing the report")
         parts["report"] = write_report(context, result, params)
-    output = StagedOutput(name=params.name, kind=Kind.EVALUATION, item_name=params.name, tags=params.tags, parts=parts)
-    context.stage([output.model_copy(update={"facets": facets_of(result, context.inputs["clips"])})])
+    context.stage(
+        [StagedOutput(name=params.name, kind=Kind.EVALUATION, item_name=params.name, tags=params.tags, parts=parts)]
+    )
+    context.publish_facets(facets_of(result, context.inputs["clips"]))
     simulating_s = round(sum(one["seconds"] for one in results), 4)
     return {"verdict": evaluation["verdict"], **evaluation["headline"], "simulating_s": simulating_s}
 

@@ -6,11 +6,12 @@ from typing import Any
 
 from marey_motion.evaluation.improvement.suggest import Suggestions, suggest
 from marey_motion.evaluation.improvement.suggestion_documents import suggestions_to_tree
+from marey_schemas.queue.facets import ItemFacets
 from marey_schemas.queue.job_params import SuggestParams
 from marey_worker.context import Context
 from marey_worker.job_io.candidates import read_candidates
 from marey_worker.job_io.evaluated_set import read_evaluated_set, store_document
-from marey_worker.job_io.matching_clips import refusing_motion_errors
+from marey_worker.job_io.matching_clips import refusing_motion_errors, split_uid
 
 
 def run(context: Context, params: SuggestParams) -> dict[str, Any]:
@@ -26,8 +27,17 @@ def run(context: Context, params: SuggestParams) -> dict[str, Any]:
             threads=context.threads,
             progress=context.progress,
         )
+    context.publish_facets(facets_of(found))
     document = {**suggestions_to_tree(found), "unusable": [one._asdict() for one in candidates.unusable]}
     return {**_counts(found), "unusable": len(candidates.unusable), "document": store_document(context, document)}
+
+
+def facets_of(found: Suggestions) -> list[ItemFacets]:
+    """Return the harm of the removal of each clip for which it is known, as its facet."""
+    harms = {removal.source: removal.harm for removal in found.redundant}
+    harms |= {clip.source: 0.0 for clip in found.unused.clips}
+    clips = ((*split_uid(source), harm) for source, harm in sorted(harms.items()))
+    return [ItemFacets(item=item, revision=revision, values={"removal_harm": harm}) for item, revision, harm in clips]
 
 
 def _counts(found: Suggestions) -> dict[str, Any]:

@@ -148,7 +148,7 @@ class AttemptOutputs(Resource):
         """
         prepared = await self.compute(partial(_prepare, body))
         return await self.answer_with(
-            lambda staged: Reply(StageAnswer(staged=staged)), staging.stage, job, fence, prepared
+            lambda staged: Reply(StageAnswer(staged=staged)), staging.stage, job, fence, prepared, body.facets
         )
 
 

@@ -1,73 +1,115 @@
-"""Facets that the results of jobs state about inputs: their check when a result is staged, and their publication.
+"""Facets that jobs publish: their check when an attempt states them, and their publication.
 
-They are stored with the draft of the result, so they are published, dropped or shared with identical jobs as the result
-is. An attempt can state facets only of the inputs of its job, and only those that the kind of the job declares.
+They are staged with the results of the attempt, so they are published, dropped or shared with identical jobs as these
+are. An attempt can state facets only of the inputs of its job, and of the clips of evaluations among these inputs, and
+only those that the kind of the job declares.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import select
 
+from marey_schemas.kinds import Kind
 from marey_schemas.queue.facets import ItemFacets
 from marey_schemas.queue.job_kinds import find_kind
 from marey_server.errors import InvalidProblem
-from marey_server.store.tables import item, item_facet
+from marey_server.store.tables import document, item, item_facet, revision, revision_part
 from marey_server.store.transaction import Transaction, in_lists
 
 StoredFacets = list[list[Any]]
-"""Facets in a draft: for each item its id, the number of its revision, and the values by name."""
+"""Staged facets: for each item its id, the number of its revision, and the values by name."""
 
 
-def stored_facets(facets: Sequence[ItemFacets], kind: str, inputs: Iterable[tuple[str, int]]) -> StoredFacets:
-    """Return facets as they are stored in a draft; `inputs` are the ids and revisions of the inputs of the job.
+def stored_facets(tx: Transaction, job_row: Any, facets: Sequence[ItemFacets]) -> StoredFacets:
+    """Return facets as they are staged; `job_row` has the columns `inputs`, `kind` and `project_id` of the job.
 
-    Raises `InvalidProblem` for a revision that is not an input of the job, one that occurs twice, and for a name that
-    the kind of the job does not declare.
+    Raises `InvalidProblem` for a revision that the job does not measure, one that occurs twice, and for a name that the
+    kind of the job does not declare.
     """
-    if not facets:
-        return []
-    declared, given = find_kind(kind).facets, set(inputs)
+    declared, given = find_kind(job_row.kind).facets, _measured(tx, job_row)
     for one in facets:
         if (one.item, one.revision) not in given:
             raise InvalidProblem(
-                f"A result states facets of {one.item} at revision {one.revision}, which is not an input of the job; "
-                "or it states them twice.",
+                f"The job states facets of {one.item} at revision {one.revision}, which is not among its inputs; or it "
+                "states them twice.",
                 code="no-facet-input",
             )
         given.discard((one.item, one.revision))
         if unknown := sorted(one.values.keys() - declared.keys()):
             name = unknown[0]
-            raise InvalidProblem(f"The job kind {kind} does not declare the facet {name!r}.", code="no-facet")
+            raise InvalidProblem(f"The job kind {job_row.kind} does not declare the facet {name!r}.", code="no-facet")
     return [[one.item, one.revision, one.values] for one in facets]
 
 
+def _measured(tx: Transaction, job_row: Any) -> set[tuple[str, int]]:
+    """Return the inputs of a job, and the clips of the evaluations among them, as ids and numbers of revisions."""
+    pins = [pin for many in job_row.inputs.values() for pin in many]
+    found = {(pin["item"], pin["revision"]) for pin in pins}
+    evaluations = sorted({pin["item"] for pin in pins if pin["kind"] == Kind.EVALUATION})
+    bodies = (
+        select(revision_part.c.item_id, revision_part.c.number, document.c.body)
+        .join(document, document.c.digest == revision_part.c.document_digest)
+        .where(revision_part.c.part == "evaluation")
+    )
+    named: set[tuple[str, int]] = set()
+    for page in in_lists(evaluations):
+        some = revision_part.c.item_id.in_(page)
+        for row in tx.execute(bodies.where(some)):
+            if (row.item_id, row.number) in found:
+                named.update(_pairs(row.body.get("clip_set")))
+    return found | _existing(tx, job_row.project_id, named)
+
+
+def _pairs(clip_set: Any) -> Iterator[tuple[str, int]]:
+    """Yield the clips of an evaluation; the schema of evaluations does not describe this member."""
+    clips = clip_set.get("clips") if isinstance(clip_set, Mapping) else None
+    for clip in clips if isinstance(clips, list) else ():
+        named = (clip.get("item"), clip.get("revision")) if isinstance(clip, Mapping) else (None, None)
+        if isinstance(named[0], str) and isinstance(named[1], int):
+            yield named[0], named[1]
+
+
+def _existing(tx: Transaction, project_id: str, named: Collection[tuple[str, int]]) -> set[tuple[str, int]]:
+    """Return those of the named revisions that exist in a project."""
+    items, found = sorted({one for one, _ in named}), set[tuple[str, int]]()
+    for some in in_lists(items):
+        statement = (
+            select(revision.c.item_id, revision.c.number)
+            .join(item, item.c.id == revision.c.item_id)
+            .where(revision.c.item_id.in_(some), item.c.project_id == project_id)
+        )
+        found.update((row.item_id, row.number) for row in tx.execute(statement))
+    return found & set(named)
+
+
 def with_revisions(facets: StoredFacets, revisions: Mapping[tuple[str, int], int]) -> StoredFacets:
-    """Return facets of the inputs of one job as those of an identical job; `revisions` has the revision of each."""
-    return [[item_id, revisions[item_id, number], values] for item_id, number, values in facets]
+    """Return the facets of one job as those of an identical job; `revisions` has the revision of each of its inputs.
+
+    Other items, the clips of evaluations, have the same revisions for both jobs.
+    """
+    return [[item_id, revisions.get((item_id, number), number), values] for item_id, number, values in facets]
 
 
-def publish_facets(tx: Transaction, job_id: str, project_id: str, facets: Iterable[StoredFacets]) -> None:
-    """Record the facets that the results of a job state.
+def publish_facets(tx: Transaction, job_id: str, project_id: str, facets: StoredFacets) -> None:
+    """Record the facets that a job states.
 
     If another job has published a facet of the same revision, its value is replaced. Items that were purged meanwhile
     are left out.
     """
-    values = {(one, number): named for stated in facets for one, number, named in stated}
-    items = sorted({one for one, _ in values})
-    for some in in_lists(items):
-        kept = _lock_items(tx, project_id, some)
+    stated: dict[str, list[tuple[int, dict[str, float]]]] = {}
+    for one, number, values in sorted(facets, key=lambda fact: (fact[0], fact[1])):
+        stated.setdefault(one, []).append((number, values))
+    published = {"job_id": job_id, "published_us": tx.now_us}
+    for some in in_lists(stated):
         rows = [
-            {
-                "item_id": one, "number": number, "name": name, "value": value, "job_id": job_id,
-                "published_us": tx.now_us,
-            }
-            for one, number in sorted(values.keys())
-            if one in kept
-            for name, value in sorted(values[one, number].items())
-        ]  # fmt: skip
+            {"item_id": one, "number": number, "name": name, "value": value, **published}
+            for one in _lock_items(tx, project_id, some)
+            for number, values in stated[one]
+            for name, value in sorted(values.items())
+        ]
         if rows:
             added = tx.insert_into(item_facet)
             newer = {name: added.excluded[name] for name in ("value", "job_id", "published_us")}
@@ -75,7 +117,7 @@ def publish_facets(tx: Transaction, job_id: str, project_id: str, facets: Iterab
             tx.execute(added.on_conflict_do_update(index_elements=key, set_=newer), rows)
 
 
-def _lock_items(tx: Transaction, project_id: str, items: Sequence[str]) -> set[str]:
+def _lock_items(tx: Transaction, project_id: str, items: Sequence[str]) -> Sequence[str]:
     """Return those items of a project that are not purged, and let no purge of them begin before the end of the write.
 
     They are locked in the order of their ids, as by purges, so that no two writes wait for each other.
@@ -86,4 +128,4 @@ def _lock_items(tx: Transaction, project_id: str, items: Sequence[str]) -> set[s
         .order_by(item.c.id)
         .with_for_update(read=True, key_share=True)
     )
-    return set(tx.execute(statement).scalars())
+    return tx.execute(statement).scalars().all()

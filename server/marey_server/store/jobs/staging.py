@@ -12,6 +12,7 @@ from sqlalchemy import and_, bindparam, delete, func, insert, select, tuple_, up
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.names import is_digest
 from marey_schemas.problems import FieldError
+from marey_schemas.queue.facets import ItemFacets
 from marey_schemas.queue.jobs import ItemInput
 from marey_schemas.queue.worker_protocol import StagedOutput
 from marey_server import faults
@@ -21,7 +22,7 @@ from marey_server.store.database.prepared import Prepared
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.folder_roles.rights import rights_of_author
 from marey_server.store.items.drafts import Draft, StoredDocument
-from marey_server.store.items.facets import publish_facets, stored_facets, with_revisions
+from marey_server.store.items.facets import StoredFacets, publish_facets, stored_facets, with_revisions
 from marey_server.store.items.publishing import publish
 from marey_server.store.jobs.fencing import hold, require_attempt
 from marey_server.store.jobs.inputs import PinnedInputs
@@ -32,8 +33,10 @@ from marey_server.store.transaction import Transaction, in_lists
 MOST_STAGED = 20_000
 
 StagedDraft = dict[str, Any]
-"""Stored draft: an object with kind, name, collection below `into`, tags, reuse, sources, digests of the parts, and
-facets of inputs."""
+"""Stored draft: an object with kind, name, collection below `into`, tags, reuse, sources, and digests of the parts."""
+
+_FACETS = ""
+"""Name of the draft that has the facets of an attempt instead of a result, and neither sources nor parts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,15 +60,31 @@ def prepare_output(output: StagedOutput) -> PreparedOutput:
     return PreparedOutput(output, parts)
 
 
-def stage(tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOutput]) -> int:
+def stage(
+    tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOutput], facets: Sequence[ItemFacets] = ()
+) -> int:
     """Store outputs until the attempt completes; they replace staged outputs of the same names. Return their number.
 
-    Raises `LeaseLostProblem` if the attempt does not hold the job, `InvalidProblem` for sources that are not inputs of
-    the job.
+    `facets`, if there are any, replace those that the attempt staged before. Raises `LeaseLostProblem` if the attempt
+    does not hold the job, `InvalidProblem` for sources and facets of items that are not inputs of the job.
     """
     require_attempt(tx.principal, job_id, fence)
-    held = hold(tx, job_id, fence, job.c.inputs, job.c.kind)
-    pins: PinnedInputs = held.inputs
+    held = hold(tx, job_id, fence, job.c.inputs, job.c.kind, job.c.project_id)
+    if facets:
+        _stage_facets(tx, job_id, fence, stored_facets(tx, held, facets))
+    return _stage_outputs(tx, job_id, fence, outputs, held.inputs)
+
+
+def _stage_facets(tx: Transaction, job_id: str, fence: int, facets: StoredFacets) -> None:
+    row = {"job_id": job_id, "fence": fence, "name": _FACETS, "position": -1}
+    of_attempt = (staged_output.c.job_id == job_id, staged_output.c.fence == fence)
+    tx.execute(delete(staged_output).where(*of_attempt, staged_output.c.name == _FACETS))
+    tx.execute(insert(staged_output).values(**row, draft={"sources": {}, "parts": {}, "facets": facets}))
+
+
+def _stage_outputs(
+    tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOutput], pins: PinnedInputs
+) -> int:
     names = [one.output.name for one in outputs]
     if len(set(names)) != len(names):
         twice = Counter(names).most_common(1)[0][0]
@@ -90,20 +109,20 @@ def stage(tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOu
                 "fence": fence,
                 "name": one.output.name,
                 "position": places[one.output.name],
-                "draft": _staged_draft(one, held.kind, pins),
+                "draft": _staged_draft(one, pins),
             }
         )
     if position >= MOST_STAGED:
         raise InvalidProblem(f"An attempt can stage at most {MOST_STAGED} results.", code="too-many")
     documents.store_documents(tx, (content for one in outputs for content in one.parts.values()))
-    tx.execute(insert(staged_output), rows)
+    if rows:
+        tx.execute(insert(staged_output), rows)
     faults.point("stage.before_commit")
     return position + 1
 
 
-def _staged_draft(prepared: PreparedOutput, kind: str, pins: PinnedInputs) -> StagedDraft:
+def _staged_draft(prepared: PreparedOutput, pins: PinnedInputs) -> StagedDraft:
     output = prepared.output
-    inputs = ((pin["item"], pin["revision"]) for many in pins.values() for pin in many)
     return {
         "kind": output.kind.value,
         "item_name": output.item_name,
@@ -111,7 +130,6 @@ def _staged_draft(prepared: PreparedOutput, kind: str, pins: PinnedInputs) -> St
         "tags": list(output.tags),
         "reuse": output.reuse,
         "sources": _pinned_sources(output, pins),
-        "facets": stored_facets(output.facets, kind, inputs),
         "parts": {part: content.digest for part, content in prepared.parts.items()},
     }
 
@@ -211,23 +229,25 @@ def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: P
 
 
 def publish_drafts(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> list[dict[str, Any]]:
-    """Publish the drafts of a job with the present rights of its author; return the published outputs.
+    """Publish the drafts and the facets of a job with the present rights of its author; return the published outputs.
 
     Raises `ForbiddenProblem` if the author may not write to a folder of the results. `row` has the columns `id`,
     `project_id`, `into_path`, `author_id` and `message` of the job.
     """
-    if not drafts:
+    if _FACETS in drafts:
+        publish_facets(tx, row.id, row.project_id, drafts[_FACETS]["facets"])
+    results = {name: draft for name, draft in drafts.items() if name != _FACETS}
+    if not results:
         return []
     project = find_by_id(tx, row.project_id)
     published = publish(
         tx,
         project,
-        [_draft(name, draft, row) for name, draft in drafts.items()],
+        [_draft(name, draft, row) for name, draft in results.items()],
         author_id=row.author_id,
         rights=rights_of_author(tx, project, row.author_id),
         job_id=row.id,
     )
-    publish_facets(tx, row.id, row.project_id, (draft.get("facets", []) for draft in drafts.values()))
     return [
         {
             "name": one.name,
