@@ -7,11 +7,12 @@ from datetime import date, datetime, timedelta
 from itertools import cycle, repeat
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from sqlalchemy import event, update
-from tests.support.store_fixtures import Lab, skeleton_tree
+from tests.support.store_fixtures import Lab, motion_tree, skeleton_tree
 from tests.support.tiers import examples
 
 from marey_schemas.items import Item, ItemCreate
@@ -312,6 +313,17 @@ def statements_of(tx: Transaction, query: str, sort: str) -> list[tuple[str, Any
     items.list_items(tx, "lab", Kind.CLIP, ItemFilters(query=query), sort=sort)
     event.remove(tx.connection, "before_cursor_execute", watch)
     return found
+
+
+def test_a_clip_may_state_a_fact_that_is_too_long_for_an_index(queried: QueriedLab) -> None:
+    digits = "".join(map(str, np.random.default_rng(0).integers(0, 10**9, 1000)))  # no database can compress it much
+    rig = next(iter(queried.rigs))
+    info = {"schema": "marey/clip-info@1", "action": digits}
+    parts = {"motion": motion_tree({"item": rig, "revision": 1}), "info": info}
+    made = queried.write(items.create_item, "lab", Kind.CLIP, ItemCreate(name="long", parts=parts))
+    for query, expected in ((f'action = "{digits[:1900]}"', []), (f'action ~ "{digits[:1900]}"', [made.id])):
+        found = queried.read(items.list_items, "lab", Kind.CLIP, ItemFilters(query=query)).items
+        assert [clip.id for clip in found] == expected
 
 
 def test_a_page_of_a_tag_shows_no_items_of_other_projects_and_kinds(queried: QueriedLab, database: Database) -> None:
