@@ -21,7 +21,7 @@ from marey_server.store import fsck, items, projects, purging
 from marey_server.store.items.drafts import Draft
 from marey_server.store.items.facets import publish_facets
 from marey_server.store.items.publishing import publish
-from marey_server.store.tables import item_facet
+from marey_server.store.tables import item_facet, staged_output
 
 
 def read(desk: Desk, function: Any, *args: Any, **kwargs: Any) -> Any:
@@ -198,6 +198,8 @@ def test_a_purge_deletes_facets_and_no_job_adds_them_afterwards(desk: Desk) -> N
     write(desk, publish_facets, "job_late", project_id, [[thing, 1, {"usage": 0.9}], [kept, 1, {"usage": 0.7}]])
     rows = read(desk, lambda tx: tx.execute(select(item_facet.c.item_id, item_facet.c.value)).all())
     assert [tuple(row) for row in rows] == [(kept, 0.7)]
+    drafts = read(desk, lambda tx: tx.execute(select(staged_output.c.draft)).scalars().all())
+    assert [draft for draft in drafts if draft.get("facets")] == []
     assert list(fsck.check_store(desk.database)) == []
     leftover = {"item_id": thing, "number": 1, "name": "usage", "value": 1.0, "job_id": job, "published_us": 1}
     write(desk, lambda tx: tx.execute(item_facet.insert().values(**leftover)))

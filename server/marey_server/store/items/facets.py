@@ -16,6 +16,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.queue.facets import ItemFacets
 from marey_schemas.queue.job_kinds import find_kind
 from marey_server.errors import InvalidProblem
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import document, item, item_facet, revision, revision_part
 from marey_server.store.transaction import Transaction, in_lists
 
@@ -99,6 +100,7 @@ def publish_facets(tx: Transaction, job_id: str, project_id: str, facets: Stored
     If another job has published a facet of the same revision, its value is replaced. Items that were purged meanwhile
     are left out.
     """
+    hold_off_purges(tx, project_id)
     stated: dict[str, list[tuple[int, dict[str, float]]]] = {}
     for one, number, values in sorted(facets, key=lambda fact: (fact[0], fact[1])):
         stated.setdefault(one, []).append((number, values))
@@ -106,7 +108,7 @@ def publish_facets(tx: Transaction, job_id: str, project_id: str, facets: Stored
     for some in in_lists(stated):
         rows = [
             {"item_id": one, "number": number, "name": name, "value": value, **published}
-            for one in _lock_items(tx, project_id, some)
+            for one in _not_purged(tx, project_id, some)
             for number, values in stated[one]
             for name, value in sorted(values.items())
         ]
@@ -117,15 +119,9 @@ def publish_facets(tx: Transaction, job_id: str, project_id: str, facets: Stored
             tx.execute(added.on_conflict_do_update(index_elements=key, set_=newer), rows)
 
 
-def _lock_items(tx: Transaction, project_id: str, items: Sequence[str]) -> Sequence[str]:
-    """Return those items of a project that are not purged, and let no purge of them begin before the end of the write.
-
-    They are locked in the order of their ids, as by purges, so that no two writes wait for each other.
-    """
-    statement = (
-        select(item.c.id)
-        .where(item.c.id.in_(items), item.c.project_id == project_id, item.c.purged_us.is_(None))
-        .order_by(item.c.id)
-        .with_for_update(read=True, key_share=True)
+def _not_purged(tx: Transaction, project_id: str, items: Sequence[str]) -> Sequence[str]:
+    """Return those items of a project that are not purged, by id; all writers lock rows in this order."""
+    statement = select(item.c.id).where(
+        item.c.id.in_(items), item.c.project_id == project_id, item.c.purged_us.is_(None)
     )
-    return tx.execute(statement).scalars().all()
+    return tx.execute(statement.order_by(item.c.id)).scalars().all()

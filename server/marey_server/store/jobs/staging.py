@@ -197,6 +197,12 @@ def drop_staged(tx: Transaction, attempts: Collection[tuple[str, int]]) -> None:
     tx.run(_DROP_STAGED, _of_attempts(attempts))
 
 
+def drop_staged_facets(tx: Transaction, job_ids: Sequence[str]) -> None:
+    """Delete the facets that the attempts of jobs staged; what the jobs have published stays."""
+    for some in in_lists(job_ids):
+        tx.execute(delete(staged_output).where(staged_output.c.job_id.in_(some), staged_output.c.name == _FACETS))
+
+
 def _of_attempts(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
     """Return the parameters with which `_BY_ATTEMPTS` selects the outputs of attempts (job id and fence)."""
     return {"jobs": [job_id for job_id, _ in attempts], "attempts": list(attempts)}

@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import delete, or_, select, update
 
 from marey_server.store.jobs.result_cache import forget_results
-from marey_server.store.jobs.staging import named_blobs
+from marey_server.store.jobs.staging import drop_staged_facets, named_blobs
 from marey_server.store.tables import attempt, document_blob, job, job_blob, revision_part
 from marey_server.store.transaction import Transaction, in_lists
 
@@ -20,6 +20,7 @@ def forget_in_jobs(tx: Transaction, items: frozenset[str], jobs: Sequence[str]) 
     """
     makers: list[str] = []
     touched: set[str] = set()
+    readers: set[str] = set()
     columns = (job.c.id, job.c.parent_id, job.c.inputs, job.c.outputs)
     for job_id in sorted(jobs):  # one by one, because the inputs of a job may take megabytes
         row = tx.execute(select(*columns).where(job.c.id == job_id).with_for_update()).one_or_none()
@@ -28,11 +29,14 @@ def forget_in_jobs(tx: Transaction, items: frozenset[str], jobs: Sequence[str]) 
         inputs, outputs = _without_names(row.inputs, items), _outputs_without_names(row.outputs, items)
         if outputs != row.outputs:
             makers.append(row.id)
+        if inputs != row.inputs:
+            readers.update({row.id, row.parent_id} - {None})
         if (inputs, outputs) != (row.inputs, row.outputs):
             tx.execute(update(job).where(job.c.id == row.id).values(inputs=inputs, outputs=outputs))
             touched.update({row.id, row.parent_id} - {None})
     _forget_in_answers(tx, items, makers)
     _release_files(tx, sorted(touched))
+    drop_staged_facets(tx, sorted(readers))  # which no other job can share any more, without the items as inputs
     _release_sources(tx, items, makers)
     forget_results(tx, makers)
 
