@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
+from sqlalchemy import select
 from tests.support.committing_desk import CommittingDesk
 from tests.support.interleaving import HEAD_START_S, Step, interleave
 from tests.support.queue_desk import Desk, document, output
@@ -28,6 +29,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.purges import DatasetPurgeRequest, PurgeAnswer, PurgeRequest
 from marey_schemas.queue.jobs import JobCreate
 from marey_schemas.queue.worker_protocol import CompleteRequest, FailRequest, Lease
+from marey_server import faults
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ApiProblem, ConflictProblem, GoneProblem, NotFoundProblem
 from marey_server.store import collections, datasets, events, fsck, items, projects, purging, quotas
@@ -35,11 +37,15 @@ from marey_server.store.database.connections import Database
 from marey_server.store.datasets import proposals
 from marey_server.store.folder_roles import managing
 from marey_server.store.items.drafts import Draft
+from marey_server.store.items.facets import publish_facets
 from marey_server.store.items.publishing import publish
-from marey_server.store.jobs import completion, reading, reaper, result_cache, submission
+from marey_server.store.jobs import completion, fan_out, reading, reaper, result_cache, submission
+from marey_server.store.jobs.finishing import commit_deferred
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.retrying import retry_job
+from marey_server.store.purge_lock import begin_purge
 from marey_server.store.purging import erasing
+from marey_server.store.tables import item_facet, job
 from marey_server.store.transaction import Transaction
 
 pytestmark = pytest.mark.every_database
@@ -453,6 +459,54 @@ def test_a_job_whose_result_others_await_ends_beside_a_purge(scene: Scene, order
     assert not isinstance(done, ApiProblem), done
     require_purged(purged, thing)
     assert scene.desk.state(behind) == {"cancel": "cancelled", "share": "waiting"}.get(ends, "failed")
+    scene.assert_sound()
+
+
+def test_a_commit_of_many_outputs_waits_for_a_purge_before_it_locks_its_job(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fan_out, "MOST_AT_END", 1)
+    things = [{"item": scene.add(f"thing{number}", n=number)} for number in range(4)]
+    made = scene.gaits.submit("square", into="made", inputs={"things": things})
+    for number in range(2):
+        scene.gaits.work(f"a{number}")
+    project_id = scene.desk.database.read(scene.desk.user, requiring(WRITE, projects.require), "lab").id
+    begun, planned = threading.Event(), threading.Event()
+
+    def passed(name: str) -> None:
+        if name == "deferred_commit.after_chunks":
+            planned.set()
+
+    def purge(tx: Transaction) -> list[str]:
+        begin_purge(tx, project_id)
+        begun.set()
+        if tx.is_postgres:
+            assert planned.wait(20)
+        threading.Event().wait(HEAD_START_S)
+        free = select(job.c.id).where(job.c.id == made).with_for_update(skip_locked=True)
+        return list(tx.execute(free).scalars())
+
+    monkeypatch.setattr(faults, "point", passed)
+    with ThreadPoolExecutor(2) as pool:
+        purging_ = pool.submit(scene.other.write, scene.desk.user, purge)
+        assert begun.wait(20)
+        committing = pool.submit(commit_deferred, scene.desk.database)
+        assert purging_.result(60) == [made]
+        assert committing.result(60) == 1
+    assert scene.desk.state(made) == "succeeded"
+
+
+@ORDERS
+def test_no_facet_of_a_purged_item_is_published(scene: Scene, order: str) -> None:
+    thing, kept = scene.add("thing"), scene.add("kept", n=2)
+    scene.delete(thing)
+    project_id = scene.desk.database.read(scene.desk.user, requiring(WRITE, projects.require), "lab").id
+    facets = [[thing, 1, {"usage": 0.5}], [kept, 1, {"usage": 0.5}]]
+    done, purged = scene.race(order, lambda tx: publish_facets(tx, "job_x", project_id, facets), scene.purge_of(thing))
+    assert not isinstance(done, ApiProblem), done
+    require_purged(purged, thing)
+    named = scene.desk.database.read(SYSTEM, lambda tx: tx.execute(select(item_facet.c.item_id)).scalars().all())
+    assert named == [kept]
     scene.assert_sound()
 
 

@@ -9,16 +9,18 @@ import pytest
 from tests.support.committing_desk import CommittingDesk
 from tests.support.queue_desk import Desk
 
-from marey_schemas.datasets.commits import CommitCreate
+from marey_schemas.datasets.commits import CommitCreate, PutEntry, RemoveEntry
 from marey_schemas.datasets.naming import DatasetCreate, RefCreate, RefKind
 from marey_schemas.datasets.protection import ProtectionRule
-from marey_schemas.queue.jobs import ItemInput
+from marey_schemas.kinds import Kind
+from marey_schemas.purges import DatasetPurgeRequest, JobHolder, PurgeAnswer, PurgeRequest
+from marey_schemas.queue.jobs import ItemInput, JobState
 from marey_server import faults
 from marey_server.app import create_app
 from marey_server.errors import InvalidProblem
 from marey_server.process import housekeeping
 from marey_server.process.settings import Settings
-from marey_server.store import datasets
+from marey_server.store import datasets, items, purging
 from marey_server.store.datasets import output_plans
 from marey_server.store.fsck import check_store
 from marey_server.store.jobs import fan_out, finishing
@@ -163,6 +165,93 @@ def test_a_branch_that_moves_during_each_plan_leaves_the_job_for_later(
     monkeypatch.undo()
     assert commit_deferred(gaits.desk.database) == 1
     assert gaits.entries().keys() >= MADE
+
+
+# -- purges -----------------------------------------------------------------------------------------------------------
+
+
+def delete_and_purge(gaits: CommittingDesk, *found: str) -> list[PurgeAnswer]:
+    """Delete items, and ask for the purge of all deleted items; return the answer."""
+    for item in found:
+        gaits.write(items.delete_item, "lab", Kind.STUDY, item, expected_rev=None)
+    request = PurgeRequest(collection="", kind=Kind.STUDY)
+    return [gaits.write(purging.record_purge, "lab", request, gaits.read(purging.prepare_purge, "lab", request))]
+
+
+def purge_dataset(gaits: CommittingDesk, name: str) -> None:
+    request = DatasetPurgeRequest(dataset=name)
+    prepared = gaits.read(purging.prepare_dataset_purge, "lab", request)
+    gaits.write(purging.record_dataset_purge, "lab", request, prepared)
+
+
+def made_by(gaits: CommittingDesk) -> list[str]:
+    """Return the items in the folder `made`."""
+    filters = items.ItemFilters(collection="made")
+    return [one.id for one in gaits.read(items.list_items, "lab", Kind.STUDY, filters).items]
+
+
+@pytest.mark.parametrize("when", ["before the plan", "after the plan"])
+def test_outputs_that_somebody_deletes_before_their_commit_are_not_purged(
+    gaits: CommittingDesk, meanwhile: Callable[[Callable[[], object]], list[str]], when: str
+) -> None:
+    made = run_tasks(gaits, cache="off")
+    outputs, answers = made_by(gaits), list[PurgeAnswer]()
+
+    def purge() -> None:
+        answers.extend(delete_and_purge(gaits, *outputs))
+
+    if when == "before the plan":
+        purge()
+    else:
+        meanwhile(purge)
+    assert commit_deferred(gaits.desk.database) == 1
+    (answer,) = answers
+    assert (answer.purged, {one.item for one in answer.refused}) == ((), set(outputs))
+    assert {holder for one in answer.refused for holder in one.holders} == {
+        JobHolder(job=made, kind="square", state=JobState.RUNNING)
+    }
+    assert gaits.entries().keys() == MADE
+    (later,) = delete_and_purge(gaits)
+    assert len(later.refused) == len(outputs)  # now the version holds them
+    assert list(check_store(gaits.desk.database)) == []
+
+
+def test_a_commit_is_planned_again_after_a_purge(
+    gaits: CommittingDesk, meanwhile: Callable[[Callable[[], object]], list[str]]
+) -> None:
+    (other,) = gaits.desk.things(1, "other")
+    made = run_tasks(gaits)
+    plans = meanwhile(lambda: delete_and_purge(gaits, other))
+    assert commit_deferred(gaits.desk.database) == 1
+    assert len(plans) == 2
+    assert gaits.job(made).state == "succeeded"
+    assert gaits.entries().keys() == MADE
+
+
+def test_chunks_that_a_purged_dataset_had_too_are_stored_again(
+    gaits: CommittingDesk, meanwhile: Callable[[Callable[[], object]], list[str]]
+) -> None:
+    """The branch moves, too, so that the last write makes its tree from chunks of the plan."""
+    (thing,) = gaits.desk.things(1, "far")
+    for one in (CommittingDesk(gaits.desk, "other"), gaits):
+        one.change(PutEntry(path="own", item=thing))
+    run_tasks(gaits, to="other")
+    assert commit_deferred(gaits.desk.database) == 1
+    gaits.write(datasets.delete_dataset, "lab", "other", expected_rev=None)
+    run_tasks(gaits, cache="off")
+
+    def purge_and_move() -> None:
+        purge_dataset(gaits, "other")
+        gaits.change(PutEntry(path="later", item=thing))
+        gaits.change(RemoveEntry(path="later", kind=Kind.STUDY))
+
+    meanwhile(purge_and_move)
+    assert commit_deferred(gaits.desk.database) == 1
+    assert gaits.entries().keys() == {"own", *MADE}
+    assert list(check_store(gaits.desk.database)) == []
+
+
+# -- commits that are not possible any more ---------------------------------------------------------------------------
 
 
 def drop_branch(gaits: CommittingDesk) -> None:

@@ -113,15 +113,16 @@ def plan_outputs(tx: Transaction, wanted: OutputEntries, head: str | None, most:
 def follow(tx: Transaction, wanted: OutputEntries, planned: PlannedCommit, head: str | None) -> PlannedCommit | None:
     """Return a plan for the commit `head`, to which others have moved the branch since the plan was computed.
 
-    The chunks of `planned` must be stored. Returns None if the plan must be computed again, because the others have
-    changed the same entries as the job, or too many entries.
+    Its chunks include those of `planned`, because these may be stored no more: a purge deletes chunks that only a
+    deleted dataset needs. Returns None if the plan must be computed again, because the others have changed the same
+    entries as the job, or too many entries.
     """
     if planned.head == head or planned.merged.conflicts:  # the commit to a branch of its own stays as it is
         return planned
     if planned.refused is not None or head is None:
         return None
     store = StoredChunks(tx)
-    store.save(planned.chunks)  # spares reading most of them again
+    store.save(planned.chunks)
     head_tree = tree_of(tx, wanted.dataset_id, head)
     others: dict[str, Value | None] = {}
     for one in difference(store, planned.head_tree, head_tree):
@@ -129,10 +130,7 @@ def follow(tx: Transaction, wanted: OutputEntries, planned: PlannedCommit, head:
             return None
         others[one.key] = one.after
     tree = change(store, planned.tree, others)
-    return replace(
-        planned, head=head, head_tree=head_tree, tree=tree, count=len(Tree(store, tree)),
-        chunks={digest: data for digest, data in store.new.items() if digest not in planned.chunks},
-    )  # fmt: skip
+    return replace(planned, head=head, head_tree=head_tree, tree=tree, count=len(Tree(store, tree)), chunks=store.new)
 
 
 # -- entries ----------------------------------------------------------------------------------------------------------

@@ -2,8 +2,8 @@
 
 A read plans the commit. Several short writes store the chunks of its tree. A last write ends the job and moves the
 branch. What others have committed since the read is added to the plan in that last write, unless it concerns the same
-entries; then the commit is planned again. If the server stops in between, nothing but chunks has been stored, and the
-next server begins again.
+entries; then the commit is planned again. It is planned again, too, if items of the project were purged meanwhile. If
+the server stops in between, nothing but chunks has been stored, and the next server begins again.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sqlalchemy import select
 from marey_schemas.queue.commits import MOST_COMMITTED
 from marey_server import faults
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import ApiProblem, UnavailableProblem
+from marey_server.errors import UnavailableProblem
 from marey_server.store.database.connections import Database
 from marey_server.store.datasets.chunks import store_chunks
 from marey_server.store.datasets.naming import find_ref
@@ -26,7 +26,7 @@ from marey_server.store.jobs import commits
 from marey_server.store.jobs.endings import end_jobs
 from marey_server.store.jobs.fan_out import DEFERRED
 from marey_server.store.jobs.propagation import propagate_ends
-from marey_server.store.purge_lock import last_purge, require_no_purge_since
+from marey_server.store.purge_lock import hold_off_purges, last_purge
 from marey_server.store.tables import dataset, job
 from marey_server.store.transaction import Transaction
 
@@ -84,6 +84,7 @@ class _JobPlan:
     wanted: OutputEntries
     commit: PlannedCommit | None
     last_purge: int
+    """Time of the last purge of the project when the plan was computed."""
 
     @property
     def chunks(self) -> Mapping[str, bytes]:
@@ -109,6 +110,7 @@ def _plan(tx: Transaction, job_id: str) -> _JobPlan | None:
 
 def _end(tx: Transaction, plan: _JobPlan) -> bool:
     """End a job and commit its outputs as planned; return False if the commit must be planned again."""
+    hold_off_purges(tx, plan.wanted.project_id)
     row = tx.execute(select(*_COLUMNS).where(job.c.id == plan.job_id, DEFERRED).with_for_update()).first()
     if row is None:  # another process has ended it
         return True
@@ -116,9 +118,7 @@ def _end(tx: Transaction, plan: _JobPlan) -> bool:
     if row.cancel_requested_us is not None:
         propagate_ends(tx, end_jobs(tx, this, "cancelled"))
         return True
-    try:
-        require_no_purge_since(tx, row.project_id, plan.last_purge)
-    except ApiProblem:
+    if last_purge(tx, row.project_id) != plan.last_purge:
         return False
     made = commits.commit_planned_tasks(tx, row, plan.wanted, plan.commit)
     if made is None:
