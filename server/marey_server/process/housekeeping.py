@@ -2,8 +2,8 @@
 
 It reclaims expired leases, shares cached results with waiting jobs, commits the outputs of jobs that made many, merges
 waiting proposals, and deletes old or unreferenced data. Only the leading process does this work, but concurrent
-housekeeping would be safe, because every statement repeats its conditions. Each kind of work runs in a separate task, so
-that a failure does not affect the others.
+housekeeping would be safe, because every statement repeats its conditions. Each kind of work runs in a separate task,
+so that a failure does not affect the others.
 """
 
 from __future__ import annotations

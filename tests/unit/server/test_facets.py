@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 from tests.support.queue_desk import Desk, document, output
-from tests.support.store_fixtures import WRITE, requiring
+from tests.support.store_fixtures import ALL_RIGHTS, WRITE, requiring
 
 from marey_schemas.access import ProjectCreate
 from marey_schemas.items import Item
@@ -212,7 +212,8 @@ def test_a_query_shows_no_facets_of_another_project(desk: Desk) -> None:
 
     def add(tx: Any) -> None:
         other = projects.require(tx, "other")
-        (made,) = publish(tx, other, [Draft("far", Kind.STUDY, "far", {"study": document(number=1)})], author_id=None)
+        draft = Draft("far", Kind.STUDY, "far", {"study": document(number=1)})
+        (made,) = publish(tx, other, [draft], author_id=None, rights=ALL_RIGHTS)
         publish_facets(tx, "job_far", other.id, [[made.item, 1, {"usage": 1.0}], [things[0], 1, {"usage": 1.0}]])
 
     desk.database.write(SYSTEM, add)

@@ -11,6 +11,7 @@ from sqlalchemy import (
     String,
     Table,
     Text,
+    text,
 )
 
 from marey_server.store.tables.columns import DIGEST, ID, Document, Micros, Name, metadata, unique_alive
@@ -86,6 +87,8 @@ dataset_ref = Table(  # a branch or a tag
     ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
 )
 
+_WAITING = text("when_green_id IS NOT NULL")
+
 proposal = Table(  # to merge a version into a branch
     "proposal",
     metadata,
@@ -112,6 +115,7 @@ proposal = Table(  # to merge a version into a branch
         for column in ("head", "target_commit", "merged", "when_green_head")
     ),
     Index("ix_proposal_state", "dataset_id", "state", "number"),
+    Index("ix_proposal_waiting", "dataset_id", "number", sqlite_where=_WAITING, postgresql_where=_WAITING),
 )
 
 proposal_comment = Table(
