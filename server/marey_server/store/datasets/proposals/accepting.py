@@ -56,7 +56,7 @@ class PreparedAcceptance:
 
 
 class MergeBasis(NamedTuple):
-    """What the result of a merge depends on: the newest commits of source and target, and the rule of the target."""
+    """Basis of the result of a merge: the newest commits of source and target, and the rule of the target."""
 
     head: str
     target: str | None

@@ -36,7 +36,7 @@ OBSTRUCTED_KEPT = 10_000
 log = logging.getLogger(__name__)
 
 
-class _Waiting(NamedTuple):
+class _PendingMerge(NamedTuple):
     """A proposal whose merge was requested with `when_green`."""
 
     dataset_id: str
@@ -65,7 +65,7 @@ class WaitingMerges:
         self._last = (found[-1].dataset_id, found[-1].number) if len(found) == EXAMINED_AT_ONCE else ("", 0)
         return merged
 
-    def _attempt_one(self, one: _Waiting) -> bool:
+    def _attempt_one(self, one: _PendingMerge) -> bool:
         key = one.dataset_id, one.number
         try:
             basis = self._database.read(SYSTEM, _basis_if_ready, one)
@@ -83,7 +83,7 @@ class WaitingMerges:
         return merged
 
 
-def _next_waiting(tx: Transaction, last: tuple[str, int]) -> list[_Waiting]:
+def _next_waiting(tx: Transaction, last: tuple[str, int]) -> list[_PendingMerge]:
     columns = proposal.c.dataset_id, proposal.c.number
     statement = (
         select(*columns, dataset.c.name, dataset.c.project_id, project.c.name.label("project"))
@@ -94,16 +94,16 @@ def _next_waiting(tx: Transaction, last: tuple[str, int]) -> list[_Waiting]:
         .order_by(*columns)
         .limit(EXAMINED_AT_ONCE)
     )
-    return [_Waiting._make(row) for row in tx.execute(statement)]
+    return [_PendingMerge._make(row) for row in tx.execute(statement)]
 
 
-def _basis_if_ready(tx: Transaction, one: _Waiting) -> MergeBasis | None:
+def _basis_if_ready(tx: Transaction, one: _PendingMerge) -> MergeBasis | None:
     """Return what the merge of a waiting proposal depends on; None if approvals, checks or rights are missing."""
     row = find_proposal(tx, one.dataset_id, one.number)
     return merge_basis(tx, find_by_id(tx, one.project_id), row)
 
 
-def _merge(tx: Transaction, one: _Waiting, prepared: PreparedAcceptance | None) -> bool:
+def _merge(tx: Transaction, one: _PendingMerge, prepared: PreparedAcceptance | None) -> bool:
     """Merge a proposal if nothing is missing; return whether it has ended."""
     hold_off_purges(tx, one.project_id)
     row = lock_open(tx, one.dataset_id, one.number)
