@@ -63,7 +63,7 @@ _ROW, _HIGHEST_ROW, _LEAST_ROWS, _ABOVE, _BELOW = 0.21, 0.36, 2.0, 2.35, 0.6
 _UPPER, _LOWER = (0.74, 0.74, 1.0, 1.0), (0.0, 0.0, 0.26, 0.26)
 """Heights of the corners of the upper bar and of the lower bar."""
 _THINNEST, _NAME_WIDTH = 0.004, 0.16
-"""Least width of a bar, and width of a number of frames in words, as shares of the longest duration."""
+"""Least width of a bar, and width of a text such as `12 removed`, as shares of the duration of the longer motion."""
 
 
 def draw_difference(difference: Difference, file_type: FileType) -> bytes:

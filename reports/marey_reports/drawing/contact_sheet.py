@@ -46,7 +46,7 @@ ARROW = {"arrowstyle": "-|>,head_length=0.35,head_width=0.18", "color": QUIET, "
 
 
 class TakePair(NamedTuple):
-    """Source clip and result of a take, with a title."""
+    """Source clip of a take and the clip that was made from it, for example by retargeting, with a title."""
 
     title: str
     source: Clip

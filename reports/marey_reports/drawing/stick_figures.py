@@ -137,7 +137,10 @@ def stances_at(clip: Clip, body: StickFigure, frames: Indices) -> Stances:
 
 
 def _tips(skeleton: Skeleton, pelvis: int, sides: dict[int, int]) -> list[tuple[int, int]]:
-    """List the last bone of each drawn chain: the index of its end site, after all joints, and its last joint."""
+    """List the last bone of each drawn chain of joints: its outer point, which is an end site, and its inner joint.
+
+    The index of an end site is counted after all joints, as in `StickFigure.bones`.
+    """
     size = float(np.ptp(skeleton.rest_global_positions[[pelvis, *sides]], axis=0).max())
     inner = {int(skeleton.parents[joint]) for joint in sides}
     return [

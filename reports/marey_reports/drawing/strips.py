@@ -156,7 +156,8 @@ def _draw_label(axes: Axes, row: StripRow, middle: float) -> None:
 class _Look(NamedTuple):
     """Style of the lines of a body.
 
-    `colour` is None for the colours of the left and right sides; a `rim` separates overlapping sides of the body.
+    If `colour` is None, each side of the body has its own colour. A `rim` is a light edge that separates overlapping
+    sides of the body.
     """
 
     width: float
@@ -241,7 +242,7 @@ def _draw_body(axes: Axes, shapes: _Shapes, stage: _StripCell, points: Floats, l
 
 
 def _add(axes: Axes, artist: Artist, frame: Rectangle) -> None:
-    """Add an artist, cut off at the frame of its cell; `add_artist` replaces rectangles that were set before it."""
+    """Add an artist, and clip it to `frame` afterwards: `add_artist` replaces a clip path that is a rectangle."""
     axes.add_artist(artist).set_clip_path(frame)
 
 

@@ -114,7 +114,7 @@ def verdict(result: EvaluationResult) -> str:
 
 
 def _failing(outcome: TrialResult) -> str:
-    """Describe one error of a trial, of offset, speed or turn rate: the one that is largest relative to its limit."""
+    """Describe the error of a trial (offset, speed or turn rate) that is largest relative to its limit."""
     kind = max(zip(strain(outcome), ("offset_mean", "se_v", "se_omega_deg"), strict=True))
     value = outcome.metrics.get(kind[1])
     if value is None or math.isinf(kind[0]):

@@ -98,8 +98,8 @@ class PasswordResource(Resource):
     async def check_password(self, name: str, password: str) -> tuple[SignInTry, str | None]:
         """Count a try to sign in and check its password.
 
-        Return the try, and the stored hash if the password matches, otherwise None. The check takes the same time for a
-        user who does not exist. Raises `TooManyRequestsProblem` or `UnavailableProblem`.
+        Return the try and the stored hash; None replaces the hash if the password does not match. The check takes the
+        same time for a user who does not exist. Raises `TooManyRequestsProblem` or `UnavailableProblem`.
         """
         services = self.services
         address = limited_address(self.client_address)
@@ -113,9 +113,9 @@ class PasswordResource(Resource):
         return attempt, stored if matches else None
 
     async def count(self, function: Callable[[Transaction, SignInTry], T], attempt: SignInTry) -> T:
-        """Run `function`, which counts a try, and return its result; a refusal is remembered.
+        """Run `function`, which counts a try to sign in or to use a code, and return its result.
 
-        Raises `TooManyRequestsProblem`.
+        Raises `TooManyRequestsProblem`, and notes it, so that further tries are refused without a transaction.
         """
         try:
             return await self.change(function, attempt)

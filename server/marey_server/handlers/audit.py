@@ -1,4 +1,4 @@
-"""Resources of the audit log, of a project and of the whole server. They can only be read."""
+"""Resources of the audit logs of a project and of the whole server; clients can only read them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ServerAudit(Resource):
 
     @reads(access=Access.ADMINISTRATOR, scope="admin", query=AuditQuery, answer=AuditEntry, paged=True)
     async def get(self, query: AuditQuery) -> Rendered:
-        """List changes of users, tokens, access and settings, and deletions, of all projects, newest first."""
+        """List the audit entries of all projects, and changes of users and tokens, newest first."""
         await self.services.number_events()
         return await self.answer(audit.list_audit, query.filter, cursor=query.cursor, limit=query.limit)
 

@@ -1,7 +1,7 @@
 """Resources that measure coverage during a recording: they receive frames and return motions to record next.
 
-A stream is stored in a row of the database, which is updated before each answer. So no acknowledged frame is lost if
-the server crashes.
+Coverage is the number of seconds of recorded motion at each speed and turn rate. A stream is stored in a row of the
+database, which is updated before each answer. So no acknowledged frame is lost if the server crashes.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class ProjectFolderRoles(Resource):
 
     @reads(access=Access.READER, query=FolderRolesQuery, answer=FolderRole, paged=True, public=False)
     async def get(self, project: str, query: FolderRolesQuery) -> Rendered:
-        """List the roles in folders that differ from the roles in the project."""
+        """List the roles that members have in single folders instead of their role in the project."""
         return await self.answer(
             managing.list_folder_roles,
             project,
@@ -75,7 +75,7 @@ class FolderRoleResource(Resource):
 
     @writes(access=Access.OWNER, precondition="required")
     async def delete(self, project: str, collection: str, user: str) -> Rendered:
-        """Remove the role of a member in a folder; the roles in the folders above it then count."""
+        """Remove the role of a member in a folder; the roles in the folders above it, or in the project, then apply."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(managing.remove_folder_role, project, collection, user, expected_rev=expected_rev)
 

@@ -38,7 +38,7 @@ MAX_FILES = 1000
 MAX_UPLOAD_BYTES = 2048 * MIB
 MAX_FORM_BYTES = 256 * KIB
 FILES_AHEAD = 2
-"""Greatest number of files that are read concurrently, in addition to the next one in order."""
+"""Greatest number of files that are read in advance, while the file before them is still being read."""
 FILES_PER_WRITE = 16
 """Greatest number of files that are stored in one transaction."""
 

@@ -168,7 +168,7 @@ class ItemRestoration(Resource):
 
 
 class ItemReversion(Resource):
-    """Return of an item to an earlier revision."""
+    """Reversion of an item to an earlier revision."""
 
     path = "/projects/{project}/{kind}/{item}/revert"
     tag = "ItemsOfKind"

@@ -50,8 +50,8 @@ def read_part(
 ) -> Reply:
     """Return a part of an item, or only some of its frames and joints.
 
-    With `encoded`, the arrays of some frames or joints are returned encoded, as they are stored. If the query gives a
-    revision, clients may keep the answer, because a part of a revision never changes.
+    If `encoded` is true and the query selects frames or joints, the arrays of the answer are compressed as in the
+    store. If the query gives a revision, clients may cache the answer, because a part of a revision never changes.
     """
     found = items.find_part(tx, project, kind, item, part, revision=query.revision)
     load = partial(items.load_part, tx, found)

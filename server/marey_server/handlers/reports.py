@@ -142,7 +142,7 @@ def find_figure(report: ReportDocument, name: str, trial: str | None) -> StoredF
 
 
 def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:
-    """Return the requested form of a figure. Raises `NotFoundProblem` if the figure does not have the table."""
+    """Return a figure's file in the requested format. Raises `NotFoundProblem` if it lacks the requested CSV table."""
     if query.format != "csv":
         return {"png": figure.png, "svg": figure.svg, "json": figure.json_}[query.format]
     if not figure.csv:

@@ -23,7 +23,10 @@ from marey_server.store import blobs, uploads
 PIECE_BYTES = MIB
 """Number of bytes written at a time; an interrupted request loses at most this number."""
 LONGEST_PAUSE_S = 0.2
-"""Longest time that a piece waits for earlier writes of the database, so that uploads do not delay other writes."""
+"""Longest time in seconds that a piece waits for the database to process earlier writes.
+
+The wait keeps uploads from delaying other writes.
+"""
 PAUSE_STEP_S = 0.01
 LONG_BODY_BYTES = 4 * MIB
 """Size above which a body is stored in pieces before it becomes a blob, each piece in its own transaction."""

@@ -108,7 +108,7 @@ class WebhookTest(Resource):
 
 
 class WebhookDeliveries(Resource):
-    """Deliveries of a webhook that failed or were requested."""
+    """Failed or requested deliveries of a webhook."""
 
     path = "/projects/{project}/webhooks/{webhook}/deliveries"
     tag = "Webhooks"
@@ -122,7 +122,7 @@ class WebhookDeliveries(Resource):
 
 
 class WebhookDeliveryResource(Resource):
-    """A delivery of a webhook that failed or was requested."""
+    """A failed or requested delivery of a webhook."""
 
     path = "/projects/{project}/webhooks/{webhook}/deliveries/{delivery}"
     tag = "Webhooks"
@@ -141,7 +141,7 @@ class WebhookRedelivery(Resource):
 
     @writes(access=Access.OWNER, answer=WebhookDelivery, status=202)
     async def post(self, project: str, webhook: str, delivery: str) -> Rendered:
-        """Send a delivery again that has succeeded, or for which the server has given up."""
+        """Send a delivery again after it has succeeded, or after the server has stopped retrying it."""
         return await self.answer(deliveries.redeliver, project, webhook, delivery)
 
 

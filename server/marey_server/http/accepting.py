@@ -28,9 +28,9 @@ MOST_CONNECTIONS = 10_000
 ADDRESS_SHARE = 0.75
 """Largest share of all connections that one address may have; trusted proxies may have more."""
 EVICTED_SHARE = 1 / 16
-"""Share of all connections that is closed at once when the limit is reached, if so many are idle."""
+"""Number of idle connections that are closed when a limit is reached, as a share of the limit on all connections."""
 ACCEPTED_AT_ONCE = 4
-"""Number of connections that are accepted in one round of the event loop; the requests on open ones come between."""
+"""Number of connections accepted in one round of the event loop; then requests on open connections get their turn."""
 PAUSE_S = 0.5
 """Time in seconds for which no connection is accepted after a failure for lack of descriptors or memory."""
 LOG_EVERY_S = 60.0
@@ -190,7 +190,7 @@ class Connections:
         self._server.handle_stream(stream, address)
 
     def _evict(self, host: str | None) -> None:
-        """Close the oldest idle connections of an address, or of the address that has the most."""
+        """Close the oldest idle connections of the address `host`, or, if None, of the address with most idle ones."""
         busy = self._busy()
         idle = [one for one in self._open if one not in busy and not one.writing()]
         if host is None and idle:

@@ -5,18 +5,18 @@ from __future__ import annotations
 from types import MappingProxyType
 
 IMMUTABLE = "private, max-age=31536000, immutable"
-"""Of an answer that never changes."""
+"""Value for an answer that never changes, which clients may keep for a year."""
 
 REVALIDATED = "private, no-cache"
-"""Of an answer that clients may keep, but must not use again without asking the server whether it has changed."""
+"""Value for an answer that clients may keep, but must revalidate with the server before each use."""
 
 NOT_STORED = "no-store"
-"""Of an answer that clients must not keep."""
+"""Value for an answer that clients must not keep."""
 
 WITH_SECRET = MappingProxyType({"Cache-Control": NOT_STORED})
 """Headers of an answer that contains a password, a token or another secret."""
 
 
 def caching_of_revision(named: int | None) -> str:
-    """Return the caching of an answer about a revision that the request names; None: about the newest one."""
+    """Return the Cache-Control of an answer about the revision `named`, or about the newest revision if it is None."""
     return REVALIDATED if named is None else IMMUTABLE

@@ -1,4 +1,4 @@
-"""Exchange that calls the store, and computes in threads and child processes, on behalf of its caller."""
+"""Base class of handlers that call the store, and compute in threads and child processes, on behalf of a caller."""
 
 from __future__ import annotations
 

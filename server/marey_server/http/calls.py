@@ -70,7 +70,7 @@ class BodyTarget:
 
 
 Admission = tuple[str, Access, str | None, bool, bool, bool, bool, BodyTarget]
-"""Hash of a token, an operation's declarations about its callers, and the target of the request."""
+"""Key of a cached decision to receive a body: hash of the token, declarations of the operation, and target."""
 
 
 def admission_of(caller: Caller, target: BodyTarget) -> Admission:

@@ -104,11 +104,11 @@ class Operation:
     stream: bool
     reserved: bool
     attempts: bool
-    """Whether running attempts of jobs may do this, besides the callers that `access` names."""
+    """Whether running attempts of jobs may use the operation, in addition to the callers that `access` admits."""
     replays: bool
-    """Whether an attempt that has ended may send the request again."""
+    """Whether an attempt of a job may repeat the request after the attempt has ended."""
     in_folders: bool = False
-    """Whether a member with the declared role in one folder of the project may do this there."""
+    """Whether members who have the declared role only in some folders may use the operation in these folders."""
 
     @property
     def required_role(self) -> RequiredRole:
@@ -201,8 +201,8 @@ def writes(
     idempotency : `key` accepts Idempotency-Key; `nature` means that repeating the request has no further effect
     answer, also, headers, reserved, attempts : as for `reads`
     replays : whether an ended attempt may repeat the request
-    in_folders : whether members who have the role in some folders only may do this there; the function that the method
-        calls must check the role in the folder
+    in_folders : whether members who have the role only in some folders may use the method in these folders; the
+        function that the method calls must check the role in the folder
     """
     if access is Access.READER:
         raise TypeError("A method that changes a project requires at least the role contributor.")

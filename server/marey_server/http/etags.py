@@ -13,7 +13,7 @@ from marey_server.errors import BadRequestProblem, PreconditionFailedProblem, Pr
 from marey_server.store.revs import ExpectedRev
 
 MOST_STATES = 100
-"""Greatest number of tags; each becomes a parameter of the statement that writes."""
+"""Greatest number of tags in If-Match; each tag becomes a parameter of the SQL statement that writes."""
 
 _TAG = re.compile(r'\s*(W/)?"([\x21\x23-\x7e\x80-\xff]*)"\s*')
 _REV = re.compile("[0-9]{1,9}")

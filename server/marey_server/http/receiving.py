@@ -11,7 +11,7 @@ from marey_server.store.blobs import Spool
 
 BATCH_BYTES = MIB
 WRITTEN_AT_ONCE_BYTES = 64 * KIB
-"""Greatest number of last bytes of a body that are written on the event loop; more are written in a thread."""
+"""Size up to which the rest of a body is written on the event loop; a longer rest is written in a thread."""
 
 
 class Receiver:

@@ -1,4 +1,7 @@
-"""Coverage of streams of frames, which a child process computes after the row of a stream is read."""
+"""Coverage of streams of recorded frames: the seconds of motion at each speed and turn rate.
+
+One transaction reads the row of a stream; a child process then computes the coverage.
+"""
 
 from __future__ import annotations
 

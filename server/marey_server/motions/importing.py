@@ -144,7 +144,7 @@ def new_skeletons(tx: Transaction, project: str, files: Sequence[PreparedImport]
 
 
 def firsts_of_skeletons(files: Sequence[PreparedImport], new: Collection[str]) -> dict[str, PreparedImport]:
-    """Return the first file of each new skeleton, by the skeleton's digest."""
+    """Return, for the digest of each new skeleton, the first file that contains the skeleton."""
     firsts: dict[str, PreparedImport] = {}
     for file in files:
         for digest in new:
@@ -174,7 +174,7 @@ def found_mapping(answer: bytes) -> PreparedDocument:
 
 
 def add_mapping(files: Sequence[PreparedImport], digest: str, mapping: PreparedDocument) -> list[PreparedImport]:
-    """Return the files; the part `mapping` is added to the skeleton with the given digest in each file that has it."""
+    """Add the part `mapping` to the skeleton with the given digest, in each file that contains it; return all files."""
 
     def with_mapping(draft: Draft) -> Draft:
         if draft.kind is not Kind.SKELETON:
@@ -251,7 +251,7 @@ def _runs(files: Sequence[PreparedImport]) -> Iterator[list[PreparedImport]]:
 
 
 def _concerns_request(error: ApiProblem) -> bool:
-    """Return whether an error concerns the whole request; that of a folder concerns only the files in this folder."""
+    """Return whether an error concerns the whole request; a missing role in a folder concerns only the files there."""
     return error.status in REFUSED_ALTOGETHER and not isinstance(error, FolderRoleProblem)
 
 

@@ -14,8 +14,8 @@ class Loading:
     that package, each can wait for a lock that the other holds; Python then ends one of the imports with an error. With
     this lock, only one thread imports at a time. Child processes need no lock, because they import in a single thread.
 
-    If modules were loaded, the garbage collector skips all objects that exist then: modules own nearly all of them and
-    live as long as the process, and searching them stops all threads for 0.2 s.
+    After an import that has loaded modules, the lock excludes all existing objects from garbage collection. Nearly all
+    of them belong to modules, which live as long as the process, and a search of them stops all threads for 0.2 s.
     """
 
     def __init__(self) -> None:

@@ -33,7 +33,7 @@ ANSWER_SEARCH = "marey_server.motions.search_answers:answer_search"
 WRITE_SEARCH = "marey_server.motions.search_answers:write_search"
 """Functions that child processes run."""
 FAR_CM = 5.0
-"""Error of a position constraint above which it is out of reach of the model, measured before inverse kinematics."""
+"""Error in cm, before inverse kinematics, above which a position constraint counts as out of the model's reach."""
 
 MOST_WORK = 3e9
 """Greatest cost of a search, in nanoseconds of one thread (estimated)."""
@@ -287,7 +287,7 @@ def _found_step(result: SearchResult, number: int, one: Searchable, found: Found
 
 
 def placement_of(start: StartPlacement) -> Placement:
-    """Return the start position and heading in the world as a `Placement` of the canonical frame."""
+    """Return the start position and heading as a `Placement`, which moves canonical coordinates into the world."""
     from marey_motion.alignment.aligned import Placement
 
     return Placement(radians(start.heading_deg), start.x, start.z)

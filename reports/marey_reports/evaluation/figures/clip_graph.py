@@ -188,7 +188,7 @@ def _draw_dots(panel: Axes, circles: dict[str, Circle], dots: dict[str, Ints], m
 
 
 def _labels(subjects: Sequence[Subject], uids: Collection[str], longest: int) -> list[dict[str, str]]:
-    """Return the labels of clips by uid for each subject, shortened to `longest` characters; subjects share labels."""
+    """Return the labels of clips by uid for each subject, at most `longest` characters long, equal for all subjects."""
     held = [{clip.uid: clip.name for clip in subject.result.clips if clip.uid in uids} for subject in subjects]
     names = {uid: name for each in reversed(held) for uid, name in each.items()}
     labels = dict(zip(names, labels_of(list(names.values()), longest), strict=True))

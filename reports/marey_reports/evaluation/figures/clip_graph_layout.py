@@ -97,7 +97,7 @@ def _ring(radii: Floats) -> Floats:
 
 
 def _dots(frames: Sequence[int]) -> Ints:
-    """Compute the number of dots per circle: proportional to the square root of its frames, at most one per frame."""
+    """Compute the numbers of dots: proportional to the square root of the number of frames, at most one per frame."""
     counts = np.asarray(frames, dtype=np.float64)
     earned = np.clip(MOST_DOTS * counts**0.5 / max((counts**0.5).sum(), 1.0), FEWEST_DOTS, FULLEST)
     return np.asarray(np.maximum(1, np.minimum(counts, earned)), dtype=np.int64)

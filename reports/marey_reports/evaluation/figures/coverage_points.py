@@ -103,7 +103,7 @@ def _draw(panel: Axes, subject: Subject, points: _Points, styles: dict[str, int]
 
 
 def _look(style: int) -> dict[str, Any]:
-    """Return colour and marker of a clip; neighbours differ in both."""
+    """Return the colour and the marker for a style number; consecutive numbers differ in both."""
     row = style // len(COLOURS)
     return {"c": COLOURS[style % len(COLOURS)], "marker": MARKERS[(style + row) % len(MARKERS)]}
 

@@ -37,7 +37,7 @@ DIRECTION_CELL_M_S = 0.25
 
 
 class _Plane(NamedTuple):
-    """Axes of a density map: two quantities of each window of a clip, their names, and the area that a count covers."""
+    """Axes of a density map: two quantities of windows of clips, their names, and the area that seconds refer to."""
 
     x: Callable[[Coverage], Floats]
     y: Callable[[Coverage], Floats]

@@ -169,7 +169,7 @@ def _draw_field(
 
 
 def _mark_extreme(panel: Axes, field: _Field, signed: bool) -> None:
-    """Write the value of the dot farthest from zero beside it."""
+    """Write the value that is farthest from zero beside its dot, with a plus sign if `signed` and positive."""
     row, column = np.unravel_index(np.nanargmax(np.abs(field.offset_m)), field.offset_m.shape)
     right, up = column <= field.offset_m.shape[1] // 2, row <= field.offset_m.shape[0] // 2
     panel.annotate(

@@ -109,10 +109,10 @@ def find_record(subject: Subject, name: str) -> TrialRecord:
 
 
 def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequence[Family]) -> Trial:
-    """Choose a trial that all subjects have, called `name` if that is given.
+    """Choose a trial that all subjects have; if `name` is given, the trial must have this name.
 
-    The trial is from the first of `families` with a suitable trial; of several, it is the trial that the first subject
-    follows worst. Raises `MotionError` if the subjects have no such trial in common.
+    The families are tried in their order, up to the first that contains such trials. Of these trials, the one that the
+    first subject follows worst is chosen. Raises `MotionError` if the subjects have no such trial in common.
     """
     known = [{each.trial.name for each in subject.result.trials} for subject in subjects]
     shared = [each for each in subjects[0].result.trials if all(each.trial.name in names for names in known)]

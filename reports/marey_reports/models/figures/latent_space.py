@@ -35,7 +35,7 @@ NAMED = 12
 MOST_ROWS = 30
 ROW = 0.2
 FARTHEST = 20.0
-"""Greatest number of robust deviations below the median that is drawn to scale."""
+"""Greatest distance below the median, in robust standard deviations, that is drawn to scale."""
 
 
 def draw_latent_space(subject: ModelSubject) -> Sketch | None:

@@ -31,7 +31,7 @@ MOST_BARS = 40
 
 
 def draw_variance(subject: ModelSubject) -> Sketch:
-    """Draw the share of the variance in the first 1, 2, ... components, of poses and of time."""
+    """Draw the share of the variance that the first 1, 2, ... components explain, for poses and for time."""
     kinds = {
         "poses": (subject.report.spatial_energy, subject.primitive.spatial.count),
         "time": (subject.report.temporal_energy, subject.primitive.temporal.count),
@@ -120,7 +120,7 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
 
 
 def draw_criterion(subject: ModelSubject) -> Sketch | None:
-    """Draw BIC and AIC over the number of mixture components; return None if the training compared no numbers."""
+    """Draw BIC and AIC over the number of mixture components; return None if the training did not compute them."""
     candidates = subject.report.candidates
     if not candidates:
         return None

@@ -35,7 +35,7 @@ from marey_server.store.wakeups import job_topic, wakeups
 
 LONGEST_WAIT_S = 30.0
 LOOK_AGAIN_S = 15.0
-"""Interval in seconds at which a waiting request polls the job, in case a wake-up is lost."""
+"""Interval in seconds at which a waiting request polls the job, in case the notification of its end is lost."""
 
 MAX_SUBMISSION_BYTES = 32 * MIB
 _WAIT = re.compile(r"(?:^|[,;\s])wait=(\d{1,4})(?:$|[,;\s])")

@@ -30,7 +30,7 @@ from marey_server.store.jobs.staging import PreparedOutput
 from marey_server.store.wakeups import wakeups, work_topic
 
 LOOK_FOR_WORK_S = 15.0
-"""Interval in seconds at which a waiting claim polls the queue, in case a wake-up is lost."""
+"""Interval in seconds at which a waiting claim polls the queue, in case the notification of a new job is lost."""
 
 MAX_STAGED_BYTES = 256 * MIB
 MAX_LOG_BYTES = MIB

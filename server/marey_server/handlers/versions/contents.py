@@ -74,10 +74,11 @@ class ReceivedContents(Resource):
     async def post(self, project: str, dataset: str, body: ReceivedRevisions) -> Rendered:
         """Store revisions from an archive or another server, so that received commits can refer to them.
 
-        The project must have the revisions to which they refer; a reference gives the content digest of a revision.
-        The server creates an item for each revision. The item of a revision that an entry has is deleted at once; a
-        checkout of a version with the entry restores it. The other items are created in the folder `imported`. Because
-        quotas do not count deleted items, only maintainers may send this request.
+        Received revisions refer to other revisions by content digest; the project must have these revisions. The server
+        creates an item for each received revision. If the revision is the content of a dataset entry, the item is
+        created as a deleted item, and a checkout of a version with this entry restores the item. The items of other
+        revisions are created in the folder `imported`. Because quotas do not count deleted items, only maintainers may
+        send this request.
         """
         local = await self.look_up(datasets.find_local, project, body.revisions)
         drafts = await self.compute(datasets.prepare_revisions, body.revisions, local)

@@ -99,16 +99,16 @@ class ProposalComments(Resource):
 
 
 class WaitingProposal(Resource):
-    """Base of resources whose changes can complete a proposal that waits to be merged."""
+    """Base of resources that can meet the last requirement of a proposal which waits to be merged."""
 
     tag = "Proposals"
 
     async def settle(
         self, function: Callable[..., Any], project: str, dataset: str, proposal: int, body: Request
     ) -> Rendered:
-        """Run `function`, which may merge the proposal, with a prepared merge; answer with its result.
+        """Prepare a merge of the proposal, pass it to `function`, which may perform it, and answer with the result.
 
-        If a branch has moved since the merge was prepared, prepare it and run `function` again.
+        If a branch has moved since the merge was prepared, prepare the merge and run `function` again.
         """
         for _ in range(TRIES - 1):
             try:
@@ -141,7 +141,7 @@ class ProposalReviews(WaitingProposal):
     async def post(self, project: str, dataset: str, proposal: int, body: ReviewCreate) -> Rendered:
         """Review the newest commit of an open proposal.
 
-        If the proposal waits to be merged and nothing else is missing, an approval merges it.
+        If the proposal waits to be merged and meets all other requirements, an approval merges it.
         """
         return await self.settle(proposals.add_review, project, dataset, proposal, body)
 
@@ -155,7 +155,7 @@ class ProposalChecks(WaitingProposal):
     async def post(self, project: str, dataset: str, proposal: int, body: CheckReport) -> Rendered:
         """Report the state of a check of the newest commit of an open proposal.
 
-        If the proposal waits to be merged and nothing else is missing, a success merges it.
+        If the proposal waits to be merged and meets all other requirements, a successful check merges it.
         """
         return await self.settle(proposals.report_check, project, dataset, proposal, body)
 
@@ -184,7 +184,7 @@ class ProposalMerges(Resource):
 
     @writes(access=Access.CONTRIBUTOR, answer=Proposal, etag=True)
     async def delete(self, project: str, dataset: str, proposal: int) -> Rendered:
-        """Stop a proposal from being merged automatically, as `when_green` requested; the proposal stays open."""
+        """Cancel the automatic merge that was requested with `when_green`; the proposal stays open."""
         return await self.answer(proposals.withdraw_merge, project, dataset, proposal)
 
 
