@@ -1,1 +1,1 @@
-"""Shared drawing code: paper and ink, bodies as lines, figures with their numbers, pages and tables."""
+"""Shared drawing code: style of figures, bodies as lines, figures with their numbers, pages and tables."""

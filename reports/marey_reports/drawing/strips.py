@@ -195,7 +195,7 @@ def _draw_way(axes: Axes, way: Floats, frame: Rectangle) -> None:
 
 
 class _Shapes(NamedTuple):
-    """Shapes of a body: by side, long lines of joined bones (`runs`) and the single bones (n, 2); also its head."""
+    """Shapes of a body: for each side, lines of joined bones (`runs`) and the single bones (n, 2); and the head."""
 
     runs: dict[int, list[Indices]]
     bones: dict[int, Indices]

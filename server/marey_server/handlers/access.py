@@ -115,7 +115,8 @@ class PasswordResource(Resource):
     async def count(self, function: Callable[[Transaction, SignInTry], T], attempt: SignInTry) -> T:
         """Run `function`, which counts a try to sign in or to use a code, and return its result.
 
-        Raises `TooManyRequestsProblem`, and notes it, so that further tries are refused without a transaction.
+        Raises `TooManyRequestsProblem` if `function` does. The server remembers such a refusal, so that it can refuse
+        further tries at once.
         """
         try:
             return await self.change(function, attempt)
@@ -297,9 +298,9 @@ class UserResource(PasswordResource):
         )
 
     async def _verify(self, user: str, body: UserChange) -> str | None:
-        """Return the stored hash that the given current password matches.
+        """Check the current password in a request, and return the stored hash that it matches.
 
-        Raises `ForbiddenProblem` if it does not match.
+        Return None if the request contains no current password. Raises `ForbiddenProblem` if the password is wrong.
         """
         if body.current_password is None:
             return None

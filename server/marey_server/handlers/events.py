@@ -20,7 +20,7 @@ from marey_server.store.wakeups import Listener, events_topic, wakeups
 
 KEEP_ALIVE_S = 15.0
 LOOK_AGAIN_EVERY = 4
-"""Number of keep-alive comments after which a connection reads the feed, in case no notification of an event came."""
+"""Number of keep-alive comments after which a connection reads the feed, in case a notification of events is lost."""
 
 
 class EventsQuery(Request):

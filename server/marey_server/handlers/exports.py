@@ -87,9 +87,9 @@ class Export(BlobSender):
         predecessor are those of Marey's predecessor: an unchanged item that was imported from such a file is returned
         as that file.
 
-        If the consent for a clip has ended, the export is refused (409, `consent-expired`). The take record of the
-        newest revision counts; for an aligned clip, that of its source clip. Maintainers can allow the export with
-        `allow_expired_consent` and a reason.
+        If the consent for a clip has ended, the export is refused (409, `consent-expired`). The last day of the
+        consent is in the take record of the clip's newest revision; for an aligned clip, in that of its source clip.
+        Maintainers can allow the export with `allow_expired_consent` and a reason.
         """
         place = (project, kind_of(kind), item, query.revision)
         options = PredecessorOptions(query.end_index, query.form, query.part, query.layout)

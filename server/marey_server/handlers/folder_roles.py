@@ -59,8 +59,8 @@ class FolderRoleResource(Resource):
         """Set the role of a member in a folder and everything below it.
 
         The role may be higher or lower than that in the project. It concerns changes only: every member may read the
-        whole project. The nearest folder with a role for the member counts; in one folder, a role for the member
-        replaces the role for all members (user `*`). Owners have all rights in all folders.
+        whole project. The role in the nearest folder that has one applies; in the same folder, a role for the member
+        takes precedence over the role for all members (user `*`). Owners have all rights in all folders.
         """
         believed = self.precondition
         return await self.answer(

@@ -40,9 +40,9 @@ class DatasetPurges(Resource):
     async def post(self, project: str, body: DatasetPurgeRequest) -> Rendered:
         """Purge a deleted dataset: delete its versions, branches, tags and proposals for good, or preview this.
 
-        A version is still needed by items that a job made from it, and by jobs that have not ended and read it. If
-        there are such items or jobs, the answer is 409 (`still-held`), and `context` lists them. A purge of a dataset
-        deletes none of the items in its versions; items that are deleted can be purged afterwards.
+        A version is still needed by items that a job made from it, and by unfinished jobs that read it. If there are
+        such items or jobs, the answer is 409 (`still-held`), and `context` lists them. The purge does not delete the
+        items in the versions; those of them that are deleted already can be purged afterwards.
         """
         if body.preview:
             return await self.render_document(Reply(await self.look_up(purging.preview_dataset_purge, project, body)))

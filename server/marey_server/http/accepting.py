@@ -28,7 +28,10 @@ MOST_CONNECTIONS = 10_000
 ADDRESS_SHARE = 0.75
 """Largest share of all connections that one address may have; trusted proxies may have more."""
 EVICTED_SHARE = 1 / 16
-"""Number of idle connections that are closed when a limit is reached, as a share of the limit on all connections."""
+"""Greatest number of idle connections that are closed when a limit is reached.
+
+The number is given as a share of the limit on all connections.
+"""
 ACCEPTED_AT_ONCE = 4
 """Number of connections accepted in one round of the event loop; then requests on open connections get their turn."""
 PAUSE_S = 0.5

@@ -126,7 +126,7 @@ class Operation:
 
     @property
     def shows_project(self) -> bool:
-        """Whether the operation changes a project and its answer shows content, which also needs the scope `read`."""
+        """Whether the operation changes a project and shows its content, so that callers need the scope `read`, too."""
         return self.scope == "write" and self.access.role is not None and self.etag and self.answer is not None
 
     @property

@@ -33,7 +33,10 @@ class ByteRange:
     last: int | None
 
     def within(self, size: int) -> tuple[int, int]:
-        """Return start and stop in a representation of `size` bytes. Raises `RangeNotSatisfiableProblem`."""
+        """Return the offsets of the first byte and of the byte after the last one, in content of `size` bytes.
+
+        Raises `RangeNotSatisfiableProblem` if no byte of the content is in the range.
+        """
         if self.first is None:
             start, stop = max(size - (self.last or 0), 0), size
         else:

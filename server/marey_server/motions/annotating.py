@@ -17,7 +17,10 @@ from marey_server.store.items.annotating import AnnotatedClip, ChangedAnnotation
 from marey_server.store.revs import ExpectedRev, is_expected, moved_on
 
 MOST_WORK = 30_000_000
-"""Greatest sum, over the commands of a request, of the numbers of segments and keyframes (some seconds of work)."""
+"""Greatest work of a request, which takes some seconds.
+
+The work of a command is the number of segments and keyframes of the annotation; the work of a request is the sum.
+"""
 
 
 def apply_commands(

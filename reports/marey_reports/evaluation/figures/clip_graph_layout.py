@@ -51,7 +51,7 @@ class Circle:
 
 
 def arrange(frames: Mapping[str, int], links: Mapping[tuple[str, str], int]) -> dict[str, Circle]:
-    """Arrange circles of clips by uid; clips with many transitions between them are side by side.
+    """Arrange the circles of clips, and return them by uid; clips with many transitions between them are side by side.
 
     Parameters
     ----------

@@ -62,7 +62,7 @@ def _followed(subject: Subject, trial: Trial) -> Floats | None:
 
 
 def _sections(trial: Trial, ticks: int, rate_hz: float) -> list[tuple[int, int, float]]:
-    """Return first and end tick of each section and its speed; the first section is the approach."""
+    """Return the first tick, the end tick and the speed of each section; the first section is the approach."""
     bounds = [0.0, trial.approach_s]
     end_s = ticks / rate_hz
     if trial.family == "switching":
@@ -91,7 +91,7 @@ def _number_sections(
     sections: Sequence[tuple[int, int, float]],
     limits: tuple[tuple[float, float], tuple[float, float]],
 ) -> None:
-    """Write its number on each section of a path, if possible at a distance from the numbers written before."""
+    """Write the number of each section on the path, if possible at a distance from the numbers written before."""
     span = limits[0][1] - limits[0][0]
     placed: list[Floats] = []
     for number, (start, stop, _) in enumerate(sections, start=1):

@@ -1,4 +1,4 @@
-"""Figure about the number of components: their variance, errors of reconstruction, choice of the mixture."""
+"""Figures about numbers of components: explained variance, error of reconstruction, and choice of the mixture."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ SAMPLES = 16
 LONGEST_LABEL = 18
 
 FROM_ASIDE_RAD, FROM_AHEAD_RAD = float(np.radians(-50.0)), float(np.radians(-25.0))
-"""Directions from which motions that travel and other motions are seen: about +Y, from the front right.
+"""Directions, in radians about +Y, from which strips show motions that travel and other motions: from the front right.
 
 Motions begin facing +z, so walks go to the right in the picture.
 """
