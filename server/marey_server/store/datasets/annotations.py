@@ -1,4 +1,4 @@
-"""Merges of annotations that both sides of a merge have changed: their documents are loaded, merged and prepared."""
+"""Merging of the documents of annotations that both sides of a merge have changed."""
 
 from __future__ import annotations
 
@@ -19,13 +19,16 @@ from marey_versions.records import document_content, local_document, portable_do
 
 PART = "annotation"
 AT_ONCE = 100
-"""Greatest number of annotations whose versions are loaded by the same statements."""
+"""Greatest number of annotations that are loaded with one set of SQL statements."""
 MOST_MERGED = 1_000
 """Greatest number of annotations that one merge combines. It limits how long other writers wait for the commit."""
 MOST_MERGED_BY_JOB = 50
-"""Greatest number of annotations that the commit of a job merges, which also computes them while others wait."""
+"""Greatest number of annotations that the commit of a job's outputs merges.
+
+It is smaller than `MOST_MERGED`, because the merge may be computed in a write transaction, while other writers wait.
+"""
 MOST_BYTES = 8 * 1024**2
-"""Greatest total size of the documents that one merge loads."""
+"""Greatest total size of the documents that one merge loads, in bytes."""
 
 NO_CONTENT = AnnotationClash("The project has no revision with the content of one of the versions.")
 
@@ -34,7 +37,7 @@ class AnnotationMerger:
     """Merges annotations of one project, and keeps the resulting documents until a commit stores them."""
 
     def __init__(self, tx: Transaction, project_id: str, most: int | None = None) -> None:
-        """Create a merger of at most `most` annotations, by default `MOST_MERGED`; further ones are in conflict."""
+        """Create a merger of at most `most` annotations (by default `MOST_MERGED`); all others become conflicts."""
         self._tx = tx
         self._project_id = project_id
         self._most = MOST_MERGED if most is None else most
@@ -48,10 +51,10 @@ class AnnotationMerger:
         """Merged documents by content digest."""
 
     def merge(self, changed: Sequence[ChangedPart]) -> list[str | AnnotationClash | None]:
-        """Merge the documents of those parts that are annotations.
+        """Merge the annotations among the parts that both sides have changed.
 
         Returns, for each part, the content digest of the merged annotation, or the reason why it cannot be merged, or
-        None if the part is no annotation.
+        None if the part is not an annotation.
         """
         outcomes: list[str | AnnotationClash | None] = [None] * len(changed)
         places = [at for at, one in enumerate(changed) if one.ours.kind == Kind.ANNOTATION.value and one.part == PART]
@@ -79,9 +82,9 @@ class AnnotationMerger:
         ]
 
     def _find_documents(self, wanted: Iterable[str]) -> dict[str, str]:
-        """Return the digests of annotations, by the content digests of the revisions that contain them.
+        """Return the digests of the documents of annotations, by the content digests of their revisions.
 
-        `wanted` are content digests of revisions; those that the project does not have are left out.
+        `wanted` are content digests of revisions; revisions that the project does not have are left out.
         """
         held = revisions_with(self._tx, self._project_id, wanted)
         parts = read_part_digests(self._tx, set(held.values()))
@@ -117,14 +120,17 @@ class AnnotationMerger:
 
 
 def _contents_of(one: ChangedPart) -> tuple[str, ...]:
-    """Return the content digests of three revisions: those with the base, our version and their version of a part.
+    """Return the content digests of the revisions with the base, with our version and with their version of a part.
 
-    If there is no base, the result is empty.
+    If the part has no base, the result is empty.
     """
     return () if one.base is None else (one.base.content, one.ours.content, one.theirs.content)
 
 
 def _version(body: Mapping[str, Any], contents: Contents) -> AnnotationVersion:
-    """Return a version of an annotation from its stored document, in which the clip is the only reference."""
+    """Return a version of an annotation, in the form that can be merged, from its stored document.
+
+    The reference to the clip, the only reference in the document, is replaced by the content digest of the clip.
+    """
     motion = next((contents.parts.get(one, {}).get("motion") for one in references_in(body["clip"])), None)
     return AnnotationVersion({**body, "clip": portable_document(body["clip"], contents.revisions.get)}, motion)

@@ -38,12 +38,12 @@ from marey_versions.tree.reading import Tree
 def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest) -> CheckoutAnswer:
     """Replace the content of a dataset's folder by a version, which becomes the parent of the folder's next commit.
 
-    An item whose entry has moved or changed keeps its id. For an entry of the version that the folder lacks, its
-    deleted item is restored if possible; otherwise a new item is created.
+    An item whose entry has moved or changed keeps its id. If the folder lacks an entry of the version, the deleted item
+    of this entry is restored if possible; otherwise a new item is created.
 
-    Raises `ForbiddenProblem` unless the caller is a maintainer in all folders of the dataset, `ConflictProblem` if the
-    folder has changes that no commit has recorded and that are not to be discarded, or if another request changes the
-    folder. Raises `InvalidProblem` if too many entries differ.
+    Raises `ForbiddenProblem` unless the caller is a maintainer in all folders of the dataset, and `InvalidProblem` if
+    too many entries differ. Raises `ConflictProblem` if another request changes the folder, or if the folder has
+    changes that no commit has recorded and the request does not discard them.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
@@ -114,9 +114,10 @@ class _Checkout:
             self._add(one, documents)
 
     def _documents(self, entries: Iterable[DatasetEntry]) -> dict[str, tuple[str, Mapping[str, str]]]:
-        """Return, for each content digest, an item and the documents of its revision with this content.
+        """Find, for the content of each entry, an item with a revision that has this content.
 
-        Raises `InvalidProblem` if the project does not have the content of an entry.
+        Returns, by content digest, the id of the item, and the digests of the documents of the revision by name of the
+        part. Raises `InvalidProblem` if the project does not have the content of an entry.
         """
         wanted = {entry.content: entry for entry in entries}
         held = revisions_with(self.tx, self.project.id, wanted)

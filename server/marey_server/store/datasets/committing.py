@@ -1,7 +1,7 @@
-"""Commits: a read prepares the new version, and a short write records it.
+"""Commits: a read transaction prepares the new version, and a short write transaction records it.
 
-The write checks that the newest commit of the branch is still the one that the read has found. So a version that was
-computed from an older commit is never recorded.
+The write transaction checks that the newest commit of the branch is still the one that the read transaction has found.
+So a version that was computed from an older commit is never recorded.
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ class PreparedCommit:
     chunks: Mapping[str, bytes] = field(default_factory=dict)
     contents: Contents = field(default_factory=Contents)
     combined: Sequence[CombinedEntry] = ()
-    """Entries that have changes of both sides of a merge; no item may have their revisions yet."""
+    """Entries that combine changes of both sides of a merge; the project may not have revisions of them yet."""
     documents: Mapping[str, PreparedDocument] = field(default_factory=dict)
-    """Documents in these entries that are not stored yet, by content digest."""
+    """Documents of the entries in `combined` that are not stored yet, by content digest."""
     of_folder: bool = False
     existing: str | None = None
     """Existing commit to which the branch moves, in place of a new one."""
@@ -267,8 +267,9 @@ def _require_checked_out(found: Row[Any], parent: str | None) -> None:
 def _from_folder(
     tx: Transaction, project_row: ProjectRow, found: Row[Any], store: StoredChunks, before: str | None
 ) -> tuple[str, Contents]:
-    """Store the tree of the items in the dataset's folder, as changes of the tree `before`, if there is one.
+    """Store the items in the dataset's folder as a tree of entries.
 
+    If there is an earlier tree `before`, only the differences between this tree and the folder are applied to it.
     Returns the digest of the root of the tree, and the content digests of the items.
     """
     state = read_folder(tx, project_row, found)

@@ -24,7 +24,7 @@ class Contents:
     revisions: dict[RevisionKey, str] = field(default_factory=dict)
     parts: dict[RevisionKey, dict[str, str]] = field(default_factory=dict)
     computed: dict[RevisionKey, dict[str, str]] = field(default_factory=dict)
-    """Parts, by revision, whose digests are not stored yet."""
+    """Content digests of parts that are not stored yet: by revision, then by name of the part."""
 
 
 def find_contents_of(tx: Transaction, wanted: Iterable[RevisionKey]) -> Contents:
@@ -79,7 +79,10 @@ class _Waiting:
 
 
 def _read(tx: Transaction, wanted: Sequence[RevisionKey], found: Contents) -> dict[RevisionKey, _Waiting]:
-    """Add the stored digests to `found`, and return the revisions that have none; missing revisions are left out."""
+    """Add the stored digests of the wanted revisions to `found`, and return the revisions without a stored digest.
+
+    Revisions that do not exist are left out.
+    """
     waiting: dict[RevisionKey, _Waiting] = {}
     for some in map(set, in_lists(wanted)):
         rows = [row for row in tx.execute(_PARTS.where(*_among(some))) if RevisionKey(row.item_id, row.number) in some]
@@ -118,8 +121,9 @@ _PARTS = (
 def _among(wanted: Collection[RevisionKey]) -> tuple[ColumnElement[bool], ...]:
     """Return SQL conditions that the parts of all wanted revisions meet.
 
-    Ids and numbers are compared separately, because SQLite would scan the whole table to compare pairs. Parts of other
-    revisions, with the id of one and the number of another, can therefore also meet the conditions; callers skip them.
+    Ids and numbers are compared separately, because SQLite would scan the whole table to compare pairs. So the parts of
+    a revision that is not wanted meet the conditions, too, if its id and its number each occur in `wanted`. Callers
+    skip such parts.
     """
     ids, numbers = {one.item for one in wanted}, {one.revision for one in wanted}
     return revision_part.c.item_id.in_(sorted(ids)), revision_part.c.number.in_(sorted(numbers))

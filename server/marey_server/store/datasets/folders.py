@@ -1,4 +1,4 @@
-"""Folders of a project whose content is recorded by datasets: their entries, and the changes since a version."""
+"""Folders of datasets: their present content as entries, and the changes since a version."""
 
 from __future__ import annotations
 

@@ -81,9 +81,9 @@ def list_commits(
 ) -> Page:
     """List a commit and the commits before it, newest first; of the parents of a merge, only the first is followed.
 
-    With `path`, list only the commits that changed entries at this path or below it, compared with their first parent,
-    and report what each commit changed there. A page ends after `MOST_EXAMINED` commits or `MOST_DIFFERENCES`
-    compared entries, so it may have fewer than `limit` commits although more follow.
+    With `path`, list only the commits that differ from their first parent in entries at this path or below it, and
+    report these differences. A page ends after `MOST_EXAMINED` commits or `MOST_DIFFERENCES` compared entries, so it
+    may have fewer than `limit` commits although more follow.
     """
     row = find_dataset(tx, projects.require(tx, project), name)
     order = listing.parse_order("place", {"place": literal(0)}, unique="place")
@@ -102,7 +102,7 @@ def list_commits(
 
 
 def _along_first_parents(tx: Transaction, dataset_id: str, start: str, steps: int) -> Sequence[Row[Any]]:
-    """Return the rows of a commit and of at most `steps` earlier commits, from each commit to its first parent."""
+    """Return the rows of a commit and of at most `steps` earlier commits, found by following first parents."""
     earlier = first_parents(dataset_id, start, steps)
     return tx.execute(
         select(dataset_commit)

@@ -1,7 +1,7 @@
 """Plans of commits of the outputs of jobs: the outputs are merged with what others have committed; nothing is written.
 
-A plan is computed in the transaction that records it, or, for many outputs, in a read before. If others have moved the
-branch since that read, `follow` adds their changes to the plan, unless they concern the same entries.
+A plan is computed in the transaction that records it, or, for many outputs, in an earlier read transaction. If others
+have moved the branch since then, `follow` adds their changes to the plan, unless they concern the same entries.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from marey_versions.tree.reading import ChunkReader, Tree
 LONGEST_PATH = 1280
 """Greatest number of characters in the path of an entry."""
 MOST_COMBINED = 10_000
-"""Greatest number of entries with changes of the job and of others; each gets a new revision in the final write."""
+"""Greatest number of entries that both the job and others have changed; the commit stores new revisions of them."""
 MOST_FOLLOWED = 1_000
 """Greatest number of changes of others that are added to a plan while the branch is locked."""
 
@@ -55,9 +55,9 @@ class OutputEntries:
     author_id: str | None
     """Author of the job."""
     replaced: str | None = None
-    """Folder whose other entries are removed; None: nothing is removed."""
+    """Folder in which all entries of `kinds` that are not outputs of the job are removed; None: nothing is removed."""
     kinds: Collection[str] = ()
-    """Kinds of the entries that are removed."""
+    """Kinds of the entries that are removed from the folder `replaced`."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class PlannedCommit:
     head: str | None
     """Newest commit of the branch when the plan was computed."""
     refused: CommitConflict | None = None
-    """Reason why no commit can have the outputs; then the fields below are empty."""
+    """Reason why the outputs cannot be committed; then the fields below are empty."""
     head_tree: str = ""
     """Tree of the commit `head`."""
     tree: str = ""
@@ -88,7 +88,8 @@ class PlannedCommit:
 def plan_outputs(tx: Transaction, wanted: OutputEntries, head: str | None, most: int) -> PlannedCommit:
     """Compute the commit of the outputs of a job to a branch whose newest commit is `head`.
 
-    It adds, changes and removes at most `most` entries; otherwise, it is refused.
+    The commit is refused if it would add, change and remove more than `most` entries in total, if a path is too long,
+    or if more than `MOST_COMBINED` entries have changes of the job and of others.
     """
     store = StoredChunks(tx)
     reader = ChunkReader(store)
@@ -113,9 +114,9 @@ def plan_outputs(tx: Transaction, wanted: OutputEntries, head: str | None, most:
 def follow(tx: Transaction, wanted: OutputEntries, planned: PlannedCommit, head: str | None) -> PlannedCommit | None:
     """Return a plan for the commit `head`, to which others have moved the branch since the plan was computed.
 
-    Its chunks include those of `planned`, because these may be stored no more: a purge deletes chunks that only a
-    deleted dataset needs. Returns None if the plan must be computed again, because the others have changed the same
-    entries as the job, or too many entries.
+    The new plan keeps all chunks of `planned`, even those that were stored already, because a purge may have deleted
+    them: it deletes chunks that only a deleted dataset needs. Returns None if the plan must be computed again, because
+    others have changed the same entries as the job, or too many entries.
     """
     if planned.head == head or planned.merged.conflicts:  # the commit to a branch of its own stays as it is
         return planned
@@ -139,8 +140,9 @@ def follow(tx: Transaction, wanted: OutputEntries, planned: PlannedCommit, head:
 def _with_removals(base: Tree, wanted: OutputEntries, most: int) -> dict[str, DatasetEntry | None]:
     """Return the outputs of a job as entries by key, and None for each entry that the job removes.
 
-    A job that replaces the content of a folder removes the other entries of its kinds in this folder of `base`. The
-    result has at most one entry more than `most`, unless there are more outputs.
+    A job that replaces the content of a folder removes the other entries of its kinds in this folder of `base`.
+    Removals are added only until the result has `most` + 1 entries, because a commit of more than `most` entries is
+    refused.
     """
     entries: dict[str, DatasetEntry | None] = dict(wanted.entries)
     if wanted.replaced is not None and entries:
@@ -155,7 +157,7 @@ def _values(entries: Mapping[str, DatasetEntry | None]) -> dict[str, Value | Non
 
 
 def _unfit(entries: Mapping[str, DatasetEntry | None], most: int) -> CommitConflict | None:
-    """Return the reason why no commit can have these entries, or None."""
+    """Return the reason why a commit cannot contain these entries, or None."""
     if len(entries) > most:
         return too_many_changes(most, "changes")
     long = [path_and_kind(key)[0] for key in entries if len(key.partition("\t")[0]) > LONGEST_PATH]
@@ -166,7 +168,10 @@ def _unfit(entries: Mapping[str, DatasetEntry | None], most: int) -> CommitConfl
 
 
 def too_many_changes(most: int, verb: str) -> CommitConflict:
-    """Return the conflict of a job whose commit would have more than `most` changes; `verb` says what it does."""
+    """Return the conflict of a job whose commit would have more than `most` changes.
+
+    `verb` is the verb phrase of the error text, such as `changes`.
+    """
     return CommitConflict(
         code="too-many-changes",
         detail=f"Such a commit {verb} at most {most:,} entries. The outputs are in the project; commit them by a "
@@ -183,7 +188,8 @@ def _merged(
 ) -> MergedEntries:
     """Merge the entries of a job, part by part, with the changes of other commits.
 
-    Other commits have changed the tree `base` to the tree `head`. Only changes at the paths of these entries count.
+    Other commits have changed the tree `base` to the tree `head`. Only their changes of the entries in `entries` are
+    considered.
     """
     before = {key: entry_of(key, value) for key, value in Tree(reader, base).get_several(entries).items()}
     if base == head:
@@ -207,8 +213,8 @@ def _is_in_folder(
 ) -> bool:
     """Return whether the dataset's folder contains a commit's changes already, so that it counts as checked out.
 
-    This is so if the commit before, `head`, was checked out in the folder, and each entry in `changes` is the newest
-    revision of an item at its path in the folder.
+    For this, the commit `head`, the parent of the new commit, must be checked out in the folder. Also, each entry in
+    `changes` must be the newest revision of an item at the entry's path in the folder.
     """
     followed = (dataset.c.id == wanted.dataset_id, dataset.c.folder_commit.is_not_distinct_from(head))
     folder = tx.execute(FOLDER.where(*followed)).scalar()

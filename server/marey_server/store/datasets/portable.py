@@ -88,7 +88,10 @@ def _loaded(tx: Transaction, held: Mapping[str, RevisionKey], request: ContentsR
 
 
 def _that_fit(digests: list[str | None], sizes: Mapping[str, int]) -> list[str | None]:
-    """Return the first digests, at least one, whose documents together have at most `MOST_BYTES_AT_ONCE`."""
+    """Return as many of the first digests as have documents of at most `MOST_BYTES_AT_ONCE` bytes in total.
+
+    The first digest is always returned, even if its document is larger.
+    """
     size_bytes = 0
     for place, digest in enumerate(digests):
         size_bytes += 0 if digest is None else sizes[digest]

@@ -49,11 +49,14 @@ class LocalRevisions:
     documents: Mapping[str, Mapping[str, str]]
     """Digest of the document of each part."""
     last_purge: int
-    """Time of the last purge of the project before they were found."""
+    """Time of the last purge of the project before the revisions were found."""
 
 
 def find_local(tx: Transaction, project: str, received: Sequence[ReceivedRevision]) -> LocalRevisions:
-    """Find the revisions that a request contains or refers to. Raises `ConflictProblem` if the project lacks one."""
+    """Find the revisions that a request contains or refers to.
+
+    Raises `ConflictProblem` if the project lacks a revision that a received revision refers to.
+    """
     project_row = projects.require(tx, project)
     last = last_purge(tx, project_row.id)
     wanted = {content for one in received for content in contents_in(one.parts)}

@@ -27,11 +27,11 @@ from marey_versions.records import RevisionKey
 MISSING_CONTENTS = "missing-contents"
 """Code of the error for revisions that the project does not have; `context.contents` lists their digests."""
 LONGEST_NAME = 200
-"""Greatest number of characters of a path's last name that the name of a new item begins with."""
+"""Greatest number of characters that the name of a new item takes from the last component of a path."""
 
 
 def require_contents(missing: Iterable[str]) -> None:
-    """Raise `ConflictProblem` if content digests are `missing` from the project."""
+    """Raise `ConflictProblem` if `missing`, the content digests that the project lacks, is not empty."""
     if lacking := sorted(missing):
         raise ConflictProblem(
             f"The project lacks {counted(len(lacking), 'revision')} that the request refers to; send them first.",
@@ -54,10 +54,10 @@ def publish_contents(
     rights: FolderRights | None = None,
     job_id: str | None = None,
 ) -> int:
-    """Publish drafts by their content digests; return how many were new.
+    """Publish those drafts whose content the project does not have; return their number.
 
-    Drafts whose content the project has already are left out. `rights` are needed as for `publish`. Raises
-    `InvalidProblem` if the content digest of a revision is not the one under which `drafts` has it.
+    `drafts` maps the content digest of each revision to its draft. `rights` may be None only if all drafts are hidden,
+    as for `publish`. Raises `InvalidProblem` if the content digest of a published revision is not its key in `drafts`.
     """
     held = revisions_with(tx, project_row.id, drafts)
     lacking = [draft for content, draft in drafts.items() if content not in held]

@@ -38,7 +38,7 @@ class EndedConsent(NamedTuple):
 
 
 def find_ended_consents(tx: Transaction, item_ids: Iterable[str]) -> dict[str, EndedConsent]:
-    """Return, by id, those of the items whose consent has ended: whose last day is before the present day, in UTC."""
+    """Return, by id, the items whose consent has ended, that is, whose last day of consent is before today (UTC)."""
     wanted = sorted(set(item_ids))
     found: dict[str, EndedConsent] = {}
     for some in in_lists(wanted):
@@ -48,7 +48,10 @@ def find_ended_consents(tx: Transaction, item_ids: Iterable[str]) -> dict[str, E
 
 
 def find_ended_with(tx: Transaction, project_id: str, contents: Sequence[str]) -> list[EndedConsent]:
-    """Return the items of a project whose consent has ended, and of which a revision has one of the content digests."""
+    """Return the items of a project whose consent has ended and that have a revision with a wanted content.
+
+    `contents` are the content digests of the wanted revisions.
+    """
     holders = select(revision.c.item_id).where(revision.c.content.in_(contents))
     rows = tx.execute(_ended(tx).where(item.c.project_id == project_id, item.c.id.in_(holders)).order_by(item.c.id))
     return [_shown(row) for row in rows]
@@ -80,7 +83,10 @@ def _shown(row: Any) -> EndedConsent:
 
 
 def require_consent(ended: Collection[EndedConsent]) -> None:
-    """Raise `ConflictProblem` if the consent for any clips has ended; it names the first of them, and the remedies."""
+    """Raise `ConflictProblem` if `ended` is not empty: the consent for these clips has ended.
+
+    The text of the error names the first of the clips, and the remedies.
+    """
     if not ended:
         return
     first = next(iter(ended))
@@ -97,8 +103,8 @@ def require_consent(ended: Collection[EndedConsent]) -> None:
 def permit_export(tx: Transaction, project: str, kind: Kind, item_id: str, override: ConsentOverride) -> bool:
     """If the consent for an item has ended, record that the caller allows its export; return whether it has ended.
 
-    Raises `ForbiddenProblem` unless the caller is a maintainer or an owner, with the scope `write`, and
-    `NotFoundProblem`.
+    Raises `ForbiddenProblem` unless the caller is a maintainer or an owner and has the scope `write`, and
+    `NotFoundProblem` if the item does not exist.
     """
     project_row = projects.require(tx, project, at_least=Role.MAINTAINER)
     projects.require_scope(tx, project, "write")

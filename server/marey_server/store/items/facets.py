@@ -1,8 +1,8 @@
-"""Facets that jobs publish: their check when an attempt states them, and their publication.
+"""Facets (named numbers that jobs publish about revisions of their inputs): checks, staging and publication.
 
-They are staged with the results of the attempt, so they are published, dropped or shared with identical jobs as these
-are. An attempt can state facets only of the inputs of its job, and of the clips of evaluations among these inputs, and
-only those that the kind of the job declares.
+An attempt stages facets together with its results. Like results, facets are published when the attempt succeeds,
+deleted if it fails, and shared with identical jobs. An attempt can state facets only of the inputs of its job, and of
+the clips of evaluations among these inputs. The kind of the job must declare the names of the facets.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ StoredFacets = list[list[Any]]
 
 
 def stored_facets(tx: Transaction, job_row: Any, facets: Sequence[ItemFacets]) -> StoredFacets:
-    """Return facets as they are staged; `job_row` has the columns `inputs`, `kind` and `project_id` of the job.
+    """Check the facets that an attempt states, and return them in the form in which they are staged.
 
-    Raises `InvalidProblem` for a revision that the job does not measure, one that occurs twice, and for a name that the
-    kind of the job does not declare.
+    `job_row` has the columns `inputs`, `kind` and `project_id` of the job. Raises `InvalidProblem` for a revision that
+    is neither an input of the job nor a clip of an evaluation among the inputs, for a revision that occurs twice, and
+    for a name that the kind of the job does not declare.
     """
     declared, given = find_kind(job_row.kind).facets, _measured(tx, job_row)
     for one in facets:
@@ -65,7 +66,10 @@ def _measured(tx: Transaction, job_row: Any) -> set[tuple[str, int]]:
 
 
 def _pairs(clip_set: Any) -> Iterator[tuple[str, int]]:
-    """Yield the clips of an evaluation; the schema of evaluations does not describe this member."""
+    """Yield the clips in the member `clip_set` of an evaluation, as pairs of item id and revision number.
+
+    The schema of evaluations does not describe this member, so whatever has another form is skipped.
+    """
     clips = clip_set.get("clips") if isinstance(clip_set, Mapping) else None
     for clip in clips if isinstance(clips, list) else ():
         named = (clip.get("item"), clip.get("revision")) if isinstance(clip, Mapping) else (None, None)
@@ -87,9 +91,10 @@ def _existing(tx: Transaction, project_id: str, named: Collection[tuple[str, int
 
 
 def with_revisions(facets: StoredFacets, revisions: Mapping[tuple[str, int], int]) -> StoredFacets:
-    """Return the facets of one job as those of an identical job; `revisions` has the revision of each of its inputs.
+    """Return facets that an identical job has staged, rewritten as facets of this job.
 
-    Other items, the clips of evaluations, have the same revisions for both jobs.
+    `revisions` maps each input of the other job (item id and revision number) to the revision that this job read. Other
+    items, the clips of evaluations, have the same revisions for both jobs.
     """
     return [[item_id, revisions.get((item_id, number), number), values] for item_id, number, values in facets]
 
@@ -97,8 +102,8 @@ def with_revisions(facets: StoredFacets, revisions: Mapping[tuple[str, int], int
 def publish_facets(tx: Transaction, job_id: str, project_id: str, facets: StoredFacets) -> None:
     """Record the facets that a job states.
 
-    If another job has published a facet of the same revision, its value is replaced. Items that were purged meanwhile
-    are left out.
+    If another job has published the same facet of the same revision, its value is replaced. Items that were purged
+    meanwhile are left out.
     """
     hold_off_purges(tx, project_id)
     stated: dict[str, list[tuple[int, dict[str, float]]]] = {}
@@ -120,7 +125,10 @@ def publish_facets(tx: Transaction, job_id: str, project_id: str, facets: Stored
 
 
 def _not_purged(tx: Transaction, project_id: str, items: Sequence[str]) -> Sequence[str]:
-    """Return those items of a project that are not purged, by id; all writers lock rows in this order."""
+    """Return those items of a project that are not purged, sorted by id.
+
+    All writers lock rows in this order, to avoid deadlocks.
+    """
     statement = select(item.c.id).where(
         item.c.id.in_(items), item.c.project_id == project_id, item.c.purged_us.is_(None)
     )

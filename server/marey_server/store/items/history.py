@@ -92,7 +92,7 @@ def read_lineage(
 
 
 def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[LineageEdge, ...]:
-    """Return the revisions that lineage rows refer to, for the rows that meet `condition`.
+    """Return the revisions at one end of the rows of `lineage` that meet `condition`.
 
     `other` and `number` are the columns of `lineage` that contain the item and the number of these revisions.
     """

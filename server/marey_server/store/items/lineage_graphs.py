@@ -34,8 +34,8 @@ Place = tuple[str, int]
 class _Ends(NamedTuple):
     """Columns of `lineage` for one direction of the search.
 
-    `item` and `number` contain the revision from which a step starts, the other two columns the revision that it
-    reaches.
+    A step of the search starts from the revision in `item` and `number`, and reaches the revision in `other_item` and
+    `other_number`.
     """
 
     item: Column[Any]

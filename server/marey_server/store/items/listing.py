@@ -58,7 +58,10 @@ class ItemFilters:
 
     @property
     def looks_up_name(self) -> bool:
-        """Whether `name` is a whole name, or `**` ends it: `walk**` selects names that begin with the text `walk*`."""
+        """Whether `name` is a whole name without a wildcard, or ends in `**`.
+
+        In `**`, the first asterisk is an ordinary character: `walk**` selects names that begin with the text `walk*`.
+        """
         return bool(self.name) and (not str(self.name).endswith("*") or str(self.name).endswith("**"))
 
 
@@ -76,7 +79,8 @@ def list_items(
 ) -> Page:
     """Return one page of a project's items of a kind; with `fields`, each item has only the members named there.
 
-    Raises `ForbiddenProblem` if the caller is an attempt of a job and the filters do not look up a name.
+    Raises `ForbiddenProblem` if the caller is an attempt of a job and the filters do not select by name
+    (`looks_up_name`).
     """
     if tx.principal.kind == "attempt" and not filters.looks_up_name:
         raise ForbiddenProblem(
@@ -107,7 +111,7 @@ def _shown(tx: Transaction, rows: Any, fields: Collection[str] | None) -> list[A
 def _fast_conditions(
     tx: Transaction, project_id: str, filters: ItemFilters, kind: Kind, order: listing.Order
 ) -> list[ColumnElement[bool]]:
-    """Return `conditions_of` the filters, in a form with which the database finds the items of the query quickly."""
+    """Return the conditions of `conditions_of`, in a form that lets the database use an index for the query."""
     if filters.query is None or filters.deleted:
         return conditions_of(project_id, filters, kind)
     few, ordered = narrowing.narrow(tx, project_id, kind, read_query(filters.query))
@@ -131,7 +135,7 @@ def conditions_of(project_id: str, filters: ItemFilters, *kinds: Kind) -> list[C
 
 
 def _filter_conditions(project_id: str, filters: ItemFilters) -> list[ColumnElement[bool]]:
-    """Return the conditions of the filters alone."""
+    """Return the SQL conditions of the filters, without the conditions on the project and the kind."""
     conditions: list[ColumnElement[bool]] = []
     if filters.deleted:
         conditions += [item.c.deleted_us.is_not(None), item.c.purged_us.is_(None)]

@@ -20,7 +20,7 @@ from marey_server.store.tables import INDEXED_CHARACTERS, INDEXED_FACTS, MemberS
 from marey_server.store.transaction import Transaction
 
 MOST_ITEMS = 1000
-"""Greatest number of items that count as few."""
+"""Greatest number of items that may meet a condition for it to be used as `Narrowing.few`."""
 
 Candidates = Callable[[Condition, str, Kind], Select[Any]]
 """Function that returns the ids of all items of a project and kind that may meet a condition, found by an index.
@@ -31,22 +31,26 @@ not select, and items of other projects, may be among them.
 
 
 class Narrowing(NamedTuple):
-    """Conditions that all items meet that a query selects, and for which the database has an index."""
+    """Condition that all items selected by a query meet, and for which the database has an index.
+
+    At most one of the two fields is set.
+    """
 
     few: ColumnElement[bool] | None = None
     """Condition that at most `MOST_ITEMS` items meet."""
     ordered: ColumnElement[bool] | None = None
-    """If there is no such condition: one that an index answers in the order of creation.
+    """Condition that more than `MOST_ITEMS` items meet, and that an index answers in the order of creation.
 
-    With it, a list in this order reads only the items with the wanted value, however many have it.
+    A list in this order then reads only the items with the wanted value, however many have this value.
     """
 
 
 def narrow(tx: Transaction, project_id: str, kind: Kind, query: Query) -> Narrowing:
-    """Return the conditions by which the fewest items have to be read for a query.
+    """Return the condition by which the fewest items have to be read for a query.
 
-    Of all operands of the outermost `and`, the one for which an index finds the fewest items is chosen. If all have
-    more than `MOST_ITEMS`, the one whose newest `MOST_ITEMS` items go back furthest is chosen.
+    Of all operands of the outermost `and`, the one for which an index finds the fewest items is chosen. If each operand
+    has more than `MOST_ITEMS` items, the one whose newest `MOST_ITEMS` items go back furthest in time is chosen, since
+    it is the rarest.
     """
     fewest, few = MOST_ITEMS + 1, None
     oldest_us, ordered = None, None
@@ -76,7 +80,10 @@ def _indexed(query: Query) -> Iterator[Condition]:
 
 
 def _start(condition: Condition) -> ColumnElement[bool]:
-    """Return the condition that a text in the summary begins with one of the values, as far as the index stores it."""
+    """Return the condition that a text in the summary begins like one of the values.
+
+    Only the first `INDEXED_CHARACTERS` characters are compared, because the index contains no more.
+    """
     start = MemberStart(item.c.summary, condition.field)
     wanted = [str(one)[:INDEXED_CHARACTERS] for one in condition.values]
     return start == wanted[0] if len(wanted) == 1 else start.in_(wanted)

@@ -379,7 +379,7 @@ class _Publication:
             self._add(head.creator_id, Held(stored_bytes=added))
 
     def _with_earlier_facts(self, one: _Ready, head: _Head) -> _Ready:
-        """Return the draft with the facts about the recording that the existing clip states and the draft leaves empty.
+        """Return the draft of a clip, with empty facts about the recording filled in from the existing clip.
 
         Otherwise, a second import of a file would remove the consent of the performer.
         """

@@ -231,7 +231,7 @@ def _tag(condition: Condition, _: str) -> ColumnElement[bool]:
 
 
 def facet_meets(condition: Condition) -> ColumnElement[bool]:
-    """Return the condition that a row of `item_facet` has the name and a value of a condition on a facet."""
+    """Return the SQL condition that a row of `item_facet` has the name and the value that a query asks for."""
     named, value = item_facet.c.name == condition.field.removeprefix(FACET_PREFIX), item_facet.c.value  # never null
     if condition.operator == "has":
         return named

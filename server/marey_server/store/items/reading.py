@@ -108,10 +108,10 @@ _PART_OF_REVISION = Prepared(_PART.where(revision_part.c.number == bindparam("nu
 
 
 def find_item(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, *, deleted: bool = False) -> Any:
-    """Return the row of an item, or of a deleted item.
+    """Return the row of an item; with `deleted`, the row of a deleted item.
 
-    Raises `NotFoundProblem` if the project has no such item of this kind, and `GoneProblem` if a deleted item is wanted
-    that was purged.
+    Raises `NotFoundProblem` if the project has no such item of this kind, and `GoneProblem` if `deleted` is true and
+    the item was purged.
     """
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value}
     row = tx.execute(_DELETED_ITEM, which).one_or_none() if deleted else tx.first(_ITEM, which)

@@ -62,7 +62,7 @@ def in_order(names: Mapping[str, Sequence[str]]) -> list[str]:
 
 
 def resolved(tree: Any, done: Mapping[str, Published]) -> Any:
-    """Return the tree with each reference to a draft replaced by the revision published from it."""
+    """Return the document `tree` with each reference to a draft replaced by the revision published from the draft."""
     if isinstance(tree, Mapping):
         if tree.keys() == {"output"} and tree["output"] in done:
             published = done[tree["output"]]

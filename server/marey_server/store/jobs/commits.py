@@ -1,8 +1,8 @@
 """Commits of the outputs of jobs: checks at submission, and the commit in the transaction that ends the job.
 
 A job commits once: tasks of a fan-out publish their outputs, and their parent job commits these when it ends. If the
-commit is not allowed any more, the job fails and publishes nothing. It also does so if its author may not write to the
-folders of its outputs any more.
+commit is not allowed any more, the job fails and publishes nothing. The same happens if the author of the job may not
+write to the folders of its outputs any more.
 """
 
 from __future__ import annotations
@@ -118,14 +118,18 @@ def check_again(
 def with_new_base(tx: Transaction, target: Target | None) -> Target | None:
     """Return the commit that a job is to make, with the present head of its branch as the base.
 
-    Called when the late inputs of a job are pinned. `target` is returned unchanged if the branch does not exist.
+    Called when inputs of the job that are outputs of other jobs are pinned. `target` is returned unchanged if the
+    branch does not exist.
     """
     ref = None if target is None else find_ref(tx, target["dataset_id"], target["branch"])
     return target if target is None or ref is None else {**target, "base": ref.digest}
 
 
 def shown_commit(row: Any) -> JobCommit | None:
-    """Return the commit of a job as a document, or None if the job makes none. Only parent jobs commit, not tasks."""
+    """Return the commit of a job as a document, or None if the job makes none.
+
+    A task makes none, because its parent job commits the outputs of all tasks.
+    """
     target: Target | None = row.commit_to
     if target is None or row.parent_id is not None:
         return None
@@ -139,7 +143,10 @@ def _invalid(pointer: str, code: str, detail: str) -> InvalidProblem:
 
 
 def _entry_folder(target: Target, into: str, below: str = "") -> str:
-    """Return the folder of the dataset that receives the outputs of the folder `below` of a job's results."""
+    """Return the folder to which outputs of a job are committed, as a path in the dataset.
+
+    `into` is the collection of the job's results, and `below` is the folder of the outputs relative to `into`.
+    """
     if target["folder"] is not None:
         return _joined(target["folder"], below)
     place, within = _joined(into, below), target["within"]
@@ -226,7 +233,7 @@ def commit_tasks(tx: Transaction, row: Any) -> PublishedOutputs:
 def entries_of_tasks(tx: Transaction, row: Any) -> OutputEntries:
     """Return the outputs of all tasks of a parent job as entries. `row` has the columns `JOB_COLUMNS`.
 
-    At most one entry more than a commit may have is returned.
+    At most `MOST_COMMITTED` + 1 outputs are read, because a commit of more than `MOST_COMMITTED` is refused.
     """
     return _entries_of(tx, row, islice(_outputs_of_tasks(tx, row.id), MOST_COMMITTED + 1))
 

@@ -309,7 +309,8 @@ def fail(
 def _is_poisoned(tx: Transaction, job_id: str, signature: str | None) -> bool:
     """Return whether an earlier attempt of the job ended with the same failure signature.
 
-    A retry would then fail in the same way, and perhaps stop another worker.
+    The signature identifies the error and the place in the code where it occurred. A retry would then fail in the same
+    way, and perhaps stop another worker.
     """
     if signature is None:
         return False

@@ -68,7 +68,7 @@ _DEPENDENCIES = Prepared(
 
 
 def _after(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, tuple[str, ...]]:
-    """Return, for each job, the ids of the jobs that it depends on, without the job whose result it shares."""
+    """Return, for each job, the ids of the jobs that it depends on, except the job whose result it shares."""
     shared = {row.id: row.cached_from for row in rows}
     found: dict[str, tuple[str, ...]] = {}
     for row in tx.run(_DEPENDENCIES, {"ids": list(shared)}):
@@ -94,7 +94,10 @@ def _children(tx: Transaction, parents: Sequence[str]) -> dict[str, dict[str, in
 def _progress_of_tasks(
     tx: Transaction, heads: Sequence[Row[Any]], children: Mapping[str, dict[str, int]]
 ) -> dict[str, Progress]:
-    """Return the progress of parent jobs as a number of tasks: ended tasks plus finished shares of running tasks."""
+    """Return the progress of parent jobs as a number of tasks.
+
+    Each task that has ended counts as one, and each running task as the share of its work that is done.
+    """
     if not heads:
         return {}
     running: dict[str, list[Progress]] = {}

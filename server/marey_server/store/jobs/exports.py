@@ -1,4 +1,4 @@
-"""Jobs that write clips to files: clips whose consent has ended, and permissions to export these."""
+"""Consents of performers for jobs that export clips to files: which consents have ended, and permissions to export."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from marey_server.store.projects import ProjectRow
 from marey_server.store.transaction import Transaction
 
 ENDED = "consent_ended"
-"""Member of a job's result that lists the ids of the exported input's clips whose consent had ended."""
+"""Member of the result of an export job: ids of those clips of the exported input whose consent had ended.
+
+In the inputs that a worker gets, the member with this name is the last day of the consent.
+"""
 
 
 def ended_inputs(tx: Transaction, kind: KindDeclaration, inputs: Mapping[str, Any]) -> dict[str, EndedConsent]:
@@ -29,9 +32,10 @@ def ended_inputs(tx: Transaction, kind: KindDeclaration, inputs: Mapping[str, An
 
 
 def lease_inputs(tx: Transaction, kind_name: str, inputs: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Return the inputs of a job as a worker gets them: of clips that the job exports, with the end of their consent.
+    """Return the inputs of a job in the form that a worker gets.
 
-    The present day counts, not that of the submission.
+    Each clip that the job exports and whose consent has ended gets the additional member `ENDED`, the last day of the
+    consent. This day is compared with the present day, not with the day of the submission.
     """
     try:
         kind = find_kind(kind_name)
@@ -50,9 +54,10 @@ def lease_inputs(tx: Transaction, kind_name: str, inputs: Mapping[str, Any]) -> 
 
 
 def may_share(tx: Transaction, kind_name: str, inputs: Mapping[str, Any], result: Mapping[str, Any] | None) -> bool:
-    """Return whether the result of an identical job has refused, or was allowed to export, the same clips as a new job.
+    """Return whether consents allow a new job to share the result of an identical job.
 
-    It has not if a consent has ended since, or if a later day was recorded.
+    If the job exports clips, the consents of the same clips must have ended for both jobs. So the result is not shared
+    if the consent for another clip has ended since, or if a later last day of a consent was recorded.
     """
     try:
         kind = find_kind(kind_name)

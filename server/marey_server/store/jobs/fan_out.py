@@ -1,6 +1,6 @@
 """End of fan-outs: combines the results of tasks, or queues the parent job so that a worker combines them.
 
-To commit many outputs takes seconds, so the transaction that ends the last task does not do it, because other writers
+A commit of many outputs takes seconds. It is not made in the transaction that ends the last task, because other writers
 would wait. The parent job stays in the state `running`, without unfinished tasks, until `finishing` has ended it.
 """
 
@@ -79,9 +79,10 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
 
 
 def _is_large(tx: Transaction, head: Any, result: Mapping[str, Any]) -> bool:
-    """Return whether the commit of a parent job has many entries. `head` has `commit_to`, `result` the outputs' number.
+    """Return whether the commit of a parent job may have more than `MOST_AT_END` entries.
 
-    A job that replaces a folder may remove all entries of the version from which it started.
+    `head` has the column `commit_to`, and `result` contains the number of outputs. A job that replaces a folder may
+    also remove all entries of the version from which it started.
     """
     if head.commit_to is None:
         return False
@@ -94,7 +95,7 @@ def _is_large(tx: Transaction, head: Any, result: Mapping[str, Any]) -> bool:
 
 
 def _defer(tx: Transaction, running: ColumnElement[bool], result: Mapping[str, Any]) -> None:
-    """Store the combined result of the tasks of a parent job, and let the server commit the outputs."""
+    """Store the combined result of the tasks of a parent job; the server commits the outputs later (`finishing`)."""
     tx.execute(update(job).where(running).values(result=result, dependencies_left=0, rev=job.c.rev + 1))
     tx.after_commit(lambda: wakeups.announce([OUTPUTS_TO_COMMIT]))
 

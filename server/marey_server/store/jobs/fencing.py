@@ -80,7 +80,8 @@ AUTHOR_MAY_RUN: ColumnElement[bool] = or_(
 )
 """The condition that the author of a job still has a role that may submit jobs, or that the job has no author.
 
-The role in one folder suffices; the transaction that publishes results checks the role in their folders."""
+The role in one folder suffices; the transaction that publishes results checks the role in the folders of the results.
+"""
 
 
 def require_attempt(principal: Principal, job_id: str, fence: int) -> None:

@@ -1,9 +1,10 @@
 """Commits of the many outputs of parent jobs, without letting other writers wait.
 
-A read plans the commit. Several short writes store the chunks of its tree. A last write ends the job and moves the
-branch. What others have committed since the read is added to the plan in that last write, unless it concerns the same
-entries; then the commit is planned again. It is planned again, too, if items of the project were purged meanwhile. If
-the server stops in between, nothing but chunks has been stored, and the next server begins again.
+A read transaction plans the commit. Several short writes store the chunks of its tree. A last write ends the job and
+moves the branch. If others have committed since the plan was computed, the last write adds their changes to the plan.
+If their changes concern the same entries, the commit is planned again. It is planned again, too, if items of the
+project were purged meanwhile. If the server stops in between, nothing but chunks has been stored, and the next server
+begins again.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ def _portions(chunks: Mapping[str, bytes]) -> Iterator[Mapping[str, bytes]]:
 
 @dataclass(frozen=True)
 class _JobPlan:
-    """The outputs of a job, and the plan of their commit; None if the branch does not exist any more."""
+    """Outputs of a job, and their planned commit; `commit` is None if the branch does not exist any more."""
 
     job_id: str
     wanted: OutputEntries

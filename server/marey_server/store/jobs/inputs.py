@@ -1,4 +1,4 @@
-"""Resolution of inputs that a submission names to the exact revisions that the job reads, and items that jobs name."""
+"""Resolves the inputs of a submission to exact revisions, and records the items that jobs name."""
 
 from __future__ import annotations
 
@@ -295,10 +295,10 @@ _INSERT = Prepared(insert(job_item))
 
 
 def record_named_items(tx: Transaction, jobs: Iterable[NamingJob], *, new: bool = False) -> None:
-    """Record the items that jobs name, so that a purge finds the jobs by an index; what is recorded already stays.
+    """Record the items that jobs name, so that a purge finds these jobs by an index; earlier records are kept.
 
-    Every write that stores inputs, parameters or outputs in the row of a job must call this. `new` says that the jobs
-    were inserted by this write, so that nothing of them is recorded yet.
+    Every write that stores inputs, parameters or outputs in the row of a job must call this. `new` says that the same
+    write has inserted the jobs, so that they have no earlier records.
     """
     rows = [{"job_id": one.id, "item_id": item} for one in jobs for item in sorted(one.items())]
     if new and rows:

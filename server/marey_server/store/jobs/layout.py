@@ -91,8 +91,8 @@ def request_of(row: Row[Any]) -> JobCreate:
 def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dict[str, result_cache.SharedResult]]:
     """Split jobs with known inputs into tasks, and give them their cache keys.
 
-    Returns the tasks, and a mapping of the ids of jobs that share a result to the jobs with this result, which exists
-    or is being computed.
+    Returns the tasks, and a mapping from the ids of jobs that share a result to the jobs that have computed, or are
+    computing, this result.
     """
     gathering = [one for one in heads if one.submission.kind.gathering is not None]
     sources = _find_results(tx, gathering)
@@ -230,5 +230,5 @@ def layout_columns(tx: Transaction, one: NewJob) -> dict[str, Any]:
 
 
 def naming(one: NewJob) -> NamingJob:
-    """Return a new job with the inputs and parameters in which it names items."""
+    """Return a new job as a `NamingJob`, with the inputs and parameters that may name items."""
     return NamingJob(one.id, one.pins, {} if one.parent_id is not None else one.submission.params)

@@ -37,7 +37,7 @@ class QueuePolicy:
 
     @property
     def end_grace_us(self) -> int:
-        """Time that a worker has to stop after a cancel or its time limit, in microseconds."""
+        """Time that a worker has to stop after a cancellation or at its time limit, in microseconds."""
         return round(self.end_grace_s * SECOND_US)
 
     def backoff_us(self, failures: int) -> int:

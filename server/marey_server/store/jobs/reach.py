@@ -32,7 +32,10 @@ _pins: LruCache[str, Pins] = LruCache(
 _named: LruCache[str, frozenset[str]] = LruCache(
     max_bytes=_REMEMBERED_BYTES, size_of=lambda named: _ENTRY_BYTES * (1 + len(named))
 )
-"""Like `_pins`, cached by the id of a job and always current, because neither its pins nor revisions change."""
+"""Results of `_named_items`, by the id of the job.
+
+They never become outdated, because neither the inputs and parameters of a job nor revisions change.
+"""
 
 
 class Pins(NamedTuple):

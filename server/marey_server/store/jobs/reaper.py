@@ -114,7 +114,10 @@ def claim_after_reaping(
 
 
 def correct_times(tx: Transaction, policy: QueuePolicy = DEFAULT_POLICY) -> int:
-    """Shorten leases and waits that end too late after the clock of the database was set back; return their number."""
+    """Shorten leases and waits that end too late because the clock of the database was set back.
+
+    Returns the number of changed jobs.
+    """
     latest_us = tx.now_us + policy.lease_ttl_us
     leases = tx.execute(
         update(job).where(job.c.state == RUNNING, job.c.lease_expires_us > latest_us).values(lease_expires_us=latest_us)

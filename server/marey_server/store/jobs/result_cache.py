@@ -244,8 +244,8 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
 def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     """Publish the shared result as the result of a waiting job; return the jobs that ended as a result.
 
-    No job ends if the shared result is no longer stored, or if it is an export for which other consents had ended.
-    Raises the errors of `publish`.
+    No job ends if the shared result is no longer stored. No job ends either if the jobs export clips, and the clips
+    whose consent has ended are not the same for both jobs. Raises the errors of `publish`.
     """
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")

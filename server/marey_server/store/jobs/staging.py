@@ -36,7 +36,7 @@ StagedDraft = dict[str, Any]
 """Stored draft: an object with kind, name, collection below `into`, tags, reuse, sources, and digests of the parts."""
 
 _FACETS = ""
-"""Name of the draft that has the facets of an attempt instead of a result, and neither sources nor parts."""
+"""Name of the staged draft that contains the facets of an attempt (numbers about its inputs), and no result."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +65,9 @@ def stage(
 ) -> int:
     """Store outputs until the attempt completes; they replace staged outputs of the same names. Return their number.
 
-    `facets`, if there are any, replace those that the attempt staged before. Raises `LeaseLostProblem` if the attempt
-    does not hold the job, `InvalidProblem` for sources and facets of items that are not inputs of the job.
+    `facets`, unless empty, replace all facets that the attempt staged before. Raises `LeaseLostProblem` if the attempt
+    does not hold the job, `InvalidProblem` for sources that are not inputs of the job, and the errors of
+    `stored_facets`.
     """
     require_attempt(tx.principal, job_id, fence)
     held = hold(tx, job_id, fence, job.c.inputs, job.c.kind, job.c.project_id)
@@ -192,7 +193,7 @@ def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> boo
 def drop_staged(tx: Transaction, attempts: Collection[tuple[str, int]]) -> None:
     """Delete the drafts of the given attempts (job id and fence).
 
-    These are attempts that failed, or whose results no other job can share.
+    Called for attempts that did not succeed, and for attempts whose results no other job can share.
     """
     tx.run(_DROP_STAGED, _of_attempts(attempts))
 

@@ -93,9 +93,9 @@ def submit_checked(
 ) -> list[Job]:
     """Insert the rows of checked jobs and queue those without unfinished dependencies.
 
-    `upstream` maps the jobs that they depend on to their states; these jobs must be locked. A dependency among the
-    submissions counts as waiting. Raises `ForbiddenProblem` for an export that requires a higher role of the caller,
-    and for results in a folder to which the caller may not write.
+    `upstream` maps the jobs on which they depend to the states of these jobs, which must be locked. If a job depends on
+    another of the submitted jobs, this dependency counts as unfinished. Raises `ForbiddenProblem` for an export for
+    which the role of the caller is too low, and for results in a folder to which the caller may not write.
     """
     rights = rights_of_caller(tx, project)
     for submitted in submissions:
@@ -267,9 +267,10 @@ def _insert_dependencies(tx: Transaction, submissions: Sequence[Submission], ups
 
 
 def submit_pipeline(tx: Transaction, project: str, pipeline: PipelineCreate) -> Pipeline:
-    """Submit a job for each step; a step that reads outputs of others gets them when these have succeeded.
+    """Submit a job for each step of a pipeline.
 
-    Raises `InvalidProblem` with a pointer to each fault, and the errors of `projects.require`.
+    If a step reads outputs of other steps, its job starts when the jobs of those steps have succeeded. Raises
+    `InvalidProblem` with a pointer to each fault, and the errors of `projects.require`.
     """
     row = require(tx, project)
     hold_off_purges(tx, row.id)

@@ -39,7 +39,7 @@ from marey_server.store.tables import member, proposal_comment, user
 from marey_server.store.transaction import Transaction
 
 MOST_PREVIEWED = 10_000
-"""Greatest number of changed entries on a side of a merge whose result is computed when a proposal is read."""
+"""Greatest number of changed entries on each side of a merge that is previewed when its proposal is read."""
 MOST_SHOWN_CONFLICTS = 100
 
 WAITING_MERGE = ProposalMerge()
@@ -76,7 +76,10 @@ def prepare_acceptance(
 
 
 def prepare_waiting(tx: Transaction, project: str, name: str, number: int) -> PreparedAcceptance | None:
-    """Compute the merge of a proposal with a pending `when_green` request; return None for other proposals."""
+    """Compute the merge of a proposal for which an automatic merge (`when_green`) is requested.
+
+    Returns None for other proposals.
+    """
     found = find_dataset(tx, projects.require(tx, project), name)
     row = find_proposal(tx, found.id, number)
     return _prepare(tx, project, name, row, WAITING_MERGE) if is_waiting(row) else None
@@ -247,10 +250,10 @@ def withdraw_merge(tx: Transaction, project: str, name: str, number: int) -> Pro
 def merge_if_green(
     tx: Transaction, project: str, name: str, row: Row[Any], prepared: PreparedAcceptance | None
 ) -> bool:
-    """Merge a locked proposal if its merge was requested with `when_green` and nothing is missing any more.
+    """Merge a locked proposal if its automatic merge (`when_green`) was requested and all requirements are met.
 
-    Returns whether it was merged. It is not if the user who requested the merge may no longer move the branch. Raises
-    `ConflictProblem` if a branch has moved since the merge was prepared.
+    Returns whether the proposal was merged. It is not merged if the user who requested the merge may no longer move the
+    branch. Raises `ConflictProblem` if a branch has moved since the merge was prepared.
     """
     if not is_waiting(row):
         return False
@@ -266,9 +269,10 @@ def merge_if_green(
 
 
 def merge_basis(tx: Transaction, project_row: ProjectRow, row: Row[Any]) -> MergeBasis | None:
-    """Return what the result of a waiting merge depends on.
+    """Return the commits and the protection rule on which the result of a waiting merge depends.
 
-    Returns None if the proposal does not wait, if approvals, checks or rights are missing, or if changes are requested.
+    Returns None if the proposal does not wait, if approvals, checks or rights are missing, or if a reviewer has
+    requested changes.
     """
     if not is_waiting(row):
         return None
@@ -279,7 +283,10 @@ def merge_basis(tx: Transaction, project_row: ProjectRow, row: Row[Any]) -> Merg
 
 
 def _ready_mover(tx: Transaction, project_row: ProjectRow, row: Row[Any], target: Row[Any]) -> Mover | None:
-    """Return the user who requested a merge; None if an approval, a check or a right for it is missing."""
+    """Return the user who requested the merge, if the approvals and checks that the target requires are present.
+
+    Returns None if they are missing, if a reviewer has requested changes, or if the user may no longer move the branch.
+    """
     if any(find_missing(tx, project_row.id, row, rule_of(target))):
         return None
     return _waiting_mover(tx, project_row, row, target)

@@ -97,9 +97,9 @@ def _rows(dataset_id: str) -> Select[Any]:
 
 
 def is_waiting(row: Row[Any]) -> bool:
-    """Return whether a proposal will be merged as soon as nothing is missing any more, as `when_green` requests.
+    """Return whether a proposal is to be merged automatically (`when_green`) when all requirements are met.
 
-    A new commit in its source cancels the request.
+    A new commit in the source of the proposal cancels the request for an automatic merge.
     """
     return row.when_green_id is not None and row.when_green_head == row.head_now
 
@@ -182,7 +182,7 @@ def end(tx: Transaction, row: Row[Any], state: ProposalState, **values: Any) -> 
 
 
 def touch(tx: Transaction, row: Row[Any], **values: Any) -> None:
-    """Set columns of a locked proposal, the time of its last change, and its next `rev`."""
+    """Set columns of a locked proposal and the time of its last change, and increase its `rev` by one."""
     changed = update(proposal).where(*is_proposal(row.dataset_id, row.number))
     tx.execute(changed.values(**values, updated_us=tx.now_us, rev=proposal.c.rev + 1))
 

@@ -27,7 +27,7 @@ def add_review(
 ) -> Review:
     """Review the newest commit of an open proposal, and merge the proposal if it waits for nothing else.
 
-    Raises `ConflictProblem` if the proposal has ended, or if its newest commit is another one.
+    Raises `ConflictProblem` if the proposal has ended, or if its newest commit is not the one that the request names.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)  # for `merge_if_green`
@@ -64,9 +64,9 @@ def report_check(
 ) -> ProposalCheck:
     """Record the state of a check of the newest commit, and merge the proposal if it waits for nothing else.
 
-    Raises `ConflictProblem` if the proposal has ended, or if its newest commit is not the commit of the report. Also
-    raises it if the report is a success and names a job that has not succeeded or has read other versions. Raises
-    `NotFoundProblem` if the project has no such job.
+    Raises `ConflictProblem` if the proposal has ended, or if its newest commit is not the commit of the report. A
+    report of success may name a job; `ConflictProblem` is also raised if this job has not succeeded, or has read only
+    other versions of the dataset. Raises `NotFoundProblem` if the project has no such job.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)  # for `merge_if_green`

@@ -1,7 +1,8 @@
-"""Merges of proposals that wait until nothing is missing any more, as `when_green` requests.
+"""Automatic merges of proposals (`when_green`): each proposal is merged as soon as it meets all requirements.
 
-A review or a report of a check tries the merge at once. Other changes can complete a proposal, too: a changed rule, a
-moved target, a new role of the user who requested the merge. So the server examines all waiting proposals regularly.
+A review or a report of a check tries the merge at once. Other changes can meet the last requirement, too: a changed
+rule, a moved target, a new role of the user who requested the merge. So the server examines all waiting proposals
+regularly.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ log = logging.getLogger(__name__)
 
 
 class _PendingMerge(NamedTuple):
-    """A proposal whose merge was requested with `when_green`."""
+    """Proposal for which an automatic merge (`when_green`) is requested."""
 
     dataset_id: str
     number: int
@@ -47,18 +48,22 @@ class _PendingMerge(NamedTuple):
 
 
 class WaitingMerges:
-    """Attempts to merge waiting proposals, in the order of their datasets and numbers, again and again."""
+    """Attempts to merge waiting proposals, in repeated rounds; each round is in the order of datasets and numbers."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._last = ("", 0)
         self._obstructed: LruCache[tuple[str, int], MergeBasis] = LruCache(max_entries=OBSTRUCTED_KEPT)
-        """What the merge of a proposal was computed from when it had conflicts; it is not computed again from that."""
+        """Basis from which the merge of a proposal was last computed in vain, by dataset and number of the proposal.
+
+        The merge is computed again only if the basis has changed.
+        """
 
     def attempt(self) -> int:
-        """Merge those of the next `EXAMINED_AT_ONCE` waiting proposals that lack nothing; return how many.
+        """Examine the next `EXAMINED_AT_ONCE` waiting proposals, and merge those that are ready.
 
-        A proposal that another request changes meanwhile is examined again in the next round.
+        Returns the number of merged proposals. A proposal that another request changes meanwhile is examined again in
+        the next round.
         """
         found = self._database.read(SYSTEM, _next_waiting, self._last)
         merged = sum(map(self._attempt_one, found))
@@ -98,13 +103,13 @@ def _next_waiting(tx: Transaction, last: tuple[str, int]) -> list[_PendingMerge]
 
 
 def _basis_if_ready(tx: Transaction, one: _PendingMerge) -> MergeBasis | None:
-    """Return what the merge of a waiting proposal depends on; None if approvals, checks or rights are missing."""
+    """Return the basis of the merge of a waiting proposal; None if approvals, checks or rights are missing."""
     row = find_proposal(tx, one.dataset_id, one.number)
     return merge_basis(tx, find_by_id(tx, one.project_id), row)
 
 
 def _merge(tx: Transaction, one: _PendingMerge, prepared: PreparedAcceptance | None) -> bool:
-    """Merge a proposal if nothing is missing; return whether it has ended."""
+    """Merge a waiting proposal if all requirements are met; return whether it was merged."""
     hold_off_purges(tx, one.project_id)
     row = lock_open(tx, one.dataset_id, one.number)
     return merge_if_green(tx, one.project, one.dataset, row, prepared)
