@@ -71,7 +71,7 @@ FIRST_COMMAND = "marey project create lab"
 
 
 class CannotListen(Exception):
-    """The server cannot listen on the address or port in the settings; the text gives both and the reason."""
+    """Error of a server that cannot listen on its address or port; the text contains both and the reason."""
 
 
 class Application(TornadoApplication):
@@ -248,7 +248,7 @@ async def serve(settings: Settings) -> None:
 
 @asynccontextmanager
 async def warming(children: Children) -> AsyncIterator[None]:
-    """Compile all kernels in a separate process, then start the child processes, while the server answers requests."""
+    """Compile all numeric kernels in a separate process, then start the children, while the server answers requests."""
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "marey_motion.warm_up", env=clean_environment()
     )

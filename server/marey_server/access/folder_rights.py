@@ -1,8 +1,8 @@
 """Rights of one user in the folders of a project: the user's role in the project, and the overrides of folders.
 
 An override gives a member, or all members, another role in a folder and everything below it. The nearest folder with an
-override counts; there, an override for the member counts more than one for all members. Overrides limit or extend who
-may write, not who may read: every member may read the whole project.
+override counts; there, an override for the member takes precedence over one for all members. Overrides limit or extend
+who may write, not who may read: every member may read the whole project.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ class FolderRoleProblem(ForbiddenProblem):
 class FolderRights:
     """Role of a user in a project, and in the folders that have overrides for this user.
 
-    `overrides` contains the role by the path of the folder, for all folders of one state: those that are not deleted,
-    and those that were deleted together. A user whom no override concerns, such as an owner, has none.
+    `overrides` has a mapping under the key None, for folders that are not deleted, and one for each time at which
+    folders were deleted. Each mapping contains the role of the user in a folder, by the path of the folder. It is empty
+    for users without overrides, such as owners.
     """
 
     project: str
@@ -35,10 +36,10 @@ class FolderRights:
     overrides: Mapping[FolderState, Mapping[str, Role]] = field(default_factory=dict)
 
     def role_in(self, path: str, deleted_us: FolderState = None) -> Role:
-        """Return the role in the folder `path`; `deleted_us` is the time at which it was deleted, if it was.
+        """Return the role in the folder `path`; `deleted_us` is the time at which a deleted folder was deleted.
 
-        A deleted folder may have the path of another one that was created later. If both have overrides, the lower role
-        counts.
+        A new folder may have been created at the path of a deleted folder. If both folders have overrides, the lower
+        role counts.
         """
         states = {None, deleted_us}
         for folder in with_ancestors(path):
@@ -62,10 +63,10 @@ class FolderRights:
                 raise self._refusal(folder, needed, held)
 
     def require_entry(self, path: str, needed: Role) -> None:
-        """Raise `FolderRoleProblem` unless the folder itself may be moved or deleted: as `require_below`, and above it.
+        """Raise `FolderRoleProblem` unless the folder at `path` may be moved or deleted.
 
-        The entry of a folder belongs to the folder above it. Otherwise a user with a role in one folder only could
-        move this folder to another place.
+        The role must be at least `needed` in this folder, in all folders below it, and in the folder above it.
+        Otherwise a user with a role in one folder only could move this folder to another place.
         """
         self.require(path.rpartition("/")[0], needed)
         self.require_below(path, needed)
@@ -73,8 +74,8 @@ class FolderRights:
     def require_restoration(self, path: str, deleted_us: FolderState) -> None:
         """Raise `FolderRoleProblem` unless an item of the folder `path`, deleted at `deleted_us`, may be restored.
 
-        If the folder is deleted, the item is restored into a folder without the roles of the deleted one. So the role
-        must suffice in both.
+        If the folder is deleted, the item is restored into another folder at this path, to which the overrides of the
+        deleted folder do not apply. So the role must suffice in both folders.
         """
         for state in (deleted_us, None):
             self.require(path, Role.MAINTAINER, state)

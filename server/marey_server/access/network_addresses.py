@@ -43,7 +43,7 @@ _REFUSED: tuple[Network, ...] = tuple(
         ),
     )
 )
-"""Networks that are not public, or whose addresses contain one of another network."""
+"""Networks that are not public, and networks whose addresses contain an IPv4 address, such as those of NAT64."""
 
 
 def may_connect(address: str, allowed: Iterable[Network]) -> bool:
@@ -55,7 +55,7 @@ def may_connect(address: str, allowed: Iterable[Network]) -> bool:
 
 
 def _parsed(address: str) -> Address:
-    """Return an address, without its zone; an IPv4 address that is written as `::ffff:1.2.3.4` becomes that address."""
+    """Parse an address, without its zone; `::ffff:1.2.3.4` becomes the IPv4 address `1.2.3.4`."""
     found = ip_address(address.partition("%")[0])
     return found.ipv4_mapped or found if isinstance(found, IPv6Address) else found
 

@@ -14,7 +14,7 @@ from marey_server.motions.child import FORK_SERVER, SINGLE
 
 CHILD_MODULE = "marey_server.motions.child"
 LOADED_FIRST = ("marey_server.motions.reading:load",)
-"""Functions that load modules and kernels in advance, so that the first orders of children do not wait for this."""
+"""Functions that load modules and kernels in advance, so that the first tasks of children do not wait for this."""
 
 Loading = TypeVar("Loading", ChildProcess, ForkServer)
 

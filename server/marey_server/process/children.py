@@ -27,9 +27,9 @@ from marey_server.process.child_starting import LOADED_FIRST, ChildStarter
 T = TypeVar("T")
 
 ORDERS_PER_CHILD = 1000
-"""Number of orders after which a child is replaced, so that memory that a library leaks does not add up."""
+"""Number of tasks after which a child process is replaced, so that memory leaks of libraries do not add up."""
 ABANDONED_S = 1.0
-"""Seconds that an order has to end after its client has disconnected; to start a new child would take longer."""
+"""Seconds in which a task may still end after its client has disconnected; starting a new child would take longer."""
 CLOSING_S = 10.0
 ASK_AGAIN_S = 5
 """Time in seconds after which a refused client may try again."""
@@ -131,7 +131,7 @@ class Children:
         self._running: list[ChildTask[Any]] = []
         self._requests: Counter[str] = Counter()
         self._turns: dict[str, int] = {}
-        """Number of the last turn of each caller; a caller gets a second turn only after all others had one."""
+        """Number of the turn in which each caller last got a child; decides between callers that use equally many."""
         self._turn = 0
         self._threads: list[threading.Thread] = []
         self._idle: set[int] = set()

@@ -64,7 +64,7 @@ def compute_on_one_thread_each() -> None:
 
 
 def leave() -> None:
-    """End this process at once if computations are still running; otherwise do nothing."""
+    """End this process without waiting for running computations; do nothing if none are running."""
     if not any(thread.name.startswith(THREAD_NAME) for thread in threading.enumerate()):
         return
     logging.shutdown()

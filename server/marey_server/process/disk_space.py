@@ -64,7 +64,7 @@ def free_bytes(folder: Path) -> int:
 
 
 def make_reserve(folder: Path) -> None:
-    """Write the reserve file if the disk has 8 times its size free; remove it if the disk is full."""
+    """Write the reserve file if at least 8 times `RESERVE_BYTES` are free; delete the file if the disk is full."""
     file = folder / RESERVE_FILE
     free = free_bytes(folder)
     if file.exists() or free < 8 * RESERVE_BYTES:

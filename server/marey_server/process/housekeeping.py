@@ -1,7 +1,7 @@
 """Periodic work of the server.
 
-It reclaims expired leases, shares cached results with waiting jobs, commits the outputs of jobs that made many, merges
-waiting proposals, and deletes old or unreferenced data. Only the leading process does this work, but concurrent
+It reclaims expired leases, shares cached results with waiting jobs, commits the outputs of jobs that have many outputs,
+merges waiting proposals, and deletes old or unreferenced data. Only the leading process does this work, but concurrent
 housekeeping would be safe, because every statement repeats its conditions. Each kind of work runs in a separate task,
 so that a failure does not affect the others.
 """
@@ -42,7 +42,7 @@ LONGEST_TICK_S = 5.0
 GARBAGE_EVERY_S = 3600.0
 FORGET_TRIES_EVERY_S = 60.0
 FIRST_GARBAGE_S = 60.0
-"""Delay of the first collection after the start; short, so that servers that run for only an hour also collect."""
+"""Seconds from the start to the first garbage collection; few, so that servers that run only an hour collect, too."""
 
 
 @asynccontextmanager
@@ -135,13 +135,13 @@ async def _share_results(services: Services, holder: str) -> None:
 
 
 async def _merge_waiting(services: Services, holder: str, merges: WaitingMerges) -> None:
-    """Merge proposals that have waited until nothing is missing any more."""
+    """Merge the waiting proposals that now meet all conditions of a merge."""
     if await _write(services, _leads, holder):
         await _in_thread(services, merges.attempt)
 
 
 async def _commit_outputs(services: Services, holder: str, *, longest_wait_s: float) -> None:
-    """Wait until jobs have many outputs to commit, or for `longest_wait_s`; then commit these and end the jobs."""
+    """Wait at most `longest_wait_s` for jobs with many outputs to commit; then commit the outputs, and end the jobs."""
     with wakeups.listen([OUTPUTS_TO_COMMIT]) as listener:
         await listener.wait(longest_wait_s)
     if await _write(services, _leads, holder):
@@ -167,7 +167,7 @@ async def _in_thread(services: Services, function: Callable[P, T], *args: P.args
 async def _forget_tries(services: Services, holder: str) -> None:
     """Delete the expired rows of the limits on sign-ins.
 
-    Few rows are added per minute, because each sign-in adds three rows, and passwords are hashed one by one.
+    This takes little time: each sign-in adds three rows, and passwords are hashed one by one, so the rows are few.
     """
     if await _write(services, _leads, holder):
         while await _write(services, rate_limits.forget_ended) == rate_limits.FORGOTTEN_AT_ONCE:

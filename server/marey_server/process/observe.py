@@ -61,7 +61,7 @@ def configure_logging(form: LogForm, level: str) -> None:
 
 
 def without_received_text(record: logging.LogRecord) -> bool:
-    """Replace what the client sent in Tornado's messages about malformed requests; return True to log the message.
+    """Remove what the client sent from Tornado's message about a malformed request; return True, so that it is logged.
 
     Only the kind of the fault is kept. The rest is removed, because it may quote a header that contains a token.
     """
@@ -75,9 +75,10 @@ def _kind_of_fault(error: Exception) -> str:
 
 
 def _is_of_an_upgrade(record: logging.LogRecord) -> bool:
-    """Return whether to keep a log record of Alembic: warnings, and upgrades that run.
+    """Return whether to keep a log record of Alembic, which upgrades the schema of the database.
 
-    Other records, such as those of the schema check in each readiness request, are dropped.
+    Warnings, errors and records of upgrades that run are kept. Other records, such as those of the schema check in each
+    readiness request, are dropped.
     """
     return record.levelno > logging.INFO or record.getMessage().startswith("Running")
 
@@ -179,6 +180,6 @@ class Metrics:
         self.children_stopped.labels(reason, work).inc()
 
     def watch(self, lanes: Mapping[str, Sized]) -> None:
-        """Let the metric of waiting calls show, for each lane, how many calls wait in it."""
+        """Let the metric of waiting calls show the number of queued calls of each lane (threads with a queue)."""
         for name, lane in lanes.items():
             self.waiting.labels(name).set_function(partial(len, lane))

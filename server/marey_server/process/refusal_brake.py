@@ -17,7 +17,7 @@ from marey_schemas.lru import LruCache
 EVERY_S = 0.05
 """Time in seconds between two measurements of the lateness of the event loop."""
 KEPT_SHARE = 0.9
-"""Share of the lateness that is kept from one measurement to the next."""
+"""Smallest ratio of a measured lateness to the previous one, so that the lateness decreases slowly."""
 TOLERATED_S = 0.1
 """Lateness in seconds up to which no refusal is delayed."""
 DELAY_PER_LATENESS = 10.0
@@ -29,7 +29,10 @@ CLIENTS_REMEMBERED = 10_000
 
 
 class RefusalBrake:
-    """Measurement of how late the event loop is, which runs while there are refusals, and delay of refused clients."""
+    """Delays of refused clients, computed from the lateness of the event loop.
+
+    The lateness is measured only while requests are refused.
+    """
 
     def __init__(self) -> None:
         self.late_s = 0.0

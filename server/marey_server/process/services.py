@@ -74,9 +74,9 @@ class Services:
             size_of=lambda body: len(body) + ANSWER_ENTRY_BYTES,
         )
         self.models: LruCache[SearchableKey, bytes] = LruCache(max_bytes=MODEL_CACHE_BYTES, size_of=len)
-        """Documents of models as bytes for children, with their search trees and mappings where these are used."""
+        """Packed models for child processes: documents and, for searches, search trees and joint mappings."""
         self.admitted: LruCache[Hashable, float] = LruCache(max_entries=ADMISSIONS_REMEMBERED)
-        """Time of the last admission of a caller, by the value that `admission_of` returns."""
+        """Time at which a caller was last allowed to send a body, by the value that `admission_of` returns."""
         self.followers: Counter[str] = Counter()
         """Number of open connections that follow events, by the id of the user."""
         self.draining = asyncio.Event()

@@ -15,7 +15,7 @@ from marey_server.store.database.lanes import Client, FairLine
 BEGUN_PER_ROUND = 4
 """Number of requests that begin in one round of the event loop if more are waiting."""
 RESERVED_PER_ROUND = 2
-"""Number of requests in a round that are reserved operations, if enough of them and other requests are waiting."""
+"""Number of places of a round that go to reserved operations first; the other places go to other requests first."""
 _ENDLESS = 2**62
 """Limit of a line that is never reached, because the number of connections is limited already."""
 

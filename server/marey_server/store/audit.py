@@ -1,7 +1,7 @@
 """Audit log: the events that concern access and deletion, newest first.
 
-Nothing but the retention deletes its entries. Nothing changes them, except that a purge of an item replaces its name by
-its id.
+Entries are deleted only when they are older than the settings allow. They are changed only when an item is purged: its
+id then replaces its name.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _ORDER = listing.parse_order("-at,-seq", _KEYS, unique="seq")
 class AuditFilter(NamedTuple):
     """Filter of the audit log; None selects all entries.
 
-    `subject` is the id of an object, or the name that entries are about; a text with the form of an id is no name.
-    Entries at `since` are selected, entries at `until` are not.
+    `subject` is the id or the name of the object that was changed; a text with the form of an id is always an id.
+    Entries at the time `since` are selected, entries at the time `until` are not.
     """
 
     kind: str | None = None

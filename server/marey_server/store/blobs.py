@@ -128,7 +128,7 @@ def require_sender(principal: Principal) -> None:
 
 
 EVERY_PROJECT = ""
-"""Stands for all projects, in place of a project id, for bytes sent with a token that is not limited to projects."""
+"""Value in place of a project id, for bytes sent with a token that is valid for all projects."""
 
 
 def places_of_sender(tx: Transaction) -> tuple[str, ...]:

@@ -22,13 +22,19 @@ PAST = frozenset(
 )  # fmt: skip
 """Columns of moments that have passed; none may lie in the future."""
 WAITING = frozenset({"expires_us", "lease_expires_us", "next_us", "old_secret_until_us", "run_at_us", "until_us"})
-"""Columns of times to wait for. If they are set to now, leases are renewed; jobs, sign-ins and webhooks go on."""
+"""Columns of times at which something ends or may go on.
+
+Times in the future are set to now: workers then renew their leases, and jobs, sign-ins and webhooks no longer wait.
+"""
 MOVED = {
     token.c.expires_us: token.c.created_us,
     invitation.c.expires_us: invitation.c.created_us,
     job.c.deadline_us: job.c.started_us,
 }
-"""Columns of ends, each with the column of the start: if the start lies in the future, both move by the same time."""
+"""Columns of end times, each with the column of the start time.
+
+A start time in the future is set to now, and the end time moves back by the same amount.
+"""
 
 
 @dataclass(frozen=True)

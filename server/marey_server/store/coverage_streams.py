@@ -1,7 +1,7 @@
-"""Streams of frames whose coverage is measured as the frames arrive: one row each, updated by compare-and-swap.
+"""Coverage streams: frames of a recording, and the measurement, as they arrive, of which motions are still missing.
 
-A row holds the whole state of a stream, and the answer to the last request, so that a sender who missed the answer gets
-it by repeating the request.
+Each stream is one row, updated by compare-and-swap. The row holds the whole state of the stream, and the answer to the
+last request, so that a sender who missed the answer gets it by repeating the request.
 """
 
 from __future__ import annotations
@@ -19,8 +19,6 @@ from marey_server.store.database.clock import DAY_US, datetime_of
 from marey_server.store.ids import new_id
 from marey_server.store.tables import coverage_stream
 from marey_server.store.transaction import Transaction
-
-"""Greatest number of streams in a project."""
 
 LIFETIME_US = DAY_US
 """Time without new frames after which a stream is deleted."""
@@ -142,7 +140,7 @@ def advance_stream(tx: Transaction, project: str, held: Stream, step: StreamStep
 
 
 def answered_before(stream: Stream, said: str) -> Tree | None:
-    """Return the stored answer if `said`, the digest of a request, is that of the last request, otherwise None."""
+    """Return the stored answer if a request, with the digest `said`, repeats the last one, otherwise None."""
     return stream.answer if stream.said == said else None
 
 

@@ -1,6 +1,7 @@
-"""Documents: JSON with a known schema, named by the digest of its content; array leaves and named files are blobs.
+"""Documents: JSON with a known schema, named by the digest of its content; its arrays and files are stored as blobs.
 
-In the database an array leaf is stored as `{"dtype", "shape", "content"}`; `document_blob` says which blob holds it.
+In the database, the JSON contains `{"dtype", "shape", "content"}` in place of an array. The table `document_blob`
+records which blob belongs to which place in a document.
 """
 
 from __future__ import annotations

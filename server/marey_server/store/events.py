@@ -8,7 +8,7 @@ nothing but the tables.
 
 Entries of the audit log are events that are kept longer than others. The feed begins after the last event that was old
 enough to be deleted. Audit entries before this place are no longer part of the feed. So clients and webhooks, which
-follow it, never receive some of the events of a period without the others.
+follow the feed, never receive audit entries of a period whose other events were deleted.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _last_deleted(tx: Transaction) -> int:
 
 
 def start_of_feed(tx: Transaction, after: int) -> int:
-    """Return the number after which the feed begins for a client that has received the events up to `after`."""
+    """Return the number after which a client that has received the events up to `after` continues to read the feed."""
     return max(after, _last_deleted(tx))
 
 
@@ -112,9 +112,9 @@ def start_of_feed(tx: Transaction, after: int) -> int:
 
 
 def find_last_old(tx: Transaction, age_us: int) -> int | None:
-    """Return the number of one of the oldest events of the feed if all up to it are older than `age_us`.
+    """Return the number up to which all events of the feed are older than `age_us`; None if there are no such events.
 
-    There are at most `DELETED_AT_ONCE` events up to it in the feed, and it is not the newest event.
+    At most `DELETED_AT_ONCE` events of the feed have numbers up to this one. The newest event is not among them.
     """
     number = number_of(tx)
     oldest = select(number.label("number"), event.c.at_us).where(follows(tx, _last_deleted(tx)))
@@ -206,7 +206,7 @@ class News(NamedTuple):
     topics: frozenset[str]
     last: int
     complete: bool
-    """Whether there were no further events."""
+    """Whether no events remain to be read."""
 
 
 def newest_number(tx: Transaction) -> int:
@@ -256,7 +256,7 @@ def kinds_due(tx: Transaction, since_us: int) -> tuple[set[str], int]:
 
 
 def forget_names(tx: Transaction, ids: Sequence[str], *members: str) -> None:
-    """Remove members, which contain names, from the events about items or folders.
+    """Remove the JSON members `members`, which contain names, from the bodies of events about items or folders.
 
     The audit log shows the id in place of the name.
     """

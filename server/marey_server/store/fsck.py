@@ -362,7 +362,7 @@ def _is_consistent(one: Row[Any], branches: set[str]) -> bool:
 
 
 def _check_job(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return a fault if a job names items that are not recorded, so that a purge would not find it."""
+    """Return a fault for each item that a job names without a row in `job_item`, from which purges find the jobs."""
     naming = NamingJob(row.id, row.inputs, {} if row.parent_id is not None else row.params, row.outputs or ())
     recorded = set(tx.execute(select(job_item.c.item_id).where(job_item.c.job_id == row.id)).scalars())
     return [

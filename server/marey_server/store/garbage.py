@@ -46,7 +46,7 @@ BATCH = 200
 BATCH_BYTES = 16 * MIB
 """Number of bytes that are deleted in one transaction, so that the writes of others do not wait long for it."""
 MOST_UPLOADS = 10_000
-"""Number of rows deleted in one round; databases limit the parameters of a statement."""
+"""Greatest number of uploads that are deleted in one round; databases limit the parameters of a statement."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ def _staged_documents(tx: Transaction) -> set[str]:
     """Return the digests of the documents of staged outputs: results that a running job has not published yet.
 
     Documents that are staged after this read are not deleted either, because staging updates the time of their rows.
-    Documents that completed attempts staged are kept only while something else refers to them.
+    If an attempt has completed, the documents that it staged are kept only while something else refers to them.
     """
     running = select(job.c.id).where(job.c.state == JobState.RUNNING.value)
     staged = select(staged_output.c.draft).where(staged_output.c.job_id.in_(running))
@@ -159,7 +159,7 @@ def delete_blobs(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_
 
 
 def _sweep_strays(database: Database, grace_us: int) -> int:
-    """Delete the files of blobs that the database does not name, after rollbacks or deletions; return their number."""
+    """Delete files of blobs that have no row in the database, after rollbacks or deletions; return their number."""
     return sum(
         database.write(SYSTEM, _remove_stray, digest)
         for digest in database.blobs.stray_digests(older_than_s=grace_us / 1_000_000)

@@ -107,11 +107,11 @@ def require(
     """Return the project `name` if the caller has the role and the scope that the transaction's operation declares.
 
     `at_least` raises the declared role and never lowers it. `deleted=True` looks for the project of this name that was
-    deleted last. If the operation declares `in_folders`, a role in some folder suffices; the role in the result is
-    that in the project nevertheless.
+    deleted last. If the operation declares `in_folders`, a role in some folder suffices, but the result contains the
+    role in the project.
 
     Raises `NotFoundProblem` if the caller may not know that the project exists, and `ForbiddenProblem` if the caller
-    lacks the role or the scope. An anonymous caller who may get them by signing in gets `UnauthenticatedProblem`
+    lacks the role or the scope. An anonymous caller, who may have them after signing in, gets `UnauthenticatedProblem`
     instead.
     """
     required = tx.required_role

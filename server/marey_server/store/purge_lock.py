@@ -1,15 +1,15 @@
 """Exclusion of purges from the writes that they could break: writes that refer to items, or publish content of items.
 
 Such a write reads items and then stores something that refers to them: a revision, an input of a job, a commit. Between
-the two, another request could delete and purge the items. So each of these writes holds off the purges of its project
-first, before it reads items and before it locks any row; many such writes run side by side. A purge waits until those
-that have begun have ended, and the others wait until it has ended. Since neither of the two waits for this lock while
-it holds a row that the other needs, they never wait for each other in a circle.
+the two, another request could delete and purge the items. So each of these writes first acquires a lock that excludes
+purges of its project, before it reads items and before it locks any row; many such writes run side by side. A purge
+waits until the writes that hold the lock have ended, and later writes wait until the purge has ended. Neither of them
+waits for this lock while it holds a row that the other needs, so there are no deadlocks.
 
-A commit is prepared in one transaction and recorded in a later one. It remembers the last purge of the project when it
-is prepared. Recording fails if another purge has followed.
+A commit is prepared in one transaction and recorded in a later one. The preparation reads the time of the project's
+last purge. Recording fails if another purge has followed.
 
-On SQLite, where writes run one after another, only the last paragraph applies.
+On SQLite, where writes run one after another, only this rule for commits is needed.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ def hold_off_purges(tx: Transaction, *project_ids: str) -> None:
 
 
 def hold_off_purges_of_jobs(tx: Transaction, job_ids: Iterable[str]) -> None:
-    """Do what `hold_off_purges` does, for the projects of jobs that this write is going to end.
+    """Call `hold_off_purges` for the projects of jobs that this write is going to end.
 
-    The end of a job can publish results, and pin them as inputs of jobs that have waited for it.
+    The end of a job can publish results, and use them as inputs of jobs that have waited for this job.
     """
     if not tx.is_postgres:
         return

@@ -128,7 +128,7 @@ class Transaction:
         return added if row is None else added.values(**row)
 
     def lock(self, name: str, *, shared: bool = False) -> None:
-        """Acquire the lock `name` and hold it until the end of the write; `shared` locks exclude only others.
+        """Acquire the lock `name` and hold it until the end of the write; `shared` locks exclude only exclusive locks.
 
         On SQLite it does nothing, because there is only one writer at a time.
         """

@@ -43,7 +43,7 @@ def create_user(tx: Transaction, request: UserCreate, *, password_hash: str | No
 
 
 def sign_up(tx: Transaction, name: str, display_name: str | None, password_hash: str) -> Principal:
-    """Create a user without a check of rights, as this user, and return the principal of the user.
+    """Create a user without a check of rights; the new user becomes the transaction's principal, and is returned.
 
     Raises `ConflictProblem` if the name is taken.
     """

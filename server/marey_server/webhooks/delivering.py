@@ -67,7 +67,7 @@ class Deliverer:
         self._lead_until_s = 0.0
         self._after: int | None = None
         self._scanned: dict[str, int] = {}
-        """Number, by webhook, of an event up to which no further event concerns the webhook."""
+        """By webhook, the number of the event up to which the feed was searched and nothing is left to send."""
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._again: set[str] = set()
         """Webhooks that may have got something new to send while their task was running."""

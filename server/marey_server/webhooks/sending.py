@@ -36,7 +36,7 @@ _FIRST_FAILURE = 300
 
 
 class AddressRefused(OSError):
-    """A host has no address to which the server may connect."""
+    """Error of a host that has no address to which the server may connect."""
 
 
 class CheckedResolver(Resolver):

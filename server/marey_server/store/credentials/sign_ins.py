@@ -24,9 +24,10 @@ from marey_server.store.tables import sign_in_limit
 from marey_server.store.transaction import Transaction
 
 MORE_FOR_MANY = 10
-"""Factor by which the limit of an address exceeds `per_minute`.
+"""Factor by which the limit of one address, for all accounts, exceeds `per_minute`.
 
-For an account from unknown addresses, only the number of tries without a pause is multiplied by it.
+The limit of an account, from all unknown addresses, allows this many times `per_minute` tries at once, but then only
+`per_minute` tries a minute.
 """
 KNOWN_FOR_US = 90 * DAY_US
 """Time for which an address is known after a sign-in."""
@@ -44,7 +45,7 @@ class SignInTry:
     """A try to sign in or to use a code: the account, which may not exist, and the client's address or network."""
 
     name: str
-    """Name of the account, or a text with a space, which no account has, that stands for the code."""
+    """Name of the account. For an invitation code: `invitation <prefix>`; names of accounts contain no spaces."""
     address: str
     per_minute: int
     """Number of tries per minute for an account from one address."""
@@ -75,7 +76,7 @@ def forgive(tx: Transaction, attempt: SignInTry) -> None:
 
 
 def take_back(tx: Transaction, attempt: SignInTry) -> None:
-    """Remove a try from the counts, because it was right."""
+    """Remove a try from the counts, because its password or code was right."""
     for limit, _scope in _limits(attempt, known=is_known(tx, attempt)):
         rate_limits.take_back(tx, limit)
 

@@ -40,7 +40,7 @@ from marey_server.store.tables import attempt, job, token, user
 from marey_server.store.transaction import Transaction
 
 NOTE_USE_EVERY_S = 3600
-"""Precision of `last_used_at`; an update on every request would make every read a write."""
+"""Precision of `last_used_at` in seconds; an update at each request would make each read a write."""
 
 KEPT_AFTER_END_US = 30 * DAY_US
 """Time for which an expired token is listed, so that its owner can see why a program stopped."""
@@ -279,8 +279,8 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
     any of these, and so on.
 
     Without `with_created`, only this token is revoked. Tokens that were created with the revoked token are then
-    recorded as created with its parent, the token with which it was itself created. Its successor is recorded as the
-    successor of its predecessor. A token may always revoke itself.
+    recorded as created with its parent, the token with which it was itself created. If it was rotated, its successor is
+    recorded as the successor of its predecessor. A token may always revoke itself.
     """
     principal = tx.principal
     if principal.kind != "user" or token_id != principal.token_id:

@@ -41,8 +41,8 @@ class DatabaseClock:
     """Clock of the database: on Postgres the time of the Postgres server, on SQLite a clock that never goes back.
 
     On SQLite it starts at the wall clock or the stored high-water mark, whichever is later, and is then advanced by the
-    monotonic clock, so that a jump of the wall clock neither extends nor ends a lease. If the wall clock is far ahead,
-    the start is refused, because the stored clock could not go back afterwards.
+    monotonic clock, so that a jump of the wall clock neither extends nor ends a lease. If the wall clock is far ahead
+    of the stored time, the server does not start, because the stored time could not go back afterwards.
     """
 
     def __init__(self) -> None:

@@ -33,7 +33,7 @@ class Client:
 
     key: str
     known: bool = True
-    """Whether it is a token that the server has accepted before, and whose requests it has not often refused lately."""
+    """Whether the server has accepted the client's token before, and has not often refused its requests lately."""
     is_gone: Callable[[], bool] = bool
     """Whether nobody waits for the result any more; then the call is not begun."""
 

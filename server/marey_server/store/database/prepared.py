@@ -24,7 +24,7 @@ Convert = Callable[[Any], Any]
 Parameters = Mapping[str, Any]
 
 MOST_FORMS = 64
-"""Greatest number of stored texts of one statement: one for each set of parameters and length of its lists."""
+"""Greatest number of stored texts of one statement: one for each combination of parameter names and list lengths."""
 
 
 class Prepared:
@@ -91,7 +91,7 @@ class _Form:
     constants: Mapping[str, Any]
     """Values that are part of the statement itself."""
     expansion: Mapping[str, Sequence[str]]
-    """Names of the members of each list parameter."""
+    """For each list parameter, the names under which the statement contains its values."""
     converts: Mapping[str, Convert]
     order: tuple[str, ...] | None
     """Names of the parameters in the order of the text; None if the driver takes parameters by name."""
@@ -108,7 +108,7 @@ class _Form:
 
 
 def _members(names: Sequence[str], given: Sequence[Any]) -> Iterable[tuple[str, Any]]:
-    """Pair each parameter name with its value from a list, or from a list of tuples, which is flattened."""
+    """Pair the names of a list parameter's members with their values; a list of tuples is flattened first."""
     nested = bool(given) and isinstance(given[0], tuple)
     return zip(names, chain.from_iterable(given) if nested else given, strict=True)
 

@@ -55,7 +55,7 @@ class WriteAheadLog:
         self._failing = False
 
     def after_commit(self, connection: sqlite3.Connection) -> None:
-        """Start to copy a long log into the database; if little is left to copy, let SQLite begin the log again.
+        """Start a thread that copies a long log into the database; if little is left to copy, restart the log instead.
 
         `connection` has just committed. Only one thread may call this method at a time.
         """

@@ -24,7 +24,7 @@ T = TypeVar("T")
 MOST_TOGETHER = 16
 """Greatest number of writes in one transaction; the first of them is answered only after the last has run."""
 MOST_RESERVED = 12
-"""Greatest number of reserved writes in one transaction while others wait, so that these go on, too."""
+"""Greatest number of reserved writes in a transaction while ordinary writes wait, so that ordinary writes run, too."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -148,9 +148,10 @@ def remove_folder_role(
 
 
 def _lock(tx: Transaction, project: str, collection_id: str) -> tuple[ProjectRow, str]:
-    """Wait for writes that have read roles in folders, and exclude new ones; return the project and the folder's path.
+    """Lock the roles in folders of a project, then the folder; return the project and the path of the folder.
 
-    The lock comes before that of the folder, because these writes lock folders after they have read roles.
+    The lock waits for writes that have read these roles, and excludes new ones. It is acquired before that of the
+    folder, because such writes lock folders after they have read roles.
     """
     project_row = lock_project(tx, project)
     tx.lock(lock_name(project_row.id))

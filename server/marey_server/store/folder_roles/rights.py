@@ -1,8 +1,8 @@
 """Rights in the folders of a project: of the caller, and of the author of a job.
 
-Every function that changes something in a folder checks these rights. They are read once per transaction, or once in
-each part of it that may be rolled back. The transaction then holds a lock until its end, or until the rollback of this
-part, so that nobody changes the roles in folders in the meantime.
+Every function that changes something in a folder checks these rights. They are read once per transaction, or once per
+savepoint. The transaction then holds a lock until its end, or until the rollback to this savepoint, so that nobody
+changes the roles in folders in the meantime.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _AUTHOR = Prepared(
 
 
 def lock_name(project_id: str) -> str:
-    """Return the name of the lock on the roles in the folders of a project: shared to write, exclusive to change."""
+    """Return the name of the lock on a project's roles in folders: shared to read them, exclusive to change them."""
     return f"folder-roles:{project_id}"
 
 
@@ -47,7 +47,7 @@ def rights_of_caller(tx: Transaction, project: ProjectRow) -> FolderRights:
 
 
 def rights_shown(tx: Transaction, project: ProjectRow) -> FolderRights:
-    """Return the caller's rights in the folders of a project, to be shown; they may change at any time."""
+    """Return the caller's rights in the folders of a project, read without a lock, only to show them in an answer."""
     if not _has_overrides(tx.principal.user_id, project.role) or project.guest:
         return FolderRights(project.name, project.role)
     return tx.folder_rights.get((project.id, tx.principal.user_id)) or _read(tx, project, project.role)
@@ -76,7 +76,7 @@ def forget_rights(tx: Transaction) -> None:
 
 
 def _has_overrides(user_id: str | None, role: Role) -> bool:
-    """Return whether overrides can concern a user: not owners, and not attempts, which have no user."""
+    """Return whether overrides may apply to a user: not to an owner, nor to an attempt of a job, which has no user."""
     return user_id is not None and role is not Role.OWNER
 
 

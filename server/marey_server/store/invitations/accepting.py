@@ -1,8 +1,8 @@
 """Acceptance of invitations: by users, who become members of a project, and by people who create an account.
 
-Each acceptance locks the project and the invitation, in this order, before it checks anything. A change that ends the
-inviter's right withdraws the invitation, so it is either complete before the acceptance or waits for it; so is the last
-use, and another change of the members.
+Each acceptance locks the project and the invitation, in this order, before it checks anything. So each of the following
+changes is either complete before the acceptance, or waits until the acceptance has ended: the last use of the
+invitation, another change of the members, and a change that ends the inviter's right and so withdraws the invitation.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def invitation_invalid() -> NotFoundProblem:
 
 
 def try_of(code: str, address: str, per_minute: int) -> SignInTry:
-    """Return the try that is counted before a code is checked."""
+    """Return the try to be counted before the invitation code is checked."""
     prefix, _ = split_invitation(code) or ("", "")
     return SignInTry(f"invitation {prefix}", address, per_minute)
 
@@ -45,7 +45,7 @@ def try_of(code: str, address: str, per_minute: int) -> SignInTry:
 def _find(tx: Transaction, code: str) -> Row[Any]:
     """Return the invitation with a code, even one that nobody can use any more.
 
-    All codes cost the same query and comparison. Raises `NotFoundProblem`.
+    Unknown codes cost the same query and comparison as known ones. Raises `NotFoundProblem`.
     """
     prefix, secret = split_invitation(code) or ("", "")
     statement = select(invitation, project.c.name.label("project"), project.c.deleted_us, is_open(tx).label("open"))
@@ -122,10 +122,10 @@ def _use(tx: Transaction, row: Row[Any], user_id: str, user_name: str) -> None:
 
 
 def needs_password_check(tx: Transaction, code: str, name: str) -> bool:
-    """Return whether `sign_up_again` must answer: the user `name` has used the code, or it is not valid for an account.
+    """Return whether to check the password and call `sign_up_again`, instead of `sign_up`, for the user `name`.
 
-    In the second case, the password is checked, too, so that a used code does not show who has used it. Raises
-    `NotFoundProblem` if the secret of the code is wrong.
+    This is so if the user has used the code. It is also so if the code is not valid for an account: otherwise the
+    answer to a used code would show who has used it. Raises `NotFoundProblem` if the secret of the code is wrong.
     """
     row = _find(tx, code)
     user_id = tx.execute(select(user.c.id).where(user.c.name == name)).scalar()
@@ -155,7 +155,7 @@ def sign_up_again(
 ) -> SignedUp:
     """Return a new token for a user who repeats `sign_up` with the same password, which matched `verified_hash`.
 
-    `login` is the counted try of the password, `attempt` that of the code.
+    `login` is the counted try to use the password, `attempt` the counted try to use the code.
 
     Raises `NotFoundProblem` if the password did not match, so that a code does not show who used it.
     """

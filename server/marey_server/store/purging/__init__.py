@@ -1,4 +1,4 @@
-"""Purges: deletion of deleted items for good, so that garbage collection can free the bytes of their content.
+"""Purges: deleted items are erased for good, so that garbage collection can free the bytes of their content.
 
 Of a purged item, an empty row remains, with a row for each of its revisions: lineage and jobs refer to them. An item
 that something still needs is not purged; `holders` says what holds it.

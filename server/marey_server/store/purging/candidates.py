@@ -27,7 +27,10 @@ _ORDER = (
     Kind.STUDY, Kind.METRIC, Kind.CHARACTER, Kind.EVALUATION, Kind.GRAPH, Kind.EDIT, Kind.ANNOTATION, Kind.MODEL,
     Kind.PROCESSED, Kind.CLIP, Kind.SKELETON,
 )  # fmt: skip
-"""Kinds in the order of a purge: documents refer to items of kinds that come later, and so do not hold them."""
+"""Kinds in the order of a purge.
+
+Documents refer to items of later kinds. So they are purged before these items, and do not hold them.
+"""
 assert set(_ORDER) == set(Kind), "every kind needs a place in the order of a purge"
 
 
@@ -38,7 +41,7 @@ class PreparedPurge:
     ids: tuple[str, ...]
     search: VersionSearch
     next: str | None = None
-    """Last of the items, if there are more."""
+    """Id of the last item in `ids`, after which the next request continues; None if no items remain."""
 
 
 def prepare_purge(tx: Transaction, project: str, request: PurgeRequest) -> PreparedPurge:
@@ -85,7 +88,7 @@ def _candidates(tx: Transaction, project_row: ProjectRow, request: PurgeRequest)
 
 
 def _kind_of(last: str) -> Kind:
-    """Return the kind of the last item of the previous request; newer items of a kind come first."""
+    """Return the kind of the item at which the previous request ended, from its id `last`."""
     try:
         return Kind(last.partition("_")[0])
     except ValueError:
@@ -97,7 +100,7 @@ def _kind_of(last: str) -> Kind:
 def contents_of(tx: Transaction, ids: Sequence[str]) -> tuple[dict[str, frozenset[str]], dict[str, frozenset[str]]]:
     """Return the content digests of the revisions of each item, and those of the parts of each such content.
 
-    A revision that no commit has needed has no content digest and is left out.
+    Content digests are computed when a commit first needs them; revisions without one are left out.
     """
     of_revision = and_(revision_part.c.item_id == revision.c.item_id, revision_part.c.number == revision.c.number)
     statement = (

@@ -18,7 +18,7 @@ from marey_server.store.transaction import Transaction
 
 @dataclass
 class FoundHolders:
-    """Holders of one item; only the first `MOST_HOLDERS` are kept."""
+    """Holders of one item, which prevent its purge; the first `MOST_HOLDERS` are named, the others only counted."""
 
     holders: list[Holder] = field(default_factory=list)
     others: int = 0
@@ -35,10 +35,10 @@ class FoundHolders:
 def find_holders(
     tx: Transaction, project_id: str, rows: Mapping[str, Row[Any]], versions: Mapping[str, Iterable[Holder]]
 ) -> dict[str, FoundHolders]:
-    """Return the holders of those items that something holds; `rows` are the items that are to be purged together.
+    """Return what holds each item, by its id; `rows` are the items that are to be purged together.
 
-    A document of one of these items does not hold another one, unless something holds the item of the document, too.
-    `versions` are the holders that a `VersionSearch` has found.
+    Items that nothing holds are left out. If a document of one of the items refers to another, this other item is held
+    only if the item of the document is held, too. `versions` are the holders that a `VersionSearch` has found.
     """
     held: dict[str, FoundHolders] = {}
     for item_id, found in versions.items():
@@ -63,7 +63,7 @@ def _unfinished_jobs(tx: Transaction, project_id: str, items: Collection[str]) -
 
 
 def _references(items: Collection[str]) -> Select[Any]:
-    """Return the ids of items (`held`), and of other items (`by`) that have documents that refer to them."""
+    """Return a query for pairs of ids: an item of `items` (`held`), and another item that refers to it (`by`)."""
     return (
         select(document_item.c.item_id.label("held"), revision_part.c.item_id.label("by"))
         .join(revision_part, revision_part.c.document_digest == document_item.c.document_digest)
@@ -73,7 +73,7 @@ def _references(items: Collection[str]) -> Select[Any]:
 
 
 def _add_referring(tx: Transaction, project_id: str, items: Collection[str], held: dict[str, FoundHolders]) -> None:
-    """Add the items of the project, apart from `items`, that have documents that refer to one of `items`."""
+    """Add the other items of the project whose documents refer to one of `items`, as holders."""
     referring = (
         _references(items)
         .join(item, item.c.id == revision_part.c.item_id)
@@ -99,7 +99,7 @@ def _add_referring(tx: Transaction, project_id: str, items: Collection[str], hel
 
 
 def _references_among(tx: Transaction, items: Collection[str]) -> dict[str, list[str]]:
-    """Return, for each of `items`, the others of them to which its documents refer."""
+    """Return the references among `items`: by the id of an item, the ids of the items to which its documents refer."""
     found: dict[str, list[str]] = {}
     for row in tx.execute(_references(items).where(revision_part.c.item_id.in_(items))):
         found.setdefault(row.by, []).append(row.held)
@@ -107,7 +107,7 @@ def _references_among(tx: Transaction, items: Collection[str]) -> dict[str, list
 
 
 def _spread(refers: Mapping[str, Iterable[str]], rows: Mapping[str, Row[Any]], held: dict[str, FoundHolders]) -> None:
-    """Hold the items to which held items refer, directly or through others."""
+    """Add to `held` the items to which held items refer (`refers`), directly or through other items."""
     waiting = sorted(held)
     spread = set(waiting)
     while waiting:

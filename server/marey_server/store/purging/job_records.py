@@ -65,7 +65,7 @@ def _release_sources(tx: Transaction, items: Collection[str], makers: Sequence[s
 
 
 def _forget_in_answers(tx: Transaction, items: Collection[str], jobs: Sequence[str]) -> None:
-    """Remove the names of items from the answers to workers, which are stored in case that a worker asks again."""
+    """Remove the names of items from answers to workers, which are stored in case a worker repeats a request."""
     for some in in_lists(jobs):
         answers = select(attempt.c.job_id, attempt.c.fence, attempt.c.answer).where(
             attempt.c.job_id.in_(some), attempt.c.answer.is_not(None)

@@ -1,4 +1,4 @@
-"""Purges and their previews: erases those of the prepared items that nothing holds, and names what holds the others."""
+"""Purges and their previews: prepared items are erased unless something holds them; the answer names the holders."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def _versions(
 ) -> dict[str, list[Any]]:
     """Return the datasets that hold the items, after a search of the commits that were added since the preparation.
 
-    If a revision has a content digest now that it did not have then, all versions are searched again.
+    If a revision has received a content digest since the preparation, all versions are searched again.
     """
     contents, parts = contents_of(tx, tuple(rows))
     search = prepared.search

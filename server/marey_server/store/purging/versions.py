@@ -30,8 +30,8 @@ class _Version(NamedTuple):
 class VersionSearch:
     """Search for contents of revisions in the trees of all commits of a project.
 
-    Each chunk is read once, although many trees share it. A second `update`, in a later transaction, reads only the
-    chunks of commits that were added in the meantime.
+    The nodes of a tree are stored as chunks. Each chunk is read once, although many trees share it. A second `update`,
+    in a later transaction, reads only the chunks of commits that were added in the meantime.
     """
 
     def __init__(self, project_id: str, wanted: Mapping[str, Collection[str]]) -> None:
@@ -41,7 +41,7 @@ class VersionSearch:
         self._parts = frozenset(part for parts in wanted.values() for part in parts)
         self._roots: dict[_Version, str] = {}
         self._below: dict[str, frozenset[str]] = {}
-        """Wanted contents that each chunk, and the chunks below it, have."""
+        """Digests of the wanted contents in a chunk and all chunks below it, by the digest of the chunk."""
 
     def update(self, tx: Transaction) -> None:
         """Search the commits that were not searched yet."""

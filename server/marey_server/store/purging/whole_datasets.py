@@ -59,9 +59,9 @@ class PreparedDatasetPurge:
     commits: frozenset[str]
     """Commits that no other dataset of the project has."""
     citing: frozenset[str]
-    """Jobs that read one of these commits; while it is deleted, only their retries can be added."""
+    """Jobs that read one of these commits; while the dataset is deleted, no new jobs can read them, except retries."""
     chunks: Mapping[str, int]
-    """Chunks of its trees that no other tree has, with the times at which they were stored last."""
+    """Digests of the chunks that are only in trees of this dataset, with the times at which they were stored last."""
     freed_bytes: int
 
 
@@ -229,7 +229,10 @@ def _still_held(answer: DatasetPurgeAnswer) -> ConflictProblem:
 
 
 def _below(store: StoredChunks, roots: Collection[str], known: Collection[str]) -> set[str]:
-    """Return the digests of chunks, and of all chunks below them, without those in `known` and what is below these."""
+    """Return the digests of the chunks `roots` and of all chunks below them.
+
+    The search leaves out chunks in `known`, and does not search below them.
+    """
     found: set[str] = set()
     waiting = set(roots).difference(known)
     while waiting:
@@ -246,8 +249,8 @@ def _below(store: StoredChunks, roots: Collection[str], known: Collection[str]) 
 def _delete_chunks(tx: Transaction, chunks: Mapping[str, int]) -> None:
     """Delete chunks, apart from those that another write has stored again since the purge was prepared.
 
-    Each write that makes a tree stores the chunks of its own again, which changes their times. Chunks that it takes
-    over from an older tree are chunks of that tree, too, and so they are not deleted.
+    A write that makes a tree stores its new chunks, even those that are stored already; this changes their times, so
+    they are not deleted. The other chunks of the new tree belong to an older tree, too, and so they are not deleted.
     """
     digests = sorted(chunks)
     for some in in_lists(digests):

@@ -74,11 +74,17 @@ item = Table(
 )
 
 INDEXED_FACTS = ("subject", "action", "take", "shoot_day", "licence")
-"""Members of summaries with an index. Queries compare others with `=`, too, but these have few different values."""
+"""Members of summaries with an index.
+
+Queries compare other members with `=`, too, but those have too few different values for an index to help.
+"""
 
 
 def _add_index(name: str) -> None:
-    """Add the index over a member of summaries; the items with one value are in the order in which lists show them."""
+    """Add the index over a member of summaries.
+
+    In the index, items with the same value are sorted by creation and id, as lists show them.
+    """
     start = MemberStart(item.c.summary, name)
     stated = and_(start.is_not(None), item.c.deleted_us.is_(None))
     columns = (item.c.project_id, item.c.kind, start, item.c.created_us, item.c.id)

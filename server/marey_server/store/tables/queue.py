@@ -22,7 +22,7 @@ UNFINISHED = text("state IN ('waiting', 'queued', 'running')")
 """Condition of `ix_job_unfinished`, written in the form in which SQLite uses this index."""
 
 ONE_RUNS_PER_KEY = "uq_job_concurrency"
-"""Index that refuses a second running job of a concurrency key; a concurrent claim that violates it picks again."""
+"""Index that refuses a second running job of a concurrency key; a claim that violates it is repeated."""
 
 job = Table(
     "job",

@@ -62,7 +62,10 @@ def _shown(row: Row[Any]) -> WebhookDelivery:
 
 
 def request_test(tx: Transaction, project: str, webhook_id: str) -> WebhookDelivery:
-    """Request a delivery of the kind `webhook.test`, which is sent once. Raises `ConflictProblem`."""
+    """Request a delivery of the kind `webhook.test`, which is sent once.
+
+    Raises `ConflictProblem` if the webhook is paused or has too many requested deliveries.
+    """
     project_row = projects.require(tx, project)
     _require_active(tx, project_row, webhook_id)
     delivery_id = new_id("delivery")

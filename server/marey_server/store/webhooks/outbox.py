@@ -31,7 +31,7 @@ RETRY = Backoff(first_s=5.0, longest_s=1800.0)
 BATCH = 100
 """Greatest number of deliveries that are read at once."""
 SKIPPED_MOST = 10_000
-"""Number of events of other kinds or projects after which the position of a webhook without deliveries moves on."""
+"""Number of events without a delivery to a webhook after which its stored position is moved past them."""
 MISSED_KIND = "webhook.events_missed"
 
 Outcome = Literal["delivered", "retry", "dead"]
@@ -102,7 +102,7 @@ class Batch:
     complete: bool
     """Whether there is nothing more to send at present."""
     waits: bool
-    """Whether events wait for the time of the next result."""
+    """Whether events wait because the next retry of the webhook is not due yet."""
 
 
 def next_batch(tx: Transaction, webhook_id: str, scanned: int) -> Batch | None:
@@ -285,7 +285,7 @@ def _note(tx: Transaction, delivery: Delivery, result: DeliveryResult, outcome: 
 def count_missed(tx: Transaction, last: int) -> None:
     """Count, for each webhook, the undelivered events up to the one numbered `last`, which are about to leave the feed.
 
-    The webhook later reports how many events it missed. Its position moves to `last`.
+    If a webhook has missed events, its position moves to `last`, and a later delivery reports their number.
     """
     for row in tx.execute(select(webhook).where(webhook.c.position < last).with_for_update()).all():
         number = events.number_of(tx)
