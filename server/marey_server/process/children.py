@@ -73,7 +73,7 @@ class ChildTask(Generic[T]):
     make: Callable[[], bytes]
     read: Callable[[bytes], T]
     count_stop: Callable[[str, str], None]
-    """Called with a reason and the function's name if the child ends before the task does."""
+    """Function that is called with a reason and the name of `function` if the child ends before the task does."""
     future: Future[T] = field(default_factory=Future)
     stopped: str = ""
     """Reason why the child was killed: `time`, `client-gone` or `closing`."""
@@ -131,7 +131,10 @@ class Children:
         self._running: list[ChildTask[Any]] = []
         self._requests: Counter[str] = Counter()
         self._turns: dict[str, int] = {}
-        """Number of the turn in which each caller last got a child; decides between callers that use equally many."""
+        """Number of the turn in which each caller last got a child.
+
+        Of the callers that use equally many children, the one with the lowest number is next.
+        """
         self._turn = 0
         self._threads: list[threading.Thread] = []
         self._idle: set[int] = set()

@@ -1,4 +1,4 @@
-"""Limit on the memory of all requests: of bodies until they are decoded, and of answers until they are sent."""
+"""Limit on the memory for requests: for their bodies until they are decoded, and for answers until they are sent."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from marey_server.errors import UnavailableProblem
 from marey_server.store.database.lanes import RETRY_AFTER_S, Client
 
 CLIENT_SHARE = 0.75
-"""Largest part of the memory that one client may hold."""
+"""Largest fraction of the memory that one client may hold."""
 UNKNOWN_SHARE = 0.25
-"""Largest part of the memory that all clients without a known token together may hold."""
+"""Largest fraction of the memory that all clients without a known token together may hold."""
 RESERVED_SHARE = 0.125
-"""Additional memory for reserved operations, such as heartbeats, as a part of the memory for other requests."""
+"""Additional memory for reserved operations, such as heartbeats, as a fraction of the memory for other requests."""
 UNKNOWN_CLIENTS = "unknown-clients"
 """Owner of the memory that all clients without a known token hold together."""
 

@@ -15,7 +15,10 @@ from marey_server.store.database.lanes import Client, FairLine
 BEGUN_PER_ROUND = 4
 """Number of requests that begin in one round of the event loop if more are waiting."""
 RESERVED_PER_ROUND = 2
-"""Number of places of a round that go to reserved operations first; the other places go to other requests first."""
+"""Number of places in a round that are offered to reserved operations, such as heartbeats, before other requests.
+
+The other places are offered to reserved operations only if no other request is waiting.
+"""
 _ENDLESS = 2**62
 """Limit of a line that is never reached, because the number of connections is limited already."""
 

@@ -39,7 +39,7 @@ class _RunningHash:
         self.offset += len(data)
 
     def digest(self) -> str:
-        """Return the digest of the bytes, once their copy is on disk."""
+        """Sync the copy to disk if there is one, and return the digest of the bytes."""
         if self.copy is not None:
             with open(self.copy, "rb") as file:
                 os.fsync(file.fileno())

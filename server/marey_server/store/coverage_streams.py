@@ -1,4 +1,4 @@
-"""Coverage streams: frames of a recording, and the measurement, as they arrive, of which motions are still missing.
+"""Coverage streams: frames are sent during a recording, and each answer shows which motions are still missing.
 
 Each stream is one row, updated by compare-and-swap. The row holds the whole state of the stream, and the answer to the
 last request, so that a sender who missed the answer gets it by repeating the request.

@@ -27,7 +27,7 @@ _MOST_IN_LIST = 1000
 T = TypeVar("T")
 
 Event = tuple[OrdinaryEventKind, str | None, str, dict[str, Any]]
-"""Kind of an event that is not in the audit log, project id, id of its subject, and body."""
+"""Event that is not in the audit log: its kind, the id of its project, the id of its subject, and its body."""
 
 _INSERT_EVENT = Prepared(sqlalchemy.insert(tables.event))
 

@@ -208,7 +208,7 @@ class Deliverer:
             await self._write(outbox.move_on, webhook_id, position, newest)
 
     async def _send(self, batch: Batch, delivery: Delivery, before: tuple[int, int]) -> Outcome | None:
-        """Send a delivery, and record the result; None if this process does not lead any more."""
+        """Send a delivery, record the result, and return the outcome; None if this process is no longer the leader."""
         async with self._places:
             lead = self._lead
             if lead is None or not self._leads():

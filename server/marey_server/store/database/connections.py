@@ -333,7 +333,7 @@ _TRY_AGAIN = ("40001", "40P01")
 
 
 def _translated(error: Exception) -> Exception:
-    """Convert a failure of the database to which the caller can react to an error of the server.
+    """Convert a failure of the database into an error of the server, if the caller can react to the failure.
 
     Other failures are returned unchanged.
     """

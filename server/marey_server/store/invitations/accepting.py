@@ -57,7 +57,7 @@ def _find(tx: Transaction, code: str) -> Row[Any]:
 
 
 def _lock(tx: Transaction, code: str) -> Row[Any]:
-    """Return the invitation with a code, after locking its project and itself."""
+    """Find the invitation with a code, lock its project and then the invitation, and return its row."""
     found = _find(tx, code)
     tx.execute(select(project.c.id).where(project.c.id == found.project_id).with_for_update(key_share=True))
     tx.execute(select(invitation.c.id).where(invitation.c.id == found.id).with_for_update())

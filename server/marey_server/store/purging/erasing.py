@@ -57,9 +57,9 @@ def erase(tx: Transaction, project_row: ProjectRow, rows: Sequence[Row[Any]], jo
 
 
 def _drop_empty_folders(tx: Transaction, project_id: str, paths: Collection[str]) -> None:
-    """Delete deleted folders, at `paths` and above, that contain no items any more, and their names in events.
+    """Delete the deleted folders, at `paths` and above, that no longer contain items; remove their names from events.
 
-    Folders that a dataset needs remain.
+    Folders that contain a dataset remain.
     """
     deleted = (collection.c.project_id == project_id, collection.c.deleted_us.is_not(None))
     used = exists().where(dataset.c.collection_id == collection.c.id)
@@ -95,7 +95,7 @@ def _is_within(ordered: Sequence[str], folder: str) -> bool:
 
 
 def freed_by(tx: Transaction, project_id: str, items: Collection[str], jobs: Collection[str]) -> int:
-    """Return the sizes of the documents, arrays and files of `items` that nothing else in the project refers to.
+    """Return the total bytes of the documents, arrays and files of `items` that nothing else in the project refers to.
 
     References of `jobs` do not count, nor do documents that no revision refers to, such as those of a running job.
     References of other projects do not count either: their content is not shown to the caller.

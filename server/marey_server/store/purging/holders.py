@@ -37,8 +37,8 @@ def find_holders(
 ) -> dict[str, FoundHolders]:
     """Return what holds each item, by its id; `rows` are the items that are to be purged together.
 
-    Items that nothing holds are left out. If a document of one of the items refers to another, this other item is held
-    only if the item of the document is held, too. `versions` are the holders that a `VersionSearch` has found.
+    Items that nothing holds are left out. If a document of one of these items refers to another of them, it holds this
+    other item only if its own item is held, too. `versions` are the holders that a `VersionSearch` has found.
     """
     held: dict[str, FoundHolders] = {}
     for item_id, found in versions.items():

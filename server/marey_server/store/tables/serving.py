@@ -9,7 +9,7 @@ _AUDITED = text("about IS NOT NULL")
 
 
 def _audit_index(name: str, *columns: str) -> Index:
-    """Return an index of the entries of the audit log, which costs nothing for the many other events."""
+    """Return a partial index of events: it contains only entries of the audit log, so other events cost nothing."""
     return Index(f"ix_event_audit_{name}", *columns, sqlite_where=_AUDITED, postgresql_where=_AUDITED)
 
 
