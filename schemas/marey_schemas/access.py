@@ -247,7 +247,7 @@ class Member(Answer):
 
 
 EVERY_MEMBER = "*"
-"""Stands for all members, in place of the name of a user, in the role of a folder."""
+"""User name that means all members, in a role for a folder."""
 
 
 class FolderRoleChange(Request):

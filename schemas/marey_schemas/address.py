@@ -1,7 +1,7 @@
 """Default addresses of a server. This module imports nothing, so that the command line starts quickly."""
 
 API = "/api/v1"
-"""Prefix of the paths of all resources, except the probes."""
+"""Prefix of the paths of the REST API. Other paths, such as those of health checks, do not have this prefix."""
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8460

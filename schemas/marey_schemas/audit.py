@@ -50,7 +50,7 @@ AUDIT_WORDS: Mapping[AuditKind, str] = {
     "token.rotated": "replaced a token of the user",
     "token.revoked": "revoked a token of the user",
 }
-"""What an entry of each kind records, as the words between `actor` and `about`."""
+"""Words for each kind of entry, such as "added the member"; in a sentence, they connect `actor` and `about`."""
 
 
 class AuditEntry(Answer):
@@ -76,5 +76,5 @@ class AuditEntry(Answer):
 
     @property
     def words(self) -> str:
-        """The words between `actor` and `about`, which say what was done; for a kind without words, the kind."""
+        """The words of `AUDIT_WORDS` for this entry, such as "added the member"; the kind itself if it has no words."""
         return next((words for kind, words in AUDIT_WORDS.items() if kind == self.kind), self.kind)

@@ -31,7 +31,7 @@ class Options(Request):
 
     @classmethod
     def of(cls, extended: BaseModel) -> Self:
-        """Return an instance with the values of `extended`, which must have at least the fields of this class."""
+        """Return an instance whose values are taken from `extended`, which must have all fields of this class."""
         return cls(**{name: getattr(extended, name) for name in cls.model_fields})
 
     def replace(self, **changes: Any) -> Self:

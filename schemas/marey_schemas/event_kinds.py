@@ -1,6 +1,6 @@
-"""Kinds of events. The type checker compares each event that the server records with this list.
+"""Kinds of events. The type checker verifies that the server records only events of these kinds.
 
-Kinds of events that concern access or deletion are kinds of audit entries: the audit log consists of these events.
+The audit log consists of the events that concern access or deletion; their kinds are the kinds of audit entries.
 """
 
 from __future__ import annotations
@@ -100,4 +100,4 @@ DEFAULT_WEBHOOK_KINDS: tuple[ProjectEventKind, ...] = (
     "job.failed",
     "job.cancelled",
 )
-"""Kinds of a webhook that names none: commits and merges, which move a branch, proposals, and ends of jobs."""
+"""Kinds of events that a webhook sends by default: moves of branches, by commits or merges; proposals; ends of jobs."""

@@ -56,7 +56,7 @@ def refused_entry(name: str, refusal: Refusal) -> ImportEntry:
 
 
 def skeleton_output(file_name: str) -> str:
-    """Return the name of the output with a file's skeleton, among the outputs of an import job.
+    """Return the name that an import job gives to its output with the skeleton of a file.
 
     The output with the file's clip has the name of the file.
     """

@@ -197,7 +197,7 @@ class Page(Answer):
 
 
 class BlobsQuery(Request):
-    """Query that asks which of the given blobs the server lacks, including those that the caller may not read."""
+    """Query for those of the given blobs that the server does not have, or that the caller may not read."""
 
     digests: tuple[str, ...] = Field(max_length=10_000)
 

@@ -74,7 +74,7 @@ class ItemHolder(Answer):
 
 
 class JobHolder(Answer):
-    """Job that has not ended and reads the item or made it."""
+    """Job that has not ended, and that reads the item or has created it."""
 
     type: Literal["job"] = "job"
     job: str

@@ -16,7 +16,7 @@ from marey_schemas.names import Label
 from marey_schemas.old_units import in_centimetres, read_old_unit
 
 Moment = Label | Annotated[float, Field(allow_inf_nan=False)]
-"""Label of a keyframe, `start`, `end`, or a canonical frame, which may be a fraction."""
+"""Moment of a motion: the label of a keyframe, `start`, `end`, or a canonical frame, which may be a fraction."""
 
 Joint = Annotated[Label, Field(description="Name of the joint, its own or its standard name.")]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
@@ -25,7 +25,8 @@ Positive = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
 Tolerance = Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)]
 """Tolerance of a constraint.
 
-Its minimum is below the accuracy of any motion capture, and squared errors divided by it stay finite.
+The smallest tolerance is finer than the accuracy of any motion capture. It is large enough that squared errors stay
+finite when they are divided by it.
 """
 Distance = Annotated[float, Field(ge=1e-5, le=1e4, allow_inf_nan=False)]
 Degrees = Annotated[float, Field(ge=-36_000, le=36_000, allow_inf_nan=False)]

@@ -61,7 +61,7 @@ class WebhookCreate(Request):
 class WebhookChange(Request):
     """Request to change a webhook; absent fields stay as they are.
 
-    After a change of the URL, or if `paused` is false, the next delivery is tried immediately.
+    If the request contains a URL, or `paused` is false, the next delivery is tried immediately.
     """
 
     url: WebhookUrl | None = None

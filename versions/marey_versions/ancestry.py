@@ -31,8 +31,8 @@ def nearest_common(commit_of: Callable[[str], HistoricCommit], ours: str, theirs
     """Return the nearest common ancestors of two commits, sorted by digest.
 
     These are the common ancestors from which no other common ancestor descends. A commit counts as its own ancestor.
-    Commits are read from the newest generation to the oldest, until all commits that remain are ancestors of common
-    ones. So the work does not depend on the length of the history before these.
+    The search reads commits in the order of decreasing generation. It stops when all commits that are left to read are
+    ancestors of common ancestors. So its time does not depend on the length of the history before the common ancestors.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ class LabelClash(Generic[Labelled]):
     """Segments or keyframes that exclude each other, in the order of their frames."""
 
     base: tuple[Labelled, ...]
-    """Labels of the base that both sides have removed; empty if both sides have added labels at free frames."""
+    """Segments or keyframes of the base that both sides have removed; empty if only additions exclude each other."""
     ours: tuple[Labelled, ...]
     theirs: tuple[Labelled, ...]
 
@@ -53,7 +53,7 @@ class AnnotationClash(NamedTuple):
 
     reason: str
     segments: LabelClash[LabelledRange] | None = None
-    """The segments that exclude each other, None if the reason is another one."""
+    """The segments that exclude each other; None if the reason does not concern segments."""
 
 
 ADDED_TWICE = AnnotationClash("Both sides have added the annotation, so there is no version to compare them with.")
@@ -157,7 +157,7 @@ def merge_segments(
     places = [([one.start for one in side], [one.end for one in side]) for side in added]
 
     def overlapping(one: LabelledRange, side: int) -> Sequence[LabelledRange]:
-        """Return the added segments of a side that overlap `one`; they follow each other in the sorted list."""
+        """Return the segments that a side has added and that overlap `one`; they are adjacent in the sorted list."""
         starts, ends = places[side]
         return added[side][bisect_right(ends, one.start) : bisect_left(starts, one.end)]
 
@@ -223,7 +223,7 @@ class _Sets(NamedTuple, Generic[Labelled]):
         return tuple(sorted((self.base & self.ours & self.theirs).union(*self.added)))
 
     def differing(self, group_of: Callable[[Labelled], Hashable]) -> set[Hashable]:
-        """Return the groups to which the two sides have added different members."""
+        """Return the groups (such as frames) in which the two sides have added different segments or keyframes."""
         return {group_of(one) for one in self.added[0] ^ self.added[1]}
 
     @staticmethod

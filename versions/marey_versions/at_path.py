@@ -20,7 +20,7 @@ def prefixes_of(path: str) -> tuple[str, ...]:
 
 
 def changes_at(reader: ChunkReader, before: str, after: str, path: str) -> Iterator[Changed]:
-    """Return the differences of two trees at a path and below it, or all for an empty path."""
+    """Return the differences of two trees at a path and below it; all differences for an empty path."""
     return chain.from_iterable(difference(reader, before, after, prefix=prefix) for prefix in prefixes_of(path))
 
 
@@ -43,14 +43,14 @@ class ChangeAtPath:
     counts: Mapping[ChangeKind, int]
     """Number of entries by kind of change."""
     moved_from: str | None = None
-    """If the commit moved a single entry to the path: where the entry was before."""
+    """Path of the entry before the commit, if the commit moved a single entry to the path; None otherwise."""
     moved_to: str | None = None
-    """If the commit moved a single entry away from the path: where the entry is now."""
+    """Path of the entry after the commit, if the commit moved a single entry away from the path; None otherwise."""
 
 
 @dataclass
 class PathComparer:
-    """Compares versions at one path, and counts the entries that it compared."""
+    """Comparison of versions at one path, which counts the entries that it has read."""
 
     reader: ChunkReader
     path: str

@@ -1,4 +1,4 @@
-"""Search for the first bad commit of a history by halving the commits that it can be."""
+"""Search for the first bad commit of a history, with tests that halve the number of possible commits."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ from collections.abc import Iterator, Mapping, Sequence
 
 
 class BadCommitSearch:
-    """State of a search. The suspects are the commits that can be the first bad one; each test reduces them.
+    """State of a search. The suspects are the commits that can be the first bad one; each test rules out some.
 
-    The search assumes that the commits after a bad commit are bad, and that the ancestors of a good commit are good. It
-    always tests the commit for which the larger of the two possible remainders is smallest. In a history without
-    merges, this takes at most log2(n) tests for n commits, rounded up. With merges, which have two parents, a test
-    leaves about two thirds of the commits in the worst case.
+    The search assumes that the commits after a bad commit are bad, and that the ancestors of a good commit are good.
+    A test leaves one number of suspects if the tested commit is bad, and another number if it is good. The search tests
+    the commit for which the larger of the two numbers is smallest. In a history without merges, this takes at most
+    log2(n) tests for n commits, rounded up. With merges, which have two parents, a test leaves about two thirds of the
+    commits in the worst case.
 
     Parameters
     ----------
-    parents : digests of the parents by digest, for `bad` and those of its ancestors that are not known to be good;
-        parents that are not among them are known to be good
+    parents : for `bad` and each of its ancestors that is not known to be good: the digests of the commit's parents, by
+        the digest of the commit; parents that are not keys of this mapping are known to be good
     bad : digest of a commit that is known to be bad
     """
 
@@ -39,7 +40,7 @@ class BadCommitSearch:
 
     @property
     def suspects(self) -> tuple[str, ...]:
-        """The commits that can be the first bad one, parents first; the last is bad, and the others are not tested."""
+        """The commits that can be the first bad one, parents first; only the last one is known to be bad."""
         return tuple(self._order[place] for place in _places_in(self._left))
 
     @property

@@ -1,4 +1,4 @@
-"""Three-way merges: what two sides changed since a common version, entry by entry and part by part."""
+"""Three-way merges of the changes of two sides since a common version, entry by entry and part by part."""
 
 from __future__ import annotations
 
@@ -25,8 +25,10 @@ class MergeConflict(NamedTuple):
     ours: DatasetEntry | None
     theirs: DatasetEntry | None
     parts: tuple[str, ...]
-    """Parts that both sides have changed; `path` if both have moved the entry or want the same path, `entry` if one
-    side has removed it.
+    """Names of the parts that both sides have changed in different ways.
+
+    `path` is among them if both sides have moved the entry to different paths, or want different entries at one path.
+    If one side has removed the entry, `entry` is the only name.
     """
     clash: AnnotationClash | None = None
     """The reason why an annotation could not be merged segment by segment."""
@@ -116,7 +118,7 @@ def merge_entries(
 
 
 class _Decided(NamedTuple):
-    """Outcome for one entry: the entries of both sides, and the merged entry that replaces ours."""
+    """Entry in the base and on both sides, and the merged entry, which is None if the entry is removed."""
 
     base: DatasetEntry | None
     ours: DatasetEntry | None
@@ -125,7 +127,7 @@ class _Decided(NamedTuple):
 
     @property
     def combined(self) -> CombinedEntry | None:
-        """The merged entry, if it has parts of both sides."""
+        """The merged entry with those of both sides; None if one is missing, or the parts are those of one version."""
         if self.merged is None or self.ours is None or self.theirs is None:
             return None
         known = [one.parts for one in (self.base, self.ours, self.theirs) if one is not None]
@@ -200,7 +202,7 @@ def _apply(
     resolutions: Mapping[str, Side],
     merged: MergedEntries,
 ) -> None:
-    """Add changes of our tree to `merged`; an entry whose new key is occupied by another entry is a conflict.
+    """Add changes of our tree to `merged`; if the new key of an entry already belongs to another, add a conflict.
 
     `occupied` contains the entries that our side has changed, by the keys that they have on our side.
     """
@@ -230,8 +232,8 @@ def _apply(
 def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: DatasetEntry | None) -> tuple[str, ...]:
     """Return the parts that both sides have changed in different ways.
 
-    Parts that one side has changed also clash if they are made from each other and the other side has changed the other
-    part: the sample tree of a model is not the tree of another model.
+    If a part is computed from another part, the two count as one part: both are returned if one side has changed the
+    first and the other side the second. For example, the sample tree of one side does not fit the model of the other.
     """
     if ours is None or theirs is None:
         return ("entry",)
@@ -257,7 +259,7 @@ def _excludes(base: Any, ours: Any, theirs: Any) -> bool:
 
 
 def _combined(sides: _Sides, choice: Side = Side.OURS) -> DatasetEntry | None:
-    """Return the entry with the changes of both sides; where these exclude each other, `choice` decides."""
+    """Return the entry with the changes of both sides; clashing parts are taken from the side `choice`."""
     base, ours, theirs, clashes = sides.base, sides.ours, sides.theirs, sides.clashes
     if ours is None or theirs is None:
         return None

@@ -19,7 +19,7 @@ PATH = "path"
 TAGS = "tags"
 """Name of the origin of an entry's tags."""
 MOST_CHANGES = 100_000
-"""Greatest number of changed entries of a commit among which a moved entry is searched for."""
+"""Greatest number of entries that a commit may change; in larger commits, moved entries are not searched for."""
 
 
 class FoundOrigin(NamedTuple):

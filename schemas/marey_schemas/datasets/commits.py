@@ -27,7 +27,7 @@ EntryPath = Annotated[
 
 
 class PutEntry(Tagged):
-    """Change that sets the content of an entry, new or existing, to that of a revision of an item of the project."""
+    """Change that gives a new or existing entry the content of a revision of an item of the project."""
 
     tag = "change"
     change: Literal["put"] = "put"

@@ -19,7 +19,7 @@ MOST_CONTENTS = 256
 MOST_CHECKED = 500
 """Greatest number of revisions in one request that checks whether they may be exported."""
 MOST_RECEIVED_CHANGES = 200_000
-"""Greatest number of entries that a commit from elsewhere may change."""
+"""Greatest number of entries that a commit from an archive or another server may change."""
 
 PartName = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 
@@ -46,7 +46,7 @@ class ContentsRequest(Request):
 
 
 class ExportCheck(ConsentOverride):
-    """Question whether revisions of a dataset may be exported; a large export is checked by several requests."""
+    """Request to check whether revisions of a dataset may be exported; a large export needs several requests."""
 
     contents: tuple[Digest, ...] = Field(
         min_length=1, max_length=MOST_CHECKED, description="Content digests of revisions that the export will contain."

@@ -64,7 +64,7 @@ class ExportedClip(Answer):
 
 
 class ExportedIdentity(Answer):
-    """Version that an exported folder contains. It is complete without the address of a server."""
+    """Version that an exported folder contains. Its digest, `commit`, identifies the version on every server."""
 
     dataset: str
     commit: str

@@ -20,8 +20,9 @@ RefName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9](?:[A-Za-z0-9._
 """Name of a branch or a tag; it is part of URLs."""
 
 Version = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}(?:~[0-9]{1,4})?$")]
-"""A version: a branch, a tag, or the digest of a commit, of which the first 8 digits are enough. With `~n` at the end,
-it is the version n commits earlier.
+"""Name of a version: a branch, a tag, or the digest of a commit (the first 8 digits are enough).
+
+With `~n` at the end, it names the version n commits earlier.
 """
 
 

@@ -21,9 +21,10 @@ def is_array_reference(value: Any) -> bool:
 
 
 def members_of(tree: Any) -> list[tuple[str, Any]]:
-    """List the JSON Pointer and value of every node of a document; objects and lists precede what they contain.
+    """List JSON Pointers and values of the nodes of a document; objects and lists precede the values in them.
 
-    Numbers and texts in lists are left out: they have no names, so they cannot be references.
+    Scalars that are elements of lists are left out. They cannot be references: only the value of a named member can be
+    the digest of a file.
     """
     found: list[tuple[str, Any]] = []
 
@@ -48,7 +49,8 @@ def members_of(tree: Any) -> list[tuple[str, Any]]:
 def references_of(schema: str, body: Any) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
     """Return two dictionaries by JSON Pointer: a stored document's references to arrays, and its digests of files.
 
-    Digests of files are in certain fields of the schema, and in members called `blob`.
+    The digest of a file is the value of a member called `blob`, or of a field that `_FILE_POINTERS` lists for the
+    schema.
     """
     fixed = _FILE_POINTERS.get(schema, ())
     arrays, files = {}, {}

@@ -96,9 +96,9 @@ _DAY = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
 
 
 def _require_day(value: object) -> object:
-    """Return the value; raise ValueError unless it is a date or has the form of one.
+    """Return the value; raise ValueError unless it is a `date` or a text in the form `2026-11-23`.
 
-    Documents are stored as they were sent, and days are compared as texts.
+    Other forms are refused, because documents are stored as they were sent, and days are compared as texts.
     """
     is_day = _DAY.fullmatch(value) if isinstance(value, str) else type(value) is date
     if is_day:
@@ -107,7 +107,7 @@ def _require_day(value: object) -> object:
 
 
 Day = Annotated[date, BeforeValidator(_require_day)]
-"""Day as in 2026-11-23."""
+"""Date; as a text, it has the form `2026-11-23`."""
 
 
 class TakeRecord(Request):
@@ -135,9 +135,10 @@ class RecordingFacts(TakeRecord):
 
 
 def with_earlier_facts(info: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the part `info` of a clip with the facts about the recording that only an earlier revision states.
+    """Return the part `info` of a clip; facts about the recording that it lacks are taken from an earlier revision.
 
-    If both state a consent, the stricter one counts: the earlier day, and the purposes that both contain.
+    If both revisions state the last day of the consent, the earlier day counts. If both state its purposes, those that
+    both contain count.
     """
     names = [name for name in RecordingFacts.model_fields if info.get(name) is None and earlier.get(name) is not None]
     kept = {**info, **{name: earlier[name] for name in names}}
@@ -157,10 +158,10 @@ class ClipInfo(RecordingFacts):
     checks: tuple[Check, ...] = ()
 
     def with_consent_of(self, others: Iterable[ClipInfo]) -> Self:
-        """Return this description with the strictest consent of it and `others`, whose motion the clip also contains.
+        """Return this description with a consent that is at least as strict as its own and those of `others`.
 
-        The last day is the earliest one of all. The purposes are those that all clips which record purposes have in
-        common.
+        `others` describe clips whose motion this clip also contains. The last day of the consent is the earliest one
+        of all clips. Its purposes are those that all clips have in common; clips without recorded purposes are ignored.
         """
         infos: tuple[ClipInfo, ...] = (self, *others)
         days = [one.consent_until for one in infos if one.consent_until is not None]

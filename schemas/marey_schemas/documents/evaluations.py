@@ -14,10 +14,10 @@ COSTS = ("match_cost", "continuing_cost", "pose_cost")
 """Costs that the part `records` contains for each tick."""
 
 CONFIDENCE = 0.95
-"""Confidence of intervals of changes between two evaluations."""
+"""Confidence level of the intervals that are computed for changes between two evaluations."""
 
 RESAMPLES = 9_999
-"""Number of samples of trials from which these intervals are computed."""
+"""Number of bootstrap samples of the trials from which each of the confidence intervals is computed."""
 
 
 class HeadlineMetric(NamedTuple):
@@ -25,7 +25,10 @@ class HeadlineMetric(NamedTuple):
 
     meaning: str
     of_trials: str | None = None
-    """The metric of trials of which it is the mean over all trials that define it; None if it is no mean."""
+    """Metric of single trials whose mean over the trials is this metric; None if this metric is not such a mean.
+
+    Trials in which the metric is not defined are left out of the mean.
+    """
 
 
 HEADLINE_METRICS: Mapping[str, HeadlineMetric] = MappingProxyType(
@@ -45,7 +48,7 @@ HEADLINE_METRICS: Mapping[str, HeadlineMetric] = MappingProxyType(
         "symmetry": HeadlineMetric("similarity of the coverage of left and right turns, from 0 to 1"),
     }
 )
-"""Numbers of the headline of an evaluation, by name; names end in their unit."""
+"""Metrics in the headline of an evaluation, by name; the name of a metric ends in its unit, if it has one."""
 USAGE_FACETS: Mapping[str, str] = MappingProxyType(
     {
         "usage": "Share of the time steps of the newest evaluation that show the clip or its mirrored copy, 0 to 1.",
@@ -59,7 +62,7 @@ REMOVAL_FACETS: Mapping[str, str] = MappingProxyType(
         "no trial needs the clip, negative if the removal helps."
     }
 )
-"""Facets that suggestions publish about the clips whose removal they tried, by name."""
+"""Facets that jobs of the kind `suggest` publish about the clips whose removal they tried, by name."""
 
 
 class EvaluationDocument(Request):

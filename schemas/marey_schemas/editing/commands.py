@@ -48,7 +48,7 @@ WHOLE_OR_RANGE = "Half-open range of frames; absent: all."
 
 Examples = tuple[dict[str, Any], ...]
 EXAMPLE_SOURCE = "other"
-"""Id of the second clip in the examples of commands that take one."""
+"""Id of the second clip in the examples of commands that need two clips."""
 
 
 def _show_examples(schema: dict[str, Any], model: type[NamedCommand]) -> None:

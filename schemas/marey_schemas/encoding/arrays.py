@@ -35,7 +35,7 @@ __all__ = [
 LEAF_KEYS = frozenset({"dtype", "shape", "data"})
 MAX_ARRAY_BYTES = 1 << 28
 _MISREAD_BITS = 0x15AE43FD
-"""7.038531e-26, the only float32 whose shortest text yields its neighbour when it is parsed as a double first."""
+"""Bits of 7.038531e-26, the only float32 that changes if its shortest text is parsed as a double and then rounded."""
 _ELEMENT_TYPES: dict[str, set[type]] = {"f": {int, float}, "i": {int}, "u": {int}, "b": {bool}}
 
 
@@ -153,7 +153,7 @@ def _from_lists(data: object, spec: ArraySpec) -> NDArray[Any]:
 
 
 def json_data(array: NDArray[Any]) -> Any:
-    """Return `data` of a JSON leaf for `orjson`, which writes arrays itself, each number as its shortest text.
+    """Return the `data` of a JSON leaf in a form in which `orjson` writes each number as its shortest text.
 
     A float32 gets at most nine digits (0.1, not 0.10000000149011612) and is read back to the same bits.
     """

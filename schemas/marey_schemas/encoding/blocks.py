@@ -92,8 +92,8 @@ def encode(array: NDArray[Any], *, predict: bool = True) -> bytes:
 def is_well_packed(data: bytes) -> bool:
     """Return whether valid bytes may be stored instead of the bytes that `encode` would produce for the same array.
 
-    This is so if they have the same layout as the bytes from `encode`, if every tile has a predicting form, and if they
-    are not larger than the plain array.
+    This is so if they have the same layout as the bytes from `encode`, if every tile has a form with prediction, and if
+    they are not larger than the plain array.
     """
     layout, starts = _read_head(data)
     return (
@@ -233,9 +233,9 @@ def _unpack(packed: bytes, layout: _Layout, block: int, group: int) -> NDArray[A
 
 
 def _rows_by_block(layout: _Layout, rows: range) -> Iterator[tuple[int, slice, slice]]:
-    """Yield, for each block with some of the rows, its index, and the rows' indices in the result and in the block.
+    """Yield each block that contains some of `rows`, which are in ascending order.
 
-    `rows` are in ascending order.
+    A block is yielded as its index, the indices of its rows in the result, and their indices in the block.
     """
     done = 0
     while done < len(rows):
@@ -250,7 +250,10 @@ def _rows_by_block(layout: _Layout, rows: range) -> Iterator[tuple[int, slice, s
 def _columns_by_group(
     layout: _Layout, picked: NDArray[np.intp] | None
 ) -> Iterator[tuple[int, slice | NDArray[np.intp], slice | NDArray[np.intp]]]:
-    """Yield, for each group with picked columns, its index, and the columns' indices in the result and in the group."""
+    """Yield each group that contains some of the picked columns; None picks all columns.
+
+    A group is yielded as its index, the indices of its columns in the result, and their indices in the group.
+    """
     if picked is None:
         for index in range(layout.groups):
             yield index, layout.group(index), slice(None)

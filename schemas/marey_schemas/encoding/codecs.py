@@ -31,7 +31,10 @@ MAX_VALUES = 1 << 21
 FREE_LISTS = 1 << 17
 """Number of objects and lists that a document of any size may contain; larger documents may contain more."""
 BYTES_PER_LIST = 6
-"""Least average size in bytes of the objects and lists in a large document; each takes 70 bytes of memory."""
+"""Least size in bytes of a document for each of its objects and lists, if it has more than `FREE_LISTS` of them.
+
+Each object or list takes 70 bytes of memory.
+"""
 BSON_COPIES = 8
 """Greatest number of bytes copied per byte of a BSON document; reading it copies nested objects once for each level."""
 

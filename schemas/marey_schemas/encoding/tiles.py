@@ -17,7 +17,10 @@ Integers = NDArray[Any]  # (channels, frames) unsigned, as wide as the numbers t
 RAW, DIFFERENCES, QUATERNIONS = 0, 1, 2
 FASTEST = -1  # of zstd's levels: it leaves numbers without repetition as they are
 HARDLY_SMALLER = 7 / 8
-"""Share of the plain bytes above which `RAW` is tried, too. To try it always would save 0.15 % for real motion."""
+"""Size of a compressed tile, as a share of its plain bytes, above which the form `RAW` is tried, too.
+
+To try `RAW` for every tile would save only 0.15 % of the size of real motion.
+"""
 MAX_ORDER = 3
 _UNIT_TOLERANCE = 1e-3  # of the squared norm: what is further from one is not a rotation
 
@@ -29,8 +32,9 @@ class TileError(ValueError):
 def pack(tile: NDArray[Any], lead: int | None) -> bytes:
     """Compress a (frames, columns) little-endian array.
 
-    `lead` is the number of columns before the first quaternion; None if there are no quaternions. The tile gets a form
-    with prediction. If this form is hardly smaller than the plain bytes, it gets the form `RAW` if that is smaller.
+    `lead` is the number of columns before the first quaternion; None if there are no quaternions. A form with
+    prediction is tried first. If its result is hardly smaller than the plain bytes, `RAW` is tried, too, and the
+    smaller result is returned.
     """
     packed = _compress(_predict(tile, lead))
     if len(packed) <= HARDLY_SMALLER * tile.nbytes:
@@ -177,8 +181,8 @@ def _difference(channels: Integers) -> list[Bytes]:
 def _bits_needed(folded: Integers) -> NDArray[np.int64]:
     """Return a measure of the bits that each channel needs, for comparison: larger values mean more bits.
 
-    The measure is the sum over the channel's numbers of their float32 bits, read as an integer, because this integer
-    grows almost linearly with log2 of the number.
+    Each number is converted to float32, and the bits of the float32 are read as an integer. This integer grows almost
+    linearly with log2 of the number. The measure is the sum of these integers over the channel.
     """
     logarithms = (folded | 1).astype(np.float32).view(np.int32)
     cost: NDArray[np.int64] = logarithms.sum(axis=1, dtype=np.int64)

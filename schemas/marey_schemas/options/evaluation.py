@@ -24,7 +24,10 @@ TARGET_PATH_S = 4.0
 
 
 class Grid(Options):
-    """Speeds and turn rates of a suite of trials, in all combinations; the defaults are the published ones."""
+    """Speeds and turn rates of trials, in all combinations.
+
+    The defaults are those of the paper that defines the trials (see docs/explanation/evaluation.md).
+    """
 
     speeds_m_s: tuple[Speed, ...] = Field(
         tuple(1.0 + 0.25 * step for step in range(9)),

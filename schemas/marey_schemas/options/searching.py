@@ -10,10 +10,11 @@ from marey_schemas.names import JointName
 CANDIDATES = 8
 """Number of nodes of the tree that a search follows at each level, by default.
 
-The published number is 4. With 8, the error of the result is a sixth smaller, and a search takes a millisecond more.
+The published method uses 4 nodes. With 8, the error of the result is a sixth smaller, and a search takes a millisecond
+more.
 """
 PASSES = 2
-"""Default number of passes of a search: one over the tree's samples, then one over samples near the best of these."""
+"""Default number of passes of a search: one over the samples of the tree, then one over samples near the best one."""
 
 TRANSITION_TOLERANCE_M = 0.02
 

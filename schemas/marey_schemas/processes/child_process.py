@@ -28,7 +28,7 @@ READY_S = 300.0
 """Longest wait in seconds for `READY`; after an installation, the child may have to compile its modules first."""
 TERMINATE_S = 10.0
 WAIT_EVERY_S = 0.005
-"""Time in seconds between two looks at whether a process that is waited for has ended."""
+"""Time in seconds between two checks whether a process has ended, while this process waits for its end."""
 MOST_MESSAGE_BYTES = 1 << 30
 ONE_DESCRIPTOR = b"\x01"
 """Number of descriptors in a message, as `multiprocessing.reduction.recv_handle` expects it."""
@@ -134,7 +134,10 @@ class ConnectedChild(ABC):
         self._close()
 
     def _close(self) -> None:
-        """Close the pipe, but not while another thread sends: a new file could get the pipe's descriptor at once."""
+        """Close the pipe and the socket, once no other thread is sending a message.
+
+        Otherwise, the system could give the descriptor of the pipe to a new file while that thread still writes to it.
+        """
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)  # ends a `send` that waits for room
         with self._sending:
@@ -161,7 +164,8 @@ class ChildProcess(ConnectedChild):
     def __init__(self, module: str, arguments: Sequence[str] = (), *, threads: int, at_most: bool = False) -> None:
         """Start the process, with `threads` threads for numeric libraries.
 
-        Variables of this process's environment, such as `OMP_NUM_THREADS`, take precedence, unless `at_most` is true.
+        If the environment of this process sets a number of threads, such as `OMP_NUM_THREADS`, the child uses that
+        number, unless `at_most` is true.
         """
         self._reaping = threading.Lock()
         ours, theirs = socket.socketpair()

@@ -4,9 +4,9 @@ Loading numeric modules and compiled kernels takes two seconds of processor time
 child is ready in milliseconds and shares this memory. The fork server has only one thread, since locks that other
 threads hold would stay locked in its children for ever. It never reads the messages from the parent to a child.
 
-The parent sends `FORK`, followed by a socket for the new child. It sends the process id of an ended child when it will
-not signal this child any more. The fork server sends the process id of a child with `STARTED`, and later with the exit
-status of the child.
+The parent sends `FORK`, followed by a socket for the new child. The fork server answers with the process id of the
+child and `STARTED`. When the child has ended, the fork server sends the process id with the exit status. The parent
+sends the process id back when it will not signal the child any more; until then, no other process gets this id.
 """
 
 from __future__ import annotations
@@ -36,22 +36,25 @@ from marey_schemas.processes.child_process import (
 from marey_schemas.processes.limits import die_with_parent
 
 FORKS = sys.platform == "linux"
-"""Whether processes may be forked after numeric libraries were loaded; on other systems, these may have threads."""
+"""Whether a process may be forked after it has loaded numeric libraries.
+
+On systems other than Linux, the libraries may have started threads by then.
+"""
 FORK = b"fork"
 STARTED = 1 << 16
 """Value in place of the exit status of a child that has been started; exit statuses are smaller."""
 LOST = 1 << 17
 """Value in place of the exit status of a child whose fork server has ended."""
 NO_CHILD = -1
-"""Value in place of the number of a child that could not be started."""
+"""Value in place of the process id of a child that could not be started."""
 _NUMBER, _NUMBER_AND_STATUS = struct.Struct("<q"), struct.Struct("<qq")
 
 
 class ForkServer:
     """Parent's side of a fork server, which runs `python -m module <file descriptor> <arguments>`.
 
-    A thread of its own starts and watches it, so it lives until it is closed or this process ends. Any thread may fork
-    children.
+    A thread of its own starts and watches the fork server, which therefore lives until it is closed or this process
+    ends. Any thread may fork children.
     """
 
     def __init__(self, module: str, arguments: Sequence[str] = ()) -> None:
@@ -70,7 +73,7 @@ class ForkServer:
     def wait_until_ready(self) -> None:
         """Start the fork server, and wait until it has loaded its modules.
 
-        Raises `ChildBroken` if it ends before, and `OSError` if the system cannot start it.
+        Raises `ChildBroken` if the fork server ends before, and `OSError` if the system cannot start it.
         """
         self._watching.start()
         if (error := self._launched.get()) is not None:
@@ -84,7 +87,7 @@ class ForkServer:
     def fork(self) -> ForkedChild:
         """Start a child, and wait until it is ready.
 
-        Raises `ChildBroken` if it or the fork server has ended, and `OSError` if this process has no descriptor left.
+        Raises `ChildBroken` if the child or the fork server ends, and `OSError` if this process has no descriptor left.
         """
         assert self._process is not None, "wait_until_ready comes first"
         ours, theirs = socket.socketpair()
@@ -106,7 +109,7 @@ class ForkServer:
         return child
 
     def status_of(self, pid: int, timeout_s: float | None = None) -> int | None:
-        """Return the exit status of a child; None if it is running after `timeout_s`; without a timeout, wait."""
+        """Return the exit status of a child, or None if it still runs after `timeout_s`; without a timeout, wait."""
         with self._changed:
             self._changed.wait_for(lambda: self._ended or pid in self._statuses, timeout_s)
             return self._statuses.get(pid, LOST if self._ended else None)
@@ -136,7 +139,7 @@ class ForkServer:
             self._watching.join()
 
     def _watch(self) -> None:
-        """Start the fork server, receive the process ids and exit statuses of children, and reap it at its end."""
+        """Start the fork server, receive process ids and exit statuses of children, and reap the server at its end."""
         module, arguments = self._command
         try:
             process = self._process = ChildProcess(module, arguments, threads=1, at_most=True)

@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 MOST_CHARACTERS = 2_000
 MOST_CONDITIONS = 50
 MOST_COMPARED_VALUES = 200
-"""Greatest number of values of all conditions together."""
+"""Greatest number of values in all conditions of a query together."""
 DEEPEST = 30
-"""Greatest number of brackets and negations inside each other."""
+"""Greatest depth of nested brackets and negations."""
 
 Operator = Literal["=", "~", "<", "<=", ">", ">=", "has"]
-"""Operators of conditions; `!=` and `in` are written with these."""
+"""Operators of conditions. The parser expresses `!=` as a negated `=`, and `in` as `=` with several values."""
 _GRAMMAR = r"""
     ?start: disjunction
     ?disjunction: conjunction (_OR conjunction)*
@@ -63,8 +63,8 @@ class QueryError(ValueError):
 class Condition:
     """Comparison of a field with values, of which one must match; `has` has no values.
 
-    Values are numbers for fields of the type `number`, texts for the type `text`, and for the type `date` texts as in
-    `2026-11-23` or times with a zone.
+    Values are numbers for fields of the type `number`, and texts for the type `text`. For the type `date`, they are
+    dates, or times with a time zone.
     """
 
     field: str
@@ -133,14 +133,14 @@ def conditions_of(query: Query) -> Iterator[Condition]:
 
 
 def parts_of(query: Query) -> tuple[Query, ...]:
-    """Return the queries that must all be true for the query to be true."""
+    """Return the queries that `and` joins at the top level of a query; the query itself if there is no such `and`."""
     return query.queries if isinstance(query, Junction) and query.word == "and" else (query,)
 
 
 def operands_of(query: Query) -> Iterator[Query]:
-    """Yield the queries that must all be true for the query to be true, also those between brackets.
+    """Yield the smallest queries that are joined by `and`: for `a and (b and c)`, these are `a`, `b` and `c`.
 
-    None of them is joined by `and`.
+    The query is true if all of them are true. None of them is itself a junction with `and`.
     """
     for part in parts_of(query):
         if part is query:

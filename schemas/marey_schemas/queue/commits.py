@@ -14,7 +14,10 @@ from marey_schemas.names import CollectionPath, Message
 MOST_COMMITTED = 200_000
 """Greatest number of entries that the commit of one job adds, changes or removes. It limits the memory needed."""
 MOST_COMMITTED_AT_ONCE = 10_000
-"""Greatest number of outputs that are committed in the transaction that publishes them, while other writers wait."""
+"""Greatest number of outputs whose commit is computed in the transaction that publishes them.
+
+During this transaction, other writers wait.
+"""
 MOST_LISTED = 100
 """Greatest number of paths that a conflict lists."""
 

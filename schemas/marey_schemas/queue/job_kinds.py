@@ -49,13 +49,13 @@ class KindDeclaration:
     * `place_counts`: whether the path of the collection that receives the results must be the same.
     * `newest_of`: parameters that contain the id of an item, or null; the item must have the same newest revision.
 
-    Some jobs never reuse results:
+    Some jobs never reuse results. A kind declares them with these fields:
 
-    * `never_cached_for`: function that returns whether a job with the given parameters looks up names while it runs.
-    * `never_cached_without`: inputs without which a job looks up names while it runs.
-    * `in_place`: parameter with which results replace their sources, if these are still the newest revisions.
+    * `never_cached_for`: function of the parameters, which returns whether the job looks up names while it runs.
+    * `never_cached_without`: inputs. If a job lacks one of them, it looks up names while it runs.
+    * `in_place`: parameter. If it is true, results replace their sources, if these are still the newest revisions.
 
-    `facets` has the meaning of each number that the job publishes about its inputs, by name.
+    `facets` contains the meaning of each facet, a number that the job publishes about its inputs, by name.
 
     `named_after` is the input whose items determine the names and relative collections of the results; the parameter
     `suffix` is appended to the names. `unclear_place` is a function of the parameters and a collection; it returns why
@@ -164,7 +164,7 @@ _RIGS = InputSpec(
 
 
 def _may_hold_graphs(params: Mapping[str, Any]) -> bool:
-    """Return whether, judging by its name, a file to import may be a graph of motion models.
+    """Return whether one of the files to import may be a graph of motion models, judging by its name.
 
     The import of a graph looks up its models by name, so such jobs have no cached results.
     """

@@ -133,7 +133,7 @@ def job_of_step(pipeline: PipelineCreate, name: str, ids: Mapping[str, str]) -> 
 
 
 def _needed(name: str, step: PipelineStep) -> Iterator[tuple[str, str]]:
-    """Return the references of a step to others: place in the document, and name of the other step."""
+    """Yield the references of a step to other steps: the JSON Pointer to each, and the other step's name."""
     for index, other in enumerate(step.after):
         yield f"/steps/{name}/after/{index}", other
     for role, choices in step.inputs.items():

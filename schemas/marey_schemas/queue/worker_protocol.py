@@ -62,7 +62,11 @@ class PinnedInput(Answer):
 
     @property
     def folder(self) -> str:
-        """The folder of this input. Its results are stored in a folder with the same path below the job's `into`."""
+        """The path of the folder below the job's `into` in which results of this input are stored.
+
+        It is the path of the input's folder in the project, or, if the input was given as an output of another job, the
+        path below the `into` of that job.
+        """
         return self.collection if self.below is None else self.below
 
     @property
@@ -76,7 +80,7 @@ class PinnedInput(Answer):
         return RevisionRef(item=self.item, revision=self.revision)
 
     def as_input(self) -> ItemInput:
-        """Return the input as it is listed in the origin of results."""
+        """Return the input in the form in which the record of a result's origin lists it."""
         return ItemInput(item=self.item, revision=self.revision)
 
 
@@ -148,7 +152,7 @@ class StagedOutput(Request):
 
 
 class StageRequest(Request):
-    """Request to stage results, and numbers about inputs of the job."""
+    """Request to stage results, and facets (numbers about inputs of the job)."""
 
     outputs: tuple[StagedOutput, ...] = Field((), max_length=256)
     facets: tuple[ItemFacets, ...] = Field(

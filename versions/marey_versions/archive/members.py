@@ -34,7 +34,7 @@ class MemberKind(StrEnum):
     CHANGES = "changes"
     """Entries that differ between a commit and its first parent; the digest of the commit names the member."""
     REVISION = "revisions"
-    """Kind and content digests of the parts of a revision that documents refer to."""
+    """Revision that documents refer to: its kind, and the content digests of its parts."""
     DOCUMENT = "documents"
     ARRAY = "arrays"
     FILE = "files"

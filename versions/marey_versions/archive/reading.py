@@ -39,9 +39,9 @@ class Manifest:
     dataset: str
     """Name that the dataset had on its server."""
     commit: str
-    """The commit that the archive was made of."""
+    """Digest of the exported commit; all other commits in the archive are its ancestors."""
     base: tuple[str, ...]
-    """Commits that precede those of the archive and that it does not contain; empty if it has the whole history."""
+    """Digests of earlier commits that the archive needs but does not contain; empty if it has the whole history."""
 
 
 class EntryChange(NamedTuple):
@@ -50,7 +50,7 @@ class EntryChange(NamedTuple):
     value: Value | None
     """The entry after the commit; None if the commit removed it."""
     unchanged: Mapping[str, str]
-    """Parts whose documents the archive lacks, each with the content digest of an earlier revision with this part."""
+    """Parts whose documents the archive lacks; for each, the content digest of an earlier revision with this part."""
 
 
 class Archive:
@@ -162,7 +162,7 @@ class Archive:
     def versions(self) -> Versions:
         """Compute the entries of all versions from the changes of their commits.
 
-        Raises `BadArchive` if the entries of a version do not have the digest that its commit names, and if the archive
+        Raises `BadArchive` if the entries of a version do not have the digest that its commit names, or if the archive
         has only the later part of a history.
         """
         if self.manifest.base:

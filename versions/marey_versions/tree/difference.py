@@ -65,7 +65,7 @@ class KeyRange(NamedTuple):
         return (self.after is None or key > self.after) and (self.last is None or key <= self.last)
 
     def overlaps(self, before: str | None, child: Child) -> bool:
-        """Return whether a child, whose keys are greater than `before`, can have keys in the range."""
+        """Return whether `child`, all of whose keys are greater than `before`, can have keys in the range."""
         starts_in_time = self.last is None or before is None or before < self.last
         return starts_in_time and (self.after is None or child.last_key > self.after)
 
@@ -85,7 +85,7 @@ def _compare(
 
 
 def _parts(before: Sequence[Child], after: Sequence[Child], within: KeyRange) -> Iterator[KeyRange]:
-    """Split a range of keys so that no part contains more than `COMPARED_TOGETHER` chunks of the longer side."""
+    """Split a range of keys into parts with at most `COMPARED_TOGETHER` chunks of the side that has more chunks."""
     longer = max(before, after, key=len)
     start = within.after
     for place in range(COMPARED_TOGETHER - 1, len(longer) - 1, COMPARED_TOGETHER):
