@@ -56,7 +56,9 @@ def uid_of(item: str, revision: int, *, mirrored: bool = False) -> str:
 def example_to_tree(
     aligned: AlignedSet, example: AlignedClip, *, digest: str | None = None, options: Tree | None = None
 ) -> Tree:
-    """Make the document part `info` for one example. All uids of the set must come from `uid_of`.
+    """Convert one example of a set to the tree that is stored as the part `info` of its document.
+
+    All uids of the set must come from `uid_of`.
 
     Parameters
     ----------
@@ -93,7 +95,7 @@ def example_to_tree(
 
 
 def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
-    """Assemble a set from stored examples, in the order of name and uid, even if some of its examples are missing.
+    """Assemble a set from stored examples, ordered by name and uid; some examples of the original set may be missing.
 
     Parameters
     ----------

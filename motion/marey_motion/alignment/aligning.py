@@ -42,7 +42,7 @@ LEAST_FRAMES = 4
 MOST_FRAMES = 4000
 """Maximum number of frames of one example: the costs of two such examples take 128 MB."""
 MOST_JOINT_FRAMES = 30_000_000
-"""Maximum of joints times frames, summed over all examples: about 3 GB of memory."""
+"""Maximum product of joints and frames, summed over all examples; their alignment takes about 3 GB of memory."""
 MIRRORED = "~mirrored"
 
 Progress = Callable[[float, float | None, str], None]
@@ -113,9 +113,10 @@ def align_clips(
     progress: Progress | None = None,
     on_refusal: OnRefusal | None = None,
 ) -> AlignedSet:
-    """Align examples of an action with one of them, in space and in time, section by section where cuts are given.
+    """Align examples of an action with one of them, the reference, in space and in time.
 
-    The result has the same bytes for any number of threads and any order of the clips.
+    If the examples have cuts, each section between two cuts is aligned with the same section of the reference. The
+    result has the same bytes for any number of threads and any order of the clips.
 
     Parameters
     ----------
@@ -204,7 +205,10 @@ class _Aligning:
             return error
 
     def _kept(self, examples: Sequence[SourceExample], tries: Sequence[Any]) -> list[Any]:
-        """Return the results that are not errors, and report the errors."""
+        """Return the results that are not errors, and pass each error to `on_refusal`.
+
+        Raises `MotionError` if there is no such callback, if the reference failed, or if too few results remain.
+        """
         for example, made in zip(examples, tries, strict=True):
             if isinstance(made, MotionError):
                 if self.on_refusal is None or example.uid == self._options.reference:

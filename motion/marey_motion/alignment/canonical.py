@@ -76,6 +76,6 @@ def _turn(angle_rad: float) -> Floats:
 
 
 def _carried(motion: Motion, skeleton: Skeleton, carrier: int, turn: Floats, places: AnyFloats) -> Motion:
-    """Move the joint `carrier`, and with it the body, to `places` (F, 3), and rotate it in the world by `turn` (4,)."""
+    """Move the joint `carrier` to `places` (F, 3) and rotate it by `turn` (4,) in the world; the body moves with it."""
     spins = quaternions.multiply(turn, spins_of(motion, skeleton, carrier))
     return carried_at(motion, skeleton, carrier, np.asarray(places, np.float64), np.asarray(spins, np.float64))

@@ -22,7 +22,8 @@ class CostPoints(NamedTuple):
     rows : (F, P, 3) float64    positions, multiplied by the square root of each point's share of the total weight
     columns : (P, 3, F) float64    the same, transposed
     energies : (n,) float64    weighted sum of squared horizontal distances from the centre, over each frame's window
-    centres : (n, 2) float64    horizontal weighted centre of each frame's window; zero if each frame is centred alone
+    centres : (n, 2) float64    horizontal weighted centre of each frame's window; zero if there is no window, or if the
+        cost is `plain`
     """
 
     rows: Floats
@@ -34,8 +35,9 @@ class CostPoints(NamedTuple):
 def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weights: ArrayLike | None = None) -> Floats:
     """Compute the cost of each pair of frames of two motions.
 
-    The cost is the weighted mean of the squared distances between corresponding points, over all frames of the window
-    if there is one.
+    The cost is the weighted mean of the squared distances between corresponding points. If the option `cost` is
+    `turned`, the distances are those after the best rotation about the vertical and the best shift on the ground. If
+    there is a window, the cost is the mean over the frames of the window.
 
     Parameters
     ----------
@@ -54,12 +56,12 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weight
 
     Notes
     -----
-    Kovar and Gleicher 2002, equation 1, divided by the sum of weights. With horizontal positions as complex numbers z
-    about their weighted centre, the minimum of the sum over all turns and shifts is Σ w|z_a|² + Σ w|z_b|² - 2 |Σ w z_a
-    z̄_b|; the differences of heights are added as they are.
+    The cost `turned` is equation 1 of Kovar and Gleicher (2002), divided by the sum of weights. Let the complex numbers
+    z be the horizontal positions relative to their weighted centre. The minimum over all rotations and shifts is then
+    Σ w|z_a|² + Σ w|z_b|² - 2 |Σ w z_a z̄_b|, plus the weighted sum of the squared differences of height.
 
-    At the ends of a motion, its first and last frame are repeated for the window. All frames of a window are turned and
-    shifted together.
+    All frames of a window are rotated and shifted together. A window that extends beyond the motion is filled with
+    copies of the first or the last frame.
     """
     options = options or CostOptions()
     require_same_points(a, b)

@@ -14,8 +14,9 @@ from marey_motion.kernels import compiled
 def _products(points, others, real, imaginary, heights):  # type: ignore[no-untyped-def]
     """Compare the points of one frame (P, 3) with each of m frames, `others` (P, 3, m).
 
-    `real` and `imaginary` (m,) are filled with the sums, over the points, of the products h·h̄' of horizontal positions
-    h = x + i·z; `heights` (m,) with the sums of squared differences of height.
+    h = x + i·z is the horizontal position of a point in the one frame, and h' its position in one of the m frames.
+    `real` and `imaginary` (m,) are filled with the real and imaginary parts of the sum of h·h̄' over the points.
+    `heights` (m,) are filled with the sums of the squared differences of height.
     """
     real[:] = 0.0
     imaginary[:] = 0.0
@@ -74,9 +75,10 @@ def turned_windows(a, b, window, costs):  # type: ignore[no-untyped-def]
 
 @compiled
 def _slide(history, row, window, sums):  # type: ignore[no-untyped-def]
-    """Fill `sums` (c, m) with sums along diagonals of c matrices, over `window` rows up to and including `row`.
+    """Sum each of c matrices over windows of frames, along the diagonals, and write the sums to `sums` (c, m).
 
-    `history` (window, c, m + window - 1) is a ring buffer with the newest rows of the matrices.
+    The sums extend over `window` rows, the last of which is `row`. `history` (window, c, m + window - 1) is a ring
+    buffer with the newest rows of the matrices.
     """
     sums[:] = 0.0
     for step in range(window):

@@ -25,8 +25,8 @@ def time_function(path: NDArray[np.integer]) -> Floats:
 
     A canonical frame that is matched with several source frames is mapped to their mean. A source frame that is matched
     with several canonical frames is assigned to their mean; the frames between are interpolated linearly. The first
-    frames of both motions correspond exactly, and so do the last frames. If a slope is below `LEAST_SLOPE`, all slopes
-    are replaced by the nearest ones, in least squares, that are at least `LEAST_SLOPE`.
+    frames of both motions correspond exactly, and so do the last frames. If a slope is below `LEAST_SLOPE`, the slopes
+    are changed as little as possible, by least squares, so that all of them are at least `LEAST_SLOPE`.
 
     Parameters
     ----------

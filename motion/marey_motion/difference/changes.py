@@ -21,7 +21,7 @@ JOINED_S = 0.1
 POINT_M = 0.01
 """Extent of a path, in metres, up to which it counts as a point, whose turn cannot be measured."""
 UNEXPLAINED = 0.1
-"""Greatest share of the mean change of a path that may remain if a movement of the whole path is to explain it."""
+"""Share of the mean change of a path. If more remains after a movement of the whole path, no movement is reported."""
 MOST_SPANS = 100
 """Maximum number of ranges in a list; if there are more, the ranges with the smallest gaps are joined, too."""
 
@@ -162,7 +162,7 @@ class Move(NamedTuple):
 
 
 def whole_move(before: Floats, after: Floats) -> Move | None:
-    """Find the rigid movement that takes a path nearest to another one, by least squares.
+    """Find the rigid movement that brings one path as close as possible to another path, by least squares.
 
     Parameters
     ----------

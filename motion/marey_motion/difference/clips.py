@@ -30,7 +30,7 @@ from marey_schemas.documents.differences import (
 )
 
 STILL_M = 0.001
-"""Greatest movement along an axis of a joint that stands still."""
+"""Largest movement along an axis, in metres, of a joint that counts as not moving."""
 MOST_ROWS = 600
 """Maximum number of rows in the plot of changed rotations."""
 MOST_POINTS = 1000
@@ -94,7 +94,10 @@ def compare_clips(
 
 
 def _carrier(before: Clip, after: Clip, pairing: JointPairs) -> int:
-    """Return the index, in the lists of `pairing`, of the first joint that moves; its path is used as the body's."""
+    """Return the index, in the lists of `pairing`, of the first joint that moves; 0 if no joint moves.
+
+    The path of this joint counts as the path of the body.
+    """
     if any(float(np.ptp(clip.root_translations, axis=0).max()) > STILL_M for clip in (before, after)):
         return 0
     for place, joints in enumerate(zip(pairing.before, pairing.after, strict=True)):

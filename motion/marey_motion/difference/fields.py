@@ -35,9 +35,9 @@ class ChangedValue(NamedTuple):
 def changed_values(before: Any, after: Any, pointer: str = "") -> Iterator[ChangedValue]:
     """Compare two documents.
 
-    Objects are compared by field, lists of equal length by position. If lists have different lengths, entries of only
-    one of them count as removed or added. Arrays are compared as a whole. Null, an empty list and an empty object count
-    as absent values.
+    Objects are compared field by field, and lists of equal length entry by entry. If two lists have different lengths,
+    an entry that only one of them contains counts as removed or added. Arrays are compared as a whole. Null, an empty
+    list and an empty object count as absent values.
 
     Parameters
     ----------

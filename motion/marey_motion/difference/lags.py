@@ -11,19 +11,19 @@ from marey_motion.arrays import AnyInts, Complexes, Floats
 from marey_motion.difference.poses import Poses
 
 MOST_LAGS = 16
-"""Maximum number of candidates from each of the two methods."""
+"""Maximum number of lags that `exact_lags` returns."""
 WINDOWS = 12
 """Number of windows of the old clip that are searched for in the whole new clip."""
 SHORTEST_WINDOW = 8
 SIMILAR = 4.0
-"""Multiple of the least squared distance up to which the second-best place of a window is a candidate, too."""
+"""Multiple of the squared distance of the best place of a window, up to which the second-best is a candidate, too."""
 NEGLIGIBLE = 1e-3
 """Squared distance of two frames that is attributed to noise."""
 GREATEST_PACE = 4.0
 """Greatest pace that is tried, in new frames per old frame; the least pace is 1 / `GREATEST_PACE`."""
 PACES = 97
 DECIMATED = 2048
-"""Approximate number of frames of the longer clip that are used to search paces."""
+"""Approximate number of frames of the longer clip that are used in the search for the pace."""
 PACE_WINDOW = 96
 PACE_WINDOWS = 3
 CHANNELS = 8

@@ -15,9 +15,9 @@ from marey_schemas.documents.differences import AnnotationDifference, KeyframeCh
 ALONE = 0.6
 """Cost of an added or removed segment."""
 OTHER_LABEL = 0.7
-"""Cost of another label, added to the cost of the range, which is from 0 (equal ranges) to 1 (ranges apart)."""
+"""Cost of different labels, added to the cost of the ranges: 0 for equal ranges, 1 for ranges that do not overlap."""
 SHIFTED = 0.05
-"""Cost of the shift that most segments of the annotation have in common."""
+"""Cost added to a pair of segments if their ranges are compared after the shift that most segments have in common."""
 MOST_PAIRS = 16_000_000
 """Maximum product of the numbers of differing segments in both annotations."""
 
@@ -25,9 +25,9 @@ MOST_PAIRS = 16_000_000
 def compare_annotations(before: Annotation, after: Annotation) -> AnnotationDifference:
     """Describe the differences between two annotations.
 
-    Segments are matched in order, at the least cost. Segments of the same label whose ranges overlap cost little, and
-    so do segments that overlap after the shift that most segments have in common. A segment with another label is
-    matched only if the ranges overlap by more than a half.
+    Segments are matched in order, at the least total cost. A pair with the same label costs little if its ranges
+    overlap, or if they overlap after the shift that most segments have in common. A pair with different labels is
+    matched only if its ranges overlap by more than a half.
 
     Parameters
     ----------
@@ -73,8 +73,8 @@ def _of_keyframes(annotation: Annotation) -> list[Segment]:
 def _match(before: Sequence[Segment], after: Sequence[Segment]) -> list[tuple[int | None, int | None]]:
     """Match the entries of two ordered lists; return the indices of each pair.
 
-    An entry without a match is paired with None. Entries that both lists have in common at their beginning or at their
-    end are left out.
+    An entry without a match is paired with None. Equal entries at the beginning of both lists, or at the end of both,
+    are left out.
     """
     shortest = min(len(before), len(after))
     head = next((place for place in range(shortest) if before[place] != after[place]), shortest)
@@ -108,8 +108,8 @@ def _pair_costs(before: Ints, after: Ints) -> Floats:
 def _range_costs(before: Ints, after: Ints) -> Floats:
     """Compute the costs (n, m) of pairing ranges: 0 for equal ranges, 1 for ranges that do not overlap.
 
-    The cost is 1 minus the number of common frames, divided by the number of frames from the first start to the last
-    end.
+    The cost is 1 minus a ratio: the number of common frames, divided by the number of frames from the first start to
+    the last end.
     """
     common = np.minimum(before[:, None, 2], after[None, :, 2]) - np.maximum(before[:, None, 1], after[None, :, 1])
     whole = np.maximum(before[:, None, 2], after[None, :, 2]) - np.minimum(before[:, None, 1], after[None, :, 1])
@@ -117,7 +117,10 @@ def _range_costs(before: Ints, after: Ints) -> Floats:
 
 
 def _common_shift(before: Ints, after: Ints) -> Ints:
-    """Return (0, d, d), where d is the most frequent shift between entries of the same label and length."""
+    """Find the most frequent shift d between entries of the same label and length; 0 if there are no such entries.
+
+    Returns (0, d, d), which is added to a row (label number, start, end) in order to shift it.
+    """
     alike = (before[:, None, 0] == after[None, :, 0]) & (
         before[:, None, 2] - before[:, None, 1] == after[None, :, 2] - after[None, :, 1]
     )

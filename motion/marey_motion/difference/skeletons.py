@@ -40,7 +40,7 @@ def pair_joints(before: Skeleton, after: Skeleton) -> JointPairs:
     """Pair the joints of two skeletons.
 
     Joints of the same name are paired. Of the other joints, two are paired as renamed if they have the same parent and
-    nearly the same offset, and no other joint could be meant.
+    nearly the same offset, and if neither of them has another possible partner.
 
     Parameters
     ----------

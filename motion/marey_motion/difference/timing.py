@@ -24,13 +24,13 @@ MANY_RUNS = 8
 MOST_REFINEMENTS = 8
 FEWEST_PAIRS = 8
 SLOPES, FRAMES_APART = 20, 64
-"""Slopes are measured over 1 / `SLOPES` of all frames, and, in turn, over `FRAMES_APART` frames."""
+"""Slopes are measured alternately over `FRAMES_APART` matched frames, and over 1 / `SLOPES` of all matched frames."""
 FARTHEST_OFFSET = 2.0
 """Maximum offset, in frames, that is estimated from velocities."""
 ROUNDED_FRAMES = 0.02
 """Deviation over the whole clip, in frames, that is attributed to rounding."""
 GREATEST_PACE = 16.0
-"""Maximum factor between the numbers of frames of the same motion."""
+"""Greatest pace that is tried, in new frames per old frame; the least pace is 1 / `GREATEST_PACE`."""
 
 
 class Pace(NamedTuple):

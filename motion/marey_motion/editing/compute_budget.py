@@ -19,7 +19,10 @@ PER_PLANTED_NUMBER = 600
 PER_TAP, MOST_OF_TAPS = 0.35, 200.0
 """Work of a moving mean for each number of the motion, in nanoseconds: per frame of the window, and the maximum."""
 PER_MEETING, PER_MET_NUMBER = 1_000_000, 10
-"""Work of solving and blending in one range of constraints, and additional work for each number in its frames."""
+"""Work of applying one group of constraints, in addition to the solver, and work for each number of the rotations.
+
+Both are in nanoseconds.
+"""
 
 
 @dataclass
@@ -42,7 +45,7 @@ class ComputeBudget:
 
         Raises
         ------
-        EditError    if less work than this is left
+        EditError    if the work exceeds the remaining budget
         """
         self.left -= work
         if self.left < 0.0:

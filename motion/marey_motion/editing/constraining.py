@@ -1,7 +1,7 @@
 """Constraints on ranges of frames, met by inverse kinematics and blended into their surroundings.
 
-Two constraints are solved together if one of them turns a joint that the other turns or depends on; otherwise
-separately.
+Two constraints are solved together if one of them turns a joint that the other turns or depends on. Otherwise,
+they are solved separately.
 """
 
 from __future__ import annotations
@@ -224,7 +224,10 @@ class _Cluster:
         return displace(motion, frames, changed, windows_around(frames, blend_frames, motion.frame_count))
 
     def _solve(self, given: Motion, frames: Ints, constraints: Sequence[Constraint]) -> Motion:
-        """Solve the given frames of a motion, in all of which the same constraints apply; return only these frames."""
+        """Solve some frames of a motion, to all of which the same constraints apply; return only these frames.
+
+        `given` is the motion in these frames, and `frames` are their numbers.
+        """
         limb = constraints[0].limb if all(one.limb == constraints[0].limb for one in constraints) else None
         joints = tuple(sorted({joint for one in constraints for joint in one.joints}))
         self.budget.spend(self._work(len(frames), constraints, limb, joints))

@@ -222,7 +222,8 @@ def _limit(rig: _Rig, asked: AnyLimit) -> JointLimit:
 def _finding(asked: AnyConstraint, constraint: Constraint, before: Any, after: Any) -> dict[str, Any]:
     """Describe the largest errors of a constraint, and count the frames that satisfy it.
 
-    `before` and `after` are its errors in its frames, in metres or radians, before and after solving.
+    `before` and `after` are the errors of the constraint in each of its frames, before and after solving, in metres or
+    radians.
     """
     is_position = isinstance(constraint.target, PositionTarget)
     unit = "m" if is_position else "rad"

@@ -1,11 +1,12 @@
-"""Changes of a few frames spread over their surroundings: displacement maps that are cubic B-splines.
+"""Displacement maps, which spread changes of a few frames over the surrounding frames with cubic B-splines.
 
 A displacement (Lee and Shin 1999) consists of a shift of the root and a rotation vector d per joint, which replaces the
-local rotation q with q·exp(d). There is one control point per frame. The displacement is the sum of two curves. The
-first is the curve of least bending through the smoothed changes of the given frames: without smoothing, it would
-continue the slope of the last two frames, which is mostly noise, far into the surroundings. The second, under high
-tension, passes through the remaining differences and hardly extends beyond the given frames. Near a smooth end of a
-window the control points are zero, so that value, slope and curvature are exactly zero there.
+local rotation q with q·exp(d). There is one control point per frame. The displacement is the sum of two curves.
+The first is the curve of least bending through the smoothed changes of the given frames. A curve through the changes
+themselves would continue the slope of the last two frames, which is mostly noise, far into the surroundings. The second
+curve passes through the differences between the changes and the smoothed changes. It has a high tension, so that it
+hardly extends beyond the given frames. Near a smooth end of a window, the control points are zero, so that value, slope
+and curvature are exactly zero there.
 """
 
 from __future__ import annotations
@@ -229,7 +230,7 @@ def _rotation_vectors(before: Floats, after: Floats) -> Floats:
 
 
 def _continued(values: Floats, joints: int) -> Floats:
-    """Return displacements with rotation vectors that are continuous over time, and may exceed half a turn.
+    """Make the rotation vectors of displacements continuous over time; their angles may then exceed half a turn.
 
     `values` (n, 3·joints + 3) are rotation vectors of `joints` joints, followed by displacements of the root.
     """

@@ -211,7 +211,7 @@ def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, 
 
 
 def _standing_heels(contacts: FootContacts, blend: int) -> Flags:
-    """Find the frames (F,) in which a heel is planted; release it shortly before each new contact of its toe.
+    """Find the frames (F,) in which a heel stays planted; it is released shortly before each new contact of its toe.
 
     The ankle follows the toe, so each toe contact moves the ankle. A heel that is planted over several toe contacts
     would otherwise jump from one position to the next.
@@ -252,9 +252,9 @@ def _turn_between(before: Floats, after: Floats) -> Floats:
 
 
 def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], zone: float, blend: int) -> Floats:
-    """Compute how far (F,), in metres, the root must be lowered so that the legs reach the planted feet undamped.
+    """Compute how far (F,), in metres, the root must be lowered so that the legs reach the planted feet.
 
-    Knees are damped if the leg is straight up to an angle of `zone` radians (see `solve_two_bone`).
+    They must do so without damping, which applies to knees within `zone` radians of a straight leg (`solve_two_bone`).
     """
     from marey_motion.editing.inverse_kinematics import two_bone_kernels
 

@@ -107,7 +107,10 @@ def concatenate(take: Take, command: Concatenate) -> Take:
 
 
 def _same_rate(take: Take, source: str) -> Take:
-    """Resample the source clip to the rate of the take. Raises `EditError`."""
+    """Resample a source clip to the rate of the take.
+
+    Raises `EditError` if the source is unknown or has another skeleton, or if the result is too long.
+    """
     clip = take.source(source)
     if not same_hierarchy(clip.skeleton, take.skeleton, tolerance_m=SAME_SKELETON_M):
         raise EditError(

@@ -17,7 +17,7 @@ from marey_schemas.options.annotations import ContactOptions
 
 FEET = ("left_foot", "right_foot")
 LOWEST_SHARE = 0.05
-"""Share of the frames, those with the lowest feet, from which the ground is estimated if no foot is ever in stance."""
+"""Quantile of the heights of the lower sole that is used as the ground if the lower foot is never in stance."""
 
 
 class Ground(NamedTuple):
@@ -26,8 +26,8 @@ class Ground(NamedTuple):
     Parameters
     ----------
     height_m : height of the ground, metres
-    standing_frames : number of frames with a foot in stance, from which the height is estimated; if 0, the height is
-        estimated from the feet in the lowest frames
+    standing_frames : number of frames in which the lower foot is in stance, from which the height is estimated; if 0,
+        the height is estimated from the frames with the lowest feet
     """
 
     height_m: float
@@ -111,7 +111,7 @@ def find_contacts(take: Take, command: FindContacts) -> Take:
 
 
 def estimate_ground(take: Take) -> Ground:
-    """Estimate the height of the ground as the median height of the lower sole while that foot is planted.
+    """Estimate the height of the ground as the median height of the lower sole, over frames with that foot in stance.
 
     The median is robust against a foot that is below the floor for some frames and against a kick that is held.
 

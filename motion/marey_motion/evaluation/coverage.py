@@ -21,7 +21,7 @@ from marey_schemas.options.evaluation import EvaluationOptions
 
 WINDOW_S = 1.0
 SPEED_STEP_M_S, TURN_RATE_STEP_DEG_S = 0.25, 25.0
-"""Width of the only cell of a grid with one speed or turn rate."""
+"""Width of a cell if the grid has only one speed, or only one turn rate."""
 EDGE_DECIMALS = 9
 """Decimals to which edges of cells are compared, so that left and right turns have the same edges."""
 

@@ -36,7 +36,9 @@ FARTHEST_M = 1e6
 
 PATH_RATE_HZ = 5.0
 AWAY_DECIMALS = 1
-"""Decimals to which distances between cells are compared; of equally distant targets, the one that lacks more is first.
+"""Decimals to which distances between cells are compared.
+
+Of equally distant targets, the one that lacks more seconds comes first.
 """
 
 

@@ -145,8 +145,8 @@ def _usage(tree: Mapping[str, Any], clips: Sequence[DatabaseClip]) -> tuple[Clip
 def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> Tree:
     """Join the records of all or some trials into a few large arrays.
 
-    Record r has the ticks [starts[r], starts[r + 1]). A cost that is not defined at every tick is stored as the ticks
-    at which it is defined, counted over all records, and its values.
+    Record r has the ticks [starts[r], starts[r + 1]). Costs are not defined at every tick. Each cost is stored
+    as two arrays: the ticks at which it is defined, counted over all records, and its values at these ticks.
 
     Parameters
     ----------

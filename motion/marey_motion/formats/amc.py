@@ -76,8 +76,8 @@ def read_amc(
 def _read_amc_header(lines: TextLines, degrees: bool) -> tuple[bool, float | None]:
     """Read the header, up to the first frame.
 
-    Returns whether angles are in degrees, and the frame rate or None. If the AMC gives no unit of angles, `degrees` is
-    returned, which says whether the ASF uses degrees.
+    Returns whether angles are in degrees, and the frame rate or None. `degrees` says whether the ASF uses degrees; the
+    same unit is assumed if the AMC gives none.
     """
     rate_hz = None
     while True:

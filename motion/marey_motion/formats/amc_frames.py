@@ -132,7 +132,7 @@ def _scan(text, names, name_ends, first_columns, values, seen, long_tokens, stat
 
 @compiled
 def _next_word(text, state):  # type: ignore[no-untyped-def]
-    """Return the position of the next word, and count the lines that are passed, in `state`."""
+    """Skip to the next word and return its position; the position and the line number in `state` are updated."""
     i = state[_POSITION]
     while i < text.size and text[i] <= 32:
         if text[i] == 10 or (text[i] == 13 and not (i + 1 < text.size and text[i + 1] == 10)):

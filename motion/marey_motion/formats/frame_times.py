@@ -23,10 +23,10 @@ LONGEST_FRAME_TIME_S = 1.0
 def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWarning]) -> float:
     """Compute the rate of a file from its frame time.
 
-    Files round frame times: .0083333 means 120 Hz. If the reciprocal of the frame time has a relative difference of at
-    most 1e-4 from a common rate, the common rate is used; a relative difference of more than 2e-5 gives a warning. If
-    it is larger than 1e-4, as for .0333 and 30 Hz, the reciprocal is used and a warning names the rate that may be
-    meant.
+    Files round frame times: .0083333 means 120 Hz. So the reciprocal of the frame time is compared with the nearest
+    common rate. If their relative difference is at most 1e-4, the common rate is used, with a warning if the difference
+    is more than 2e-5. If the difference is larger, the reciprocal is used; up to a difference of 2 %, as for .0333 and
+    30 Hz, a warning names the common rate, which may be meant.
 
     Parameters
     ----------

@@ -56,7 +56,7 @@ class BadNumber(ValueError):
 
 @compiled
 def parse_number(text, start):  # type: ignore[no-untyped-def]
-    """Read one decimal number at `text[start:]`, which must end in a line feed, since the end of text is not checked.
+    """Read one decimal number at `text[start:]`. The text must end in a line feed, since its end is not checked.
 
     Positions are unsigned, because signed positions would need a test for negative indices at every byte.
 

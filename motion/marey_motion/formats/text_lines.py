@@ -59,7 +59,7 @@ class TextLines:
         Parameters
         ----------
         message : str    the problem and its remedy
-        code : str, optional    stable slug
+        code : str, optional    machine-readable code of the error
         joint : str, optional    name of the joint that was being read
 
         Returns
@@ -136,7 +136,7 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?,?")
 
 
 def number_problem(word: str) -> str:
-    """Explain why a word is not a finite decimal number, and the remedy.
+    """Explain why a word is not a finite decimal number, and what to do about it if the cause is known.
 
     Parameters
     ----------

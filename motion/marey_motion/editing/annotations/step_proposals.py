@@ -64,8 +64,8 @@ def propose_steps(clip: Clip, body: MatchingBody, options: StepsProposal | None 
 class _Step(NamedTuple):
     """Step in which a foot swings from frame `start` and touches the ground at frame `end`.
 
-    `side` is 0 for the left and 1 for the right foot. `from_standing` and `to_standing` are whether the body stands
-    before and after the step.
+    `side` is 0 for the left and 1 for the right foot. `from_standing` is true if the body stands before the step,
+    `to_standing` if it stands after the step.
     """
 
     side: int
@@ -157,7 +157,10 @@ class _Travel(NamedTuple):
         return ahead >= cos(radians(options.most_aside_deg)) and turned <= options.most_turn_deg
 
     def passing(self, step: _Step) -> int | None:
-        """Find the first frame in which the swinging foot passes the other; None if it begins ahead or never passes."""
+        """Find the first frame in which the swinging foot is ahead of the other foot.
+
+        Returns None if the swinging foot is ahead from the start of the step, or never.
+        """
         swing, stand = (self.ankles[step.start : step.end, side] for side in (step.side, 1 - step.side))
         ahead = (swing - stand) @ (self.hips[step.end] - self.hips[step.start]) > 0.0
         if ahead[0] or not ahead.any():

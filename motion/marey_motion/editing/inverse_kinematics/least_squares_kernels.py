@@ -168,7 +168,10 @@ def _fill_softness(body, damping, work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _soften(work, vector, out):  # type: ignore[no-untyped-def]
-    """Fill `out` with D⁻¹·vector, D as in `_fill_softness`, without the directions that `_block` has excluded."""
+    """Fill `out` with D⁻¹·vector; the components along directions that `_block` has excluded are removed.
+
+    D is the matrix of `_fill_softness`.
+    """
     for v in range(work.blocked.shape[0]):
         known, along = work.blocked[v], 0.0
         for i in range(3):

@@ -72,8 +72,9 @@ def look_error(gaze, wished):  # type: ignore[no-untyped-def]
 def target_error(targets, c, frame, tip, turn):  # type: ignore[no-untyped-def]
     """Compute the error of target `c` as three numbers along the axes of the world.
 
-    For a position: `tip` minus the target in metres, 0 along the axes that the target leaves free. For other targets:
-    the rotation vector in radians from the target's rotation or direction to that of `turn`.
+    The error of a position is `tip` minus the target, in metres, and 0 along the axes that the target leaves free. The
+    error of an orientation is the rotation vector, in radians, from the target's rotation to `turn`. The error of a
+    look-at target is the rotation vector from the direction of the target to the look-at axis, rotated by `turn`.
     """
     values = targets.values[frame]
     if targets.kinds[c] == POSITION:

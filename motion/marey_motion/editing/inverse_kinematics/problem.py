@@ -32,7 +32,7 @@ class JointChains(NamedTuple):
     Parameters
     ----------
     parents, offsets : (K,), (F or 1, K, 3) index of each joint's parent, and offset from it in metres
-    movable, stiffness : (K,) whether a solver may turn the joint, and how little it turns, from 0 to below 1
+    movable, stiffness : (K,) whether a solver may turn the joint, and its resistance, from 0 (turns freely) to below 1
     limited, limits : (K,), (K, 14) whether the joint has limits, and the limits as `JointLimit.row`
     carries : (K, C) whether each target moves with the joint
     root_moves : whether a solver may shift the root

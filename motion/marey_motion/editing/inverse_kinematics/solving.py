@@ -137,10 +137,11 @@ def solve(
     motion : Motion    F frames, which stay unchanged
     targets : sequence of targets    C targets
     freedom : Freedom    joints that may turn
-    limb : TwoBoneLimb, optional    a limb that may turn. "auto" uses the two-bone solver if a limb is given, all
-        targets are the position (in all axes) and the orientation of its end, and there are no limits. Otherwise, or if
-        the limb is too short in any of the frames and other joints may turn, it uses least squares.
-    solver : str    "auto", "ccd", "two_bone" or "least_squares"
+    limb : TwoBoneLimb, optional    a limb that may turn
+    solver : str    "auto", "ccd", "two_bone" or "least_squares". "auto" uses the two-bone solver for a limb without
+        limits whose end has a position target in all axes and at most one orientation target, if these are all targets.
+        If the limb is too short in any of the frames, and other joints or the root may move, "auto" then uses least
+        squares. It also uses least squares in all other cases.
     options : SolverOptions    tolerances and iterations
 
     Returns

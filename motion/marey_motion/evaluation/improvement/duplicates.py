@@ -45,7 +45,7 @@ class NearDuplicate:
 
 @dataclass(frozen=True)
 class NearDuplicates:
-    """Pairs within the threshold, nearest first, with the number of pairs that were aligned and of all pairs."""
+    """Pairs within the threshold, nearest first, with the numbers of aligned pairs and of all pairs."""
 
     pairs: tuple[NearDuplicate, ...]
     threshold_cm: float
@@ -125,7 +125,8 @@ class _Families:
     def compared(self, number: int, limit_m: float) -> tuple[list[NearDuplicate], int, int]:
         """Find the near-duplicates of source `number` among later sources, up to the distance `limit_m` per frame.
 
-        Returns them, the number of clips that were aligned with the source, and the number of all later clips.
+        Returns the near-duplicates, the number of clips that were aligned with the source, and the number of all later
+        clips.
         The source is compared with the later sources and with their mirrored copies. Its own mirrored copy is left out:
         mirroring both clips of a pair does not change their distance.
         """
@@ -170,7 +171,7 @@ def frame_points(database: MatchingDatabase) -> NDArray[np.float64]:
 def spared_sources(
     database: MatchingDatabase, duplicates: NearDuplicates, ticks: dict[str, int]
 ) -> tuple[tuple[str, NearDuplicate], ...]:
-    """Choose source clips to remove so that no pair of near-duplicates is left.
+    """Choose the source clips that can be spared: after their removal, no pair of near-duplicates is left.
 
     Of each pair, the source that is displayed for fewer ticks is removed. If both are displayed for equally many ticks,
     the shorter source is removed; if they are also equally long, the source with the higher uid is removed.

@@ -20,7 +20,9 @@ from marey_schemas.options.evaluation import EvaluationOptions
 ProgressCallback = Callable[[int, int, str], None]
 
 MOST_FRAMES = 200
-"""Maximum number of frames of a candidate that are compared with the set; if more lie in holes, every k-th is compared.
+"""Maximum number of frames of a candidate that are compared with the set.
+
+If more frames of the candidate lie in holes, every k-th of these frames is compared.
 """
 
 
@@ -68,7 +70,7 @@ class Filling:
 
 @dataclass(frozen=True)
 class Addition:
-    """One step of filling: the gain of a candidate over the set with all earlier candidates."""
+    """One step of filling: a candidate, and its gain if all earlier candidates are already in the set."""
 
     filling: Filling
     filled_s: float
@@ -173,7 +175,7 @@ def plan_fillings(
 def source_seconds(
     database: MatchingDatabase, options: EvaluationOptions
 ) -> dict[str, tuple[Floats, NDArray[np.int64], NDArray[np.int64]]]:
-    """Compute the data of each source clip in each cell of the trial grid.
+    """Compute the seconds of data that each source clip has in each cell of the trial grid.
 
     Parameters
     ----------

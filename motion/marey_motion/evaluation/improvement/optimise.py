@@ -29,7 +29,7 @@ class OptimisationStep:
 
     Parameters
     ----------
-    sources : the removed or added sources: one, or all sources that no trial needs
+    sources : the removed or added source, or all sources that no trial needs if these are removed in one step
     absent : the sources that are not in the set after the step, in ascending order
     objective : objective after the step, metres
     metrics : headline metrics after the step
@@ -53,7 +53,8 @@ class OptimisationStep:
 class Optimisation:
     """Steps of an optimisation, beginning with the unchanged set ("start"), and the reason for its end.
 
-    `ended` is "no gain" if no candidate lowers the objective enough, "steps" or "evaluations" if that limit is reached.
+    `ended` is "no gain" if no candidate lowers the objective enough, and "steps" or "evaluations" if the maximum number
+    of steps or of evaluations is reached.
     """
 
     steps: tuple[OptimisationStep, ...]

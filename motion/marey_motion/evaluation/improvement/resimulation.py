@@ -10,8 +10,8 @@ clips, for three reasons:
 A trial needs a clip if it displays or chooses one of the clip's rows. Removing clips that a trial does not need leaves
 the trial bit-identical. By induction, the trial is unchanged up to each search; at the search, the cheapest row is
 still available, and still the first among equally cheap rows. So after a removal, only the trials that need a removed
-clip are simulated again. This also holds if the removed clips are taken from a part of the database, so results are
-shared between parts.
+clip are simulated again. The same is true if clips were removed before. So the result of a trial over some of the clips
+is reused after further removals, as long as the clips that the trial needs remain.
 """
 
 from __future__ import annotations

@@ -31,8 +31,9 @@ from marey_schemas.options.improvement import SuggestionOptions
 ProgressCallback = Callable[[int, int, str], None]
 
 USUAL_BLENDABLE_M = 0.5
-"""Default of the largest blendable distance, a pose cost in metres summed over seven joints, used if a suite made no
-transition from which the distance could be measured.
+"""Largest blendable distance that is used if a suite made no transition from which the distance could be measured.
+
+The distance is a pose cost, in metres, summed over seven joints.
 """
 
 
@@ -131,9 +132,9 @@ def suggest(
 def _redundancy(
     simulation: Resimulation, how: SuggestionOptions, gone: frozenset[str], stages: _Stages
 ) -> tuple[tuple[Removal, ...], tuple[PlannedRemoval, ...]]:
-    """Rank the clips by the harm of their removal, and plan several removals, both for the set without `gone`.
+    """Rank the clips by the harm of their removal, and plan several removals.
 
-    `gone` are the sources of its unused clips.
+    Both start from the set without its unused clips, whose sources are `gone`.
     """
     found = leave_one_out(
         simulation, how.objective, removed=gone, consider=how.consider, progress=stages.within("leaving out")

@@ -110,7 +110,7 @@ def _redundant_to_tree(suggestions: Suggestions) -> Tree:
 
 
 def _similarity_to_tree(similarity: PoseSimilarity) -> Tree:
-    """Convert to plain values. NaN is written as 0; it occurs in cells without frames or with only one source."""
+    """Convert a similarity to plain values. NaN, in cells without frames or with only one source, is written as 0."""
     values = {field.name: getattr(similarity, field.name) for field in fields(similarity)}
     return {name: np.nan_to_num(value) if isinstance(value, np.ndarray) else value for name, value in values.items()}
 

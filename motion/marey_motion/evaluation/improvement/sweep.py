@@ -135,7 +135,7 @@ def sweep_weights(
 
 
 def reweighted(database: MatchingDatabase, weights: FeatureWeights) -> MatchingDatabase:
-    """Return a database with the features of another one, and other weights.
+    """Return a copy of a database in which the groups of features have other weights.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Clips that a suite of trials never needs, and unneeded ranges of clips that are used elsewhere.
 
-Removing both from the database leaves every trial bit-identical, as long as the normaliser stays the same;
-`resimulation` explains why for whole clips. The needed frames are those that a trial displayed or chose. A frame of a
-used clip is unneeded if it is far from every needed frame, in two respects:
+Removing these clips and ranges from the database leaves every trial bit-identical, as long as the normaliser stays the
+same; `resimulation` explains why for whole clips. The needed frames are those that a trial displayed or chose. A frame
+of a used clip is unneeded if it is far from every needed frame, in two respects:
 
 * It is more than `MARGIN_BEFORE_S` before the needed frame, or more than the look-ahead plus `MARGIN_AFTER_S` after it.
 * It is outside the `reselect_window_s` around the needed frame. Within this window, a search may not choose rows of the

@@ -301,9 +301,10 @@ def _time(parts: ModelParts, frames: int, file: str) -> PredecessorTime:
 
 
 def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> tuple[LatentMixture, int]:
-    """Read the mixture, and the number of temporal scores in its vectors; 0 if they have spatial scores only.
+    """Read the Gaussian mixture of the latent vectors, and the number of temporal scores in each of these vectors.
 
-    `spatial` and `temporal` are the numbers of spatial and temporal components of the model.
+    The number is 0 if the vectors contain spatial scores only. `spatial` and `temporal` are the numbers of spatial and
+    temporal components of the model.
     """
     if part is None:
         dimensions = spatial + temporal

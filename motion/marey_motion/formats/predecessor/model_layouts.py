@@ -1,8 +1,10 @@
 """Conversion of the four layouts of motion primitives of Marey's predecessor to one form.
 
-Layouts 1 and 2 are flat: the field `eigen_vectors_spatial` contains space, and fields `*_temporal_semantic*` or
-`*_time*` contain time. Layout 3 has the parts `sspm` (space), `tspm` (time) and `gmm` (mixture). The layout `static`
-has the field `spatial_coeffs` alone.
+A model consists of a spatial part (the poses over canonical time), a temporal part (the time function) and a Gaussian
+mixture of latent vectors. Layouts 1 and 2 are flat: fields such as `eigen_vectors_spatial` contain the spatial part,
+and fields `*_temporal_semantic*` (layout 1) or `*_time*` (layout 2) contain the temporal part. Layout 3 has one object
+for each part: `sspm` (spatial), `tspm` (temporal) and `gmm` (mixture). The layout `static` has only a mean motion, in
+the field `spatial_coeffs`.
 """
 
 from __future__ import annotations

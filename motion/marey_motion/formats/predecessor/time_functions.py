@@ -4,8 +4,8 @@ A time function t(x) maps each canonical frame x, from 0 to N - 1, to a frame of
 scores. Marey's model contains ln(t(x + 1) - t(x)), which is linear in g. The predecessor has two forms:
 
 * `coefficients` (layouts 1 and 3, and layout 2 by its later training program): t(x) is a spline whose coefficients are
-  cumsum(exp(mean + g · eigen)) - 1. The logarithm of its slope is not linear in g. It is approximated by the linear
-  function that fits best for scores drawn from the model; `as_log_slopes` also returns the largest error.
+  cumsum(exp(mean + g · eigen)) - 1. The logarithm of the slope of t is not linear in g. `as_log_slopes` approximates it
+  by the linear function that fits best for scores drawn from the model, and also returns the largest error.
 * `increments` (layout 2 by its first training program): t(x + 1) - t(x) = exp(spline(x + 1)), where the spline is
   linear in g. This is also the form of Marey's model.
 """
@@ -25,7 +25,7 @@ from marey_motion.modelling.splines import DEGREE, SplineBasis
 TimeForm = Literal["coefficients", "increments"]
 
 DRAWN, SEED = 512, 0
-"""Number of scores to which a linear function is fitted, and the seed with which they are drawn."""
+"""Number of score vectors to which a linear function is fitted, and the seed with which they are drawn."""
 ODD_LOG_SLOPE = 20.0
 KNOTS_AT_MOST = 500
 """Maximum number of knots of a converted time function; no published model has as many canonical frames."""
@@ -106,8 +106,8 @@ def as_log_slopes(
 def components_of(basis: SplineBasis, mean: Floats, directions: Floats, variances: Floats) -> FunctionalComponents:
     """Make components from directions; their projections are the pseudo-inverse of the directions.
 
-    The variance that the components do not explain is unknown. `energy` therefore contains shares of the variance that
-    the components explain together.
+    The variance that the components do not explain is unknown. Therefore, `energy` contains cumulative shares of the
+    variance that all components explain together, instead of the total variance.
 
     Parameters
     ----------
@@ -193,9 +193,9 @@ def _basis_over(steps: int) -> SplineBasis:
     """Make a spline basis for functions of canonical time that have `steps` values.
 
     If `steps` is at most `KNOTS_AT_MOST`, there are at least as many coefficients as steps, so that any function is
-    represented exactly. Its knots are at all steps but the second and the last but one. Evenly spaced knots would drift
-    away from the steps to places between them, where interpolation amplifies rounding. Longer functions have fewer
-    knots, and are approximated.
+    represented exactly. The knots are then at all steps except the second and the last but one. Evenly spaced knots
+    would drift away from the steps to places between them, where interpolation amplifies rounding. A basis for longer
+    functions has fewer knots, and only approximates them.
     """
     if steps <= DEGREE:
         return SplineBasis.clamped(steps, DEGREE + 1)

@@ -168,8 +168,8 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]
 def _in_tree_order(indices: list[Ints], children: list[int]) -> Ints:
     """Return the samples in the order of the leaves, so that the samples of each node are consecutive.
 
-    Each list has one element for each node, in the order of levels: `indices` the samples of the node, `children` the
-    count of its children.
+    Both lists have one element for each node, in the order of `_by_levels`: `indices` contains the samples of the node,
+    `children` the number of its children.
     """
     first = np.concatenate(([1], 1 + np.cumsum(children)[:-1]))
     order: list[Ints] = []
