@@ -23,7 +23,7 @@ SHARED = ("set", "reference", "keyframes")
 
 
 class StoredExample(NamedTuple):
-    """Stored form of an aligned example: its frames as a clip, and everything else as a tree.
+    """Stored form of an aligned example: its frames as a clip, and all other data as a tree of values and arrays.
 
     Parameters
     ----------

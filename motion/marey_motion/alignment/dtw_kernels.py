@@ -143,7 +143,7 @@ def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
 
 @compiled
 def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first, not_second):  # type: ignore[no-untyped-def]
-    """Fill row `i` of the least totals, `not_first` and `not_second` (m,), from the row before.
+    """Compute the least totals of paths with limited runs to the cells of row `i`: `not_first` and `not_second` (m,).
 
     `not_first[j]` is the least total of the paths to cell j whose last step does not advance the first motion alone;
     `not_second[j]` is that of the paths whose last step does not advance the second motion alone. `first_before` and

@@ -27,7 +27,7 @@ DECIMATED = 2048
 PACE_WINDOW = 96
 PACE_WINDOWS = 3
 CHANNELS = 8
-"""Number of random projections of a pose in which windows are searched."""
+"""Number of random projections of the rotations of a pose; windows are compared by these instead of the rotations."""
 
 
 def exact_lags(before: Poses, after: Poses) -> tuple[int, ...]:

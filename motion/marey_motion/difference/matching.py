@@ -18,13 +18,13 @@ from marey_motion.difference.lags import exact_lags, similar_lags
 from marey_motion.difference.poses import Poses, frame_costs
 
 UNMATCHED = 0.25
-"""Cost of a removed or inserted frame. A pair that costs more than twice as much is reported as one of each instead."""
+"""Cost of a removed or inserted frame. A pair of different frames costs at most twice as much."""
 NEW_RUN = 1.0
 """Cost of a change of the lag inside the clips."""
 AT_AN_END = 0.995
 """Cost of removing or inserting frames at an end; less than `NEW_RUN`, so that an end is preferred to other places."""
 WELL_MATCHED = 0.02
-"""Cost up to which a frame counts as matched well, so that no search for further lags is made for it."""
+"""Cost up to which a frame counts as matched well, so that no further lags are tried for it."""
 MOST_ROUNDS = 64
 """Maximum number of rounds of the search; the cheapest path with k changes of the lag needs at most k rounds."""
 SHORTEST_REPLACEMENT = 10

@@ -24,7 +24,10 @@ MANY_RUNS = 8
 MOST_REFINEMENTS = 8
 FEWEST_PAIRS = 8
 SLOPES, FRAMES_APART = 20, 64
-"""Slopes are measured alternately over `FRAMES_APART` matched frames, and over 1 / `SLOPES` of all matched frames."""
+"""Distances in matched frames over which `_refined` measures a slope.
+
+It alternates between `FRAMES_APART` frames, and 1 / `SLOPES` of all matched frames.
+"""
 FARTHEST_OFFSET = 2.0
 """Maximum offset, in frames, that is estimated from velocities."""
 ROUNDED_FRAMES = 0.02

@@ -127,7 +127,7 @@ class _Rig:
 
     @property
     def axes(self) -> dict[str, JointAxes]:
-        """Axes of the mapped joints by name; if the rest pose does not define the axes of a limb, the motion does."""
+        """Axes of the mapped joints by name; those that the rest pose does not define are computed from the motion."""
         if self._axes is None:
             take = self.take
             clip = take.motion.as_clip(take.skeleton, take.frame_rate_hz)

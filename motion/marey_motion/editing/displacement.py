@@ -36,7 +36,7 @@ MISSED_SHARE = 1e-13
 
 
 class Window(NamedTuple):
-    """Frames [start, stop) that may change, and whether the change ends smoothly at each of their ends.
+    """Frames [start, stop) that may change. At a smooth end of the window, the change fades out to zero.
 
     A frame at an end that is not smooth, such as the end of the clip, may change as much as its neighbours.
     """

@@ -254,7 +254,8 @@ def _turn_between(before: Floats, after: Floats) -> Floats:
 def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], zone: float, blend: int) -> Floats:
     """Compute how far (F,), in metres, the root must be lowered so that the legs reach the planted feet.
 
-    They must do so without damping, which applies to knees within `zone` radians of a straight leg (`solve_two_bone`).
+    A knee within `zone` radians of a straight leg is damped (see `solve_two_bone`), so that the leg misses its target
+    slightly. The root is lowered to avoid this, by at most `MOST_LOWERING_M`.
     """
     from marey_motion.editing.inverse_kinematics import two_bone_kernels
 

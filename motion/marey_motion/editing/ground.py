@@ -111,7 +111,7 @@ def find_contacts(take: Take, command: FindContacts) -> Take:
 
 
 def estimate_ground(take: Take) -> Ground:
-    """Estimate the height of the ground as the median height of the lower sole, over frames with that foot in stance.
+    """Estimate the height of the ground: the median height of the lower sole while the foot of that sole is in stance.
 
     The median is robust against a foot that is below the floor for some frames and against a kick that is held.
 

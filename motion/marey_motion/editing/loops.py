@@ -72,7 +72,7 @@ def _in_place(motion: Motion, places: Floats, seam: LoopSeam) -> Motion:
 
 
 def _closed(motion: Motion, seam: LoopSeam, life: float, velocity_life: float) -> Motion:
-    """Remove the difference in pose and velocity between end and start, half of it at each of them.
+    """Remove the difference in pose and velocity between end and start, half of it at each end of the motion.
 
     `life` and `velocity_life` are the numbers of frames over which the correction of pose and of velocity decays.
     """

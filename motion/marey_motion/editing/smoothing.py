@@ -15,7 +15,10 @@ from marey_motion.errors import EditError
 from marey_schemas.editing.commands import Smooth
 
 LONG_WINDOW = 512
-"""Frames of a window above which means are computed by Fourier transforms, whose cost hardly depends on the window."""
+"""Longest window, in frames, over which means are computed directly; longer windows use Fourier transforms.
+
+The cost of Fourier transforms hardly depends on the length of the window.
+"""
 CHANNELS_AT_ONCE = 32
 """Channels that are transformed together. The number is limited because a Fourier transform takes several times the
 memory of its input.

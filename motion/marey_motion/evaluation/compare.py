@@ -17,7 +17,7 @@ from marey_schemas.documents.evaluations import CONFIDENCE, RESAMPLES
 
 BOOTSTRAP_SEED = 0
 SAME_CHANGE = 1e-12
-"""Relative difference up to which two changes count as equal, since rounding can cause it."""
+"""Relative difference up to which two changes count as equal, because rounding can cause such a difference."""
 
 LESS_IS_BETTER = (
     "abs_se_v",

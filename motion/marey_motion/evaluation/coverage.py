@@ -23,7 +23,7 @@ WINDOW_S = 1.0
 SPEED_STEP_M_S, TURN_RATE_STEP_DEG_S = 0.25, 25.0
 """Width of a cell if the grid has only one speed, or only one turn rate."""
 EDGE_DECIMALS = 9
-"""Decimals to which edges of cells are compared, so that left and right turns have the same edges."""
+"""Decimals to which edges of cells are rounded, so that the edges of left and right turns are equal."""
 
 
 class Windows(NamedTuple):

@@ -326,7 +326,7 @@ SUMMED = ("transitions", "clip_ends", "response_missed")
 
 
 def pooled_metrics(results: Sequence[TrialResult]) -> dict[str, float | None]:
-    """Pool the metrics of several trials, and of their regimes under the regime's name.
+    """Pool the metrics of several trials; metrics of a regime get the prefix `<regime>.`.
 
     Maxima are pooled to the largest value of all trials, root mean squares to the root mean square of the trials'
     values, and counts to their sum. Every other metric is pooled to the mean over the trials in which it is defined.

@@ -14,7 +14,7 @@ from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import Status, TrialRecord
 
 TREADING_S = 1 / 3
-"""Seconds; a jump to a moment of the same clip at most this far away makes the character tread on the spot."""
+"""Duration, in seconds. A jump within a clip over at most this duration makes the character tread on the spot."""
 
 
 class Jumps(NamedTuple):

@@ -116,7 +116,7 @@ def channel_columns(channels: tuple[tuple[str, ...], ...]) -> ChannelColumns:
 def _read_frames(
     header: BvhHeader, columns: ChannelColumns, lines: TextLines, warnings: list[CheckWarning]
 ) -> NDArray[np.float64]:
-    """Read the values (F, C) of all channels in all frames; an unusual layout is added to `warnings`."""
+    """Read the values (F, C) of all channels in all frames; `warnings` receives a warning about an unusual layout."""
     width = len(columns.labels)
     text = np.frombuffer(lines.data, np.uint8, offset=min(header.data_start, len(lines.data)))
     try:

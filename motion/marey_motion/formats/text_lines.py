@@ -114,7 +114,7 @@ class TextLines:
 
 
 def read_number(word: bytes) -> float | None:
-    """Parse a finite decimal number as `float` does, without "nan" and "1_0", which `float` accepts.
+    """Parse a finite decimal number as `float` does, but refuse "nan" and "1_0", which `float` accepts.
 
     Parameters
     ----------

@@ -138,10 +138,10 @@ def solve(
     targets : sequence of targets    C targets
     freedom : Freedom    joints that may turn
     limb : TwoBoneLimb, optional    a limb that may turn
-    solver : str    "auto", "ccd", "two_bone" or "least_squares". "auto" uses the two-bone solver for a limb without
-        limits whose end has a position target in all axes and at most one orientation target, if these are all targets.
-        If the limb is too short in any of the frames, and other joints or the root may move, "auto" then uses least
-        squares. It also uses least squares in all other cases.
+    solver : str    "auto", "ccd", "two_bone" or "least_squares". "auto" uses the two-bone solver if a limb is
+        given, joints have no limits, and the targets are a position of the limb's end in all axes and, optionally, an
+        orientation of its end. In all other cases, "auto" uses least squares; also if the limb turns out to be too
+        short in any of the frames, and other joints or the root may move.
     options : SolverOptions    tolerances and iterations
 
     Returns

@@ -1,1 +1,1 @@
-"""Improvements of a dataset: removable clips, clips that fill its holes, and the effect of settings."""
+"""Improvements of a data set: removable clips, clips that fill holes in its coverage, and better feature weights."""

@@ -20,7 +20,7 @@ TYPES = ("start", "standard", "end", "idle", "single", "cycle_end")
 START_FIELDS = ("start_node", "startNode")
 
 Place = tuple[str, str]
-"""Action and name of a primitive."""
+"""Action and name of a motion primitive."""
 
 
 @dataclass(frozen=True)
