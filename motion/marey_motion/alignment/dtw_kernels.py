@@ -34,9 +34,10 @@ def align(costs, path):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
-    """Find the least of three totals, and the number of its step: 0 in both motions, 1 in the first, 2 in the second.
+    """Find the least of three totals, and the number of its step.
 
-    No branches are used, since they are unpredictable.
+    Step 0 advances both motions, step 1 the first motion alone, and step 2 the second motion alone. The code has no
+    branches, because the processor could not predict them.
     """
     least = min(both, first, second)
     alone = least < both

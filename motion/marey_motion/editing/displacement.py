@@ -209,8 +209,8 @@ def _energy(count: int, window: Window, swing: float) -> Floats:
     """Compute the matrix of the quadratic form that gives the bending and tension energy of a curve.
 
     The form applies to the `count` control points of the curve. Returns the main diagonal and the three diagonals
-    below it (4, count); `swing` is as in `_curve`. Control points beyond a smooth end of the window are zero; beyond
-    other ends there are none.
+    below it (4, count); `swing` is as in `_curve`. Beyond a smooth end of the window, all control points are zero;
+    beyond other ends, there are no control points.
     """
     bands = np.zeros((4, count))
     tension = swing**-2

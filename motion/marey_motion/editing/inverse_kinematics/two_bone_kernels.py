@@ -163,8 +163,8 @@ def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):
     """Turn the joints of a limb in each frame so that its tip reaches a target; change `rotations` (F, K, 4) in place.
 
     `targets` (F or 1, 3) are in metres in the world, and `roots` (F, 3) are the positions of the root. If `limb.ending`
-    is GIVEN, the last joint of the limb gets the rotations `target_rotations` (F or 1, 4) in the world; otherwise, they
-    are not used.
+    is GIVEN, the last joint of the limb gets the rotations `target_rotations` (F or 1, 4) in the world; otherwise,
+    these rotations are not used.
     """
     for f in range(rotations.shape[0]):
         target = vector_at(targets, min(f, targets.shape[0] - 1))

@@ -126,9 +126,8 @@ class _Families:
         """Find the near-duplicates of source `number` among later sources, up to the distance `limit_m` per frame.
 
         Returns the near-duplicates, the number of clips that were aligned with the source, and the number of all later
-        clips.
-        The source is compared with the later sources and with their mirrored copies. Its own mirrored copy is left out:
-        mirroring both clips of a pair does not change their distance.
+        clips. The source is compared with the later sources and with their mirrored copies. Its own mirrored copy is
+        left out: mirroring both clips of a pair does not change their distance.
         """
         one, others = self._first[number], np.arange(self._first[number + 1], len(self._clips))
         near: dict[int, list[NearDuplicate]] = {}
