@@ -140,10 +140,10 @@ def forward_kinematics(
 
 
 class _Chain(NamedTuple):
-    """Those arguments of `kinematics_kernels.positions` that depend only on the skeleton.
+    """Arguments of `kinematics_kernels.positions` that depend only on the skeleton.
 
-    Points are the joints, then the end sites. `no_slots` (points,) is -1 everywhere: it is the argument `slots` if all
-    points have the offsets of the skeleton. `turned` (joints,) is True for joints with children.
+    Points are the joints, then the end sites. `no_slots` (points,) contains only -1; it is passed as `slots` if no
+    translation replaces the offset of a point. `turned` (joints,) is True for joints with children.
     """
 
     offsets: AnyFloats

@@ -31,7 +31,8 @@ def loop_seam(positions: Floats, headings: Floats) -> LoopSeam:
     """Compute the seam of a loop that moves on the ground.
 
     The step from the last frame to the first frame of the next round is not in the data. It is estimated as the mean of
-    the clip's last and first step, each relative to the heading at its start, so that velocities are continuous there.
+    the clip's last and first step, each relative to the heading at its start. So velocities are continuous across the
+    seam.
 
     Parameters
     ----------

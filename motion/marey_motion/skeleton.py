@@ -20,9 +20,9 @@ from marey_motion.errors import SkeletonError, UnknownJoint
 UNIT_TOLERANCE = 1e-3
 
 SAME_OFFSET_M = 1e-3
-"""Largest difference of bone offsets that counts as rounding of one skeleton in several files."""
+"""Largest difference of bone offsets, in metres, that is attributed to rounding if several files have one skeleton."""
 SAME_SKELETON_M = 1e-5
-"""Largest difference of bone offsets that counts as rounding of a skeleton written to one file and read again."""
+"""Largest difference of bone offsets, in metres, that is attributed to rounding if one file is written and read."""
 
 _Vector: TypeAlias = tuple[float, float, float]
 _Rotation: TypeAlias = tuple[float, float, float, float]

@@ -284,7 +284,11 @@ STAGES: Mapping[str, Callable[[Clip], None]] = {
     "alignment": _align,
     "coverage": _measure,
 }
-"""Functions that use kernels, by name; first the function that the others need, then the others, the longest first."""
+"""Functions that use kernels, by name.
+
+The first function compiles kernels that the other functions need, too. The others are in order of their duration, the
+longest first.
+"""
 
 
 def main() -> None:

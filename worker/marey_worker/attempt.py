@@ -188,9 +188,9 @@ class RunningAttempt:
         self._staging: list[Future[ChildReply | None]] = []
 
     def run(self, child: ChildProcess) -> Done | Failed | Stop:
-        """Run the job in `child`, and return its end. Afterwards, the child is idle or has ended.
+        """Run the job in `child`; return its result, its failure, or the reason why it was stopped.
 
-        The caller must then call `finish`.
+        Afterwards, the child is idle or has ended, and the caller must call `finish`.
         """
         try:
             child.send(pack(self._order()))
@@ -203,10 +203,10 @@ class RunningAttempt:
         return end
 
     def finish(self, end: Done | Failed | Stop) -> Done | Failed | Stop:
-        """Wait until all results are stored, report the end to the server, and return it.
+        """Wait until all results are stored, and report the end of the job to the server.
 
-        The child may run the next job in the meantime. If results cannot be stored, a failure or a stop is reported
-        instead of a success.
+        `end` is the result of `run`. The child may run the next job in the meantime. If results cannot be stored, a
+        failure or a stop is reported instead of a success. Returns the end of the job, even if it cannot be reported.
         """
         try:
             if isinstance(end, Done):
@@ -236,7 +236,10 @@ class RunningAttempt:
     # -- while the child computes --
 
     def _attend(self, child: ChildProcess) -> Done | Failed | Stop:
-        """Answer the requests of the child until the job ends; return its end, or the reason to stop it."""
+        """Answer the requests of the child until it reports its result or failure, and return this message.
+
+        Returns a failure if the child dies, and the reason to stop if the job must be stopped.
+        """
         while True:
             try:
                 data = child.receive(WATCH_EVERY_S)
@@ -336,7 +339,9 @@ class RunningAttempt:
         return done
 
     def _report(self, end: Done | Failed | Stop) -> Done | Failed | Stop:
-        """Report the end to the server and return it. If the results cannot be published, report a failure instead.
+        """Report the end of the job to the server, and return it.
+
+        If the results of a success cannot be published, a failure is reported and returned instead.
 
         Heartbeats continue, because the server may be unreachable for a while.
         """

@@ -61,7 +61,10 @@ class AttemptApi:
         return read_model(HeartbeatAnswer, self._post("heartbeat", as_json(Heartbeat(progress=progress)), sender))
 
     def append_log(self, offset: int, piece: bytes) -> LogAnswer:
-        """Append to the attempt's log if the log has `offset` bytes; in both cases, return its length afterwards."""
+        """Append `piece` to the attempt's log, and return the length of the log.
+
+        If the log does not have `offset` bytes, nothing is appended.
+        """
         headers = {"Upload-Offset": str(offset)}
         try:
             return read_model(LogAnswer, self._post("log", piece, media_type=PLAIN_TEXT, headers=headers))

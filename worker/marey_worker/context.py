@@ -156,9 +156,10 @@ class Context:
         self._stage(encode_outputs(outputs))
 
     def publish_facets(self, facets: Sequence[ItemFacets]) -> None:
-        """Publish numbers about inputs when the job completes; they replace those of an earlier call.
+        """Stage facets: named numbers about revisions of inputs, which are published when the job completes.
 
-        Inputs are those of the job, and the clips of evaluations among them. Raises `RequestRefused` like `stage`.
+        They replace the facets of an earlier call. If an input is an evaluation, facets of its clips are allowed, too.
+        Raises `RequestRefused` if earlier results could not be stored.
         """
         if facets:
             request = StageRequest(facets=tuple(facets))

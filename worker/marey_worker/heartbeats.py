@@ -15,7 +15,10 @@ from marey_worker.attempt_api import AttemptApi
 log = logging.getLogger(__name__)
 
 CONFIRM_AFTER = 2 / 3
-"""Part of a lease's duration. If no heartbeat has succeeded for longer, one must succeed before the final request."""
+"""Greatest age of the last successful heartbeat, as a share of the lease's duration, at the final request.
+
+If the last success is older, another heartbeat must succeed before the final request.
+"""
 
 PROGRESS_EVERY_S = 2.0
 RETRY_S = 1.0

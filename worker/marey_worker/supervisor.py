@@ -165,9 +165,9 @@ class Supervisor:
         return claim(opened.transport, wanted)
 
     def _attempt(self, lease: Lease, child: ChildProcess, finisher: Executor) -> Future[None]:
-        """Run a job; return a future that ends when its results are stored and its end is reported.
+        """Run a job; return a future that ends when the job's results are stored and its end is reported.
 
-        If the job was successful, the child can run the next job before that.
+        After a success, this method returns before the future ends, so that the child can run the next job meanwhile.
         """
         place = (lease.job, lease.fence)  # a lost job may run again before its former attempt has ended
         self._running.add(place)

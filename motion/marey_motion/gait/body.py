@@ -67,8 +67,9 @@ class GaitMoments:
     def settled_below(self, limits: AnyFloats, window_s: float = SETTLING_S) -> AnyFloats:
         """Compute a smooth curve that is nowhere above given limits.
 
-        Each value averages minima of the limits over windows that contain its moment, so that it cannot exceed the
-        limit there.
+        Each limit is first replaced by the least limit in a window around its moment. The result is then smoothed with
+        a Hann window of the same width. All values that enter an average are minima of windows that contain the moment
+        of the average, so that the curve does not exceed the limit at this moment.
 
         Parameters
         ----------
@@ -173,10 +174,10 @@ def _pelvis_heights(
     ankles: Mapping[str, AnyFloats],
     loaded: Mapping[str, NDArray[np.bool_]],
 ) -> AnyFloats:
-    """Compute heights (n,) of the root: the gait's rise and fall, limited by the reach of the legs on the ground.
+    """Compute heights (n,) of the root: the gait's rise and fall, lowered where a leg would not reach its loaded foot.
 
-    `pelvis` (n, 4) are rotations, and `ankles` positions (n, 3) by side; `loaded` are flags (n,) by side that mark the
-    moments at which the foot is on the ground.
+    `pelvis` (n, 4) are rotations of the pelvis. For each side, `ankles` has positions (n, 3), and `loaded` has flags
+    (n,) that are True while the foot is on the ground.
     """
     speeds = moments.settled(moments.root.speeds)
     leg = _thigh_m(skeleton) + _shank_m(skeleton)
@@ -211,8 +212,8 @@ def _bend_leg(
 ) -> None:
     """Solve a leg by two-bone inverse kinematics; the knee bends towards the heading `facing` (n,), in radians.
 
-    The heading `facing` lies between the headings of pelvis and foot. A swinging foot that is out of reach is pulled
-    along by the leg; the pull is softer where `freedom` (n,) is higher.
+    The heading `facing` lies between the headings of pelvis and foot. An ankle that is out of reach is moved towards
+    the hip until the leg reaches it. Where `freedom` (n,) is greater, this begins earlier and more gradually.
     """
     thigh, shank = _thigh_m(skeleton), _shank_m(skeleton)
     reach = ankle - hip
@@ -282,7 +283,7 @@ def _drift(style: GaitStyle, moments: GaitMoments, which: int) -> AnyFloats:
 
 
 def _turned(axes: str, *angles: AnyFloats) -> AnyFloats:
-    """Compute rotations (n, 4) about the axes of the moving frame, in the order given; angles (n,) in radians."""
+    """Compute intrinsic rotations (n, 4) by `angles` (n,), in radians, about `axes`, which are letters such as "yzx"."""
     result: AnyFloats = quaternions.identity()
     for axis, angle in zip(axes, angles, strict=True):
         result = quaternions.multiply(result, quaternions.from_axis_angle(np.eye(3)["xyz".index(axis)], angle))

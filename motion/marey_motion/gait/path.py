@@ -115,7 +115,7 @@ class RootPath:
 
     @cached_property
     def starts_s(self) -> AnyFloats:
-        """Start of each of `pieces`, in seconds; for the endless first piece, the time to which its formula refers."""
+        """Start of each of `pieces`, in seconds; 0 for the first piece, which has no start and ends at time 0."""
         ends = np.cumsum([segment.duration_s for segment in self.segments])
         return np.concatenate(([0.0, 0.0], ends))
 
@@ -198,7 +198,7 @@ class RootPath:
 
     @cached_property
     def _anchors(self) -> tuple[Complexes, AnyFloats]:
-        """Position and heading where each piece starts."""
+        """Position and heading of the root at each time in `starts_s`."""
         positions, headings = [0j, 0j], [0.0, 0.0]
         for segment in self.segments:
             duration, turn_rate = np.array(segment.duration_s), np.array(segment.turn_rate_rad_s)

@@ -190,7 +190,10 @@ def _both_sides(
 
 
 def _rotation_along(direction: AnyFloats, *, against: bool) -> AnyFloats:
-    """Compute the global rotation with x axis along ±`direction` and y axis as close to forward as possible."""
+    """Compute the global rotation whose x axis points along `direction`, or opposite to it if `against` is True.
+
+    The y axis is as close as possible to forward (+Z) or, if the x axis is nearly parallel to Z, to up (+Y).
+    """
     x = direction / np.linalg.norm(direction) * (-1.0 if against else 1.0)
     hint = (0.0, 1.0, 0.0) if abs(x[2]) > 0.8 else (0.0, 0.0, 1.0)
     y = quaternions.perpendicular(hint, x)

@@ -118,7 +118,8 @@ def foot_motions(
 ) -> dict[str, FootMotion]:
     """Compute the motion of both feet of `generate_along`, as ground truth for contacts.
 
-    In the clip, swinging feet are nearer to the body where the leg would otherwise be too short.
+    The clip of `generate_along` differs from this motion where a leg is too short to reach a swinging foot: there, the
+    foot is moved towards the hip.
 
     Parameters
     ----------

@@ -36,7 +36,9 @@ _LONGEST_COLLECTION = 1024
 
 
 def planned_entry(planned: PlannedFile) -> ImportEntry | None:
-    """Make the import's entry for a file that is not read on its own: a companion file, or one that the plan refuses.
+    """Make the entry in the result of the import for a file that is not read on its own.
+
+    Such a file is the companion of another file, or is refused by the plan.
 
     Parameters
     ----------
@@ -77,7 +79,7 @@ def import_file(file: FileToImport) -> ImportedFile:
 
 
 def refusal_of(error: MotionError) -> Refusal:
-    """Describe an error for the entry of its file, with line and joint if they are known.
+    """Convert the error that stopped the import of a file to a refusal, with line and joint if they are known.
 
     Parameters
     ----------

@@ -106,9 +106,10 @@ def _place(name: str, taken: set[tuple[str, str]]) -> PlannedFile:
 def pair_companions(names: Iterable[str]) -> tuple[Pairing, ...]:
     """Find the companion of every file that needs one, such as the ASF of an AMC.
 
-    Only files of the same folder match. The companion is the file with the same stem. If there is none, it is the file
-    with the longest stem that precedes a separator in the other stem (16.asf for 16_01.amc, 07.asf for 07_01-walk.amc).
-    If there is none either, it is the only file of the companion's format in the folder.
+    Only files in the same folder are considered. A companion matches if both files have the same stem, or if the stem
+    of the file consists of the stem of the companion, a separator and more text (16.asf for 16_01.amc, 07.asf for
+    07_01-walk.amc). Of several matches, the one with the longest stem is chosen. If none matches, and the folder has
+    only one file of the companion's format, this file is chosen.
 
     Parameters
     ----------

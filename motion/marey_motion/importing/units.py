@@ -177,8 +177,8 @@ def _choose_up_axis(source: SourceMotion, body: _Measurements, options: ImportOp
 def _settle_up_axis(body: _Measurements, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
     """Choose the upward axis if the body is not upright along y: it may lie or climb, or another axis may point up.
 
-    `axis` is the axis nearest to the direction from feet to head, and `cosine` that of the angle between them. `flat`
-    is the axis along which the lowest of feet and hands hardly moves, with the evidence in words, or None.
+    `axis` is the axis nearest to the direction from feet to head, and `cosine` is the cosine of the angle between this
+    axis and the direction. `flat` is the result of `_flat_axis`.
     """
     rest_axis, rest_cosine = _body_axis(body.rest[:, None], body.landmarks)
     standing, resting = f"mean direction from feet to head is {axis} with cosine {cosine:.2f}", _FOLDED
@@ -263,9 +263,9 @@ def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _flat_axis(body: _Measurements) -> tuple[UpAxis, str] | None:
-    """Find the axis along which the lowest of feet and hands hardly moves, while it moves along the others.
+    """Find the axis along which the lowest point of feet and hands hardly moves, while it moves along the other axes.
 
-    Returns the axis with the evidence in words, or None.
+    Returns the axis, and the evidence for it in words; returns None if there is no such axis.
     """
     limbs = [*body.landmarks.ground_joints, *(body.landmarks.hands or ())]
     assert body.leg is not None
@@ -282,7 +282,7 @@ def _flat_axis(body: _Measurements) -> tuple[UpAxis, str] | None:
 
 
 def _stands_on_origin(body: _Measurements, axis: UpAxis) -> bool:
-    """Return whether a ground through the origin, orthogonal to the axis, is just under the body."""
+    """Return whether the body stands on the plane through the origin that is perpendicular to `axis`."""
     assert body.leg is not None
     lowest = _heights(body.positions, axis).min(axis=0)
     return bool(abs(low_quantile(lowest)) <= _FLAT_GROUND * body.leg)

@@ -88,7 +88,7 @@ class MatchingBody:
 
     @cached_property
     def pose_chain(self) -> tuple[NDArray[np.int64], Skeleton]:
-        """Indices (K,) of the pose joints and their ancestors, in the skeleton's order, and the skeleton of these."""
+        """Indices (K,) of the pose joints and all their ancestors, increasing, and a skeleton of only these joints."""
         needed = {0}
         for joint in self.pose_joints:
             while joint > 0:

@@ -19,7 +19,10 @@ from marey_schemas.options.matching import ControllerOptions
 
 
 class Trajectory(Protocol):
-    """A trajectory to follow, sampled at every tick: `marey_motion.evaluation.scenario.Reference` is one."""
+    """Interface of a trajectory to follow, sampled at every tick.
+
+    For example, `marey_motion.evaluation.scenario.Reference` implements it.
+    """
 
     @property
     def rate_hz(self) -> float:
@@ -66,11 +69,14 @@ class ControllerConstants(NamedTuple):
     ----------
     follow : whether the desired path is followed by time, by position or in open loop, numbered in `controller_kernels`
     by_distance : whether poses are compared by the distances of their joints instead of their features
-    period, window : ticks from one search to the next; rows on each side of the displayed one that are not chosen
-    bias, margin : added to, and subtracted from, the cost of continuing before other rows are compared with it
-    blends_root, decay : whether the root's velocity is blended at a switch; (2, 2) decay of the difference per tick
-    holds, pull, clamp_m : whether the root is pulled to the desired path; share of the distance per tick, and largest
-        distance that remains
+    period : number of ticks from one search to the next
+    window : number of rows on each side of the displayed row that a search may not choose
+    bias, margin : numbers that are added to, and subtracted from, the cost of continuing the displayed clip, before the
+        costs of other rows are compared with it
+    blends_root : whether the velocity of the root is blended at a switch
+    decay : (2, 2) matrix that advances the offset of the velocity, and its change per second, by one tick
+    holds : whether the root is pulled to the desired path
+    pull, clamp_m : share of the distance from the path that is removed in each tick, and largest distance that remains
     tick_s : duration of a tick
     """
 

@@ -189,11 +189,10 @@ def _search(index, playback, rules, row, query, skip_start, skip_stop):  # type:
 
 @compiled
 def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
-    """Choose the row whose successor is displayed next; `row` is displayed now.
+    """Choose the row whose successor is displayed next: the displayed row `row`, or the result of a search.
 
-    Returns the chosen row (`row` itself, if its clip continues), its cost, and the cost of continuing from `row`, which
-    is NaN at the end of a clip. The pose of the query is that of `row`, so the cost of continuing is only that of the
-    trajectory.
+    Returns the chosen row, its cost, and the cost of continuing from `row`, which is NaN at the end of a clip. The pose
+    in `query` is the pose of `row`, so only the trajectory contributes to the cost of continuing.
     """
     skip_start = skip_stop = 0
     if rules.window > 0:
@@ -213,7 +212,7 @@ def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
 
 @compiled
 def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-untyped-def]
-    """Find the first row of a trial, and its cost: the row whose trajectory is nearest to the desired one.
+    """Find the row with which a trial starts, and its cost; only trajectories are compared, not poses.
 
     `root` is x, z and heading; `query` (D,) is overwritten.
     """
@@ -235,10 +234,10 @@ def _jumped(wish, before, when):  # type: ignore[no-untyped-def]
 
 @compiled
 def _advance(playback, rules, row, offsets, root):  # type: ignore[no-untyped-def]
-    """Move `root` (x, z, heading) by the step that follows `row`, plus the remaining offset of the root's velocity.
+    """Move `root` (x, z, heading) by one tick: by the step that follows `row`, and by an offset of the root's velocity.
 
-    `offsets` (2, 3) are this offset (left, forward, turn per second), which a switch to another row caused, and its
-    change per second; both decay by one tick.
+    The offset is caused by switches to other rows, and decays. `offsets` (2, 3) contains the offset (left, forward,
+    turn per second) and its change per second; both are advanced by one tick.
     """
     left = playback.steps[row, 0] + offsets[0, 0] * rules.tick_s
     forward = playback.steps[row, 1] + offsets[0, 1] * rules.tick_s

@@ -76,7 +76,9 @@ def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: Con
 
 
 def switched_rows(database: MatchingDatabase, rows: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Find the row that a search chose instead of the displayed row at each tick; its successor is displayed next.
+    """Find, for each tick, the row that a search chose instead of the displayed row.
+
+    The successor of the chosen row is displayed at the next tick.
 
     Parameters
     ----------

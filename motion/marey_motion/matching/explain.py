@@ -34,10 +34,10 @@ metres.
 
 @dataclass(frozen=True)
 class Candidate:
-    """A row that could be chosen: frame `frame` of clip `clip` (an index into the database's clips).
+    """A row of the database with its cost at a tick: frame `frame` of clip `clip` (an index into the database's clips).
 
-    `groups` is the cost of each group of features; these costs add up to `cost`. `barred` is the reason why a listed
-    row could not be chosen, "not selectable" or "too near"; None if it could.
+    `groups` is the cost of each group of features; these costs add up to `cost`. `barred` is the reason why the search
+    at this tick may not choose the row, "not selectable" or "too near"; None if it may.
     """
 
     row: int
@@ -170,7 +170,7 @@ def _chosen(
     record: TrialRecord,
     tick: int,
 ) -> tuple[int, float, Reason]:
-    """Find the row that was chosen at a tick, its cost, and the reason for the choice; `query` is that of the tick."""
+    """Find the row that was chosen at a tick, its cost, and the reason for the choice; `query` is the tick's query."""
     from marey_motion.matching import controller_kernels as kernels
 
     shown = int(record.rows[tick])

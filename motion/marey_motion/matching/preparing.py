@@ -137,7 +137,7 @@ def _wanted_frames(
 
 
 def _moves(clip: Clip, skeleton: Skeleton) -> bool:
-    """Return whether the clip's own skeleton has the same joints as `skeleton`.
+    """Return whether a clip can move `skeleton`, because the clip's own skeleton has the same joints.
 
     End sites may differ, and so may the offsets of the root and of joints whose translations the clip contains.
     """

@@ -17,7 +17,7 @@ class Status(IntEnum):
     REPLACING = 1
     """A search chose another frame: the displayed row is the first after a switch."""
     REPLACED = 2
-    """The displayed row is the last before a switch, and neither the first after another switch nor forced."""
+    """The displayed row is the last before a switch; `REPLACING` and `FORCED` have precedence over this status."""
     FORCED = 3
     """The displayed row is the first of the trial, the first of a loop's new round, or the first after a clip's end."""
 

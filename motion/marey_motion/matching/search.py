@@ -198,7 +198,9 @@ def find_nearest(
     warm_rows: NDArray[np.int64] | None = None,
     skips: NDArray[np.int64] | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Find the nearest selectable row of each query, and its squared distance; of equally near rows, the lowest.
+    """Find the nearest selectable row of each query, and its squared distance.
+
+    Of several rows that are equally near, the one with the lowest number is returned.
 
     Parameters
     ----------
@@ -236,7 +238,7 @@ def find_best(
     weights: NDArray[np.float64] | None = None,
     skip: tuple[int, int] = (0, 0),
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Find the selectable rows nearest to a query, the nearest first; of equally near rows, the lowest first.
+    """Find the selectable rows nearest to a query, the nearest first; equally near rows are sorted by their numbers.
 
     Parameters
     ----------

@@ -14,10 +14,17 @@ from marey_motion.modelling.splines import SplineBasis
 from marey_schemas.options.modelling import DEFAULT_INNER_PRODUCT, InnerProduct
 
 SMALLEST_RELATIVE_DEVIATION = 2e-7
-"""Share of the largest singular value below which a singular value is a rounding error: the Gram matrix has squares."""
+"""Ratio to the largest singular value below which a singular value is treated as a rounding error.
+
+The ratio is much larger than the precision of float64, because singular values are computed as square roots of the
+eigenvalues of the Gram matrix.
+"""
 
 SMALLEST_RELATIVE_SPREAD = 1e-11
-"""Examples that differ from their mean by less than this share of their size are copies of one example."""
+"""Ratio to the norm of all examples below which a singular value is treated as a rounding error.
+
+Examples that vary less than this are copies of one example.
+"""
 
 
 @dataclass(frozen=True)

@@ -88,13 +88,15 @@ class LatentMixture:
         return np.asarray(highest + np.log(np.exp(each - highest[:, None]).sum(axis=1)))
 
     def sample(self, count: int, seed: int, attempt: int = 0) -> Floats:
-        """Draw latent vectors; a smaller count gives the first vectors of a larger one.
+        """Draw latent vectors.
+
+        With the same seed and attempt, a smaller count gives the first vectors of a larger count.
 
         Parameters
         ----------
         count : int    number of vectors
         seed : int    the same seed gives the same vectors
-        attempt : int    each attempt gives other vectors
+        attempt : int    number of the draw with this seed, from 0 on; each attempt gives different vectors
 
         Returns
         -------

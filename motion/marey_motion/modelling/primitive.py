@@ -20,8 +20,9 @@ MOST_FRAMES = 100_000
 """Maximum number of frames of one motion."""
 
 MOST_LOG_SLOPE = 12.0
-"""Bound of |ln(slope)| for a model whose examples are unknown; sums of steps between e^-12 and e^12 frames still
-increase.
+"""Limit of |ln(slope)| of time functions, for a model whose examples are unknown.
+
+Steps of e^-12 to e^12 frames are similar enough in size that their sum increases with each step, despite rounding.
 """
 
 MOST_ATTEMPTS = 100
@@ -177,7 +178,7 @@ class MotionPrimitive:
         """Draw latent vectors from the mixture.
 
         Vectors whose motions would be too short or too long are drawn again; each is redrawn independently of the
-        others, so that a smaller count gives the first vectors of a larger one.
+        others, so that a smaller count gives the first vectors of a larger count.
 
         Parameters
         ----------

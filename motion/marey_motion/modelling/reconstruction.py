@@ -133,7 +133,10 @@ class _Comparison:
     directions: Floats
 
     def distances(self, scores: Floats, poses: Floats) -> Floats:
-        """Compute the mean distance (c,) in metres of joints between the motions of scores (c, r) and poses (T, D)."""
+        """Compute the mean distance of joints, in metres, between each of c motions and one given motion; (c,).
+
+        The c motions are given by their `scores` (c, r), and the one motion by its `poses` (T, D).
+        """
         from marey_motion import kinematics
         from marey_motion.modelling import reconstruction_kernels
 

@@ -19,9 +19,9 @@ MOST_DIFFERENCES = 1_000_000
 
 
 def root_max_weights(poses: Floats) -> Floats:
-    """Compute weights that bring each root axis to a maximum of 1, as the published code does.
+    """Compute weights that scale each root axis to a maximum of 1 (the default of Herrmann et al. 2019).
 
-    Each axis is scaled by itself; an axis that hardly moves keeps its unit.
+    Each axis is scaled by itself. An axis along which the root hardly moves is not scaled.
 
     Parameters
     ----------

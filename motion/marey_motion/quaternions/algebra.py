@@ -290,8 +290,9 @@ def _rotated(q: Floats, v: Floats) -> Floats:
 def _between_opposite(start: Floats, end: Floats, wished: NDArray[Any] | None) -> Floats:
     """Find rotations (n, 4) from `start` (n, 3) to nearly opposite unit vectors `end` (n, 3).
 
-    Each is half a turn about an axis perpendicular to `start`, then the small rotation from there to `end`. `wished`
-    (..., 3) gives the axis of the half turn where `start` and `end` are exactly opposite; it may be None.
+    Each is half a turn about an axis perpendicular to `start`, then the small rotation from the opposite of `start` to
+    `end`. `wished` (..., 3) gives the axis of the half turn where `start` and `end` are exactly opposite; it may be
+    None.
     """
     candidates = [cross(start, end), np.eye(3)[np.argmin(np.abs(start), axis=-1)]]
     if wished is not None:

@@ -246,7 +246,10 @@ class _PosedBody:
         return _unit(trunk - _dot(trunk, self.hips_left) * self.hips_left)
 
     def _level(self, names: tuple[str, ...]) -> Floats | None:
-        """Find positions (K, 3) of the first of `names` that is mapped; for a pair, the middle of left and right."""
+        """Find the positions (K, 3) of the first of `names` that is mapped; None if none is mapped.
+
+        A name that stands for a left and a right joint gives the middle of the two joints.
+        """
         for name in names:
             joints = (name,) if name in CENTRE_JOINTS else tuple(f"{side}_{name}" for side in SIDES)
             if all(joint in self.joints for joint in joints):

@@ -102,7 +102,7 @@ def _parsed_names(rig: KnownRig) -> tuple[tuple[str, tuple[JointName, ...]], ...
 def _prefixes(pelvis: tuple[JointName, ...], joints: dict[JointName, int]) -> list[str]:
     """List prefixes that all joint names may share, the shortest first.
 
-    A prefix is the text before the rig's name of the pelvis in a joint name that ends with it.
+    They come from joint names that end with the rig's name of the pelvis: the text before this name may be a prefix.
     """
     prefixes = {
         joint.base[: len(joint.base) - len(name.base)]

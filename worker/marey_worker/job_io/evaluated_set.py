@@ -19,7 +19,7 @@ from marey_worker.job_io.matching_clips import MatchingClips, read_evaluated_cli
 
 @dataclass(frozen=True)
 class EvaluatedSet:
-    """Evaluation with the records of its trials, and the matching database of its clips in the same scaling."""
+    """Evaluation with the records of its trials, and the matching database of its clips with the same normaliser."""
 
     result: EvaluationResult
     clips: MatchingClips
@@ -46,12 +46,12 @@ def read_evaluated_set(context: Context) -> EvaluatedSet:
 
 
 def store_document(context: Context, tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Send a document as a JSON file; return the entry for the job's result that refers to it."""
+    """Send a document as a JSON file; return an entry for the job's result, which refers to the file."""
     return store_file(context, encode_tree(tree, JSON))
 
 
 def store_file(context: Context, data: bytes) -> dict[str, Any]:
-    """Send a file; return the entry for the job's result, which also prevents garbage collection of the file."""
+    """Send a file; return an entry for the job's result, which refers to the file and so protects it from deletion."""
     file = context.scratch / "document"
     file.write_bytes(data)
     return StoredFile(blob=context.put_file(file), size_bytes=len(data)).model_dump(mode="json")

@@ -1,4 +1,7 @@
-"""Folders and names of a job's results, which must be unique and differ from the folders and names of its inputs."""
+"""Places (folder and name) of a job's results: no two results may have the same place.
+
+A result may have the place of an input only if it is made from this input, as its next revision.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from marey_worker.context import Context, JobRefused
 
 
 class ResultPlaces:
-    """Folders and names that the results and inputs of one job already have."""
+    """Places (folder and name) of the inputs of one job, and of its results so far."""
 
     def __init__(self, context: Context) -> None:
         self._into = context.into

@@ -184,7 +184,7 @@ class _Job:
     def _read_annotations(self) -> dict[str, list[_ClipAnnotation]] | None:
         """Return the annotations of the requested layer by id of the clip, or None if no annotations are given.
 
-        Raises `JobRefused` if no annotations are given, but a layer or labels.
+        Raises `JobRefused` if a layer or labels are given without annotations.
         """
         pins = self._context.inputs.get("annotations", ())
         if not pins:

@@ -141,7 +141,7 @@ class _Cutting:
             )
 
     def _why_nothing(self, todo: Sequence[_AnnotatedClip]) -> str:
-        """Return the reason why no segment is cut out, without the refused annotations."""
+        """Return the reason why no segment is cut out; it does not mention annotations that were refused."""
         if not todo:
             layer = self._params.layer
             return "no annotation can be used" if layer is None else f"no annotation of the layer {layer!r} can be used"

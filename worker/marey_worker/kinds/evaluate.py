@@ -127,7 +127,10 @@ def headline_of(result: EvaluationResult) -> Headline:
 
 
 def facets_of(result: EvaluationResult, pins: Sequence[PinnedInput]) -> tuple[ItemFacets, ...]:
-    """Return the use of each evaluated clip as its facets; a mirrored copy counts as the clip itself."""
+    """Return how much each evaluated clip was used in the trials, as facets (published numbers) of the clip.
+
+    The use of a mirrored copy is added to that of the clip itself.
+    """
     used = {source.uid: source for source in sum_by_source(result.clips, result.usage)}
     return tuple(
         ItemFacets(

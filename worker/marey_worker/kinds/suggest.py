@@ -33,7 +33,10 @@ def run(context: Context, params: SuggestParams) -> dict[str, Any]:
 
 
 def facets_of(found: Suggestions) -> list[ItemFacets]:
-    """Return the harm of the removal of each clip for which it is known, as its facet."""
+    """Return how much the removal of a clip would harm the set, as a facet (published number) of the clip.
+
+    Only clips whose harm is known have this facet.
+    """
     harms = {removal.source: removal.harm for removal in found.redundant}
     harms |= {clip.source: 0.0 for clip in found.unused.clips}
     clips = ((*split_uid(source), harm) for source, harm in sorted(harms.items()))

@@ -1,4 +1,4 @@
-"""Check of the search for motions of a model: remaining distances to positions that left-out examples reached."""
+"""Check of how closely a search reaches positions of hands and feet from examples that the model does not know."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ REFINING = RefineOptions(likelihood_weight=0.01)
 
 @dataclass(frozen=True, eq=False)
 class SearchCheck:
-    """Errors of searches for positions that left-out examples reached; the model is trained on the other examples.
+    """Errors of searches for motions in which a hand or foot reaches a position.
+
+    The positions come from examples that were left out of the training of the model.
 
     Parameters
     ----------
@@ -51,7 +53,7 @@ class SearchCheck:
 def check_search(
     aligned: AlignedSet, standard_joints: Mapping[str, int], options: ModelOptions, *, seed: int
 ) -> SearchCheck | None:
-    """Leave every fifth example out, and search for the positions of its hands and feet.
+    """Train a model without every fifth example, and search for the positions of hands and feet in these examples.
 
     Parameters
     ----------

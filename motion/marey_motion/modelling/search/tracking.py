@@ -47,9 +47,9 @@ class Chains(NamedTuple):
     parents : (V,) index of the parent among the V joints, -1 for roots
     offsets : (V, 3) metres
     term_starts, term_nodes, term_signs : (n + 1,), (t,), (t,) the joints whose positions make up each point
-    held : (n,) 1 if the point is a position, which moves with the placement; 0 if it is a difference of positions,
-        which is only turned by it
-    turned : (n,) index among the V joints of the one whose rotation is tracked with each point
+    held : (n,) 1 if the point is a position, which the placement turns and shifts; 0 if it is a difference of
+        positions, which the placement only turns
+    turned : (n,) the joint whose rotation is tracked with each point, as an index among the V joints
     """
 
     mean: Floats
@@ -67,7 +67,8 @@ class Chains(NamedTuple):
 class Clocks(NamedTuple):
     """Arrays from which the time of n canonical frames, in seconds, is computed for a latent vector.
 
-    A step is the time between two consecutive ones of the N canonical frames, in frames of the motion.
+    A model has N canonical frames. A step is the time between two consecutive canonical frames, in frames of the
+    motion.
 
     Parameters
     ----------

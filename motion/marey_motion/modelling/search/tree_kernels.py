@@ -155,7 +155,10 @@ def grow(features, randoms, branching, leaf_size, depth, order, starts, sizes, c
 
 @compiled
 def locate(sizes, children, starts):  # type: ignore[no-untyped-def]
-    """Fill `starts` with the first sample of each node: the parent's, plus the sizes of the siblings before it."""
+    """Fill `starts` with the index of the first sample of each node.
+
+    The samples of a node are those of its first child, then those of its second child, and so on.
+    """
     starts[0] = 0
     following = 1
     for node in range(sizes.shape[0]):
