@@ -21,9 +21,9 @@ CHANNELS = 32
 def resample_clip(clip: Clip, frame_rate_hz: float, *, seam: LoopSeam | None = None) -> Clip:
     """Sample a clip at another frame rate.
 
-    The first frames coincide, and no sample lies beyond the last frame. Positions follow cubic splines. Rotations
-    follow cubic splines through their sign-continuous components and are then normalised. If all samples fall on
-    frames, these frames are copied unchanged.
+    The first sample is the first frame, and no sample lies beyond the last frame. Positions follow cubic splines.
+    Rotations follow cubic splines through their sign-continuous components and are then normalised. If all samples fall
+    on frames, these frames are copied unchanged.
 
     Parameters
     ----------

@@ -381,7 +381,7 @@ def _position_in_world(clip: Clip, joint: int) -> AnyFloats:
 
 
 def _offsets_by_joint(translations: NDArray[np.float32] | None, joints: tuple[int, ...]) -> dict[int, AnyFloats]:
-    """Return the translations (F, 3) of each of `joints`, by joint index; none if `translations` is None."""
+    """Return the translations (F, 3) of each of `joints`, by joint index; empty if `translations` is None."""
     return {} if translations is None else {joint: translations[:, slot] for slot, joint in enumerate(joints)}
 
 

@@ -132,7 +132,7 @@ def _compile(stage: str) -> None:
 
 
 def _read(clip: Clip) -> None:
-    """Read, check, write and retarget a walk; retarget it once more with a joint that has translations."""
+    """Compile the kernels of files and retargeting: read, check and write a walk, and retarget it with translations."""
     from marey_motion.formats import ImportOptions, read_motion, write_motion
     from marey_motion.gait import game_skeleton
     from marey_motion.retargeting import plan_retarget, retarget
@@ -153,7 +153,7 @@ def _read(clip: Clip) -> None:
 
 
 def _edit(clip: Clip) -> None:
-    """Constrain a wrist by every solver and plant the feet."""
+    """Compile the kernels of editing: constrain a wrist by every solver, and plant the feet."""
     from marey_motion.editing.registry import edit_clip
     from marey_schemas.editing.constraints import Constrain, PlantFeet, PositionConstraint, Solver
 
@@ -163,7 +163,7 @@ def _edit(clip: Clip) -> None:
 
 
 def _match(clip: Clip) -> None:
-    """Build a database of a clip, search it, simulate a trial, and display and explain the trial."""
+    """Compile the kernels of matching: build a database, search it, and simulate, display and explain a trial."""
     from marey_motion.evaluation.scenario import Trial, reference
     from marey_motion.matching.body import MatchingBody
     from marey_motion.matching.building import build_database
@@ -188,7 +188,7 @@ def _match(clip: Clip) -> None:
 
 
 def _compare(points: NDArray[np.float32]) -> None:
-    """Align a motion with itself by every method, and search it for the poses nearest to its own poses."""
+    """Compile the kernels that compare poses: align a motion with itself by every method, and find nearest poses."""
     from marey_motion.alignment.dtw import RangeBounds, align, distances, warped_distance
     from marey_motion.evaluation.similarity import nearest_poses
 
@@ -201,7 +201,7 @@ def _compare(points: NDArray[np.float32]) -> None:
 
 
 def _align(clip: Clip) -> None:
-    """Align a clip with itself by every cost, with and without a slope limit."""
+    """Compile the kernels of alignment: align a clip with itself by every cost, with and without a slope limit."""
     from marey_motion.alignment.aligning import SourceExample, align_clips
     from marey_motion.matching.body import MatchingBody
     from marey_motion.rigs import map_joints
@@ -220,7 +220,7 @@ def _align(clip: Clip) -> None:
 
 
 def _measure(clip: Clip) -> None:
-    """Measure the coverage of a clip with the code for live recordings, which receives frames as they arrive."""
+    """Compile the kernels of live recordings: measure the coverage of a clip by the code that receives live frames."""
     from marey_motion.evaluation.online import OnlineCoverage
     from marey_motion.matching.body import MatchingBody
     from marey_motion.rigs import map_joints
@@ -231,7 +231,7 @@ def _measure(clip: Clip) -> None:
 
 
 def _model(clip: Clip) -> None:
-    """Compute the components of two motions, and the errors of reconstruction from them."""
+    """Compile the kernels of models: compute components of two motions, and the errors of their reconstruction."""
     from marey_motion.modelling.fpca import Keep, find_components
     from marey_motion.modelling.reconstruction import reconstruction_errors
     from marey_motion.modelling.scaled_fpca import optimised_weights
@@ -247,7 +247,7 @@ def _model(clip: Clip) -> None:
 
 
 def _search(clip: Clip) -> None:
-    """Search for two steps in a model trained on a single motion, and refine the result."""
+    """Compile the kernels of searches: search for two steps in a model of a single motion, and refine the result."""
     from marey_motion.modelling.mixture import LatentMixture
     from marey_motion.modelling.primitive import FunctionalComponents, MotionPrimitive
     from marey_motion.modelling.search.step_search import search_steps

@@ -283,7 +283,7 @@ def _drift(style: GaitStyle, moments: GaitMoments, which: int) -> AnyFloats:
 
 
 def _turned(axes: str, *angles: AnyFloats) -> AnyFloats:
-    """Compute intrinsic rotations (n, 4) by `angles` (n,), in radians, about `axes`, which are letters such as "yzx"."""
+    """Compute intrinsic rotations (n, 4) about the axes that `axes` lists, such as "yzx"; angles (n,) in radians."""
     result: AnyFloats = quaternions.identity()
     for axis, angle in zip(axes, angles, strict=True):
         result = quaternions.multiply(result, quaternions.from_axis_angle(np.eye(3)["xyz".index(axis)], angle))

@@ -342,7 +342,7 @@ def _cubic(share: AnyFloats, start: Any, start_rate: Any, end: Any, end_rate: An
 
 
 def smooth_positive_part(values: AnyFloats, width: AnyFloats) -> AnyFloats:
-    """Compute max(values, 0), rounded around zero and never below it.
+    """Compute a smooth approximation of max(values, 0), which rounds its corner at 0 and is nowhere below it.
 
     Parameters
     ----------

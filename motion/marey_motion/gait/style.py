@@ -32,8 +32,9 @@ class GaitStyle:
     lean : forward lean of the trunk and banking into turns
     sway : counter-rotation of the shoulders against the legs
     arm_swing : amplitude of the arms
-    wander : amplitude of slow sine waves that are added to the angles of trunk, head and arms; 0 for neutral
-    wander_phases_rad : phases of these three waves
+    wander : amplitude of three slow sine waves that are added to the angles of trunk, head and arms; the neutral gait
+        has none, so the default is 0
+    wander_phases_rad : phases of the three waves
     """
 
     stride: float = 1.0

@@ -126,7 +126,7 @@ def given_skeleton(given: GivenSkeleton) -> Skeleton:
 
 
 def skeleton_item(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
-    """Make the item of a file's own skeleton, marked so that an equal skeleton of the project is used instead.
+    """Make the item of a file's own skeleton, marked to be stored only if the project has no equal skeleton.
 
     Parameters
     ----------

@@ -22,11 +22,11 @@ _FRAMES_PER_BLOCK = 4096
 class BodyPoints:
     """Points of a skeleton that the checks use, and lengths between them.
 
-    `points` are the indices of joints, followed by those of end sites, which are numbered from J on; `column` maps each
-    of these indices to its position in `points`. `soles` are, for each foot, the positions in `points` of its joints
-    and end sites from the ankle down; `all_soles` are those of both feet. `limbs` are the joints of arms and legs,
-    `span_m` is the length of both arms, and `leg_m` that of the left leg. If there are no hands or no feet, `limbs` is
-    empty and both lengths are zero.
+    `points` lists the points: joints by their index, then end sites, which are numbered from J on. The place of a point
+    in this list is its column; `column` maps points to columns. `soles` has, for each foot, the columns of its joints
+    and end sites from the ankle down. `all_soles` has the columns of both feet.
+    `limbs` are the joint indices of each arm and leg, `span_m` is the length of both arms together, and `leg_m` the
+    length of the left leg. If there are no hands or no feet, `limbs` is empty and both lengths are zero.
     """
 
     landmarks: Landmarks

@@ -139,7 +139,7 @@ def union_normaliser(databases: Sequence[MatchingDatabase]) -> Normaliser:
 
 
 def database_digest(database: MatchingDatabase) -> str:
-    """Compute a digest of everything that a search and a controller use of a database, except its normaliser.
+    """Compute a digest of all data of a database that searches and controllers use, except the normaliser.
 
     Parameters
     ----------

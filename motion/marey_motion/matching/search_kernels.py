@@ -237,7 +237,7 @@ def nearest(index, query, warm_row, skip_start, skip_stop):  # type: ignore[no-u
 
 @compiled
 def nearest_weighted(index, query, weights, skip_start, skip_stop):  # type: ignore[no-untyped-def]
-    """Find the same as `nearest`, but with squared differences multiplied by non-negative weights (D,)."""
+    """Find the nearest row, as `nearest` does, with squared differences multiplied by non-negative weights (D,)."""
     return _nearest(index, query, weights, -1, skip_start, skip_stop)
 
 

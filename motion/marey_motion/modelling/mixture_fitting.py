@@ -167,8 +167,9 @@ class _Fitting:
     def _best(self, candidates: dict[int, MixtureCandidate]) -> tuple[int, Floats | None]:
         """Choose the number of components with the best criterion among the candidates that are not refused.
 
-        `candidates` are by number of components; refusals are recorded in them. Returns the chosen number, and the
-        held-out log-likelihoods (n,) of the examples with this number, or None.
+        `candidates` maps a number of components to its candidate. A candidate that is refused here is replaced by one
+        with the reason. Returns the chosen number, and the held-out log-likelihoods (n,) of the examples with this
+        number, or None.
         """
         single = self._held_out(1)
         falling = sorted(candidates.values(), key=lambda one: getattr(one, self.options.criterion))

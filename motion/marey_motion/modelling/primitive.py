@@ -295,7 +295,8 @@ class MotionPrimitive:
     def latents_of(self, poses: Floats, time_functions: Floats) -> Floats:
         """Compute the latent vectors of aligned examples.
 
-        Quaternions must have the signs of the training examples (dot products with the mean motion not negative).
+        The signs of quaternions must be those of the training examples: the dot product of a quaternion with the same
+        quaternion of the mean motion must not be negative.
 
         Parameters
         ----------

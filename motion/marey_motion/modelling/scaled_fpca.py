@@ -34,9 +34,10 @@ def optimised_weights(
     keep: Keep,
     inner_product: InnerProduct = DEFAULT_INNER_PRODUCT,
 ) -> tuple[Floats, Keep]:
-    """Optimise weights, one for each root axis and each joint, that minimise the squared distance of joints.
+    """Optimise weights of channels, one weight for each root axis and each joint.
 
-    The number of components is determined by `keep` with the first starting weights, and is then fixed.
+    The weights minimise the squared distances of joints between the examples and their reconstructions from a few
+    components. The number of components is determined by `keep` with the first starting weights, and is then fixed.
 
     Parameters
     ----------

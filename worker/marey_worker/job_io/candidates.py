@@ -79,7 +79,10 @@ def _named(context: Context, groups: dict[tuple[str, str], _Group]) -> Iterator[
 
 
 def _build(context: Context, group: _Group, database: MatchingDatabase) -> MatchingDatabase:
-    """Return the matching database of a group; if its skeleton equals that of `database`, use the same body."""
+    """Return the matching database of a group.
+
+    If the skeleton of the group equals the skeleton of `database`, the joints for matching are taken from `database`.
+    """
     newest = max(map(_skeleton_of, group.motions), key=lambda ref: ref.revision)
     rigged = read_rigged(context, Rig.as_stored(newest))
     body = database.body

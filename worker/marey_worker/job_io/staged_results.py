@@ -18,7 +18,7 @@ BYTES_PER_STAGE = 4 << 20
 OUTPUTS_PER_STAGE = 64
 
 _encoder = ThreadPoolExecutor(1, thread_name_prefix="marey-encode")
-"""Thread that encodes arrays of results; compression does not hold Python's lock."""
+"""Thread that encodes arrays of results; compression does not hold Python's global interpreter lock."""
 
 
 class StagedResults:
