@@ -266,8 +266,9 @@ def ground_projection(positions: AnyFloats) -> AnyFloats:
 def forward_directions(positions: AnyFloats, left: Sequence[int], right: Sequence[int]) -> NDArray[np.float64]:
     """Compute the direction that the body faces on the ground.
 
-    The sum of the left-minus-right vectors is crossed with up. If the sum is vertical, a frame has no direction of its
-    own, and the direction of the frame before it is used. Frames before the first direction have the first direction.
+    The direction is the cross product of the sum of the vectors from right to left joints and the upward direction. If
+    the sum is vertical, a frame has no direction of its own, and the direction of the frame before it is used. Frames
+    before the first direction have the first direction.
 
     Parameters
     ----------

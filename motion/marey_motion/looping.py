@@ -1,6 +1,6 @@
 """Loops: clips whose last frame leads into their first frame, which may be at another position on the ground.
 
-Ground positions are (x, z) in metres, headings radians that grow to the left.
+Ground positions are (x, z) in metres; headings are in radians and increase in a left turn.
 """
 
 from __future__ import annotations

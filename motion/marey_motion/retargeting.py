@@ -238,7 +238,7 @@ def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None)
 
 
 def moved_bones(clip: Clip, plan: RetargetPlan) -> FollowedBones:
-    """Correct the rotations of a clip so that its bones keep their directions without the clip's translations.
+    """Correct the rotations of a clip so that its bones keep their directions when its translations are removed.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from collections import Counter
 from marey_schemas.queue.worker_protocol import FAULT_VARIABLE
 
 SETTLE_S = 0.2
-"""Pause after SIGSTOP, which stops the threads of a process one by one; the calling thread must not continue first."""
+"""Pause of the calling thread after SIGSTOP, which stops the threads one by one and may reach this thread last."""
 ACTIONS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
 
 _passes: Counter[str] = Counter()

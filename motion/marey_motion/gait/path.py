@@ -91,7 +91,7 @@ class RootState:
 
 @dataclass(frozen=True)
 class RootPath:
-    """Segments one after the other, starting at the origin and heading along +Z at time 0.
+    """Path of consecutive segments; at time 0, it starts at the origin and heads along +Z.
 
     Before time 0, the path continues with the speed and turn rate of its start; after `duration_s`, with the speed and
     turn rate of its end.

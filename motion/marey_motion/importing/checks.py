@@ -201,7 +201,7 @@ def _rest_pose_frames(clip: Clip, tracks: Tracks) -> tuple[int, int]:
 
 
 def _leading(blocks: Iterable[NDArray[np.bool_]]) -> int:
-    """Count the true values before the first false one in a sequence of arrays, which is read only up to there."""
+    """Count the true values before the first false value in consecutive arrays; later arrays are not computed."""
     total = 0
     for block in blocks:
         if not block.all():

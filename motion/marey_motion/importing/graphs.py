@@ -32,7 +32,10 @@ class NamedModel:
 
 
 FindModels = Callable[[str, str | None], tuple[int, Sequence[NamedModel]]]
-"""Function that counts the models of a name in a collection or in the whole project, and returns the first `FEW`."""
+"""Function that returns the number of models with a name, and the first `FEW` of them.
+
+Its arguments are the name and a collection, or None for the whole project.
+"""
 
 
 def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
@@ -77,9 +80,10 @@ def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
 
 
 def _find_model(find: FindModels, name: str, collection: str) -> dict[str, Any]:
-    """Return the reference to the model called `name` in `collection`, or to the only one of that name in the project.
+    """Return the reference to the model called `name` in `collection`.
 
-    Raises `FormatError` if there is no such model, or if there are several.
+    If the collection does not have exactly one model of this name, the whole project is searched. Raises `FormatError`
+    if the project does not have exactly one either.
     """
     count, models = find(name, collection)
     if count != 1:

@@ -414,7 +414,10 @@ def _stands_on_all_fours(body: _Measurements, up_axis: UpAxis) -> bool:
 
 
 def _look_for_mirroring(source: SourceMotion, body: _Measurements, options: ImportOptions, up_axis: UpAxis) -> None:
-    """Warn if left and right are exchanged: seen in the direction of the feet, the left foot must be on the left."""
+    """Warn if left and right seem exchanged.
+
+    The body is assumed to face where its feet point. Left and right seem exchanged if the left leg is on the right.
+    """
     landmarks = body.landmarks
     if landmarks.feet is None or landmarks.toes is None or options.handedness == "left":
         return

@@ -47,7 +47,7 @@ def _arc(speed, turn_rate, elapsed):  # type: ignore[no-untyped-def]
 
 @compiled
 def _outward(heading, left, forward):  # type: ignore[no-untyped-def]
-    """Convert a step, to the left and forward of a root with `heading`, to (x, z) in the world."""
+    """Convert a step of a root with `heading`, given as distances to the left and forward, to (x, z) in the world."""
     sine, cosine = np.sin(heading), np.cos(heading)
     return left * cosine + forward * sine, forward * cosine - left * sine
 

@@ -28,7 +28,7 @@ NOTES = {
 
 
 class RootMotion(NamedTuple):
-    """The step that follows each row, as a tuple of arrays that can be passed to compiled code.
+    """Steps of the root from each row of a database to the next row, as arrays that compiled code can take.
 
     Parameters
     ----------

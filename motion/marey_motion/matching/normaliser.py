@@ -153,9 +153,10 @@ class Normaliser:
 
 
 def fit_normaliser(features: Floats, layout: FeatureLayout, fitted_on: str) -> Normaliser:
-    """Fit the mean of each dimension and the scale of each group: mean standard deviation of its dimensions / weight.
+    """Fit an offset for each dimension and a scale for each group of dimensions.
 
-    Groups that hardly vary get the scale `LEAST_SCALE`, and are listed in `floored`.
+    The offset is the mean. The scale is the mean of the standard deviations of the group's dimensions, divided by the
+    weight of the group. Groups that hardly vary get the scale `LEAST_SCALE`, and are listed in `floored`.
 
     Parameters
     ----------

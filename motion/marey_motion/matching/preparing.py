@@ -153,7 +153,7 @@ def _moves(clip: Clip, skeleton: Skeleton) -> bool:
 
 
 def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], warn: _Warn) -> tuple[int, int]:
-    """Find the range [start, stop) of frames between the rest poses at a clip's ends, which `warnings` name."""
+    """Find the range [start, stop) of frames between the rest poses that `warnings` report at the ends of a clip."""
     start, stop = 0, clip.frame_count
     for warning in warnings:
         if warning.code == "rest-pose-frame" and warning.frames is not None:

@@ -168,7 +168,8 @@ def _by_sixteen(count: int) -> NDArray[np.int32]:
 def _boxes(low: NDArray[np.float32], high: NDArray[np.float32], starts: NDArray[np.int32]) -> NDArray[np.float32]:
     """Arrange the lower and upper bounds of K boxes, (K, D') each, in M groups of up to sixteen boxes.
 
-    Group m begins at box `starts[m]`. The result has the shape (M, D', 2, 16): lower and upper bound come third.
+    Group m begins at box `starts[m]`. The result has the shape (M, D', 2, 16); its axis of length 2 has the lower and
+    the upper bound.
     """
     lanes = np.minimum(starts[:-1, None] + np.arange(_SIXTEEN), starts[1:, None] - 1)
     return np.ascontiguousarray(np.stack([low[lanes], high[lanes]], axis=2).transpose(0, 3, 2, 1))

@@ -137,7 +137,7 @@ def _components_from_tree(tree: Mapping[str, Any], columns: NDArray[np.int64] | 
 
 
 def _columns(joints: list[str], skeleton: Skeleton) -> NDArray[np.int64] | None:
-    """Return the index in a document of each channel of the skeleton; None if the document has the same order."""
+    """Return, for each channel of the skeleton, its index in a document; None if the document has the same order."""
     if tuple(joints) == skeleton.joint_names:
         return None
     if sorted(joints) != sorted(skeleton.joint_names) or joints[0] != skeleton.joint_names[0]:

@@ -63,7 +63,7 @@ def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-un
 
 @compiled
 def squared_error_gradient(poses, parents, offsets, targets, gradient):  # type: ignore[no-untyped-def]
-    """Compute the sum of squared distances of joints from targets (F, J, 3), and its gradient (F, D) in the poses.
+    """Compute the sum of squared distances of joints from targets (F, J, 3), and its gradient (F, D) by the poses.
 
     Quaternions need not be of unit length: the error, and so the gradient, is that of the rotations they represent.
     From the leaves to the root, the gradients of all joints below a joint are added up to a force and a torque on this

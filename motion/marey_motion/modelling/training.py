@@ -242,10 +242,10 @@ def _sampled_range(aligned: AlignedSet) -> tuple[float, float]:
 
 
 def _log_slope_range(aligned: AlignedSet, temporal: PrincipalExamples) -> tuple[float, float]:
-    """Compute the range of the logarithms of the examples' time steps, extended by `LOG_SLOPE_MARGIN` at both ends.
+    """Compute the range to which the logarithms of time steps are clipped in motions of the model.
 
-    The range also covers the time steps of the examples as rebuilt from the kept components. So no rebuilt example is
-    changed when samples are clipped to the range.
+    It covers the time steps of the examples, and of the examples rebuilt from the kept components, and is extended by
+    `LOG_SLOPE_MARGIN` at both ends. So clipping changes no rebuilt example. The range never exceeds ±`MOST_LOG_SLOPE`.
     """
     functions = temporal.functions
     rebuilt = functions.basis.at_frames @ functions.coefficients(_kept_scores(temporal))[..., 0].T

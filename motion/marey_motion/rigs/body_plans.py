@@ -41,7 +41,10 @@ SHORTER = -1.5
 
 @dataclass(frozen=True)
 class Build:
-    """Usual proportions of an arm or a leg of a person: each is the usual value and the spread of its logarithm."""
+    """Usual proportions of an arm or a leg of a person.
+
+    `ratio` and `end` are pairs of a usual value and the spread of its logarithm; `before` is an upper limit.
+    """
 
     ratio: tuple[float, float]  # upper by lower long bone
     end: tuple[float, float]  # what follows, to the tip of toes or fingers, by both long bones

@@ -109,7 +109,7 @@ def read_clips(context: Context, params: EvaluateParams, options: DatabaseOption
 def read_evaluated_clips(
     context: Context, evaluation: PinnedInput, document: Mapping[str, Any], options: DatabaseOptions
 ) -> MatchingClips:
-    """Return the clips of an evaluation at the revisions that it used, scaled by the normaliser of the evaluation.
+    """Return the matching database of an evaluation's clips, with the revisions and the normaliser that it used.
 
     Raises `JobRefused` if the evaluation does not list its clips.
     """

@@ -119,7 +119,7 @@ def _placed(motion: Motion, placement: Placement) -> Motion:
 
 
 def _in_a_row(motions: Sequence[Motion]) -> Motion:
-    """Concatenate motions; signs of quaternions are chosen so that each is as near as possible to the one before."""
+    """Concatenate motions; the signs of quaternions are chosen so that they are continuous from motion to motion."""
     rotations = [motions[0].rotations]
     for motion in motions[1:]:
         agreeing = np.einsum("jc,jc->j", rotations[-1][-1], motion.rotations[0]) >= 0.0
