@@ -67,7 +67,7 @@ class ControllerConstants(NamedTuple):
 
     Parameters
     ----------
-    follow : whether the desired path is followed by time, by position or in open loop, numbered in `controller_kernels`
+    follow : constant of `controller_kernels`: the desired path is followed by time, by position or in open loop
     by_distance : whether poses are compared by the distances of their joints instead of their features
     period : number of ticks from one search to the next
     window : number of rows on each side of the displayed row that a search may not choose

@@ -34,7 +34,7 @@ class RootMotion(NamedTuple):
     ----------
     successors : (N,) int64    the row that follows; -1 after the last row of a clip that does not wrap
     steps : (N, 3) float64    metres to the left and forward, in the frame of the row's root, and radians to the left.
-        The last row of a clip that does not wrap repeats the step that led to it, which gives the root's velocity.
+        The last row of a clip that does not wrap has the step that led to it, so that its velocity is known, too.
     """
 
     successors: NDArray[np.int64]

@@ -143,7 +143,8 @@ def inertialised(  # type: ignore[no-untyped-def]
     ----------
     poses, places : (N, 3 + 4·J), (N, L, 3) poses and local translations of the N rows of the database
     successors : (N,) the row that continues each row's clip, or -1
-    joints, moved : (K,), (M,) indices of the wanted joints, and of their translations among the L of the database
+    joints, moved : (K,), (M,) indices of the wanted joints; indices of their translations among the L translations of
+        the database
     rows : (T,) the row that is displayed at each tick, that is, each frame of the display
     cuts : (T,) the row that a search chose at each tick instead of the displayed one, so that its successor is
         displayed next; -1 if the displayed clip continues

@@ -37,8 +37,9 @@ class TrialRecord:
     match_cost : (T,) float64    normalised squared cost of the row that was chosen; NaN at ticks without a search
     continuing_cost : (T,) float64    cost of continuing the displayed clip, comparable to `match_cost`; NaN at ticks
         without a search and at the end of the clip
-    pose_cost : (T,) float64    metres: distance, summed over the pose joints, from the displayed pose, including the
-        remaining offsets of earlier switches, to the pose of the row that follows at the next tick, without offsets
+    pose_cost : (T,) float64    distance in metres, summed over the pose joints, from the displayed pose to the pose of
+        the row that follows at the next tick. The displayed pose includes the remaining offsets of earlier switches;
+        the other pose has no offsets
     """
 
     rate_hz: float

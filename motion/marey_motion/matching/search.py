@@ -207,7 +207,8 @@ def find_nearest(
     ----------
     index : SearchIndex    N rows of D dimensions
     queries : (Q, D) float64    normalised like the rows
-    weights : (D,) float64, optional    factors, at least 0, of each dimension's squared difference; 1 if None
+    weights : (D,) float64, optional    factors by which the squared differences are multiplied, one per dimension and
+        not negative; 1 if None
     warm_rows : (Q,) int64, optional    a row likely to be near each query, or -1; it only makes the search quicker
     skips : (Q, 2) int64, optional    rows [start, stop) that each query may not choose
 

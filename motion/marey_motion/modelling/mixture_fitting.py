@@ -38,8 +38,8 @@ class MixtureCandidate:
     log_likelihood : float    of all examples, natural logarithm
     smallest_weight : float    the least weight of a component
     converged : bool    whether the fit converged
-    refusal : str    reason for excluding the mixture whatever its criterion, empty if it is not excluded:
-        "small-component" if a component has too few examples, "held-out" if held-out examples are not more likely than
+    refusal : str    reason why the mixture is excluded, regardless of its criteria; empty if it is not excluded.
+        "small-component": a component has too few examples; "held-out": held-out examples are not more likely than
         with one component
     """
 

@@ -120,7 +120,7 @@ class MotionPrimitive:
     duration_range_s : shortest and longest duration of a motion, or None for no limits; limits matter because normal
         distributions of logarithms have long tails
     log_slope_range : limits of the temporal function, or None if the examples are not known; without limits, splines
-        overshoot at their ends, and a motion would stop there
+        could overshoot at their ends, so that a motion would nearly stop there
     """
 
     name: str
