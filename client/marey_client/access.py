@@ -32,11 +32,11 @@ from marey_schemas.access import (
 from marey_schemas.items import Collection
 
 ANY_STATE = {"If-Match": "*"}
-"""Header of a request that applies a change whatever the present state of the resource is."""
+"""Header with which the server makes a change even if the resource has changed since it was read."""
 
 
 def change_quotas(transport: Transport, path: str, change: QuotaChange) -> QuotasInUse:
-    """Change the quotas at `path`, those of a project or of a user; return all of its quotas and their use."""
+    """Change quotas of the project or user at `path`; return all quotas of this project or user, with their use."""
     return read_model(QuotasInUse, transport.send("PATCH", path, content=as_json(change), repeatable=True))
 
 
@@ -92,7 +92,7 @@ class Users:
 
 @dataclass(frozen=True)
 class Tokens:
-    """Tokens of the caller; for administrators, of everybody."""
+    """Tokens of the caller; administrators can also list and revoke the tokens of others."""
 
     transport: Transport
 

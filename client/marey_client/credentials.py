@@ -76,7 +76,7 @@ class Credential:
 
     @property
     def bearer(self) -> str | TokenFile | None:
-        """The token; or, if it was read from a file, the file, which may get a new token while the program runs."""
+        """The token; or, if `file` is given, a `TokenFile`, which is read again when the token in the file changes."""
         return self.token if self.file is None else TokenFile(self.file)
 
 
@@ -174,7 +174,7 @@ def logins_path(environment: Mapping[str, str]) -> Path:
 
 
 def read_logins(path: Path) -> Logins:
-    """Return the stored logins, empty without a file. Raises `BadCredentialFile` if the file is damaged."""
+    """Return the stored logins, none if there is no file. Raises `BadCredentialFile` if the file is damaged."""
     if not path.exists():
         return Logins()
     try:

@@ -54,7 +54,7 @@ class EarlierVersionsMissing(MareyError):
 
 
 class NothingToArchive(MareyError):
-    """All commits of the version to archive are among those to leave out."""
+    """Every commit that the archive would contain is to be left out."""
 
 
 class CannotExport(MareyError):
@@ -70,7 +70,7 @@ class BadSidecar(MareyError):
 
 
 class MissingPackage(MareyError):
-    """A Python package is not installed that only some functions need."""
+    """A Python package that only some functions need is not installed."""
 
 
 class CannotBisect(MareyError):

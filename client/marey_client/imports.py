@@ -63,13 +63,13 @@ class FoundFiles:
     unit: LengthUnit | None = None
     """Unit of length of the files, known if all of them come from one export."""
     changed_tables: tuple[Path, ...] = ()
-    """Tables of take records that differ from the sidecars beside them, which are used instead."""
+    """Tables of take records that differ from the sidecars in their folders; imports use only the sidecars."""
 
 
 def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
     """Find the motion files in folders and below, except hidden ones; files among `places` are always included.
 
-    In a folder that an export of a dataset wrote, the files get the names of the clips' paths. Raises `NothingToUpload`
+    Files in a folder that an export of a dataset wrote are named by the paths of their clips. Raises `NothingToUpload`
     if a place does not exist or no motion file is found, `SameName` if two files would get the same name, `BadSidecar`
     if the sidecar of an export is damaged, and `OSError` if a folder cannot be read.
     """

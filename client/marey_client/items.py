@@ -137,9 +137,9 @@ class ItemHandle:
     ) -> Difference:
         """Return how the revision `after` differs from the revision `before`; by default the newest two.
 
-        With `other`, `after` is a revision of that item, and both revisions are the newest by default. `options` are
-        those of `DifferenceOptions`, such as `threshold_deg=5`; `plot` requests values to draw. Raises `NotFound` if
-        there is no such revision.
+        With `other`, `after` is a revision of the item `other`, and the newest revisions of both items are the default.
+        `options` are those of `DifferenceOptions`, such as `threshold_deg=5`; `plot` requests values to draw. Raises
+        `NotFound` if there is no such revision.
         """
         request = DifferenceRequest.model_validate(
             {"from": before, "to": after, "to_item": None if other is None else other.id, "plot": plot, **options}
@@ -226,7 +226,7 @@ class Items(Generic[Handle]):
         return (self._handle(item) for item in pages(self.transport, Item, self.url, params))
 
     def explain(self, query: str, *, collection: str | None = None) -> QueryExplanation:
-        """Count the items that a query selects, and those that each of its conditions hides.
+        """Count the items that a query selects, and those that each of its conditions excludes.
 
         `collection` is a folder; without it, all items of the kind in the project are counted.
         """

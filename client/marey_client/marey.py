@@ -25,7 +25,7 @@ from marey_schemas.invitations import AcceptedInvitation, InvitationAcceptance, 
 
 
 class Marey:
-    """A Marey server. May be used by several threads; close it, or use it in a `with` block.
+    """Client of a Marey server. Several threads may share a client; close it, or use it in a `with` block.
 
     Parameters
     ----------
@@ -79,9 +79,9 @@ class Marey:
         return self.transport.post(SignedUp, "/sign-up", request, repeatable=True)
 
     def accept_invitation(self, code: str) -> AcceptedInvitation:
-        """Become a member of a project by the code of an invitation, which may be sent again if its answer is lost.
+        """Become a member of a project by the code of an invitation.
 
-        Raises `NotFound` if the code is not valid.
+        The request is sent again if its answer is lost. Raises `NotFound` if the code is not valid.
         """
         request = InvitationAcceptance(code=SecretStr(code))
         return self.transport.post(AcceptedInvitation, "/invitations/accept", request, repeatable=True)

@@ -21,7 +21,7 @@ Places: TypeAlias = Place[Handle] | Sequence[Place[Handle]]
 
 
 def as_inputs(places: Places[Handle]) -> tuple[ExistingInput, ...]:
-    """Return one or several folders or items as inputs of jobs; a handle stands for the revision that it has read."""
+    """Return one or several folders or items as inputs of jobs; a handle becomes the revision that it has read."""
     return tuple(map(_as_input, _as_list(places)))
 
 
@@ -49,9 +49,9 @@ def _as_list(places: Places[Handle]) -> list[Place[Handle]]:
 
 
 def entries_at(items: Items[Handle], place: DatasetInput) -> Iterator[tuple[Entry, Item]]:
-    """Yield the entries of a dataset version, each with its item, which may have been deleted since.
+    """Yield the entries of a dataset version that have the kind of `items`, each with its item.
 
-    Entries without an item are left out.
+    The item may have been deleted since the commit. Entries without an item are left out.
     """
     dataset = Datasets(items.transport, items.project).at(place.dataset)
     folder = dataset.read().collection

@@ -52,7 +52,7 @@ from marey_schemas.queue.model_pipelines import model_pipeline
 from marey_schemas.queue.pipelines import PipelineCreate
 
 CommitTo = OutputsCommit | str | None
-"""Commit of the results of a job to a branch, in short form `dataset[@branch][/folder]`."""
+"""Branch and folder to which a job commits its results, as `OutputsCommit` or as `dataset[@branch][/folder]`."""
 
 
 class ProjectHandle(ProjectItems):
@@ -312,7 +312,7 @@ class ProjectHandle(ProjectItems):
 
         `options` are those of `EvaluateParams`. Raises `CannotBisect` if there is no such metric, if `good` is not
         among the versions before `bad`, if one of these two versions cannot be evaluated, if by `limit` the version
-        `good` is bad or `bad` is good, or if there is no value half-way between theirs.
+        `good` is bad or `bad` is good, or if no `limit` is given and both versions have the same value.
         """
         handle = self.datasets.at(dataset)
         evaluations = VersionEvaluations(

@@ -90,8 +90,8 @@ class ProjectItems:
         """Delete deleted items for good, so that garbage collection frees their bytes. For owners of the project.
 
         `conditions` are the fields of `PurgeRequest`, such as `collection="raw", older_than_days=30`; with
-        `preview=True`, nothing changes. The answer says which items something still needs, and what; these are not
-        purged. Raises `Conflict` if `item` names a single item that something needs.
+        `preview=True`, nothing changes. Items that something still needs are not purged; the answer lists them
+        with what needs them. Raises `Conflict` if `item` names a single item that something needs.
         """
         return purge_items(self.transport, self.name, PurgeRequest.model_validate(conditions))
 
@@ -131,7 +131,7 @@ class Collections:
         return pages(self.transport, Collection, self.url, params)
 
     def at(self, path: str, *, deleted: bool = False) -> Collection | None:
-        """Return the folder with this path, or None; if several were deleted, the one that was deleted last."""
+        """Return the folder with this path, or None; with `deleted`, the one that was deleted last at this path."""
         found = [one for one in self.list(path=path, deleted=deleted) if one.path == path]
         return max(found, key=lambda one: one.deleted_at or one.created_at, default=None)
 

@@ -43,9 +43,10 @@ class ComparedOutput:
 def rerun_request(job: Job, kind: JobKind, tasks: Iterable[Job] = (), *, into: str | None = None) -> JobCreate:
     """Return the request that repeats a job with the same revisions, parameters and seed, without cached results.
 
-    `tasks` are the tasks of the job. If an input was distributed over them, only their records name its items. The
-    results are stored in the folder `into`, by default `reruns/` and the id of the job. Raises `CannotRerun` for a job
-    that has not succeeded, a task of another job, and a job that replaced its sources.
+    `tasks` are the tasks of the job. If an input was distributed over the tasks, only the records of the tasks name the
+    items of this input. The results are stored in the folder `into`, by default `reruns/` and the id of the job. Raises
+    `CannotRerun` for a job that has not succeeded, a task of another job, and a job that wrote new revisions of its
+    inputs.
     """
     if job.state is not JobState.SUCCEEDED:
         raise CannotRerun(f"the job {job.id} has no result to repeat; its state is {job.state.value}")

@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 
 class BearerToken(httpx.Auth):
-    """Authentication that adds the token to requests; the token appears nowhere else, for example in logs."""
+    """Authentication that adds the token to requests; the token is not shown elsewhere, for example in logs."""
 
     def __init__(self, token: str | TokenFile) -> None:
         self._source = token if isinstance(token, TokenFile) else as_token(token)

@@ -1,1 +1,1 @@
-"""Archives of datasets: writing, extraction, import, and the copies between servers that use them."""
+"""Archives of datasets: writing, extraction, import, and copies between servers by means of archives."""

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 def request_contents(
     transport: Transport, project_url: str, request: ContentsRequest, *, keep_blocks: bool = False
 ) -> dict[str, Any]:
-    """Return the server's answer: `revisions` and `documents`, each in the order of the request.
+    """Request revisions and documents of a project by content digest, and return the server's answer as a dict.
 
-    With `keep_blocks`, arrays stay compressed.
+    Its lists `revisions` and `documents` have the order of the request. With `keep_blocks`, arrays stay compressed.
     """
     url = f"{project_url}/contents"
     response = transport.send("POST", url, content=as_json(request), headers={"Accept": BLOCKS})
@@ -30,7 +30,9 @@ def request_contents(
 def first_documents(
     transport: Transport, project_url: str, places: Sequence[PartOfContent], *, keep_blocks: bool = False
 ) -> list[Any]:
-    """Return the documents at `places`, in order, as many as fit into one answer, at least one.
+    """Request the documents at the given addresses, and return as many of them as fit into one answer, at least one.
+
+    The documents are the first ones in the order of `places`.
 
     Raises `UnexpectedAnswer` if the project does not have one of the revisions any more.
     """
@@ -45,7 +47,7 @@ def first_documents(
 
 
 def read_documents(transport: Transport, project_url: str, places: Sequence[PartOfContent]) -> Iterator[dict[str, Any]]:
-    """Yield the documents at `places`, in order, with numpy arrays; not more than one answer is in memory."""
+    """Yield the documents at the given addresses, in order, with numpy arrays, keeping one answer in memory."""
     waiting = list(places)
     while waiting:
         found = first_documents(transport, project_url, waiting[:MOST_CONTENTS])

@@ -38,7 +38,7 @@ class _Extraction:
     archive: Archive
     folder: Path
     entries: Mapping[str, DatasetEntry]
-    """An entry of the version with each content digest."""
+    """Entries of the version by content digest; only one of several entries with the same content."""
     taken: TakenPaths
 
     def write(self, entry: DatasetEntry) -> Iterator[Path]:

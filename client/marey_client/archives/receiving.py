@@ -24,7 +24,7 @@ from marey_versions.archive.reading import Archive, EntryChange
 from marey_versions.records import CommitRecord, contents_in, path_and_kind, revision_content
 
 MOST_BYTES_SENT = 16 * MIB
-"""Size of the documents from which on a request contains no further revision."""
+"""Total size of documents, in bytes, above which no further revision is added to a request."""
 
 
 class ReceivingDataset(Protocol):
@@ -55,7 +55,7 @@ def send_versions(
     """Record the versions of an archive in a dataset, with their digests; return the newest version.
 
     If `begins` names a branch without commits, this branch moves to the newest version; no other branch moves. After an
-    interrupted import, the next one sends only what is missing.
+    interrupted import, the next import sends only the data that the server lacks.
     """
     return _Import(dataset, archive, on_progress).run(begins)
 
@@ -146,12 +146,12 @@ class _Import:
                 self._send(together)
 
     def _references(self, content: str) -> set[str]:
-        """Return the revisions to which a revision refers; those of documents that the project has are left out."""
+        """Return the revisions to which a revision refers, except in documents that the project has already."""
         documents = [digest for digest in self._revision(content).parts.values() if not self._is_stored(digest)]
         return {one for digest in documents for one in contents_in(self._document(digest))}
 
     def _missing(self, contents: list[str]) -> list[str]:
-        """Return those of the revisions that the project lacks, and note that it has the others."""
+        """Ask the server which of the revisions the project lacks, and return them; record the rest in `held`."""
         missing = []
         for some in batched(contents, MOST_CONTENTS):
             request = ContentsRequest(revisions=tuple(some))
@@ -172,9 +172,10 @@ class _Import:
         return self.revisions[content]
 
     def _is_stored(self, document: str) -> bool:
-        """Return whether the project has a document, so that a reference to its home is enough.
+        """Return whether the project has a document, so that a request can refer to a revision that contains it.
 
-        If its home was not sent yet, the archive has the document, unless the home belongs to an earlier version, which
+        This is so in two cases: the project has the revision that `homes` names for the document, or the archive lacks
+        the document. In the second case, the document belongs to a version before those in the archive, all of which
         the dataset has.
         """
         member = ArchiveMember(MemberKind.DOCUMENT, document)
@@ -184,7 +185,7 @@ class _Import:
         return self.archive.tree(MemberKind.DOCUMENT, digest)
 
     def _batches(self, contents: list[str]) -> Iterator[list[str]]:
-        """Divide revisions into batches, one for each request, of limited number and size."""
+        """Divide revisions into batches, one for each request; the number and the size of revisions are limited."""
         batch: list[str] = []
         size_bytes = 0
         for content in contents:

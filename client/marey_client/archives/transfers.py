@@ -15,7 +15,7 @@ from marey_schemas.datasets.commits import Commit
 from marey_versions.archive.reading import Archive
 
 MOST_DAYS_KEPT = 7
-"""Age in days from which on files of interrupted copies are deleted."""
+"""Number of days after which files of interrupted copies are deleted."""
 
 
 class MissingCommits(NamedTuple):
@@ -50,10 +50,11 @@ def find_missing(source: DatasetReader, head: Commit, has: Callable[[str], bool]
 def fetched_versions(
     source: DatasetReader, head: Commit, bases: Sequence[str], on_progress: OnProgress
 ) -> Iterator[Archive]:
-    """Write and open an archive of the versions up to `head` and after `bases`; delete it after the `with` block.
+    """Write an archive of `head` and its ancestors, without `bases` and their ancestors; yield the opened archive.
 
-    Consents are not checked: take records are copied with their clips, so that the other server checks them.
-    If writing is interrupted, the next call continues it. If the block ends with an error, the archive stays.
+    The file is deleted after the `with` block, but kept if the block ends with an error. If the program is interrupted
+    while it writes the file, the next call continues writing. Consents are not checked here: take records are copied
+    with their clips, so that the other server checks them.
     """
     path = transfers_folder() / f"{short_name([head.digest, *bases])}.tar"
     if not path.exists():

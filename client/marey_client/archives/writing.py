@@ -153,9 +153,9 @@ class _Making:
     known: set[str] = field(default_factory=set)
     """Content digests of the revisions that the archive has, or will have."""
     documents: dict[str, PartOfContent] = field(default_factory=dict)
-    """Where the server has each document of an entry."""
+    """Addresses on the server of the documents of entries, by the digest of the document."""
     earlier: dict[str, PartOfContent] = field(default_factory=dict)
-    """Where the server has the document that was replaced by one of `documents`."""
+    """Addresses of the documents that were replaced by documents of entries, by the digest of the new document."""
 
     def run(self, head: Commit, bases: Sequence[Commit]) -> None:
         before: dict[str, Commit] = {}
@@ -175,7 +175,7 @@ class _Making:
     # -- versions ------------------------------------------------------------------------------------------------------
 
     def _history(self, head: Commit, known: Mapping[str, Commit]) -> dict[str, Commit]:
-        """Return, by digest, the commit `head`, its ancestors, and `known`; ancestors of known commits are not read."""
+        """Read the commit `head` and its ancestors, back to the commits `known`; return all of them by digest."""
         found = dict(known)
         waiting = [head.digest]
         while waiting:
@@ -210,7 +210,10 @@ class _Making:
         self.writer.add(ArchiveMember(MemberKind.COMMIT, commit.digest), canonical_json(record.document))
 
     def _note(self, entry: Entry, earlier: Entry | None) -> None:
-        """Record the revision of an entry, and where to fetch its documents; skip documents that `earlier` also has."""
+        """Record the revision of an entry, and the addresses of its documents.
+
+        Documents that the entry also has in its state `earlier` are left out.
+        """
         content = _content(entry)
         self.known.add(content)
         for part, digest in entry.parts.items():
@@ -241,7 +244,10 @@ class _Making:
     # -- content -------------------------------------------------------------------------------------------------------
 
     def _add_documents(self, wanted: Mapping[str, PartOfContent]) -> None:
-        """Add documents, given by content digest, to the archive; each follows everything that it refers to."""
+        """Add documents, given by digest, to the archive.
+
+        New revisions, arrays and files to which a document refers are added before the document.
+        """
         digests = [one for one in wanted if ArchiveMember(MemberKind.DOCUMENT, one) not in self.writer]
         total = len(digests)
         while digests:

@@ -1,1 +1,1 @@
-"""Bridges: versions of datasets as folders that other programs read, with the identity of the version."""
+"""Bridges: exports of dataset versions to folders that other programs read; some of them can be imported again."""

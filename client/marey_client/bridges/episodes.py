@@ -39,7 +39,7 @@ class ColumnStatistics:
         return cls(len(values), values.min(axis=0), values.max(axis=0), mean, squares)
 
     def merged(self, other: ColumnStatistics) -> ColumnStatistics:
-        """Return the statistics of the rows of both, after Chan, Golub and LeVeque (1979)."""
+        """Combine these statistics and `other` into those of all rows, after Chan, Golub and LeVeque (1979)."""
         count = self.count + other.count
         shift = other.mean - self.mean
         return ColumnStatistics(
@@ -52,7 +52,7 @@ class ColumnStatistics:
 
     @property
     def document(self) -> dict[str, list[float] | list[int]]:
-        """The statistics in the form of LeRobot; `std` is that of the whole, not of a sample."""
+        """The statistics in the form of LeRobot; `std` is the population standard deviation (divisor n)."""
         return {
             "min": self.low.tolist(),
             "max": self.high.tolist(),
@@ -86,7 +86,7 @@ class EpisodeTable:
         place: FilePlace,
         statistics: Mapping[str, ColumnStatistics],
     ) -> None:
-        """Add the episode whose frames begin at the index `start` of the whole, in the data file at `place`."""
+        """Add an episode; its frames are in the data file at `place`, and begin at the index `start` of the dataset."""
         row: dict[str, Any] = {
             "episode_index": number, "tasks": [task], "length": length,
             "data/chunk_index": place.chunk, "data/file_index": place.file,
@@ -120,7 +120,7 @@ class EpisodeTable:
 
 
 def episode_of(motion: Mapping[str, Any], fps: float, number: int, start: int, task: int) -> Episode:
-    """Return the rows of a clip: episode `number`, whose first frame has the index `start` in the whole."""
+    """Return the rows of a clip as episode `number`; its first frame has the index `start` in the whole dataset."""
     poses = np.asarray(motion["poses"], dtype=np.float32)
     length = len(poses)
     moved = motion.get("translations")

@@ -46,7 +46,7 @@ class ExportedVersion(NamedTuple):
     folder: Path
     clips: int
     renamed: Mapping[str, str]
-    """File of each clip whose path is no name of a file on all systems, by the path of the entry."""
+    """Names of the files of clips whose paths are not valid as file names on all systems, by the path of the entry."""
     left_out: Mapping[str, int]
     """Number of entries that are not clips, by kind."""
 
@@ -118,10 +118,10 @@ def prepare_files(
     unit: str | None = None,
     allow_expired_consent: str | None = None,
 ) -> MotionFiles:
-    """Check what an export to files needs, and read the entries of the version below `path`.
+    """Check whether a version can be exported to files, and read its entries below `path`.
 
-    Raises `CannotExport` unless files of the format can be uploaded again, each on its own; also the errors of
-    `require_free` and `version_to_export`.
+    Raises `CannotExport` unless each file of the format contains motion with its skeleton, so that it can be imported
+    again without other files; also the errors of `require_free` and `version_to_export`.
     """
     if format not in WHOLE_FORMATS:
         raise CannotExport(
@@ -144,7 +144,10 @@ def write_files(motions: MotionFiles, target: Path, on_progress: OnProgress) -> 
 
 
 def exported(version: VersionToExport, target: Path, names: Sequence[str], ending: str) -> ExportedVersion:
-    """Return the result of an export to files, given by names that are relative to the folder of the entries."""
+    """Return the result of an export to files.
+
+    `names` are the paths of the clips' files, in order, without folders that only the layout adds.
+    """
     pairs = zip((one.path for one in version.clips), names, strict=True)
     renamed = {path: name for path, name in pairs if name != path + ending}
     return ExportedVersion(version.commit, target, len(version.clips), renamed, version.left_out)

@@ -48,11 +48,12 @@ def require_free(target: Path) -> None:
 
 
 def file_names(paths: Sequence[str], ending: str, *, reserved: Sequence[str] = ()) -> list[str]:
-    """Return a file for each path of an entry, in order: the path with the ending, in names that all systems accept.
+    """Return the path of a file for each entry, in order: the path of the entry with `ending`, valid on all systems.
 
-    Characters that Windows refuses become `_`, and its names of devices get a `_`. If two files would have the same
-    name, where upper and lower case count as equal, the later one gets a number. `reserved` are names of other files in
-    the folder. Raises `CannotExport` if a path contains `.` or `..`, which would lead to other folders.
+    Characters that Windows refuses become `_`, and names of devices in Windows, such as `con`, get a `_` after them.
+    If two files would have the same name, where upper and lower case count as equal, the later one gets a number.
+    `reserved` are names of other files in the folder. Raises `CannotExport` if a path contains an empty name, `.` or
+    `..`, which would lead to other folders.
     """
     steps = [_steps(path) for path in paths]
     taken = TakenPaths()

@@ -48,7 +48,7 @@ class _Summary:
 
     licences: Counter[str | None] = field(default_factory=Counter)
     jobs: Counter[tuple[str, tuple[str, ...]] | None] = field(default_factory=Counter)
-    """Number of clips by the kind of the job that made them and the commits of its inputs; None: by no job."""
+    """Number of clips by the kind of the job that made them and the commits of its inputs; None: made by no job."""
 
     def add(self, clip: ExportedClip) -> None:
         self.licences[clip.record.licence] += 1

@@ -63,7 +63,7 @@ class CommonRig(NamedTuple):
     """Content digest of the skeleton's hierarchy."""
     joints: tuple[str, ...]
     translated: tuple[str, ...]
-    """Joints with positions of their own."""
+    """Joints that have a position in each frame, in addition to their rotation."""
     rate_hz: float
 
     @property
@@ -77,12 +77,12 @@ class CommonRig(NamedTuple):
 
     @property
     def fps(self) -> int | float:
-        """The frame rate in hertz, as a whole number if it is one but for rounding."""
+        """The frame rate in hertz, rounded to a whole number if the difference is within `RATE_TOLERANCE`."""
         whole = round(self.rate_hz)
         return whole if math.isclose(self.rate_hz, whole, rel_tol=RATE_TOLERANCE) else self.rate_hz
 
     def difference_to(self, other: CommonRig) -> str | None:
-        """Return what differs in another rig, in words; None if nothing does."""
+        """Return a text that says how another rig differs, or None if it does not differ."""
         if (self.hierarchy, self.joints) != (other.hierarchy, other.joints):
             return "another skeleton"
         if self.translated != other.translated:
@@ -100,7 +100,7 @@ def prepare_lerobot(
     path: str = "",
     allow_expired_consent: str | None = None,
 ) -> VersionToExport:
-    """Check what an export to LeRobot needs, and read the entries of the version below `path`.
+    """Check whether a version can be exported to LeRobot, and read its entries below `path`.
 
     Raises `MissingPackage` if pyarrow is not installed; also the errors of `require_free` and `version_to_export`.
     """
@@ -206,7 +206,7 @@ class _Writing:
         return [self.statistics[name]] if name in self.statistics else []
 
     def write_summary(self, meta: Path, identity: Mapping[str, Any]) -> None:
-        """Write the description of the whole, the statistics, and the table of tasks."""
+        """Write the files about the whole dataset: its description, the statistics, and the table of tasks."""
         assert self.rig is not None
         lineage = [
             {"job": kind, "commits": commits, "clips": count} for (kind, commits), count in sorted(self.made.items())

@@ -1,4 +1,4 @@
-"""Folders that an export wrote and that are imported again: names of the clips, and their take records."""
+"""Import of folders that an export wrote: the clips get their former paths, take records and tags."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReturningFolder:
-    """Folder with the sidecar of an export."""
+    """Folder that an export wrote and that is imported again, with its sidecar."""
 
     folder: Path
     sidecar: ExportedFolder

@@ -82,7 +82,7 @@ def record_cells(clip: ExportedClip) -> tuple[str, ...]:
 
 
 def read_sidecar(folder: Path) -> ExportedFolder | None:
-    """Return the sidecar of a folder, None if the folder has no file of this name.
+    """Return the sidecar of a folder, or None if the folder has no file `marey.json`.
 
     Raises `BadSidecar` if the file is not the sidecar of an export.
     """

@@ -62,7 +62,7 @@ class DescribedClip(NamedTuple):
 
 
 class _Located(NamedTuple):
-    """Clip entry with the revision of an item that has its content."""
+    """Entry of a clip, and the revision of an item that has the content of this entry."""
 
     entry: Entry
     item: str
@@ -113,12 +113,12 @@ class VersionToExport:
             ]
 
     def documents(self, entries: Sequence[Entry], part: str) -> Iterator[dict[str, Any]]:
-        """Yield the document of a part of each entry; in documents, references to revisions are content digests."""
+        """Yield the document of the given part of each entry; the documents refer to revisions by content digest."""
         places = [PartOfContent(content=_located(one).content, part=part) for one in entries]
         return read_documents(self.dataset.transport, self.dataset.project_url, places)
 
     def parts_of(self, content: str) -> Mapping[str, str]:
-        """Return the content digest of each part of a revision to which a document refers by its content digest."""
+        """Return the content digest of each part, by name, of the revision that has the content digest `content`."""
         request = ContentsRequest(revisions=(content,))
         (found,) = request_contents(self.dataset.transport, self.dataset.project_url, request)["revisions"]
         if found is None:

@@ -71,7 +71,7 @@ def login(
 
 
 def _sign_up(marey: Marey, name: str | None, days: int) -> str:
-    """Create an account with an invitation, report its project, and return a token."""
+    """Create an account with an invitation, print the user and the project, if any, and return a token."""
     from marey_schemas.invitations import SignUp
 
     url = marey.transport.url

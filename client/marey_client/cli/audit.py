@@ -97,7 +97,7 @@ def _kind(text: str | None) -> AuditKind | None:
 
 
 def _time(option: str, text: str | None) -> datetime | None:
-    """Return a time from the text of an option; without an offset, it is in UTC. Raises `WrongUsage`."""
+    """Parse the time that an option gives; a time without an offset is in UTC. Raises `WrongUsage` for other texts."""
     if text is None:
         return None
     try:

@@ -133,7 +133,7 @@ def _role(text: str) -> Role:
 
 
 def _lifetime(days: int, uses: int) -> timedelta:
-    """Return the days of an option as a duration. Raises `WrongUsage` if the days or the uses are too many."""
+    """Return the days of the option --days as a duration. Raises `WrongUsage` if --days or --uses is too large."""
     from marey_schemas.invitations import MAX_DAYS, MAX_USES
 
     for option, given, most in (("--days", days, MAX_DAYS), ("--uses", uses, MAX_USES)):

@@ -64,13 +64,14 @@ def described(graph: LineageGraph) -> Iterator[str]:
 
 
 _Branch: TypeAlias = "Iterator[str | _Branch]"
-"""Lines of a tree, and branches that follow them."""
+"""Iterator over the lines of a tree, and over branches with further lines."""
 
 
 class _LineageTree:
-    """Lineage graph as indented text: first the inputs of the start, then its results.
+    """Lineage graph as indented text: first the inputs of the revision at its start, then the results.
 
-    The inputs or results of a group of revisions are listed only the first time that the group occurs.
+    Revisions of one kind that one job created, and that the same jobs used, are listed as one group. The inputs or
+    results of a group are listed only the first time that the group occurs.
     """
 
     def __init__(self, graph: LineageGraph) -> None:

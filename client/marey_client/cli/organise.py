@@ -170,7 +170,10 @@ def restore(
 
 
 def _last_at_each_path(things: Sequence[Thing]) -> list[Thing]:
-    """Return the first of the things at each path, and report the number of the others."""
+    """Return, for each path, the item or folder that was removed last, and print how many others were left out.
+
+    Of things with the same path, the one that was removed last must come first.
+    """
     chosen: dict[str, Thing] = {}
     for one in things:
         chosen.setdefault(one.place, one)
@@ -275,7 +278,10 @@ def _with_tags(thing: Thing, added: Sequence[str], removed: Set[str]) -> ItemCha
 def _named_or_selected(
     marey: Marey, places: Sequence[str], kind: str | None, query: str | None, *, deleted: bool = False
 ) -> Sequence[Thing]:
-    """Return the folders and items at addresses, or the items that a query selects there, or deleted ones."""
+    """Return the folders and items at addresses or, with `query`, the items that it selects there.
+
+    With `deleted`, these are deleted folders and items.
+    """
     if query is not None:
         return items_selected(marey, places, query, kind, deleted=deleted)
     things = [the_thing(marey, place, kind, deleted=deleted) for place in places]

@@ -218,7 +218,7 @@ def _refused(job: Job) -> list[Mapping[str, Any]]:
 
 
 def _print_shortfalls(run: PipelineRun) -> None:
-    """Print for each step the inputs that it refused or in which it found nothing, the notes, and the commit."""
+    """Print, for each step, its refused inputs, the inputs in which it found nothing, its notes, and its commit."""
     for step, job in run.steps.items():
         if refused := _refused(job):
             print_message(f"{step} refused {counted(len(refused), 'input')}:")

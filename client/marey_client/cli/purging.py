@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from marey_schemas.purges import HeldItem, PurgeAnswer, PurgedItem, PurgeRequest
 
 MOST_SHOWN = 100
-"""Greatest number of refused items whose holders are printed."""
+"""Greatest number of refused items that are printed with what still needs them."""
 
 
 def add_to(app: typer.Typer) -> None:

@@ -200,7 +200,7 @@ def _rotate_stored_token(marey: Marey, credential: Credential, *, grace: timedel
 
 
 def _rotation_id(begun: Path, token: str) -> str:
-    """Return the id of this token's rotation from the file `begun`; if it has none, store a new id there."""
+    """Return the id of this token's rotation from the file `begun`; if the file has none, store a new id in it."""
     from marey_client.credentials import write_private
 
     prefix = token.split("_")[1] if token.count("_") > 1 else ""

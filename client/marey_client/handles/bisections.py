@@ -11,7 +11,7 @@ from marey_schemas.datasets.commits import Commit
 from marey_versions.bisection import BadCommitSearch
 
 IsBad = Callable[[Commit], bool | None]
-"""Test of a version: whether it is bad; None means that it cannot be tested."""
+"""Function that tests a version: it returns whether the version is bad, or None if it cannot be tested."""
 
 
 class VersionReader(Protocol):
@@ -33,7 +33,7 @@ class VersionRange:
     good, bad : the ends of the range
     commits : the versions that can be the first bad one, by digest: `bad` and its ancestors, without `good` and the
         ancestors of `good`
-    parents : for each of these versions, those of its parents that can lead to the first bad one
+    parents : the parents of each of these versions, by digest; only the first parent if merged versions are left out
     """
 
     good: Commit
@@ -48,7 +48,7 @@ class VersionRange:
 
     @property
     def first(self) -> Commit | None:
-        """The version that is tested first after the ends; None if the ends decide."""
+        """The version that is tested first after the two ends; None if no test between the ends is needed."""
         chosen = self.search().next()
         return None if chosen is None else self.commits[chosen]
 
@@ -120,7 +120,7 @@ def read_range(dataset: VersionReader, good: str, bad: str, *, first_parent: boo
 
 
 def bisect(among: VersionRange, is_bad: IsBad, on_step: OnStep | None = None) -> Bisection:
-    """Test the ends, then versions between them until the first bad one is found.
+    """Test both ends of a range of versions, then versions between them until the first bad one is found.
 
     Raises `CannotBisect` if the good end is not good, or if the bad end is not bad.
     """
@@ -145,7 +145,7 @@ def bisect(among: VersionRange, is_bad: IsBad, on_step: OnStep | None = None) ->
 
 
 def _plain(listed: Commit) -> Commit:
-    """Return a commit of a list without the members that only lists have."""
+    """Return a commit without the fields that commits have only in lists of commits."""
     return Commit.model_validate(listed.model_dump(include=set(Commit.model_fields)))
 
 

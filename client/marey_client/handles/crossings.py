@@ -77,7 +77,7 @@ class Crossing:
 
     Parameters
     ----------
-    search : the tests of versions, and the versions that, according to these, can be the first bad one
+    search : the tests of versions, and the versions that can be the first bad one according to the tests
     metric, limit : name of the metric, and the value that it has crossed
     measurements : values at the tested versions and at the parents of the first bad one, in the order of measuring
     changes : if there is a single first bad version, the change of the metric from each of its parents
@@ -114,7 +114,8 @@ class VersionEvaluations:
     params : options of the evaluations; each evaluation is named after the digest of its version
     path : folder of the dataset whose clips are evaluated; empty: all clips
     into : folder that receives the evaluations; None: the name of the dataset with `-bisect` at its end
-    normaliser : evaluation whose scales of features are used, given as a handle or an id; None: each fits its own
+    normaliser : evaluation, given as a handle or an id, whose scales of features are used; None: each
+        evaluation computes its own scales
 
     Raises `CannotBisect` if there is no such metric.
     """
@@ -200,9 +201,9 @@ class VersionEvaluations:
 def find_crossing(
     among: VersionRange, evaluations: VersionEvaluations, limit: Limit | None, on_measured: OnMeasured | None = None
 ) -> Crossing:
-    """Evaluate the ends, then versions between them until the first bad one is found.
+    """Evaluate both ends of a range of versions, then versions between them until the first bad one is found.
 
-    Without `limit`, it is half-way between the values at the ends. Raises `CannotBisect` if the ends cannot be
+    Without `limit`, the limit is half-way between the values at the ends. Raises `CannotBisect` if the ends cannot be
     evaluated, or if the good end is not good or the bad end not bad.
     """
     limit = _checked_limit(among, evaluations, limit)
@@ -242,7 +243,7 @@ def _end(evaluations: VersionEvaluations, commit: Commit, which: str) -> float:
 
 
 def _changes(among: VersionRange, evaluations: VersionEvaluations, first_bad: Commit) -> tuple[ParentChange, ...]:
-    """Measure the parents of the first bad version; some of them may have been taken as good without a test."""
+    """Return the change of the metric from each parent of the first bad version; evaluate untested parents."""
     after = evaluations.measure(first_bad)
     changes = []
     for digest in among.parents[first_bad.digest]:

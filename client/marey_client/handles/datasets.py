@@ -24,9 +24,9 @@ class ImportedVersion(NamedTuple):
 
     commit: Commit
     branch: str
-    """The branch that was to have the version."""
+    """The branch that was to move to the version."""
     moved: bool
-    """Whether the branch is at the version now; if not, it has other versions, and the two can be merged."""
+    """Whether the branch is at the version now; if not, the branch has other versions, and a merge can combine both."""
     tag: str | None = None
     """The tag that was copied with the version, or None."""
 
@@ -139,9 +139,9 @@ def _receive(dataset: DatasetHandle, archive: Archive, into: str, on_progress: O
 
 
 def _forward(dataset: DatasetHandle, branch: str, commit: Commit) -> ImportedVersion:
-    """Move a branch to a commit if the branch's newest commit is one of its ancestors.
+    """Move a branch to a commit if the newest commit of the branch is an ancestor of that commit.
 
-    A branch that does not exist is created. The result contains whether the branch is at the commit now.
+    A branch that does not exist is created. The result says whether the branch is at the commit now.
     """
     ref = dataset.find_ref(branch)
     if ref is None:
@@ -154,7 +154,7 @@ def _forward(dataset: DatasetHandle, branch: str, commit: Commit) -> ImportedVer
 
 
 def _fast_forward(dataset: DatasetHandle, branch: str, commit: str) -> bool:
-    """Move a branch to a commit if the commit follows the branch's newest one.
+    """Move a branch that has commits to a commit if the newest commit of the branch is an ancestor of that commit.
 
     Return whether the branch is at the commit now.
     """

@@ -173,7 +173,7 @@ def record_arrays(document: Mapping[str, Any]) -> dict[str, dict[str, NDArray[An
     positions (T, 2): root on the ground, x and z, in metres
     headings (T,): in radians
     status (T,): 0 the clip continues, 1 first row after a switch, 2 last row before a switch, 3 first row of the trial,
-        after the end of a clip, or of a new round of a loop
+        first row after the end of a clip, or first row of a new round of a loop
     match_cost, continuing_cost, pose_cost (T,): NaN at ticks without this cost
     """
     starts = document["starts"].tolist()

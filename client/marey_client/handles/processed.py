@@ -30,7 +30,10 @@ class ProcessedHandle(ItemHandle):
         return AlignmentInfo.model_validate(self.part("info", revision=revision))
 
     def time_function(self) -> NDArray[np.float64]:
-        """Return the fractional source frame of each of N canonical frames, counted at the aligned clip's rate."""
+        """Return the fractional source frame of each canonical frame, (N,).
+
+        Source frames are counted at the rate of the aligned clip.
+        """
         return self.info().time_function
 
     def source(self) -> ClipHandle | None:

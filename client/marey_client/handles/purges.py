@@ -9,7 +9,7 @@ from marey_schemas.purges import PurgeAnswer, PurgeRequest
 
 
 def purge_step_by_step(transport: Transport, project: str, request: PurgeRequest) -> Iterator[PurgeAnswer]:
-    """Yield the answer to each request of a purge; each answer is about other items than those before it."""
+    """Send as many requests as a purge needs, and yield each answer; each request continues after the last one."""
     wanted = request
     while True:
         answer = transport.post(PurgeAnswer, f"/projects/{project}/purges", wanted)
@@ -25,7 +25,7 @@ def purge_items(transport: Transport, project: str, request: PurgeRequest) -> Pu
 
 
 def combined(answers: Sequence[PurgeAnswer]) -> PurgeAnswer:
-    """Return one answer for several of them, at least one; an item that several previews name is listed once."""
+    """Combine one or several answers into one; an item that several previews contain is listed once."""
     return PurgeAnswer(
         preview=answers[0].preview,
         purged=tuple({one.item: one for answer in answers for one in answer.purged}.values()),

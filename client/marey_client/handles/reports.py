@@ -12,7 +12,7 @@ from marey_schemas.documents.reports import StoredFigure
 
 
 class ReportedHandle(ItemHandle):
-    """Handle of an evaluation or a model: an item with a verdict that may have a part `report`."""
+    """Handle of an evaluation or a model: an item that has a verdict, and may have a part `report`."""
 
     @property
     def verdict(self) -> str:

@@ -326,7 +326,7 @@ class DatasetHandle:
     def move_branch(self, name: str, to: str, *, expected_rev: int | None = None) -> Ref:
         """Move a branch to any version. No commit is deleted.
 
-        Raises `PreconditionFailed` if `expected_rev` is given and the branch has changed since.
+        Raises `PreconditionFailed` if `expected_rev` is given and is not the present `rev` of the branch.
         """
         body = as_json(RefMove(at=to))
         state = ANY_STATE if expected_rev is None else {"If-Match": f'"{expected_rev}.json"'}

@@ -25,7 +25,10 @@ if TYPE_CHECKING:
     from marey_schemas.queue.jobs import Job
 
 OPTIONS = replace(EVALUATE, without=(*EVALUATE.without, "name", "report", "trial_figures"))
-"""Options of the evaluations. Each gets the name of its version, and no report."""
+"""Options of the evaluations, except those of the name and of the report.
+
+Each evaluation is named after its version, and no report is made.
+"""
 
 
 def add_to(dataset: typer.Typer) -> None:

@@ -54,10 +54,10 @@ def parse(text: str, *, version: bool = False) -> NamedVersion:
 
 
 def imported(at: NamedVersion, made: ImportedVersion, *, server: str | None = None) -> str:
-    """Return a sentence for the user after an import, with the next command.
+    """Return a sentence about an import for the user, which ends with the command to run next.
 
-    If the branch moved to the imported version, the command checks out the branch; otherwise, it merges the version
-    into the branch. `server` is the address of the server with the dataset, if it is not the server of the command.
+    If the branch moved to the imported version, this next command checks out the branch; otherwise, it merges the
+    version into the branch. `server` is the address of the server with the dataset if another server was named for it.
     """
     name, digits = f"{at.project}/{at.dataset}", short(made.commit.digest)
     there = f" --server {server}" if server else ""

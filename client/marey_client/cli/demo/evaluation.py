@@ -23,7 +23,7 @@ OPTIONS: dict[str, Any] = {
     "speeds_m_s": (1.0, 1.5, 2.0, 2.5, 3.0),
     "turn_rates_deg_s": (-100.0, -50.0, 0.0, 50.0, 100.0),
 }
-"""Every other speed and turn rate of the published suite: 50 trials instead of 162."""
+"""Options of the evaluation: every other speed and turn rate of the published suite, 50 trials instead of 162."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def evaluate_locomotion(
     folder: Path,
     advance: Advance,
 ) -> DemoEvaluation:
-    """Evaluate those clips that are locomotion, as they are in the version, and write the report to `folder`.
+    """Evaluate those of the clips that show locomotion, with their content in `version`; write the report to `folder`.
 
     `clips` maps the paths of the version's entries to their clips; `root` is the name of their root joint. If no clip
     is locomotion, or if there is no version because there are no clips, nothing is evaluated.

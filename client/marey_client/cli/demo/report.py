@@ -49,7 +49,7 @@ class DemoReport:
 
     @property
     def refused(self) -> list[tuple[str, str]]:
-        """Refusals, each as a step and a text with the name and the reason."""
+        """Refused files and clips: for each, the step that refused it, and a text with its name and the reason."""
         imports = [("import", refusal_text(entry)) for entry in self.entries if entry.error is not None]
         result = (self.job.result if self.job else None) or {}
         retargets = [

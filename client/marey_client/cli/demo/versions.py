@@ -29,7 +29,7 @@ SHORTEST_FRAMES = 30
 
 @dataclass(frozen=True)
 class DemoVersion:
-    """Tagged version that has the results, one of them smoothed.
+    """Tagged version that contains the results of the demonstration; one of them is smoothed.
 
     `edited` is the path of the smoothed clip, and `picture` the file that shows what smoothing changed; both are None
     if all clips are too short.
@@ -56,8 +56,9 @@ def version_results(
 ) -> DemoVersion:
     """Commit the results, smooth the longest one on a branch, merge the branch, and tag the merged version.
 
-    `results` maps the paths of entries to the clips that they will contain. If the newest tag already names a version
-    with all of this, no new tag is set. A picture of what smoothing changed is written to `folder`.
+    `results` maps the paths of entries to the clips that they will contain. If the newest tag already
+    names a version with these results, no new tag is set. A picture that shows what smoothing changed is written to
+    `folder`.
     """
     dataset = _opened(project)
     smoothed = {clip.path.removeprefix(f"{EDITED}/") for clip in project.clips.list(collection=EDITED)}

@@ -29,7 +29,7 @@ MOST_SPANS = 3
 LEAST_TURN_DEG = 0.05
 LEAST_SHIFT_CM = 0.05
 THROUGHOUT = 0.95
-"""Least share of the matched frames with a change for which the text says that the whole clip changed."""
+"""Least share of the matched frames whose change must exceed the threshold for the text to say `throughout`."""
 
 
 def described(difference: Difference) -> Iterator[str]:

@@ -77,7 +77,7 @@ def download(
 
 
 class _Exported(NamedTuple):
-    """Revision of an item that is written to a file; None means the newest revision."""
+    """Item to write to a file, and the revision to write; the revision None means the newest one."""
 
     item: ItemHandle
     revision: int | None

@@ -156,7 +156,7 @@ def _columns(text: str, *, also: Sequence[str] = ()) -> list[str]:
 
 
 def _value(item: Item, column: str) -> object:
-    """Return the value of a column for an item; of a facet four digits, or None if the item does not have it."""
+    """Return the value of a column for an item; a facet is rounded to four digits, or None if the item lacks it."""
     if column.startswith(FACET_PREFIX):
         value = item.facets.get(column.removeprefix(FACET_PREFIX))
         return None if value is None else float(f"{value:.4g}")

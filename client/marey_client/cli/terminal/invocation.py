@@ -60,7 +60,7 @@ def credential_of(context: typer.Context) -> Credential:
 
 @contextmanager
 def connect_other(url: str | None, token_file: Path | None, first: Marey) -> Iterator[Marey]:
-    """Return a connection to a second server, or the connection to the first one if no other is named."""
+    """Return a connection to the server at `url`, or, without `url`, the given connection to the first server."""
     from marey_client.cli.terminal.failures import WrongUsage
     from marey_client.credentials import resolve_other
     from marey_client.errors import Unauthenticated
