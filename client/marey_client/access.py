@@ -104,7 +104,7 @@ class Tokens:
         prefix: str | None = None,
         ends_within_s: int | None = None,
     ) -> Iterator[Token]:
-        """List the tokens, without secrets: yours, or, for administrators, those of a user or of everybody.
+        """List tokens without their secrets: your own, or, as an administrator, those of `user` or of `everybody`.
 
         `prefix` selects the token whose secret begins with `marey_<prefix>_`. `ends_within_s` selects the tokens that
         expire within this number of seconds.
@@ -196,7 +196,7 @@ class FolderRoles:
         )
 
     def remove(self, folder: Collection, user: str) -> None:
-        """Remove the role of a member in a folder; the roles in the folders above it then count."""
+        """Remove the role of a member in a folder; then the roles in the folders above it apply."""
         self.transport.send("DELETE", self._url(folder, user), headers=ANY_STATE, repeatable=False)
 
     def _url(self, folder: Collection, user: str) -> str:

@@ -236,7 +236,7 @@ def write_private(path: Path, text: str) -> None:
 
 
 def _keep_owner(handle: int, path: Path) -> None:
-    """Give a new file the owner of the file that it will replace, as when root rotates the token of a service."""
+    """Give a new file the owner of the file that it will replace, such as when root rotates a service's token."""
     if os.name != "posix" or not path.exists():
         return
     before, now = path.stat(), os.fstat(handle)
@@ -245,7 +245,7 @@ def _keep_owner(handle: int, path: Path) -> None:
 
 
 def _local_token_file(url: str, environment: Mapping[str, str]) -> Path | None:
-    """Return the path of the file with the administrator's token of a server on this machine; None if not readable."""
+    """Return the path of the administrator's token file of a server on this machine; None if it cannot be read."""
     if urlsplit(url).hostname not in LOOPBACK:
         return None
     path = Path(environment.get("MAREY_DATA") or _configured_data() or DEFAULT_DATA) / ADMIN_TOKEN

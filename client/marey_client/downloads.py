@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _NOT_IN_A_NAME = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]+')
 LONGEST_NAME_BYTES = 240
-"""Greatest length of a file name; file systems allow 255, the rest is for a number."""
+"""Greatest length of a file name in bytes; file systems allow 255, so a number can still be added to the name."""
 LONGEST_ENDING = 16
 
 
@@ -63,8 +63,9 @@ class TakenPaths:
         self._lock = threading.Lock()
 
     def take(self, target: Path) -> Path:
-        """Return `target`, or a similar path that is not taken yet; upper and lower case count as equal, as on many
-        file systems.
+        """Return `target`, or the path with a number added if `target` is taken already.
+
+        Upper and lower case count as equal, as on many file systems.
         """
         with self._lock:
             free, number = target, 1
@@ -84,7 +85,7 @@ def download(
     name: str,
     beside: TakenPaths | None = None,
 ) -> Path:
-    """Download a file to `folder` under the server's name for it, or `name`; return its path.
+    """Download a file to `folder` under the name that the server gives it, by default `name`; return its path.
 
     `beside` contains the paths of files that were written before as part of the same download; if one of them has the
     same name, a number is added to the name. All other existing files of that name are replaced.

@@ -1,4 +1,4 @@
-"""Errors of the SDK. `RequestFailed` and its subclasses are answers of the server; the others arise in the client."""
+"""Errors of the SDK. `RequestFailed` and its subclasses are reported by the server; the others arise in the client."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class EarlierVersionsMissing(MareyError):
 
 
 class NothingToArchive(MareyError):
-    """Every commit that the archive would contain is to be left out."""
+    """An archive would contain no commit, because all of its commits are to be left out."""
 
 
 class CannotExport(MareyError):
@@ -74,7 +74,7 @@ class MissingPackage(MareyError):
 
 
 class CannotBisect(MareyError):
-    """No first bad version can be searched for between two versions of a dataset; the text gives the reason."""
+    """A search for the first bad version between two versions is not possible; the text gives the reason."""
 
 
 class FileChanged(MareyError):

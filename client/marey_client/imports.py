@@ -218,7 +218,7 @@ class Imports:
         return changed
 
     def run(self, files: tuple[ImportFile, ...], options: ImportOptions | None = None) -> tuple[ImportEntry, ...]:
-        """Import up to 1000 files whose bytes the server has; if the server does this in a job, wait for its end."""
+        """Import up to 1000 files whose bytes the server has; if the server imports them in a job, wait for its end."""
         given = options.model_dump(exclude_unset=True) if options else {}
         request = ImportRequest(files=files, **given)
         response = self.transport.send(

@@ -26,7 +26,7 @@ def as_inputs(places: Places[Handle]) -> tuple[ExistingInput, ...]:
 
 
 def items_at(items: Items[Handle], places: Places[Handle], *, sort: str | None = None) -> Iterator[Item]:
-    """Yield the items in one or several inputs, each at the revision that its input names, or else at its newest.
+    """Yield the items in one or several inputs, at the revisions that the inputs name; by default, at the newest ones.
 
     Items in a version of a dataset have the tags that they have in this version.
     """

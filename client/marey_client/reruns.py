@@ -20,7 +20,7 @@ Agreement = Literal["identical", "other bytes", "missing", "deleted"]
 """Comparison of an output with its repetition.
 
 `missing`: only one of the jobs has this output; `deleted`: one of the two items was deleted, so that they cannot be
-compared. Outputs of the same job that refer to each other have other bytes, because their ids differ.
+compared. An output that refers to another output of its job has other bytes, because the ids differ.
 """
 
 

@@ -241,7 +241,7 @@ class Transport:
 
 
 def _quoted(path: str) -> str:
-    """Return a path with percent-encoded names, which may contain any character."""
+    """Return a path with its names percent-encoded, because names may contain any character."""
     return quote(path, safe="/:@!$&'()*+,;=~")
 
 

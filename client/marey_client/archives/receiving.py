@@ -90,7 +90,7 @@ class _Import:
     held: set[str] = field(default_factory=set)
     """Content digests of the revisions that the project has."""
     homes: dict[str, str] = field(default_factory=dict)
-    """For the content digest of a document, the content digest of a revision with this document."""
+    """For the digest of each document: the content digest of a revision that contains the document."""
 
     def run(self, begins: str | None) -> Commit:
         require_base(self.archive, self.dataset.has)

@@ -147,7 +147,7 @@ class _Making:
     dataset: DatasetReader
     writer: ArchiveWriter
     folder: Path
-    """Folder for files on their way from the server into the archive."""
+    """Folder for files that were downloaded from the server and are not in the archive yet."""
     on_progress: OnProgress
     check: CheckContents
     known: set[str] = field(default_factory=set)
@@ -155,7 +155,7 @@ class _Making:
     documents: dict[str, PartOfContent] = field(default_factory=dict)
     """Addresses on the server of the documents of entries, by the digest of the document."""
     earlier: dict[str, PartOfContent] = field(default_factory=dict)
-    """Addresses of the documents that were replaced by documents of entries, by the digest of the new document."""
+    """For the digest of each document that replaced an earlier one: the address of that earlier document."""
 
     def run(self, head: Commit, bases: Sequence[Commit]) -> None:
         before: dict[str, Commit] = {}

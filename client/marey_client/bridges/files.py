@@ -36,7 +36,7 @@ class FileExportOptions(ExportOptions, total=False):
     format: str
     """Name of the format of the files; default: `DEFAULT_FORMAT`."""
     unit: str | None
-    """Unit of lengths in the files; None: that of the format, or `DEFAULT_UNIT` if it has several."""
+    """Unit of lengths in the files; None: the unit of the format, or `DEFAULT_UNIT` if the format has several units."""
 
 
 class ExportedVersion(NamedTuple):
@@ -53,7 +53,7 @@ class ExportedVersion(NamedTuple):
 
 @dataclass(frozen=True)
 class MotionFiles:
-    """Motion files of a version: their format and unit, and the permission to export."""
+    """Motion files of a version: their format and unit, and the reason to include clips whose consent has ended."""
 
     version: VersionToExport
     format: str
@@ -82,7 +82,7 @@ class MotionFiles:
         add: Callable[[ExportedClip], None],
         on_progress: OnProgress,
     ) -> None:
-        """Write each clip to the file below `folder` with its name, and call `add` with the clips in order."""
+        """Write the clips to the files `names` below `folder`, and call `add` with each clip, in order."""
         total, done = len(self.version.clips), 0
         with ThreadPoolExecutor(EXPORTS_AT_ONCE, thread_name_prefix="marey-export") as pool:
             for group in self.version.described(pool):

@@ -173,7 +173,7 @@ def _sorted(licences: Mapping[str | None, int]) -> Sequence[str | None]:
 
 
 def _quoted(text: str) -> str:
-    """Return a text as a YAML string in double quotes, which may have the escapes of JSON."""
+    """Return a text as a YAML string in double quotes; such strings may contain the escapes of JSON."""
     return json.dumps(text)
 
 

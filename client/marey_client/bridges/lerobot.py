@@ -52,12 +52,12 @@ CODEBASE_VERSION = "v3.0"
 NO_ACTION = "motion"
 """Task of the clips whose take record names no action."""
 RATE_TOLERANCE = 1e-4
-"""Greatest relative difference of frame rates that count as equal; files state them with few digits."""
+"""Greatest relative difference of frame rates that count as equal, because files state rates with few digits."""
 NAMES_SHOWN = 10
 
 
 class CommonRig(NamedTuple):
-    """Facts in which all clips of a LeRobotDataset must agree."""
+    """Properties that all clips of a LeRobotDataset must have in common."""
 
     hierarchy: str
     """Content digest of the skeleton's hierarchy."""
@@ -68,7 +68,7 @@ class CommonRig(NamedTuple):
 
     @property
     def names(self) -> list[str]:
-        """The names of the numbers of a state, in order."""
+        """The names of the numbers that make up a state, in order."""
         return [
             *(f"root.position.{axis}" for axis in "xyz"),
             *(f"{joint}.rotation.{axis}" for joint in self.joints for axis in "wxyz"),
@@ -251,7 +251,7 @@ def _info(rig: CommonRig) -> dict[str, Any]:
 
 
 def _write_tasks(path: Path, tasks: Mapping[str, int]) -> None:
-    """Write the table of tasks, whose index in pandas is the text of the task, as LeRobot reads it."""
+    """Write the table of tasks as LeRobot reads it: with pandas, where the text of a task is the index."""
     pyarrow = import_pyarrow()
     columns = [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}

@@ -19,7 +19,7 @@ COMPRESSION = "zstd"
 
 
 class FilePlace(NamedTuple):
-    """Numbers of a file: the folder `chunk-...`, and the file in it."""
+    """Two numbers that identify a file: that of its folder `chunk-...`, and that of the file in this folder."""
 
     chunk: int
     file: int

@@ -51,7 +51,7 @@ class ExportOptions(TypedDict, total=False):
     path: str
     """Folder of entries to which the export is limited; default: all entries."""
     allow_expired_consent: str | None
-    """Reason why clips are exported although their consent has ended; None: they are refused."""
+    """Reason why clips are exported although their consent has ended; None: such clips are refused."""
 
 
 class DescribedClip(NamedTuple):

@@ -331,7 +331,7 @@ def _print_preview(shown: EditPreview, piece: int) -> None:
 
 
 def _finding(finding: dict[str, Any]) -> str:
-    """Return the finding of a command as one line, with segments as ranges of frames."""
+    """Return what a command reported about a clip as one line of text, with segments as ranges of frames."""
     figures = []
     for name, value in finding.items():
         if name == "segments":

@@ -243,7 +243,7 @@ def print_steps(run: PipelineRun, as_json: bool) -> None:
 
 @contextmanager
 def _live_table() -> Iterator[Callable[[Mapping[str, Job]], None]]:
-    """Yield a function that shows a table of jobs on standard error, or nothing if that is not a terminal."""
+    """Yield a function that shows a table of jobs on standard error; without a terminal, the function does nothing."""
     if not sys.stderr.isatty():
         yield lambda _steps: None
         return

@@ -164,7 +164,7 @@ def _is_folder(project: ProjectHandle, address: Address) -> bool:
 
 
 def _report(project: str, answer: PurgeAnswer, as_json: bool) -> None:
-    """Print what was purged or would be, and what was refused. Raises `Refused` if an item was refused."""
+    """Print which items were, or would be, purged or refused. Raises `Refused` if an item was refused."""
     if as_json:
         print_json(answer)
     elif answer.preview and answer.purged:

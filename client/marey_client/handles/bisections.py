@@ -76,8 +76,8 @@ class Bisection:
     Parameters
     ----------
     range : the versions among which the first bad one was searched for
-    suspects : the first bad version. If some versions could not be tested, there may be several suspects: all versions
-        that can be the first bad one; only the last of them was tested and is bad
+    suspects : the first bad version; or, if some versions could not be tested, all versions that can be the first bad
+        one: the last of these was tested and is bad, and the others were not tested
     tests : all tests in their order; the first two are those of the ends
     """
 

@@ -32,7 +32,7 @@ class Limit:
     above: bool = True
 
     def exceeded_by(self, value: float) -> bool:
-        """Return whether a value is bad."""
+        """Return whether a value is bad: above the limit, or below it if `above` is false."""
         return value > self.value if self.above else value < self.value
 
     def __str__(self) -> str:
@@ -95,7 +95,7 @@ class Crossing:
         return self.search.first_bad
 
     def value(self, commit: Commit) -> float | None:
-        """Return the value of the metric at a version; None if it was not measured or cannot be."""
+        """Return the value of the metric at a version; None if the version was not or cannot be evaluated."""
         return next((one.value for one in self.measurements if one.commit.digest == commit.digest), None)
 
 
@@ -256,7 +256,7 @@ def _changes(among: VersionRange, evaluations: VersionEvaluations, first_bad: Co
 def change_interval(
     before: Iterable[Mapping[str, Any]], after: Iterable[Mapping[str, Any]], metric: str
 ) -> tuple[float, float] | None:
-    """Compute the bounds of the mean change of a metric over the trials that both evaluations define.
+    """Compute the bounds of the mean change of a metric over the trials for which both evaluations have a value.
 
     Parameters
     ----------

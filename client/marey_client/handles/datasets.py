@@ -154,9 +154,9 @@ def _forward(dataset: DatasetHandle, branch: str, commit: Commit) -> ImportedVer
 
 
 def _fast_forward(dataset: DatasetHandle, branch: str, commit: str) -> bool:
-    """Move a branch that has commits to a commit if the newest commit of the branch is an ancestor of that commit.
+    """Move a branch to a commit if the newest commit of the branch is an ancestor of that commit.
 
-    Return whether the branch is at the commit now.
+    The branch must have a commit already. Returns whether the branch is at the given commit now.
     """
     if dataset.at(branch).digest == commit:
         return True

@@ -1,4 +1,4 @@
-"""Invitations to a project, and of people who have no account."""
+"""Invitations of users to a project, and of people who have no account to a server."""
 
 from __future__ import annotations
 

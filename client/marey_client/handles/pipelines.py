@@ -72,7 +72,7 @@ class PipelineRun:
         return self._jobs.outputs(self._steps[step].id)
 
     def cancel(self) -> Mapping[str, Job]:
-        """Cancel every job that has not ended, the last ones first, so that none fails because of another."""
+        """Cancel every job that has not ended, the last ones first, so that none fails because its input is missing."""
         for job in reversed(self.refresh().values()):
             if not job.state.terminal:
                 with suppress(Conflict):  # it has ended since

@@ -56,8 +56,8 @@ class PickOptions(TypedDict, total=False):
 class DatasetHandle:
     """Handle of a dataset; requests are sent only by its methods.
 
-    A version is the name of a branch or a tag, or the digest of a commit, of which the first 8 digits are enough. With
-    `~n` at its end, it is the version n commits earlier.
+    A version is the name of a branch or a tag, or the digest of a commit, of which the first 8 digits are enough. Each
+    of these with `~n` at its end is the version n commits earlier.
     """
 
     transport: Transport
@@ -96,7 +96,7 @@ class DatasetHandle:
         changes: Sequence[EntryChange] | None = None,
         expected: str | None = None,
     ) -> Commit:
-        """Record a new version: the content of the dataset's folder, or the newest version with `changes`.
+        """Record a new version: the content of the dataset's folder, or the newest version after the given `changes`.
 
         If the answer is lost, the request is sent again and returns the commit that was made the first time. Raises
         `Conflict` if `expected` is given and is not the newest commit of the branch.
@@ -258,8 +258,8 @@ class DatasetHandle:
 
         The files have the paths of their entries. The sidecar `marey.json` names the version and the origin of each
         clip, so that an upload of the folder restores paths and take records. The folder exists only when it is
-        complete. Raises `FolderNotEmpty` if it exists already, `CannotExport` if the version has no clips or a path is
-        no name of a file, and `Conflict` if the consent for a clip has ended, as `archive` does.
+        complete. Raises `FolderNotEmpty` if it exists already, `CannotExport` if the version has no clips or a path
+        cannot be a file name, and `Conflict` if the consent for a clip has ended, as `archive` does.
         """
         from marey_client.bridges.files import prepare_files, write_files
 

@@ -42,7 +42,7 @@ class NamedVersion(NamedTuple):
 def parse(text: str, *, version: bool = False) -> NamedVersion:
     """Parse `project/dataset` or `project/dataset@version`; without a version, the result names `main`.
 
-    Raises `WrongUsage` for other texts, and for a version if the command takes none, which is the default.
+    Raises `WrongUsage` for other texts. Unless `version` is true, a text that names a version is refused, too.
     """
     place, at, named = text.partition("@")
     project, _, name = place.strip("/").partition("/")

@@ -44,7 +44,7 @@ class DemoEvaluation:
 
     @property
     def selection(self) -> str:
-        """The evaluated clips, and the reason for the choice."""
+        """A text that says which of the clips were evaluated, and by which rule they were chosen."""
         return (
             f"of {self.clips} retargeted clips: those whose root moves at least {TRAVEL_M:g} m within "
             f"{TRAVEL_WINDOW_S:g} s from at least half of the frames"

@@ -38,7 +38,7 @@ SHEET_TAKES = 8
 
 
 def demonstrate(motion: Path | None, *, data: Path, keep_serving: bool, as_json: bool) -> None:
-    """Run the demonstration; repeated with the same `data`, it reuses the earlier results."""
+    """Run the demonstration; a second run with the same folder `data` uses the results of the first run again."""
     os.environ.setdefault("MAREY_LOG_LEVEL", "warning")
     with embedded.server_in_thread(data, workers=1) as url, Marey(url, read_secret(data / ADMIN_TOKEN)) as marey:
         files = find_files([motion]) if motion else _generated_takes(data / "generated")
@@ -142,7 +142,7 @@ class Story:
     def _contact_sheet(self, pairs: Sequence[tuple[ClipHandle, ClipHandle]], total: int) -> Path | None:
         """Draw pairs of source and result side by side; return the path of the image, or None if there are no pairs.
 
-        `total` is the number of pairs from which these were chosen.
+        `total` is the number of all pairs, from which `pairs` were chosen.
         """
         if not pairs:
             return None

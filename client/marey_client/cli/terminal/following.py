@@ -94,9 +94,9 @@ def follow(
 ) -> Job | None:
     """Wait until a job has ended, and show a progress bar.
 
-    The progress of a job with tasks is counted in tasks; if `count` is given, it is scaled to `count` units, which
-    `unit` names. Without `wait`, print the job's id and return None. Raises `JobUnsuccessful` if the job did not
-    succeed.
+    The progress of a job with tasks is counted in tasks; if `count` is given, the progress is scaled to `count`
+    units with the name `unit`. Without `wait`, print the job's id and return None. Raises `JobUnsuccessful` if the job
+    did not succeed.
     """
     if not wait:
         print_json(submitted) if as_json else typer.echo(submitted.id)

@@ -86,7 +86,7 @@ Advance = Callable[[str, float, float | None], None]
 
 @contextmanager
 def progress() -> Iterator[Advance]:
-    """Show a progress bar during the `with` block if standard error is a terminal; yield a function that moves it."""
+    """Show a progress bar during the `with` block if standard error is a terminal; yield a function that updates it."""
     if not sys.stderr.isatty():
         yield lambda _what, _done, _total: None
         return

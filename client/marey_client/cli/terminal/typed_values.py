@@ -24,7 +24,7 @@ MOST_VALUES = 200
 """Greatest number of values in a range if the schema sets no limit."""
 EVEN = 1e-9
 GREATEST_SHOWN_BOUND = 1e15
-"""Larger bounds are the limits of machine integers; they are not shown."""
+"""Bounds of numbers are shown only below this value; larger bounds are the limits of machine integers."""
 
 
 # -- schemas --
