@@ -103,9 +103,10 @@ class Marey:
         return self.project(self.transport.post(Project, "/projects", project).name)
 
     def audit(self, **conditions: Unpack[AuditConditions]) -> Iterator[AuditEntry]:
-        """List changes of users, tokens and access, and deletions, of all projects, newest first.
+        """List the audit log of the server, newest entries first.
 
-        Only administrators may read this log. `AuditConditions` describes the conditions.
+        The log records changes of users, tokens and access, and deletions, in all projects. Only administrators may
+        read it. `AuditConditions` describes the conditions.
         """
         return read_audit(self.transport, "/audit", **conditions)
 

@@ -126,7 +126,7 @@ class ConstraintError(Answer):
 
 
 class FoundStep(Answer):
-    """Motion that the search found for one step of the request."""
+    """Motion that a search found for one step of its request, as a model and a latent vector."""
 
     model: RevisionRef
     tree: Literal["stored", "drawn"] = Field(

@@ -57,11 +57,15 @@ def _of_sides(before: bool, after: bool) -> ChangeKind:
 
 
 def compare_entries(changes: Iterable[Changed]) -> list[ComparedEntry]:
-    """Return the differing entries of two versions by path, with removed and added entries paired as moved.
+    """Return the entries that differ between two versions, sorted by path; moved entries are recognised.
 
-    A removed and an added entry of the same kind are paired if all their parts are equal, or else if one part is equal.
-    If there are several possible pairs, the order of the paths decides. An entry of which all parts changed counts as
-    removed and added if another entry has the old or the new parts, as when two entries exchanged their names.
+    An entry consists of parts, such as `motion` and `info`. A removed and an added entry of the same kind count as one
+    moved entry if all their parts are equal. Entries that remain count as moved if one part is equal. If there are
+    several possible pairs, the order of the paths decides.
+
+    An entry of which all parts changed usually counts as changed. But if another differing entry now has all its old
+    parts, or had all its new parts, it is divided into a removed and an added entry, which are paired as above. So two
+    entries that exchanged their names count as moved.
     """
     compared = [
         ComparedEntry(*(None if value is None else entry_of(one.key, value) for value in (one.before, one.after)))

@@ -19,7 +19,7 @@ COMPRESSION = "zstd"
 
 
 class FilePlace(NamedTuple):
-    """Two numbers that identify a file: that of its folder `chunk-...`, and that of the file in this folder."""
+    """Two numbers that identify a file: the number of its folder `chunk-...`, and its number in this folder."""
 
     chunk: int
     file: int
@@ -67,12 +67,12 @@ class ParquetFiles:
         return self
 
     def place_for(self, size_bytes: int) -> FilePlace:
-        """Return the place of the file to which a table with this size will be added."""
+        """Return the numbers of the file to which a table with this size would be added."""
         full = self._bytes > 0 and self._bytes + size_bytes > self._most_bytes
         return self._place.following if full else self._place
 
     def add(self, table: pa.Table) -> FilePlace:
-        """Write a table as one row group; return the place of its file."""
+        """Write a table as one row group; return the numbers of the file that now contains it."""
         size_bytes: int = table.nbytes
         place = self.place_for(size_bytes)
         if place != self._place:

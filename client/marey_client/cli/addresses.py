@@ -250,9 +250,9 @@ def items_selected(
 ) -> list[SingleItem]:
     """Return the items of a kind, by default clips, that a query selects in projects or folders and their subfolders.
 
-    The items of each place are sorted by path; an item in several places is returned once. With `deleted`, deleted
-    items are selected, also in deleted folders; of several with the same path, the one that was deleted last comes
-    first.
+    The items of each place are sorted by path; an item in several places is returned once. With `deleted`, only deleted
+    items are selected, including those in deleted folders. If several deleted items have the same path, the one that
+    was deleted last comes first.
 
     Raises `WrongUsage` if a place is not a project or folder, or if the query selects nothing.
     """

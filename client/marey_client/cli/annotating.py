@@ -73,7 +73,8 @@ def create(
     clip: Annotated[str, typer.Argument(help="The clip: project/folder/name, or project/id.")],
     layer: Annotated[str, typer.Option(help="Name of the annotation layer, such as steps.")] = "default",
     name: Annotated[
-        str | None, typer.Option(help="Name of the annotation; default: the names of the clip and the layer.")
+        str | None,
+        typer.Option(help="Name of the annotation; default: name of the clip, space, name of the layer."),
     ] = None,
     segment: Annotated[list[str] | None, typer.Option(help="Segment as label=first:end; may be repeated.")] = None,
     keyframe: Annotated[list[str] | None, typer.Option(help="Keyframe as label=frame; may be repeated.")] = None,
@@ -219,7 +220,8 @@ def import_annotation(
     file: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="A JSON file of Marey's predecessor.")],
     layer: Annotated[str, typer.Option(help="Name of the annotation layer, such as steps.")] = "imported",
     name: Annotated[
-        str | None, typer.Option(help="Name of the annotation; default: the names of the clip and the layer.")
+        str | None,
+        typer.Option(help="Name of the annotation; default: name of the clip, space, name of the layer."),
     ] = None,
     end_index: Annotated[
         EndIndex,

@@ -63,31 +63,35 @@ def search(
     at: Annotated[
         Many,
         typer.Option(
-            help="Put a joint at a position in metres: WHEN:JOINT=x,y,z, such as end:left_wrist=0.2,_,1; _ leaves a "
-            "coordinate free."
+            help="Require a position of a joint, in metres: WHEN:JOINT=x,y,z, such as end:left_wrist=0.2,_,1; _ leaves "
+            "a coordinate free."
         ),
     ] = None,
     turned: Annotated[
-        Many, typer.Option(help="Give a joint a rotation in the world: WHEN:JOINT=w,x,y,z, such as end:head=1,0,0,0.")
+        Many, typer.Option(help="Require a global rotation of a joint: WHEN:JOINT=w,x,y,z, such as end:head=1,0,0,0.")
     ] = None,
     look: Annotated[
         Many,
         typer.Option(
-            help="Point a joint's z axis in a direction of the world: WHEN:JOINT=x,y,z, such as start:head=0,0,1."
+            help="Require a direction of a joint's z axis, in world coordinates: WHEN:JOINT=x,y,z, such as "
+            "start:head=0,0,1. WHEN is start, end, a keyframe or a canonical frame."
         ),
     ] = None,
     look_at: Annotated[
         Many,
-        typer.Option(help="Point a joint's z axis at a position in metres: WHEN:JOINT=x,y,z, such as end:head=0,1,3."),
+        typer.Option(
+            help="Require that a joint's z axis points at a position, in metres: WHEN:JOINT=x,y,z, such as "
+            "end:head=0,1,3."
+        ),
     ] = None,
     stand: Annotated[
-        Many, typer.Option(help="Put the body at a position on the ground: WHEN=x,z in metres, such as end=0,1.5.")
+        Many, typer.Option(help="Require a position of the body on the ground: WHEN=x,z in metres, such as end=0,1.5.")
     ] = None,
     face: Annotated[
         Many,
-        typer.Option(help="Turn the body to a heading: WHEN=degrees from +z, positive to the left, such as end=90."),
+        typer.Option(help="Require a heading of the body: WHEN=degrees from +z, positive to the left, such as end=90."),
     ] = None,
-    time: Annotated[Many, typer.Option(help="Set the time of a keyframe in seconds: KEYFRAME=seconds.")] = None,
+    time: Annotated[Many, typer.Option(help="Require a time of a keyframe, in seconds: KEYFRAME=seconds.")] = None,
     start: Annotated[str | None, typer.Option(help="Position and heading of the motion's start: x,z,degrees.")] = None,
     tolerance_cm: Annotated[
         float | None, typer.Option(help="Tolerance of positions, in centimetres; default: 1.")

@@ -38,7 +38,10 @@ def create_token(
     name: Annotated[str, typer.Argument(help="Purpose of the token, for your own reference.")],
     scope: Annotated[
         list[str] | None,
-        typer.Option(help="Scope: read, write, jobs, work or admin; for one project only, as in read!project=lab."),
+        typer.Option(
+            help="Scope: read, write, jobs, work or admin. To limit a scope to one project, append !project= and the "
+            "name of the project, as in read!project=lab."
+        ),
     ] = None,
     days: Annotated[
         int | None,

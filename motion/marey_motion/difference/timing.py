@@ -49,11 +49,11 @@ class Pace(NamedTuple):
     phase: float = 0.0
 
     def places(self, samples: AnyInts | Floats) -> Floats:
-        """Return the places of samples in the old clip.
+        """Compute the frames of the old clip at which samples are taken.
 
         Parameters
         ----------
-        samples : (n,)    numbers of samples, from 0
+        samples : (n,)    numbers of the samples, counted from 0
 
         Returns
         -------

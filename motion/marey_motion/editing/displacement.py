@@ -135,10 +135,11 @@ def _check_windows(frames: AnyInts, windows: Sequence[Window]) -> None:
 
 
 def spread_displacements(frames: AnyInts, values: Floats, window: Window) -> Floats:
-    """Compute the displacement curve of a window through values at some frames.
+    """Compute a curve of displacements over the frames of a window; at some frames, its values are given.
 
-    The curve is a sum: the curve of least bending through the smoothed values, and a curve under high tension through
-    the differences between the values and their smoothed version.
+    The curve is the sum of two curves. The first passes through the smoothed values, and bends least. The second passes
+    through the differences between the values and the smoothed values. It has a high tension, so that it hardly
+    extends beyond the given frames. So noise in the values is not continued into the rest of the window.
 
     Parameters
     ----------

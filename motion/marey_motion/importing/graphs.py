@@ -39,9 +39,10 @@ Its arguments are the name and a collection, or None for the whole project.
 
 
 def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
-    """Make the item of a graph, in which each node refers to the model with the node's name.
+    """Make the item of an imported graph of models, in which each node refers to a model of the project.
 
-    A model in the collection of the graph is preferred to models in other collections.
+    The model of a node is the one with the node's name. A model in the collection of the graph is preferred to models
+    in other collections.
 
     Parameters
     ----------

@@ -253,7 +253,10 @@ def _advance(playback, rules, row, offsets, root):  # type: ignore[no-untyped-de
 
 @compiled
 def _hold(rules, wish, when, root):  # type: ignore[no-untyped-def]
-    """Pull `root` (x, z, heading) towards the desired path at `when` ticks, and limit its distance from the path."""
+    """Pull `root` (x, z, heading) towards a place on the desired path, and limit its distance from this place.
+
+    The place is the one that the path reaches after `when` ticks; the limit is `rules.clamp_m`, in metres.
+    """
     x, z, heading = _wished(wish, when)
     turn = heading - root[2]
     root[0] += rules.pull * (x - root[0])

@@ -183,7 +183,7 @@ class _Fitting:
             if single is None or held_out is None or held_out.mean() > single.mean():
                 return count, held_out
             candidates[count] = replace(candidate, refusal="held-out")
-        raise ModelError("the list of possible numbers of components must contain 1")
+        raise ModelError("no mixture can be chosen, because a mixture with 1 component was not tried")
 
     def _held_out(self, count: int) -> Floats | None:
         """Compute ln p of each example under a mixture of `count` components fitted without the example's fold; (n,).

@@ -260,9 +260,9 @@ class MotionPrimitive:
         return np.asarray(self.time_functions(latents)[:, -1] / self.frame_rate_hz)
 
     def motions(self, latents: Floats) -> list[Motion]:
-        """Compute motions in real time.
+        """Compute the motions that latent vectors describe, with their durations and their changes of speed.
 
-        The duration of each is rounded to a whole number of frames.
+        The duration of each motion is rounded to a whole number of frames.
 
         Parameters
         ----------

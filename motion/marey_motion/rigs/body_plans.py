@@ -167,10 +167,11 @@ def _worth(tree: BoneTree, pair: LimbPair, places: tuple[int, int, int], build: 
 
 
 def _worth_of_joints_between(tree: BoneTree, pair: LimbPair, start: int, stop: int) -> float:
-    """Score the extra joints between the ends of a long bone.
+    """Score the extra joints between the ends of a long bone: 0 without such joints, otherwise negative.
 
-    Twist joints that divide a straight bone evenly cost least, joints that bend it cost most. Joints at the position of
-    their parent are not counted.
+    Each joint lowers the score: by the least amount if the joints divide a straight bone evenly, as twist joints do, by
+    more if they divide a straight bone unevenly, and by the most if they bend the bone. Joints at the position of their
+    parent are not counted.
     """
     count = sum(bone > SHORTEST_BONE_M for bone in pair.bones[start:stop]) - 1
     if count < 1:

@@ -18,10 +18,11 @@ Names = str | tuple[str, ...]
 class KnownRig:
     """Names of one rig's joints; if a joint has several alternative names, the first that is found is used.
 
-    `signature` distinguishes rigs that use the same names for the body: it lists names of further joints, or a prefix
-    of most names, written "prefix*". More than half of the signature must be found. `everyday` marks names that are
-    everyday words and belong to no particular tool; they are chosen only if they match more essential joints than the
-    names of every tool.
+    Several rigs use the same names for the joints of the body; `signature` distinguishes these rigs. It lists names of
+    further joints, or a prefix of most names, written "prefix*". More than half of the signature must be found.
+
+    `everyday` is true if the names are everyday words and belong to no particular tool. Such names are chosen only if
+    they match more essential joints than the names of any tool.
     """
 
     name: str
@@ -81,9 +82,10 @@ def _finger_roots(pattern: str, fingers: tuple[str, ...]) -> dict[str, Names]:
 
 
 def _everyday_fingers() -> dict[str, Names]:
-    """Build templates for the joints of fingers in common words.
+    """Build templates for the names of finger joints, from everyday words for fingers such as "Index".
 
-    The joints are numbered (Index1, HandIndex1, Index01), or named by bones (IndexProximal) as in Unity and VRM.
+    A word is followed by a number (Index1, HandIndex1, Index01), or by the name of a bone, as in Unity and VRM
+    (IndexProximal). In each template, "{}" represents the side of the body.
     """
     bones = {"base": ("1", "Proximal"), "mid": ("2", "Intermediate", "Medial"), "tip": ("3", "Distal")}
     thumb = {"base": ("1", "Metacarpal", "Proximal"), "mid": ("2", "Intermediate"), "tip": ("3", "Distal")}

@@ -73,9 +73,9 @@ class ClipAnnotations(Resource):
         in_folders=True,
     )
     async def post(self, project: str, kind: str, item: str, body: AnnotationImport) -> Rendered:
-        """Create an annotation of a clip (kind `clips`) from a document of Marey's predecessor.
+        """Create an annotation of a clip from a document of Marey's predecessor.
 
-        The annotation is created in the clip's folder.
+        The path parameter `kind` must be `clips`. The annotation is created in the clip's folder.
         """
         if kind_of(kind) is not Kind.CLIP:
             raise NotFoundProblem(f"Only clips can be annotated, not items of the kind {kind}.", code="no-annotations")

@@ -20,10 +20,10 @@ class EditPreviewResource(Resource):
 
     @reads(access=Access.READER, body=EditPreviewRequest, answer=Document)
     async def post(self, project: str, kind: str, item: str, body: EditPreviewRequest) -> Reply:
-        """Return some frames of the result of commands on a clip (kind `clips`); nothing is stored.
+        """Apply commands to a clip, and return some frames of the result; nothing is stored.
 
-        The whole edit is computed, so the frames equal those that a job of the kind `edit` would store. Edits that
-        would take longer than some seconds are refused with 413.
+        The path parameter `kind` must be `clips`. The whole edit is computed, so the frames equal those that a job of
+        the kind `edit` would store. Edits that would take longer than some seconds are refused with 413.
         """
         source = await self.look_up(previewing.read_preview, project, kind_of(kind), item, body)
         order = partial(previewing.preview_order, source, body, self.media.encoding)

@@ -77,7 +77,7 @@ class BeginOrder(Message):
     measured: bytes | None
 
     def given(self) -> Given:
-        """Return the documents that the stream refers to, decoded."""
+        """Return the skeleton and the evaluation of the new stream; the part `evaluation` is decoded."""
         return Given(
             self.skeleton, self.rig, self.evaluation, None if self.measured is None else unpack_tree(self.measured)
         )
@@ -166,9 +166,10 @@ def look_order(stream: Stream) -> bytes:
 
 
 def next_frames(held: Stream, frames: CoverageFrames) -> NextFrames | Tree:
-    """Return the message that adds the frames of a request, or the stored answer to a repeated request.
+    """Return the message that asks a child process to add the frames of a request to a stream.
 
-    Raises `CoverageOffset` if the frames do not start at the stream's offset.
+    If the request repeats the last one, the stored answer is returned instead. Raises `CoverageOffset` if the frames do
+    not start at the stream's offset.
     """
     digest = _digest_of(frames)
     if (answer := answered_before(held, digest)) is not None:

@@ -124,10 +124,10 @@ def _find(tx: Transaction, project: str, item_id: str) -> FoundSearchable:
 
 
 def usable_searchables(models: SearchedModels, seed: int, most_work: float) -> list[Searchable]:
-    """Return the model of each step, parsed or from the cache.
+    """Return the model for each step of a search request, with a tree of samples that can be searched.
 
-    Some models have no stored tree, so samples are drawn to build one. Raises `TooLargeProblem` if that would take too
-    long for all these models together.
+    The models are parsed, or taken from the cache. For a model without a stored tree, samples are drawn, and a tree is
+    built from them. Raises `TooLargeProblem` if drawing the samples for all models of the request would take too long.
     """
     usable: dict[str, Searchable] = {}
     for one in models.found:

@@ -148,7 +148,7 @@ class DatabaseBlobs:
 
     def adopt(self, copy: Path, digest: str) -> None:
         """Raise `AssertionError`: this backing makes no copies."""
-        raise AssertionError(f"got the copy {copy} of the blob {digest}, but a database needs no copies of uploads")
+        raise AssertionError(f"blobs in a database use no files, but the server made the file {copy} for {digest}")
 
     def check_writable(self) -> None:
         """Do nothing: the server checks the database separately."""

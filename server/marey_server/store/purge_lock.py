@@ -66,9 +66,11 @@ def require_no_purge_since(tx: Transaction, project_id: str, last: int) -> None:
 
 
 def begin_purge(tx: Transaction, project_id: str) -> int:
-    """Wait for the writes that hold off purges, let no other begin, and return the time of this purge.
+    """Lock a project for a purge until the transaction ends, and return the time of the purge in microseconds.
 
-    Each purge of a project has a later time than the one before it.
+    The call first waits until the running writes that hold off purges of the project (`hold_off_purges`) have ended.
+    While the project is locked, later writes of this kind, and other purges of the project, wait. Each purge of a
+    project has a later time than the purge before it.
     """
     tx.lock(f"purge:{project_id}")
     return max(tx.now_us, last_purge(tx, project_id) + 1)

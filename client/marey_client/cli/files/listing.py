@@ -242,7 +242,13 @@ def _items_in(
 def show(
     context: typer.Context,
     place: Annotated[str, typer.Argument(help="The item: project/folder/name[@revision], or project/id[@revision].")],
-    part: Annotated[str | None, typer.Option(help="Print only the document of this part, as JSON.")] = None,
+    part: Annotated[
+        str | None,
+        typer.Option(
+            help="Print only one part of the item, as JSON, such as motion or info of a clip; without this option, "
+            "marey show lists the parts."
+        ),
+    ] = None,
     history: Annotated[bool, typer.Option("--history", help="Show every revision and its inputs.")] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -26,12 +26,15 @@ ProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class NearDuplicate:
-    """Two source clips with nearly the same motion; if `mirrored`, one is nearly the mirror image of the other.
+    """Pair of source clips with nearly the same motion, or with motions that are nearly mirror images.
 
     Parameters
     ----------
-    distance_cm : distance per frame, centimetres
-    same_content : whether the sources are the same frames of equal documents
+    first, second : uids of the source clips
+    first_name, second_name : names of the clips
+    distance_cm : distance of the two motions per frame, as in the description of the module, but in centimetres
+    same_content : whether both are the same frames of clips with equal content
+    mirrored : whether the first motion is nearly the mirror image of the second
     """
 
     first: str

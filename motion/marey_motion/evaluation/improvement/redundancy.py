@@ -37,13 +37,13 @@ class Removal:
 
 @dataclass(frozen=True)
 class PlannedRemoval:
-    """One step of a plan: a removal after all earlier ones, and its result.
+    """One step of a plan: the removal of one more source of clips from the data set, and its result.
 
     Parameters
     ----------
-    removal : the removal, measured against the step before
+    removal : the removed source, and the effect of its removal compared with the state after the previous step
     metrics : headline metrics of the suite after this step
-    seconds_left : seconds of data left
+    seconds_left : seconds of data that are left after this step
     """
 
     removal: Removal

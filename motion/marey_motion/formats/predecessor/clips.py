@@ -185,7 +185,9 @@ def _fill_motion(source: SourceMotion, names: list[str], poses: NDArray[np.float
     unknown = next((name for name in names if name not in indices), None)
     if unknown is not None:
         raise FormatError(
-            "the skeleton has no joint of this name; it may not be the skeleton of this clip", file=file, joint=unknown
+            "the skeleton has no joint of this name; check that it is the skeleton of this clip",
+            file=file,
+            joint=unknown,
         )
     given = poses[:, 3:].reshape(len(poses), len(names), 4) * MIRROR_ROTATION
     rotations = np.tile(source.rest_rotations, (len(poses), 1, 1))

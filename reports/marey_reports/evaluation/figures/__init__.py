@@ -43,7 +43,7 @@ class FigureKind(NamedTuple):
 
     Parameters
     ----------
-    number : number of the figure in the paper, or "" if the paper does not have it
+    number : number of the figure in Abichequer Sangalli et al. (2022), or "" if that paper does not have the figure
     trials : "one" if it shows one trial, "any" if it shows the suite or one trial, "none" if it always shows the suite
     families : families of trials that it can show
     draw : function that draws the figure for one or two subjects

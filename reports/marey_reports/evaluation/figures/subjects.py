@@ -109,10 +109,11 @@ def find_record(subject: Subject, name: str) -> TrialRecord:
 
 
 def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequence[Family]) -> Trial:
-    """Choose a trial that all subjects have; if `name` is given, the trial must have this name.
+    """Choose the trial that a figure shows; every evaluation in the figure (subject) must have this trial.
 
-    The families are tried in their order, up to the first that contains such trials. Of these trials, the one that the
-    first subject follows worst is chosen. Raises `MotionError` if the subjects have no such trial in common.
+    If `name` is given, the trial must have this name. `families` are kinds of trials in the order of preference: the
+    first family with a possible trial is used. Of several possible trials in this family, the one in which the first
+    subject deviates most from the desired motion is chosen. Raises `MotionError` if no trial is possible.
     """
     known = [{each.trial.name for each in subject.result.trials} for subject in subjects]
     shared = [each for each in subjects[0].result.trials if all(each.trial.name in names for names in known)]

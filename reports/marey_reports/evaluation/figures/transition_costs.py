@@ -1,4 +1,4 @@
-"""Figure 7: costs of transitions during a trial, below the speeds."""
+"""Figure 7: speeds during a trial in the upper panel, and costs of transitions in the lower panel."""
 
 from __future__ import annotations
 

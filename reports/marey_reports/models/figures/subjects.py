@@ -94,7 +94,7 @@ class ModelSubject:
         return np.asarray(self.primitive.poses(np.zeros((1, self.primitive.dimensions)))[0], dtype=np.float64)
 
     def points(self, poses: Floats) -> Floats:
-        """Compute positions (..., P, 3) of joints, then end sites, of poses (..., 3 + 4·J), in metres."""
+        """Compute positions (..., P, 3), in metres, of all joints and then all end sites in poses (..., 3 + 4·J)."""
         return points_of(self.primitive.skeleton, poses)
 
     def moments(self, count: int = MOMENTS) -> tuple[NDArray[np.int64], StripMoments]:
@@ -111,7 +111,7 @@ def evenly(count: int, most: int) -> NDArray[np.int64]:
 
 
 def points_of(skeleton: Skeleton, poses: Floats) -> Floats:
-    """Compute positions (..., P, 3) of joints, then end sites, of poses (..., 3 + 4·J), in metres."""
+    """Compute positions (..., P, 3), in metres, of all joints and then all end sites in poses (..., 3 + 4·J)."""
     flat = np.ascontiguousarray(poses).reshape(-1, poses.shape[-1])
     points = kinematics.forward_kinematics(skeleton, flat, end_sites=True)
     return np.asarray(points.reshape(*poses.shape[:-1], -1, 3), dtype=np.float64)

@@ -137,10 +137,12 @@ def _record(
 
 
 def _on_own_branch(tx: Transaction, wanted: OutputEntries, mover: Mover, planned: PlannedCommit) -> CommittedOutputs:
-    """Commit the outputs to a new branch that begins at the commit from which the job started.
+    """Commit the outputs of a job to a new branch, because they conflict with changes of the intended branch.
 
-    Returns the commit, and the conflicts of the plan as the reason why it is not on the intended branch. If the dataset
-    has too many branches and tags, no commit is made.
+    The new branch begins at the commit from which the job started. `planned` is the commit that was planned for the
+    intended branch; its conflicts are the paths that changed on this branch while the job ran. Returns the new commit,
+    with a description of the conflict. If the dataset already has `MOST_REFS` branches and tags, no commit is made, and
+    only the description is returned.
     """
     paths = sorted({path_and_kind(one.key)[0] for one in planned.merged.conflicts})
     changed = f"{counted(len(paths), 'path')} of the outputs changed on {wanted.branch!r} while the job ran"

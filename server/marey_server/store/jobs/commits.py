@@ -51,7 +51,7 @@ inputs were fixed), `within` (the dataset's folder), and `kinds` (of the outputs
 def check_target(
     tx: Transaction, project: ProjectRow, kind: KindDeclaration, request: OutputsCommit, into: str, at: str
 ) -> Target:
-    """Return the commit that a submission asks for, as it is stored.
+    """Check the commit of outputs that a submission requests, and return it in the form in which the job stores it.
 
     Raises `InvalidProblem` with a pointer below `at` for an unknown dataset or branch, and for a job without outputs
     to commit; `ForbiddenProblem` and `ConflictProblem` if the caller may not commit to the branch.

@@ -39,10 +39,12 @@ DEFERRED: ColumnElement[bool] = and_(
 def gather(tx: Transaction, parent_id: str) -> list[Ended]:
     """End a parent job whose tasks have all ended; return the jobs that ended.
 
-    If all tasks succeeded, the parent job succeeds. If a worker must combine the results of the tasks, the parent job
-    is queued instead, and nothing is returned. Nothing is returned either if the server must first prepare the commit
-    of many outputs (`finishing`). If a task failed, the parent job fails; if cancellation was requested
-    before, it is cancelled.
+    If all tasks succeeded, the parent job succeeds, or fails if its outputs cannot be committed. In two cases it does
+    not end yet, and the list is empty: if a worker must combine the results of the tasks, the parent job is queued; if
+    the outputs are too many to be committed in this transaction, the module `finishing` commits them later.
+
+    If a task failed, the parent job fails. If cancellation was requested before, the parent job is cancelled if a task
+    did not succeed, or if a worker must still combine the results.
     """
     columns = (*commits.JOB_COLUMNS, job.c.gathers, job.c.cancel_requested_us)
     head = tx.execute(select(*columns).where(job.c.id == parent_id)).one()

@@ -30,7 +30,7 @@ PAGE = 1000
 
 
 def propagate_ends(tx: Transaction, ended: Iterable[Ended]) -> None:
-    """Propagate these ends to dependants, parent jobs and jobs that share a result, until no further job ends."""
+    """Propagate the ends of jobs to dependants, parent jobs and jobs that share a result, until no further job ends."""
     queue = list(ended)
     while queue:
         page, queue = queue[:PAGE], queue[PAGE:]
