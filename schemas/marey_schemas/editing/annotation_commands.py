@@ -128,7 +128,7 @@ class AnnotationImport(Request):
     document: dict[str, Any] = Field(description="The predecessor's document, as it stores or exports it.")
     layer: LayerName = "imported"
     name: ItemName | None = Field(
-        None, description="Name of the annotation; default: the names of the clip and the layer."
+        None, description="Name of the annotation; default: the name of the clip, a space, and the name of the layer."
     )
     end_index: EndIndex = Field(
         DEFAULT_END_INDEX,

@@ -19,7 +19,9 @@ FolderState = int | None
 
 
 class FolderRoleProblem(ForbiddenProblem):
-    """Error of a user whose role in a folder is too low, although it may suffice in other folders."""
+    """Your role in this folder does not allow the operation."""
+
+    code = "insufficient-role"
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,14 +87,12 @@ class FolderRights:
         if not self.overrides:
             return FolderRoleProblem(
                 f"You need at least the role {needed.value} in the project {self.project!r} for this.",
-                code="insufficient-role",
                 context=context,
             )
         place = f"the folder {path!r}" if path else "the top folder"
         return FolderRoleProblem(
             f"You need at least the role {needed.value} in {place} of the project {self.project!r} for this; your role "
             f"there is {held.value}. An owner of the project can change it.",
-            code="insufficient-role",
             context=context,
         )
 

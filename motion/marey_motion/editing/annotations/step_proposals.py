@@ -64,8 +64,8 @@ def propose_steps(clip: Clip, body: MatchingBody, options: StepsProposal | None 
 class _Step(NamedTuple):
     """Step in which a foot swings from frame `start` and touches the ground at frame `end`.
 
-    `side` is 0 for the left and 1 for the right foot. `from_standing` is true if the body stands before the step,
-    `to_standing` if it stands after the step.
+    `side` is 0 for the left and 1 for the right foot. `from_standing` is true if the body is at rest before the
+    step, `to_standing` if it is at rest after the step.
     """
 
     side: int
