@@ -293,7 +293,7 @@ def test_a_worker_beside_the_server_logs_in_the_same_form(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("path", ["/", "/api/v1"])
 def test_the_roots_tell_programs_where_to_go_and_lead_browsers_to_the_page(server: Server, path: str) -> None:
-    with httpx.Client(base_url=server.address) as client:
+    with httpx.Client(base_url=server.address, timeout=60) as client:  # the description is built at the first request
         told = client.get(path).json()
         assert told["name"] == "Marey"
         assert client.get(told["openapi"]).json()["info"]["version"] == told["version"]

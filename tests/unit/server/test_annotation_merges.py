@@ -239,7 +239,7 @@ def test_a_job_and_a_person_label_different_ranges(labelling: LabellingDesk) -> 
 def test_the_commit_of_a_job_merges_fewer_annotations_since_others_wait(
     labelling: LabellingDesk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("marey_server.store.datasets.outputs.MOST_MERGED_BY_JOB", 0)
+    monkeypatch.setattr("marey_server.store.datasets.output_plans.MOST_MERGED_BY_JOB", 0)
     made = labelling.submit("label")
     labelling.label(OURS)
     stage_labels(labelling, THEIRS)
