@@ -189,6 +189,9 @@ queries = st.recursive(
 @example("facet.usage > 0.5 and not facet.used_frames in (1, 0.025)", 3)
 @example("facet.usage != 1 and has facet.usage", 0)
 @example("subject = 02 and not action ~ walk and tag = night", 1000)
+@example("shoot_day = 2025-03-01T10:00", 1000)
+@example("shoot_day = 2025-03-01T10:00", 0)
+@example("shoot_day in (2025-02-28, 2025-03-01T10:00)", 1000)
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(150))
 def test_sql_selects_what_the_conditions_say(queried: QueriedLab, text: str, few: int) -> None:
     query = parse(text)

@@ -15,7 +15,7 @@ from sqlalchemy import ColumnElement, Select, func, null, select
 from marey_schemas.kinds import Kind
 from marey_schemas.queries.fields import FACET_PREFIX
 from marey_schemas.queries.grammar import Condition, Query, operands_of
-from marey_server.store.items.querying import facet_meets
+from marey_server.store.items.querying import facet_meets, stored_text
 from marey_server.store.tables import INDEXED_CHARACTERS, INDEXED_FACTS, MemberStart, item, item_facet, item_tag
 from marey_server.store.transaction import Transaction
 
@@ -85,7 +85,7 @@ def _start(condition: Condition) -> ColumnElement[bool]:
     Only the first `INDEXED_CHARACTERS` characters are compared, because the index contains no more.
     """
     start = MemberStart(item.c.summary, condition.field)
-    wanted = [str(one)[:INDEXED_CHARACTERS] for one in condition.values]
+    wanted = [stored_text(one)[:INDEXED_CHARACTERS] for one in condition.values]
     return start == wanted[0] if len(wanted) == 1 else start.in_(wanted)
 
 

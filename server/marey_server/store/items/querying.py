@@ -143,17 +143,22 @@ def _number_of(name: str) -> Comparison:
     return lambda condition, _: _numbers(_NumberIn(item.c.summary, literal_column(f"'{name}'")), condition)
 
 
-def _day_of(name: str) -> Comparison:
-    """Return the comparison for a field that stores a day, such as `2026-11-23`.
+def stored_text(value: object) -> str:
+    """Return the text that a summary stores for a value of a query: a text unchanged, a day such as `2026-11-23`.
 
-    If a condition gives a time, only its day is compared.
+    Of a time, only the day is compared, because summaries store no times.
     """
+    return value.isoformat()[: len("2026-11-23")] if isinstance(value, date) else str(value)
+
+
+def _day_of(name: str) -> Comparison:
+    """Return the comparison for a field that stores a day."""
 
     def compare(condition: Condition, _: str) -> ColumnElement[bool]:
         stored: ColumnElement[Any] = item.c.summary[name].as_string()
         if condition.operator == "has":
             return stored.is_not(None)
-        days = [one.isoformat()[: len("2026-11-23")] for one in condition.values if isinstance(one, date)]
+        days = [stored_text(one) for one in condition.values]
         if condition.operator == "=":
             return _is_true(stored.in_(days))
         return _is_true(_ordered(stored, condition.operator, days[0]))
