@@ -27,6 +27,8 @@ CLIPS = 142_220
 QUERIES = {
     "a rare value": "subject = 0412 and frames > 120 and not warning = foot-slide",
     "a rare and a common value": "action = walk and subject = 0412 and select = best",
+    "one of several rare values": "subject in (0007, 0412, 0633) and frames > 120 and not warning = foot-slide",
+    "one of several common values": "action in (walk, crawl) and frames > 120 and not warning = foot-slide",
     "values of many clips": "action = walk and frames > 120 and not warning = foot-slide",
     "a value of most clips": 'licence = CC0 and duration > 2 and not select = "no good"',
     "common values that few clips share": "action = crawl and licence = CC0 and frames > 622",

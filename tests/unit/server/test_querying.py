@@ -192,6 +192,7 @@ queries = st.recursive(
 @example("shoot_day = 2025-03-01T10:00", 1000)
 @example("shoot_day = 2025-03-01T10:00", 0)
 @example("shoot_day in (2025-02-28, 2025-03-01T10:00)", 1000)
+@example("action in (walk, Übung) and subject in (02, 2)", 3)
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(150))
 def test_sql_selects_what_the_conditions_say(queried: QueriedLab, text: str, few: int) -> None:
     query = parse(text)
@@ -272,6 +273,13 @@ def test_skeletons_of_other_projects_have_no_names_here(queried: QueriedLab, dat
     assert list(pages()) == [0, 0]
 
 
+SHARED_VALUES = {
+    "subject": "02", "action": "walk", "take": "7b", "licence": '"CC-BY 4.0"', "shoot_day": "2025-03-01",
+}  # fmt: skip
+READS_ALL = "(project_id=? AND kind=?)"
+"""Part of SQLite's plan if all clips are read."""
+
+
 @pytest.mark.parametrize(
     ("field", "sort", "few"),
     [*zip(INDEXED_FACTS, cycle(["-created_at", "name", "-frames"]), repeat(1000)), ("subject", "-created_at", 0)],
@@ -282,17 +290,25 @@ def test_clips_with_a_value_are_found_through_an_index(
     if not queried.database.is_sqlite:
         return  # Postgres reads so few rows without an index
     monkeypatch.setattr(narrowing, "MOST_ITEMS", few)
-    value = {"subject": "02", "action": "walk", "take": "7b", "licence": '"CC-BY 4.0"'}.get(field, "2025-03-01")
-
-    def plans(tx: Transaction) -> list[str]:
-        statements = statements_of(tx, f"{field} = {value} and frames > 2", sort)
-        explained = [tx.connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {one}", given) for one, given in statements]
-        return [" ".join(row.detail for row in rows) for rows in explained]
-
-    counting, listing, *_ = queried.read(plans)
+    counting, listing, *_ = queried.read(plans_of, f"{field} = {SHARED_VALUES[field]} and frames > 2", sort)
     for plan in (counting, listing):
         assert f"ix_item_by_{field}" in plan
-        assert "(project_id=? AND kind=?)" not in plan, "all clips would be read"
+        assert READS_ALL not in plan
+
+
+@pytest.mark.parametrize("field", INDEXED_FACTS)
+@pytest.mark.parametrize("few", [1000, 0])
+def test_clips_with_one_of_several_values_are_found_through_an_index_if_they_are_few(
+    queried: QueriedLab, monkeypatch: pytest.MonkeyPatch, field: str, few: int
+) -> None:
+    if not queried.database.is_sqlite:
+        return  # as above
+    monkeypatch.setattr(narrowing, "MOST_ITEMS", few)
+    query = f"{field} in ({SHARED_VALUES[field]}, 1999-12-31)"
+    counting, listing, *_ = queried.read(plans_of, query, "-created_at")
+    for plan in (counting, listing) if few else (counting,):
+        assert f"ix_item_by_{field}" in plan
+        assert READS_ALL not in plan
 
 
 def test_a_frequent_value_is_looked_up_only_in_the_order_of_its_index(
@@ -302,6 +318,15 @@ def test_a_frequent_value_is_looked_up_only_in_the_order_of_its_index(
     for sort, looked_up in (("-created_at", True), ("created_at", True), ("name", False), ("-updated_at", False)):
         _, (listing, _), *_ = queried.read(statements_of, "subject = 02", sort)
         assert ("substr(" in listing) == looked_up
+
+
+def plans_of(tx: Transaction, query: str, sort: str) -> list[str]:
+    """Return how SQLite runs each of the statements that list the first page of a query."""
+    explained = [
+        tx.connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {one}", given)
+        for one, given in statements_of(tx, query, sort)
+    ]
+    return [" ".join(row.detail for row in rows) for rows in explained]
 
 
 def statements_of(tx: Transaction, query: str, sort: str) -> list[tuple[str, Any]]:

@@ -2,7 +2,8 @@
 
 An index helps if few items have the wanted value, and costs time if most of them have it. Databases estimate which is
 the case: Postgres from statistics that may be old, SQLite from none at all. So this module counts the items that
-conditions of a query select, up to a limit; within the limit, this takes less than a millisecond.
+conditions of a query select, up to a limit. For each condition, the database reads at most that many entries of an
+index, and one more, which takes less than a millisecond.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ MOST_ITEMS = 1000
 Candidates = Callable[[Condition, str, Kind], Select[Any]]
 """Function that returns the ids of all items of a project and kind that may meet a condition, found by an index.
 
-The second column is the time of creation, or null for all items; the newest are first. Items that the condition does
-not select, and items of other projects, may be among them.
+The second column is the time of creation, and the newest items are first; or it is null for all items, and their order
+is arbitrary. Items that the condition does not select, and items of other projects, may be among them.
 """
 
 
@@ -39,7 +40,7 @@ class Narrowing(NamedTuple):
     few: ColumnElement[bool] | None = None
     """Condition that at most `MOST_ITEMS` items meet."""
     ordered: ColumnElement[bool] | None = None
-    """Condition that more than `MOST_ITEMS` items meet, and that an index answers in the order of creation.
+    """Condition on a single value that more than `MOST_ITEMS` items have, found by an index in the order of creation.
 
     A list in this order then reads only the items with the wanted value, however many have this value.
     """
@@ -49,8 +50,8 @@ def narrow(tx: Transaction, project_id: str, kind: Kind, query: Query) -> Narrow
     """Return the condition by which the fewest items have to be read for a query.
 
     Of all operands of the outermost `and`, the one for which an index finds the fewest items is chosen. If each operand
-    has more than `MOST_ITEMS` items, the one whose newest `MOST_ITEMS` items go back furthest in time is chosen, since
-    it is the rarest.
+    has more than `MOST_ITEMS` items, the choice is among the comparisons of a fact with a single value: the one whose
+    newest `MOST_ITEMS` items go back furthest in time is chosen, since it is the rarest.
     """
     fewest, few = MOST_ITEMS + 1, None
     oldest_us, ordered = None, None
@@ -90,7 +91,14 @@ def _start(condition: Condition) -> ColumnElement[bool]:
 
 
 def _with_fact(condition: Condition, project_id: str, kind: Kind) -> Select[Any]:
+    """Return the items with one of the values.
+
+    Only for a single value does the index of the fact return the newest items first. For several values, SQLite would
+    read all items in the order of creation instead, so the order and the times are left out.
+    """
     present = (item.c.project_id == project_id, item.c.kind == kind.value, item.c.deleted_us.is_(None))
+    if len(condition.values) > 1:
+        return select(item.c.id, null().label("created_us")).where(*present, _start(condition))
     return select(item.c.id, item.c.created_us).where(*present, _start(condition)).order_by(item.c.created_us.desc())
 
 
