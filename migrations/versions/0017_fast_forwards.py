@@ -22,7 +22,7 @@ def upgrade() -> None:
         sa.ForeignKeyConstraint(
             ["dataset_id", "digest"],
             ["dataset_commit.dataset_id", "dataset_commit.digest"],
-            name="fk_fast_forward_dataset_id_dataset_commit",
+            name="fk_fast_forward_dataset_id_digest_dataset_commit",
         ),
         sa.PrimaryKeyConstraint("dataset_id", "write_id", name="pk_fast_forward"),
     )

@@ -30,7 +30,7 @@ def upgrade() -> None:
         sa.Column("job_id", sa.String(40), nullable=False),
         sa.Column("published_us", sa.BigInteger(), nullable=False),
         sa.ForeignKeyConstraint(
-            ["item_id", "number"], ["revision.item_id", "revision.number"], name="fk_item_facet_item_id_revision"
+            ["item_id", "number"], ["revision.item_id", "revision.number"], name="fk_item_facet_item_id_number_revision"
         ),
         sa.PrimaryKeyConstraint("item_id", "number", "name", name="pk_item_facet"),
     )
