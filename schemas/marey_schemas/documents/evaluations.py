@@ -51,15 +51,18 @@ HEADLINE_METRICS: Mapping[str, HeadlineMetric] = MappingProxyType(
 """Metrics in the headline of an evaluation, by name; the name of a metric ends in its unit, if it has one."""
 USAGE_FACETS: Mapping[str, str] = MappingProxyType(
     {
-        "usage": "Share of the time steps of the newest evaluation that show the clip or its mirrored copy, 0 to 1.",
-        "used_frames": "Share of the clip's frames that the trials of the newest evaluation show, 0 to 1.",
+        "usage": "Share of the time steps that show the clip or its mirrored copy, 0 to 1, in the newest evaluation "
+        "that contains the clip.",
+        "used_frames": "Share of the clip's evaluated frames that at least one trial shows, 0 to 1, in the newest "
+        "evaluation that contains the clip. If only a range of the clip was evaluated, its other frames are not "
+        "counted.",
     }
 )
 """Facets that an evaluation publishes about its clips, by name."""
 REMOVAL_FACETS: Mapping[str, str] = MappingProxyType(
     {
-        "removal_harm": "Harm of removing the clip from the evaluated set, in metres, by the newest suggestions; 0 if "
-        "no trial needs the clip, negative if the removal helps."
+        "removal_harm": "Harm of removing the clip from the evaluated set, in metres, by the newest suggestions that "
+        "assessed the clip; 0 if no trial needs the clip, negative if the removal helps."
     }
 )
 """Facets that jobs of the kind `suggest` publish about the clips whose removal they tried, by name."""
