@@ -127,7 +127,8 @@ def publish_facets(tx: Transaction, job_id: str, project_id: str, facets: Stored
 def _not_purged(tx: Transaction, project_id: str, items: Sequence[str]) -> Sequence[str]:
     """Return those items of a project that are not purged, sorted by id.
 
-    All writers lock rows in this order, to avoid deadlocks.
+    So the facets of one job are written in the order of item ids. A transaction that publishes the facets of several
+    jobs begins this order again for each job, so two such transactions can deadlock; `Database.write` then repeats one.
     """
     statement = select(item.c.id).where(
         item.c.id.in_(items), item.c.project_id == project_id, item.c.purged_us.is_(None)
