@@ -22,12 +22,16 @@ from tornado.iostream import IOStream
 
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree
+from marey_server.access.principal import SYSTEM
 from marey_server.http import reply
 from marey_server.http.exchange import JOINED_BYTES
 from marey_server.http.negotiation import MediaType
 from marey_server.process.observe import without_received_text
+from marey_server.store import projects
 from marey_server.store.blobs import Spool
 from marey_server.store.database.connections import Database
+from marey_server.store.items.facets import publish_facets
+from marey_server.store.transaction import Transaction
 
 JOINTS = ("hips", "knee", "foot")
 HIERARCHY = {
@@ -132,6 +136,27 @@ def test_what_the_caller_holds_already_is_not_sent_again(owner: httpx.Client, cl
         assert (again.status_code, again.content, again.headers["ETag"]) == (304, b"", etag)
         other_form = owner.get(path, headers={"If-None-Match": etag, "Accept": "application/msgpack"})
         assert other_form.status_code == 200
+
+
+def test_an_item_with_new_facets_is_sent_again(server: Server, owner: httpx.Client, clip: str) -> None:
+    def publish(value: float) -> None:
+        def publish_usage(tx: Transaction) -> None:
+            publish_facets(tx, "job", projects.require(tx, "lab").id, [[clip.rpartition("/")[2], 1, {"usage": value}]])
+
+        server.database.write(SYSTEM, publish_usage)
+
+    held = owner.get(clip).headers["ETag"]
+    for value in (0.0, 0.5):
+        publish(value)
+        answer = owner.get(clip, headers={"If-None-Match": held})
+        assert (answer.status_code, answer.json()["facets"]) == (200, {"usage": value})
+        held = answer.headers["ETag"]
+        publish(value)
+        assert owner.get(clip, headers={"If-None-Match": held}).status_code == 304
+    publish(1.0)
+    changed = owner.patch(clip, json={"name": "run"}, headers={"If-Match": held})
+    assert (changed.status_code, changed.json()["facets"]) == (200, {"usage": 1.0})
+    assert owner.get(clip, headers={"If-None-Match": changed.headers["ETag"]}).status_code == 304
 
 
 def test_a_change_says_which_state_it_changes(owner: httpx.Client, clip: str) -> None:

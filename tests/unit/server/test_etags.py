@@ -24,6 +24,10 @@ def test_what_was_read_in_one_form_can_be_changed_in_another() -> None:
     assert write_precondition('"7.msgpack"', None).expected_rev == 7
 
 
+def test_a_change_does_not_depend_on_members_without_a_rev() -> None:
+    assert write_precondition('"7.0a1b2c.json"', None).expected_rev == 7
+
+
 def test_a_change_may_name_several_states() -> None:
     assert write_precondition('"7.json", "9.msgpack", "foreign"', None).expected_rev == frozenset({7, 9})
     assert write_precondition('"7.json", "7.msgpack"', None).expected_rev == 7
