@@ -75,7 +75,7 @@ class Transaction:
         self.folder_rights: dict[tuple[str, str | None], FolderRights] = {}
         """Rights that this transaction has read, by project and user; see `store.folder_roles.rights`."""
         self.shared_outputs = 0
-        """Number of cached results that this transaction has published."""
+        """Number of outputs that this transaction has published from the cache; many facets count as outputs, too."""
         self._clock = clock
         self._now_us: int | None = None
         self._after_commit: list[Callable[[], None]] = []

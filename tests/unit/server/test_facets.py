@@ -14,6 +14,7 @@ from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import PurgeRequest
 from marey_schemas.queue.facets import ItemFacets, require_facet_names
+from marey_schemas.queue.jobs import JobCreate
 from marey_schemas.queue.worker_protocol import Lease
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import InvalidProblem, LeaseLostProblem
@@ -21,6 +22,8 @@ from marey_server.store import fsck, items, projects, purging
 from marey_server.store.items.drafts import Draft
 from marey_server.store.items.facets import publish_facets
 from marey_server.store.items.publishing import publish
+from marey_server.store.jobs import result_cache
+from marey_server.store.jobs.reaper import share_waiting
 from marey_server.store.tables import item_facet, staged_output
 
 
@@ -119,6 +122,21 @@ def test_a_shared_result_states_facets_of_the_revisions_of_its_own_job(desk: Des
     assert (study(desk, things[0]).revision, study(desk, things[0]).facets) == (3, {})
     assert desk.job(submit(desk, things)).cached_from == first
     assert study(desk, things[0]).facets == {"usage": 0.5}
+
+
+def test_many_facets_are_shared_in_several_transactions(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(result_cache, "MOST_SHARED_OUTPUTS", 4)
+    monkeypatch.setattr(result_cache, "MEASURED_PER_OUTPUT", 1)
+    things = desk.things(3)
+    first = measure(desk, things, 0.1, 0.2, 0.3)
+    wanted = {"things": [{"item": one} for one in things]}
+    same = JobCreate(kind="measure", inputs=wanted, params={"number": 0}, into="results")
+    again = desk.submit_many(same, same, same)
+    assert [desk.state(one) for one in again] == ["succeeded", "waiting", "waiting"]
+    assert desk.database.write(SYSTEM, share_waiting) == 1
+    assert desk.database.write(SYSTEM, share_waiting) == 1
+    assert {desk.job(one).cached_from for one in again} == {first}
+    assert [desk.state(one) for one in again] == ["succeeded"] * 3
 
 
 @pytest.mark.parametrize(

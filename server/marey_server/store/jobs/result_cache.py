@@ -36,6 +36,9 @@ SHARED_AT_ONCE = 64
 MOST_SHARED_OUTPUTS = 256
 """Greatest number of outputs published from the cache in one transaction; a single job may exceed it."""
 
+MEASURED_PER_OUTPUT = 5
+"""Number of revisions with facets that count as one output, because publishing their facets takes about as long."""
+
 
 class SharedResult(NamedTuple):
     """Job whose result another job shares."""
@@ -266,7 +269,7 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
         return []
     place = (row.source_id, row.fence)
     drafts = staging.staged_drafts(tx, [place]).get(place, {})
-    tx.shared_outputs += len(drafts)
+    tx.shared_outputs += len(drafts) + staging.number_measured(drafts) // MEASURED_PER_OUTPUT
     named = set(staging.named_blobs(row.result))
     if not staging.take_up_documents(tx, drafts) or not blobs.share_with_job(tx, row.id, named):
         return []

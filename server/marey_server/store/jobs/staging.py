@@ -235,6 +235,11 @@ def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: P
     }
 
 
+def number_measured(drafts: Mapping[str, StagedDraft]) -> int:
+    """Return the number of revisions about which the drafts of a job state facets."""
+    return len(drafts[_FACETS]["facets"]) if _FACETS in drafts else 0
+
+
 def publish_drafts(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> list[dict[str, Any]]:
     """Publish the drafts and the facets of a job with the present rights of its author; return the published outputs.
 
