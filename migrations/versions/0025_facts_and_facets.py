@@ -27,8 +27,6 @@ def upgrade() -> None:
         sa.Column("number", sa.Integer(), nullable=False),
         sa.Column("name", sa.String(64), nullable=False),
         sa.Column("value", sa.Double(), nullable=False),
-        sa.Column("job_id", sa.String(40), nullable=False),
-        sa.Column("published_us", sa.BigInteger(), nullable=False),
         sa.ForeignKeyConstraint(
             ["item_id", "number"], ["revision.item_id", "revision.number"], name="fk_item_facet_item_id_number_revision"
         ),

@@ -502,7 +502,7 @@ def test_no_facet_of_a_purged_item_is_published(scene: Scene, order: str) -> Non
     scene.delete(thing)
     project_id = scene.desk.database.read(scene.desk.user, requiring(WRITE, projects.require), "lab").id
     facets = [[thing, 1, {"usage": 0.5}], [kept, 1, {"usage": 0.5}]]
-    done, purged = scene.race(order, lambda tx: publish_facets(tx, "job_x", project_id, facets), scene.purge_of(thing))
+    done, purged = scene.race(order, lambda tx: publish_facets(tx, project_id, facets), scene.purge_of(thing))
     assert not isinstance(done, ApiProblem), done
     require_purged(purged, thing)
     named = scene.desk.database.read(SYSTEM, lambda tx: tx.execute(select(item_facet.c.item_id)).scalars().all())

@@ -141,7 +141,7 @@ def test_what_the_caller_holds_already_is_not_sent_again(owner: httpx.Client, cl
 def test_an_item_with_new_facets_is_sent_again(server: Server, owner: httpx.Client, clip: str) -> None:
     def publish(value: float) -> None:
         def publish_usage(tx: Transaction) -> None:
-            publish_facets(tx, "job", projects.require(tx, "lab").id, [[clip.rpartition("/")[2], 1, {"usage": value}]])
+            publish_facets(tx, projects.require(tx, "lab").id, [[clip.rpartition("/")[2], 1, {"usage": value}]])
 
         server.database.write(SYSTEM, publish_usage)
 

@@ -110,8 +110,6 @@ def test_the_newest_job_determines_a_facet_also_if_it_shares_the_result_of_anoth
     again = submit(desk, things, number=1)
     assert (desk.state(again), desk.job(again).cached_from) == ("succeeded", first)
     assert [study(desk, one).facets["usage"] for one in things] == [0.1, 0.2]
-    publishers = read(desk, lambda tx: tx.execute(select(item_facet.c.job_id)).scalars().all())
-    assert set(publishers) == {again}
 
 
 def test_a_shared_result_states_facets_of_the_revisions_of_its_own_job(desk: Desk) -> None:
@@ -208,18 +206,18 @@ def test_an_attempt_that_fails_or_lost_its_lease_publishes_no_facets(desk: Desk)
 
 def test_a_purge_deletes_facets_and_no_job_adds_them_afterwards(desk: Desk) -> None:
     thing, kept = desk.things(2)
-    job = measure(desk, [thing, kept], 0.5, 0.6)
+    measure(desk, [thing, kept], 0.5, 0.6)
     write(desk, items.delete_item, "lab", Kind.STUDY, thing, expected_rev=None)
     wanted = PurgeRequest(item=thing)
     write(desk, purging.record_purge, "lab", wanted, read(desk, purging.prepare_purge, "lab", wanted))
     project_id = read(desk, projects.require, "lab").id
-    write(desk, publish_facets, "job_late", project_id, [[thing, 1, {"usage": 0.9}], [kept, 1, {"usage": 0.7}]])
+    write(desk, publish_facets, project_id, [[thing, 1, {"usage": 0.9}], [kept, 1, {"usage": 0.7}]])
     rows = read(desk, lambda tx: tx.execute(select(item_facet.c.item_id, item_facet.c.value)).all())
     assert [tuple(row) for row in rows] == [(kept, 0.7)]
     drafts = read(desk, lambda tx: tx.execute(select(staged_output.c.draft)).scalars().all())
     assert [draft for draft in drafts if draft.get("facets")] == []
     assert list(fsck.check_store(desk.database)) == []
-    leftover = {"item_id": thing, "number": 1, "name": "usage", "value": 1.0, "job_id": job, "published_us": 1}
+    leftover = {"item_id": thing, "number": 1, "name": "usage", "value": 1.0}
     write(desk, lambda tx: tx.execute(item_facet.insert().values(**leftover)))
     assert [one.code for one in fsck.check_store(desk.database)] == ["purge-incomplete"]
 
@@ -232,7 +230,7 @@ def test_a_query_shows_no_facets_of_another_project(desk: Desk) -> None:
         other = projects.require(tx, "other")
         draft = Draft("far", Kind.STUDY, "far", {"study": document(number=1)})
         (made,) = publish(tx, other, [draft], author_id=None, rights=ALL_RIGHTS)
-        publish_facets(tx, "job_far", other.id, [[made.item, 1, {"usage": 1.0}], [things[0], 1, {"usage": 1.0}]])
+        publish_facets(tx, other.id, [[made.item, 1, {"usage": 1.0}], [things[0], 1, {"usage": 1.0}]])
 
     desk.database.write(SYSTEM, add)
     assert (selected(desk, "has facet.usage"), selected(desk, "has facet.usage", "other")) == ([], ["far"])

@@ -76,11 +76,11 @@ class QueriedLab(Lab):
         measured = items.list_items(tx, "lab", Kind.CLIP, sort="name", limit=100).items[::3]
         for number, clip in enumerate(measured):
             values = {"usage": number / 2} if number % 2 else {"usage": 1.0, "used_frames": 0.025}
-            publish_facets(tx, "job", project.id, [[clip.id, 1, values]])
+            publish_facets(tx, project.id, [[clip.id, 1, values]])
         for clip in measured[:2]:
             info = {"schema": "marey/clip-info@1", "comment": "changed"}
             items.put_part(tx, "lab", Kind.CLIP, clip.id, "info", info, expected_rev=None)
-        publish_facets(tx, "job", project.id, [[measured[1].id, 2, {"usage": 4.5}]])
+        publish_facets(tx, project.id, [[measured[1].id, 2, {"usage": 4.5}]])
 
 
 @pytest.fixture

@@ -99,7 +99,7 @@ def with_revisions(facets: StoredFacets, revisions: Mapping[tuple[str, int], int
     return [[item_id, revisions.get((item_id, number), number), values] for item_id, number, values in facets]
 
 
-def publish_facets(tx: Transaction, job_id: str, project_id: str, facets: StoredFacets) -> None:
+def publish_facets(tx: Transaction, project_id: str, facets: StoredFacets) -> None:
     """Record the facets that a job states.
 
     If another job has published the same facet of the same revision, its value is replaced. Items that were purged
@@ -109,19 +109,17 @@ def publish_facets(tx: Transaction, job_id: str, project_id: str, facets: Stored
     stated: dict[str, list[tuple[int, dict[str, float]]]] = {}
     for one, number, values in sorted(facets, key=lambda fact: (fact[0], fact[1])):
         stated.setdefault(one, []).append((number, values))
-    published = {"job_id": job_id, "published_us": tx.now_us}
     for some in in_lists(stated):
         rows = [
-            {"item_id": one, "number": number, "name": name, "value": value, **published}
+            {"item_id": one, "number": number, "name": name, "value": value}
             for one in _not_purged(tx, project_id, some)
             for number, values in stated[one]
             for name, value in sorted(values.items())
         ]
         if rows:
             added = tx.insert_into(item_facet)
-            newer = {name: added.excluded[name] for name in ("value", "job_id", "published_us")}
             key = list(item_facet.primary_key.columns)
-            tx.execute(added.on_conflict_do_update(index_elements=key, set_=newer), rows)
+            tx.execute(added.on_conflict_do_update(index_elements=key, set_={"value": added.excluded.value}), rows)
 
 
 def _not_purged(tx: Transaction, project_id: str, items: Sequence[str]) -> Sequence[str]:

@@ -247,7 +247,7 @@ def publish_drafts(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft])
     `project_id`, `into_path`, `author_id` and `message` of the job.
     """
     if _FACETS in drafts:
-        publish_facets(tx, row.id, row.project_id, drafts[_FACETS]["facets"])
+        publish_facets(tx, row.project_id, drafts[_FACETS]["facets"])
     results = {name: draft for name, draft in drafts.items() if name != _FACETS}
     if not results:
         return []

@@ -131,8 +131,6 @@ item_facet = Table(  # numbers that jobs published about revisions of their inpu
     Column("number", Integer, primary_key=True),
     Column("name", String(64), primary_key=True),
     Column("value", Double, nullable=False),
-    Column("job_id", ID, nullable=False),  # the newest job that published it
-    Column("published_us", Micros, nullable=False),
     ForeignKeyConstraint(["item_id", "number"], ["revision.item_id", "revision.number"]),
     Index("ix_item_facet_name_value", "name", "value", "item_id"),
 )
