@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import update
 from tests.support.committing_desk import CommittingDesk
 from tests.support.queue_desk import Desk
 
@@ -16,8 +17,9 @@ from marey_schemas.kinds import Kind
 from marey_schemas.purges import DatasetPurgeRequest, JobHolder, PurgeAnswer, PurgeRequest
 from marey_schemas.queue.jobs import ItemInput, JobState
 from marey_server import faults
+from marey_server.access.principal import SYSTEM
 from marey_server.app import create_app
-from marey_server.errors import InvalidProblem
+from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.process import housekeeping
 from marey_server.process.settings import Settings
 from marey_server.store import datasets, items, purging
@@ -25,6 +27,7 @@ from marey_server.store.datasets import output_plans
 from marey_server.store.fsck import check_store
 from marey_server.store.jobs import fan_out, finishing
 from marey_server.store.jobs.finishing import commit_deferred
+from marey_server.store.tables import tree_chunk
 from marey_server.store.wakeups import job_topic, wakeups
 
 
@@ -297,6 +300,36 @@ def test_a_job_that_is_cancelled_before_its_commit_commits_nothing(gaits: Commit
     gaits.desk.cancel(made)
     assert commit_deferred(gaits.desk.database) == 1
     assert (gaits.job(made).state, gaits.head()) == ("cancelled", None)
+
+
+def test_no_commit_is_planned_for_a_cancelled_job(gaits: CommittingDesk, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = run_tasks(gaits)
+    gaits.desk.cancel(made)
+    monkeypatch.setattr(finishing, "plan_outputs", lambda *_: pytest.fail("a commit was planned"))
+    assert commit_deferred(gaits.desk.database) == 1
+    assert gaits.job(made).state == "cancelled"
+
+
+def test_a_job_fails_if_its_commit_is_refused_while_it_is_planned(
+    gaits: CommittingDesk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise ConflictProblem("There is no room.", code="no-room")
+
+    made = run_tasks(gaits)
+    monkeypatch.setattr(finishing, "plan_outputs", refuse)
+    assert commit_deferred(gaits.desk.database) == 1
+    found = gaits.job(made)
+    assert (found.state, found.failure and found.failure.code) == ("failed", "no-room")
+
+
+def test_a_job_fails_if_the_dataset_is_damaged(gaits: CommittingDesk) -> None:
+    gaits.put("own", number=1)
+    made = run_tasks(gaits)
+    gaits.desk.database.write(SYSTEM, lambda tx: tx.execute(update(tree_chunk).values(data=b"damaged")))
+    assert commit_deferred(gaits.desk.database) == 1
+    found = gaits.job(made)
+    assert (found.state, found.failure and found.failure.code) == ("failed", "dataset-damaged")
 
 
 def test_a_job_that_depends_on_a_large_commit_starts_after_it(gaits: CommittingDesk) -> None:

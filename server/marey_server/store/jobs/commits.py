@@ -249,7 +249,7 @@ def commit_planned_tasks(
         with tx.connection.begin_nested():
             made = commit_planned(tx, wanted, _mover(tx, row), planned)
     except ApiProblem as error:
-        return PublishedOutputs(failure=_CommitRefused(row.commit_to, error).failure)
+        return PublishedOutputs(failure=refused_commit(row.commit_to, error.error_code, error.detail))
     return None if made is None else PublishedOutputs([], _columns(made))
 
 
@@ -264,9 +264,14 @@ class _CommitRefused(Exception):
     """The outputs of a job may not be committed to its branch."""
 
     def __init__(self, target: Target, error: ApiProblem) -> None:
-        detail = f"The outputs cannot be committed to {target['dataset']}@{target['branch']}. {error.detail}"
-        super().__init__(detail)
-        self.failure = failure_document(FailureReason.ERROR, error.error_code, detail)
+        super().__init__(error.detail)
+        self.failure = refused_commit(target, error.error_code, error.detail)
+
+
+def refused_commit(target: Target, code: str, reason: str) -> dict[str, Any]:
+    """Return the failure of a job whose outputs cannot be committed; `reason` is one or several sentences."""
+    detail = f"The outputs cannot be committed to {target['dataset']}@{target['branch']}. {reason}"
+    return failure_document(FailureReason.ERROR, code, detail)
 
 
 def _publish_entries(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> list[dict[str, Any]]:

@@ -11,14 +11,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 from sqlalchemy import select
 
 from marey_schemas.queue.commits import MOST_COMMITTED
 from marey_server import faults
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import UnavailableProblem
+from marey_server.errors import ApiProblem, UnavailableProblem
 from marey_server.store.database.connections import Database
 from marey_server.store.datasets.chunks import store_chunks
 from marey_server.store.datasets.naming import find_ref
@@ -30,11 +31,15 @@ from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.purge_lock import hold_off_purges, last_purge
 from marey_server.store.tables import dataset, job
 from marey_server.store.transaction import Transaction
+from marey_versions.tree.chunks import DamagedChunk
 
 CHUNKS_AT_ONCE = 500
 """Number of chunks that one write stores, so that it is short."""
 MOST_PLANS = 5
 """Number of times that a commit is planned before the next jobs have their turn."""
+
+DATASET_DAMAGED = "dataset-damaged"
+"""Code of the failure of a job whose commit cannot be computed, because chunks of the dataset are damaged."""
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +47,8 @@ log = logging.getLogger(__name__)
 def commit_deferred(database: Database) -> int:
     """Commit the outputs of jobs whose tasks have all ended, and end these jobs; return how many have ended.
 
-    A job whose commit cannot be computed stays as it is, and does not keep the others from ending.
+    A job fails if its commit is refused, or cannot be computed because chunks of the dataset are damaged. After any
+    other error, the job stays as it is, and does not keep the others from ending.
     """
     return sum(_commit_one(database, one) for one in database.read(SYSTEM, _deferred_jobs))
 
@@ -79,13 +85,18 @@ def _portions(chunks: Mapping[str, bytes]) -> Iterator[Mapping[str, bytes]]:
 
 @dataclass(frozen=True)
 class _JobPlan:
-    """Outputs of a job, and their planned commit; `commit` is None if the branch does not exist any more."""
+    """Outputs of a job, and their planned commit; or the reason why no commit was planned."""
 
     job_id: str
-    wanted: OutputEntries
-    commit: PlannedCommit | None
+    project_id: str
     last_purge: int
     """Time of the last purge of the project when the plan was computed."""
+    wanted: OutputEntries | None = None
+    """Outputs of the job; None if no commit was planned."""
+    commit: PlannedCommit | None = None
+    """The planned commit; None if the branch does not exist any more."""
+    failure: dict[str, Any] | None = None
+    """Failure of the job, because its commit cannot be computed."""
 
     @property
     def chunks(self) -> Mapping[str, bytes]:
@@ -97,21 +108,36 @@ _COLUMNS = (*commits.JOB_COLUMNS, job.c.cancel_requested_us)
 
 
 def _plan(tx: Transaction, job_id: str) -> _JobPlan | None:
-    """Plan the commit of a job; None if the job has ended already."""
+    """Plan the commit of a job; None if the job has ended already. No commit is planned for a cancelled job."""
     row = tx.execute(select(*_COLUMNS).where(job.c.id == job_id, DEFERRED)).first()
     if row is None:
         return None
-    purged = last_purge(tx, row.project_id)
+    plan = _JobPlan(job_id, row.project_id, last_purge(tx, row.project_id))
+    if row.cancel_requested_us is not None:
+        return plan
+    try:
+        return _with_commit(tx, row, plan)
+    except UnavailableProblem:
+        raise
+    except ApiProblem as error:
+        return replace(plan, failure=commits.refused_commit(row.commit_to, error.error_code, error.detail))
+    except DamagedChunk as error:
+        log.exception("the outputs of %s cannot be committed", job_id)
+        detail = f"The stored data of the dataset are damaged: {error}."
+        return replace(plan, failure=commits.refused_commit(row.commit_to, DATASET_DAMAGED, detail))
+
+
+def _with_commit(tx: Transaction, row: Any, plan: _JobPlan) -> _JobPlan:
     wanted = commits.entries_of_tasks(tx, row)
     exists = select(dataset.c.id).where(dataset.c.id == wanted.dataset_id, dataset.c.deleted_us.is_(None))
     ref = None if tx.execute(exists).first() is None else find_ref(tx, wanted.dataset_id, wanted.branch)
     planned = None if ref is None else plan_outputs(tx, wanted, ref.digest, MOST_COMMITTED)
-    return _JobPlan(job_id, wanted, planned, purged)
+    return replace(plan, wanted=wanted, commit=planned)
 
 
 def _end(tx: Transaction, plan: _JobPlan) -> bool:
     """End a job and commit its outputs as planned; return False if the commit must be planned again."""
-    hold_off_purges(tx, plan.wanted.project_id)
+    hold_off_purges(tx, plan.project_id)
     row = tx.execute(select(*_COLUMNS).where(job.c.id == plan.job_id, DEFERRED).with_for_update()).first()
     if row is None:  # another process has ended it
         return True
@@ -119,7 +145,10 @@ def _end(tx: Transaction, plan: _JobPlan) -> bool:
     if row.cancel_requested_us is not None:
         propagate_ends(tx, end_jobs(tx, this, "cancelled"))
         return True
-    if last_purge(tx, row.project_id) != plan.last_purge:
+    if plan.failure is not None:
+        propagate_ends(tx, end_jobs(tx, this, "failed", failure=plan.failure))
+        return True
+    if plan.wanted is None or last_purge(tx, row.project_id) != plan.last_purge:
         return False
     made = commits.commit_planned_tasks(tx, row, plan.wanted, plan.commit)
     if made is None:
