@@ -26,6 +26,7 @@ from marey_server.store.datasets.proposals import waiting as waiting_module
 from marey_server.store.fsck import check_store
 from marey_server.store.tables import job, proposal
 from marey_server.store.transaction import Transaction
+from marey_versions.tree.chunks import DamagedChunk
 
 LAB = "/projects/lab"
 GAITS = f"{LAB}/datasets/gaits"
@@ -350,6 +351,33 @@ def test_more_proposals_wait_than_one_attempt_examines(
     assert waiting.attempt() == 0
     ok(team.mia.delete(f"{MAIN}/protection", headers=ANY))
     assert (waiting.attempt(), waiting.attempt(), waiting.attempt()) == (1, 2, 0)
+
+
+def wait_on_branches(team: Team, *branches: str) -> None:
+    """Propose new branches, and ask for their merges, which wait for an approval; then require none any more."""
+    team.protect(approvals=1)
+    for branch in branches:
+        ok(team.ada.post(f"{GAITS}/refs", json={"name": branch, "kind": "branch"}), 201)
+        ok(team.put(branch, branch, 1), 201)
+        ok(team.ada.post(f"{PROPOSALS}/{team.propose(source=branch)}/merge", json={"when_green": True}))
+    ok(team.mia.delete(f"{MAIN}/protection", headers=ANY))
+
+
+@on_sqlite
+def test_a_proposal_that_cannot_be_computed_does_not_delay_the_others(
+    team: Team, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wait_on_branches(team, "one", "two")
+    prepare = proposals.prepare_waiting
+
+    def prepare_second(tx: Transaction, project: str, name: str, number: int) -> Any:
+        if number == 1:
+            raise DamagedChunk("a chunk is missing")
+        return prepare(tx, project, name, number)
+
+    monkeypatch.setattr(waiting_module, "prepare_waiting", prepare_second)
+    assert WaitingMerges(server.database).attempt() == 1
+    assert [ok(team.rita.get(f"{PROPOSALS}/{number}"))["state"] for number in (1, 2)] == ["open", "merged"]
 
 
 @on_sqlite

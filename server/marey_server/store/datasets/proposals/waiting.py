@@ -63,7 +63,7 @@ class WaitingMerges:
         """Examine the next `EXAMINED_AT_ONCE` waiting proposals, and merge those that are ready.
 
         Returns the number of merged proposals. A proposal that another request changes meanwhile is examined again in
-        the next round.
+        the next round. An error does not keep the other proposals from being merged.
         """
         found = self._database.read(SYSTEM, _next_waiting, self._last)
         merged = sum(map(self._attempt_one, found))
@@ -82,6 +82,9 @@ class WaitingMerges:
             raise
         except ApiProblem as problem:
             log.info("proposal %d of %s is examined again later: %s", one.number, one.dataset_id, problem.detail)
+            return False
+        except Exception:
+            log.exception("proposal %d of %s cannot be merged", one.number, one.dataset_id)
             return False
         if not merged:
             self._obstructed.put(key, basis)
