@@ -381,6 +381,26 @@ def test_a_proposal_that_cannot_be_computed_does_not_delay_the_others(
 
 
 @on_sqlite
+def test_a_right_that_is_lost_for_a_moment_is_no_lasting_obstacle(
+    team: Team, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The user who requested the merge has no right to write just when the merge would be recorded."""
+    wait_on_branches(team, "one")
+    prepare = proposals.prepare_waiting
+
+    def prepare_and_lose(*arguments: Any) -> Any:
+        ok(team.olga.put(f"{LAB}/members/ada", json={"role": "reader"}))
+        return prepare(*arguments)
+
+    waiting = WaitingMerges(server.database)
+    with monkeypatch.context() as patch:
+        patch.setattr(waiting_module, "prepare_waiting", prepare_and_lose)
+        assert waiting.attempt() == 0
+    ok(team.olga.put(f"{LAB}/members/ada", json={"role": "contributor"}))
+    assert waiting.attempt() == 1
+
+
+@on_sqlite
 def test_a_merge_that_waits_is_prepared_again_if_a_branch_moves(
     team: Team, server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import Enum, auto
 from typing import Any, NamedTuple
 
 from sqlalchemy import Row, func, select
@@ -53,6 +54,16 @@ class PreparedAcceptance:
     request: MergeRequest
     merge: PreparedMerge | None
     refusal: ApiProblem | None
+
+
+class WaitingOutcome(Enum):
+    """Outcome of an attempt to merge a proposal for which an automatic merge (`when_green`) may be requested."""
+
+    MERGED = auto()
+    NOT_READY = auto()
+    """No merge is requested, or approvals, checks or rights are missing."""
+    OBSTRUCTED = auto()
+    """The merge has conflicts or another obstacle, until a branch moves or the rule of the target changes."""
 
 
 class MergeBasis(NamedTuple):
@@ -249,23 +260,23 @@ def withdraw_merge(tx: Transaction, project: str, name: str, number: int) -> Pro
 
 def merge_if_green(
     tx: Transaction, project: str, name: str, row: Row[Any], prepared: PreparedAcceptance | None
-) -> bool:
+) -> WaitingOutcome:
     """Merge a locked proposal if its automatic merge (`when_green`) was requested and all requirements are met.
 
-    Returns whether the proposal was merged. It is not merged if the user who requested the merge may no longer move the
-    branch. Raises `ConflictProblem` if a branch has moved since the merge was prepared.
+    It is not merged if the user who requested the merge may no longer move the branch. Raises `ConflictProblem` if a
+    branch has moved since the merge was prepared.
     """
     if not is_waiting(row):
-        return False
+        return WaitingOutcome.NOT_READY
     target = _target(tx, row, lock=True)
     mover = _ready_mover(tx, projects.require(tx, project), row, target)
     if mover is None:
-        return False
+        return WaitingOutcome.NOT_READY
     prepared = _require_current(row, prepared)
     if any(_obstacles(prepared, rule_of(target))):
-        return False
+        return WaitingOutcome.OBSTRUCTED
     _record(tx, project, name, row, prepared, mover, row.when_green_id)
-    return True
+    return WaitingOutcome.MERGED
 
 
 def merge_basis(tx: Transaction, project_row: ProjectRow, row: Row[Any]) -> MergeBasis | None:

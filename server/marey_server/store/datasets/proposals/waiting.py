@@ -19,6 +19,7 @@ from marey_server.store.database.connections import Database
 from marey_server.store.datasets.proposals.accepting import (
     MergeBasis,
     PreparedAcceptance,
+    WaitingOutcome,
     merge_basis,
     merge_if_green,
     prepare_waiting,
@@ -77,7 +78,7 @@ class WaitingMerges:
             if basis is None or basis == self._obstructed.get(key):
                 return False
             prepared = self._database.read(SYSTEM, prepare_waiting, one.project, one.dataset, one.number)
-            merged = self._database.submit_write(SYSTEM, _merge, one, prepared).result()
+            outcome = self._database.submit_write(SYSTEM, _merge, one, prepared).result()
         except UnavailableProblem:
             raise
         except ApiProblem as problem:
@@ -86,9 +87,9 @@ class WaitingMerges:
         except Exception:
             log.exception("proposal %d of %s cannot be merged", one.number, one.dataset_id)
             return False
-        if not merged:
+        if outcome is WaitingOutcome.OBSTRUCTED:
             self._obstructed.put(key, basis)
-        return merged
+        return outcome is WaitingOutcome.MERGED
 
 
 def _next_waiting(tx: Transaction, last: tuple[str, int]) -> list[_PendingMerge]:
@@ -111,8 +112,8 @@ def _basis_if_ready(tx: Transaction, one: _PendingMerge) -> MergeBasis | None:
     return merge_basis(tx, find_by_id(tx, one.project_id), row)
 
 
-def _merge(tx: Transaction, one: _PendingMerge, prepared: PreparedAcceptance | None) -> bool:
-    """Merge a waiting proposal if all requirements are met; return whether it was merged."""
+def _merge(tx: Transaction, one: _PendingMerge, prepared: PreparedAcceptance | None) -> WaitingOutcome:
+    """Merge a waiting proposal if all requirements are met."""
     hold_off_purges(tx, one.project_id)
     row = lock_open(tx, one.dataset_id, one.number)
     return merge_if_green(tx, one.project, one.dataset, row, prepared)
