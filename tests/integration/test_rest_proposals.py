@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import AsyncMock
 
@@ -18,6 +20,7 @@ from tests.support.furnished_house import MOTION
 from tests.support.rest_server import Server, running
 
 from marey_server.access.principal import SYSTEM
+from marey_server.errors import ConflictProblem
 from marey_server.process import housekeeping
 from marey_server.store.database.connections import Database
 from marey_server.store.datasets import proposals
@@ -378,6 +381,33 @@ def test_a_proposal_that_cannot_be_computed_does_not_delay_the_others(
     monkeypatch.setattr(waiting_module, "prepare_waiting", prepare_second)
     assert WaitingMerges(server.database).attempt() == 1
     assert [ok(team.rita.get(f"{PROPOSALS}/{number}"))["state"] for number in (1, 2)] == ["open", "merged"]
+
+
+@on_sqlite
+@pytest.mark.parametrize(("code", "computed"), [("quota-exceeded", 1), ("purged-meanwhile", 3)])
+def test_a_merge_that_was_refused_is_computed_again_after_a_pause(
+    team: Team, server: Server, monkeypatch: pytest.MonkeyPatch, code: str, computed: int
+) -> None:
+    """After a purge, there is no pause."""
+    wait_on_branches(team, "one")
+    prepare, prepared = proposals.prepare_waiting, list[Any]()
+
+    def prepare_and_count(*arguments: Any) -> Any:
+        prepared.append(arguments)
+        return prepare(*arguments)
+
+    def refuse(*_: Any) -> Any:
+        raise ConflictProblem("There is no room.", code=code)
+
+    monkeypatch.setattr(waiting_module, "prepare_waiting", prepare_and_count)
+    waiting = WaitingMerges(server.database)
+    with monkeypatch.context() as patch:
+        patch.setattr(waiting_module, "merge_if_green", refuse)
+        assert [waiting.attempt() for _ in range(3)] == [0, 0, 0]
+        assert len(prepared) == computed
+    later_s = time.monotonic() + waiting_module.REFUSED_PAUSE_S
+    monkeypatch.setattr(waiting_module, "time", SimpleNamespace(monotonic=lambda: later_s))
+    assert waiting.attempt() == 1
 
 
 @on_sqlite

@@ -22,6 +22,9 @@ from marey_server.errors import ConflictProblem
 from marey_server.store.tables import item, job
 from marey_server.store.transaction import Transaction, in_lists
 
+PURGED_MEANWHILE = "purged-meanwhile"
+"""Code of the error for a request that was prepared before a purge, and can be sent again."""
+
 
 def last_purge(tx: Transaction, project_id: str) -> int:
     """Return the time of the last purge of a project in microseconds, 0 if there was none."""
@@ -61,7 +64,7 @@ def require_no_purge_since(tx: Transaction, project_id: str, last: int) -> None:
     if last_purge(tx, project_id) != last:
         raise ConflictProblem(
             "Items of the project were purged while the request was prepared; send the request again.",
-            code="purged-meanwhile",
+            code=PURGED_MEANWHILE,
         )
 
 

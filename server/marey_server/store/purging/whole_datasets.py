@@ -22,7 +22,7 @@ from marey_server.store import projects
 from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.jobs.reading import UNFINISHED
 from marey_server.store.projects import ProjectRow
-from marey_server.store.purge_lock import begin_purge
+from marey_server.store.purge_lock import PURGED_MEANWHILE, begin_purge
 from marey_server.store.purging.holders import FoundHolders
 from marey_server.store.purging.recording import STILL_HELD
 from marey_server.store.tables import (
@@ -109,7 +109,7 @@ def record_dataset_purge(
     if _own_commits(tx, project_row, prepared.id) != prepared.commits:
         raise ConflictProblem(
             "Versions were added or purged while this purge was prepared; send the request again.",
-            code="purged-meanwhile",
+            code=PURGED_MEANWHILE,
         )
     answer = _answer(tx, project_row, request, prepared)
     if answer.holders:

@@ -8,6 +8,8 @@ regularly.
 from __future__ import annotations
 
 import logging
+import math
+import time
 from typing import NamedTuple
 
 from sqlalchemy import select, tuple_
@@ -26,14 +28,16 @@ from marey_server.store.datasets.proposals.accepting import (
 )
 from marey_server.store.datasets.proposals.opening import find_proposal, lock_open
 from marey_server.store.projects import find_by_id
-from marey_server.store.purge_lock import hold_off_purges
+from marey_server.store.purge_lock import PURGED_MEANWHILE, hold_off_purges
 from marey_server.store.tables import dataset, project, proposal
 from marey_server.store.transaction import Transaction
 
 EXAMINED_AT_ONCE = 100
 """Greatest number of proposals that one call of `WaitingMerges.attempt` examines."""
-OBSTRUCTED_KEPT = 10_000
-"""Greatest number of proposals whose conflicts are remembered."""
+IN_VAIN_KEPT = 10_000
+"""Greatest number of proposals whose merges in vain are remembered."""
+REFUSED_PAUSE_S = 60.0
+"""Seconds until a merge that was refused, for example because of a quota, is computed again on the same basis."""
 
 log = logging.getLogger(__name__)
 
@@ -48,17 +52,21 @@ class _PendingMerge(NamedTuple):
     project: str
 
 
+class _InVain(NamedTuple):
+    """Merge that was computed in vain: its basis, and the monotonic time in seconds when the basis is tried again."""
+
+    basis: MergeBasis
+    again_s: float
+
+
 class WaitingMerges:
     """Attempts to merge waiting proposals, in repeated rounds; each round is in the order of datasets and numbers."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._last = ("", 0)
-        self._obstructed: LruCache[tuple[str, int], MergeBasis] = LruCache(max_entries=OBSTRUCTED_KEPT)
-        """Basis from which the merge of a proposal was last computed in vain, by dataset and number of the proposal.
-
-        The merge is computed again only if the basis has changed.
-        """
+        self._in_vain: LruCache[tuple[str, int], _InVain] = LruCache(max_entries=IN_VAIN_KEPT)
+        """Last merge of each proposal that was computed in vain, by dataset and number of the proposal."""
 
     def attempt(self) -> int:
         """Examine the next `EXAMINED_AT_ONCE` waiting proposals, and merge those that are ready.
@@ -73,9 +81,10 @@ class WaitingMerges:
 
     def _attempt_one(self, one: _PendingMerge) -> bool:
         key = one.dataset_id, one.number
+        basis: MergeBasis | None = None
         try:
             basis = self._database.read(SYSTEM, _basis_if_ready, one)
-            if basis is None or basis == self._obstructed.get(key):
+            if basis is None or self._is_in_vain(key, basis):
                 return False
             prepared = self._database.read(SYSTEM, prepare_waiting, one.project, one.dataset, one.number)
             outcome = self._database.submit_write(SYSTEM, _merge, one, prepared).result()
@@ -83,13 +92,21 @@ class WaitingMerges:
             raise
         except ApiProblem as problem:
             log.info("proposal %d of %s is examined again later: %s", one.number, one.dataset_id, problem.detail)
-            return False
+            pause_s = 0.0 if problem.error_code == PURGED_MEANWHILE else REFUSED_PAUSE_S
         except Exception:
             log.exception("proposal %d of %s cannot be merged", one.number, one.dataset_id)
-            return False
-        if outcome is WaitingOutcome.OBSTRUCTED:
-            self._obstructed.put(key, basis)
-        return outcome is WaitingOutcome.MERGED
+            pause_s = REFUSED_PAUSE_S
+        else:
+            pause_s = math.inf if outcome is WaitingOutcome.OBSTRUCTED else 0.0
+            if outcome is WaitingOutcome.MERGED:
+                return True
+        if basis is not None and pause_s:
+            self._in_vain.put(key, _InVain(basis, time.monotonic() + pause_s))
+        return False
+
+    def _is_in_vain(self, key: tuple[str, int], basis: MergeBasis) -> bool:
+        last = self._in_vain.get(key)
+        return last is not None and last.basis == basis and time.monotonic() < last.again_s
 
 
 def _next_waiting(tx: Transaction, last: tuple[str, int]) -> list[_PendingMerge]:
