@@ -108,6 +108,19 @@ def test_items_that_only_its_versions_held_can_be_purged_afterwards(gaits: Commi
     assert sound(gaits)
 
 
+def test_an_item_is_purged_whose_dataset_was_purged_since_the_preparation(gaits: CommittingDesk) -> None:
+    walk = add(gaits.desk, "walk")
+    gaits.change(PutEntry(path="walk", item=walk))
+    delete_gaits(gaits)
+    gaits.write(items.delete_item, "lab", Kind.STUDY, walk, expected_rev=None)
+    request = PurgeRequest(item=walk)
+    prepared = gaits.read(purging.prepare_purge, "lab", request)
+    purge(gaits)
+    answer = gaits.write(purging.record_purge, "lab", request, prepared)
+    assert [one.item for one in answer.purged] == [walk]
+    assert sound(gaits)
+
+
 def test_an_item_that_a_job_made_from_a_version_holds_the_dataset(gaits: CommittingDesk) -> None:
     gaits.change(PutEntry(path="walk", item=add(gaits.desk, "walk")))
     gaits.write(datasets.create_ref, "lab", "gaits", RefCreate(name="v1", kind=RefKind.TAG, at="main"))

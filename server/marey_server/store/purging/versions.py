@@ -44,13 +44,13 @@ class VersionSearch:
         """Digests of the wanted contents in a chunk and all chunks below it, by the digest of the chunk."""
 
     def update(self, tx: Transaction) -> None:
-        """Search the commits that were not searched yet."""
+        """Search the commits that were not searched yet, and forget those that were purged since."""
         if not self.wanted:
             return
         statement = select(dataset_commit.c.dataset_id, dataset_commit.c.digest, dataset_commit.c.tree)
         statement = statement.join(dataset, dataset.c.id == dataset_commit.c.dataset_id)
-        for row in tx.execute(statement.where(dataset.c.project_id == self._project_id)):
-            self._roots[_Version(row.dataset_id, row.digest)] = row.tree
+        rows = tx.execute(statement.where(dataset.c.project_id == self._project_id))
+        self._roots = {_Version(row.dataset_id, row.digest): row.tree for row in rows}
         self._search(StoredChunks(tx), set(self._roots.values()) - self._below.keys())
 
     def _search(self, store: StoredChunks, roots: Collection[str]) -> None:
