@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from sqlalchemy import func, insert, select
 from tests.support.committing_desk import CommittingDesk
-from tests.support.queue_desk import Desk, document
+from tests.support.queue_desk import Desk, document, output
 
 from marey_schemas.datasets.commits import PutEntry
 from marey_schemas.datasets.naming import DatasetCreate, RefCreate, RefKind
@@ -17,7 +17,7 @@ from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, ItemHo
 from marey_schemas.queue.jobs import JobState
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ConflictProblem, NotFoundProblem
-from marey_server.store import datasets, events, fsck, items, purging
+from marey_server.store import datasets, events, fsck, items, purging, transaction
 from marey_server.store.datasets import proposals
 from marey_server.store.items.drafts import Draft
 from marey_server.store.jobs import retrying
@@ -152,6 +152,23 @@ def test_a_task_that_made_something_from_a_version_holds_the_dataset(gaits: Comm
     assert gaits.desk.state(job) == "succeeded"
     delete_gaits(gaits)
     assert {one.path for one in preview(gaits).holders if isinstance(one, ItemHolder)} == {"made/one", "made/two"}
+
+
+def test_an_item_that_several_jobs_made_from_a_version_counts_once(
+    gaits: CommittingDesk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(transaction, "_MOST_IN_LIST", 1)
+    gaits.change(PutEntry(path="walk", item=add(gaits.desk, "walk")))
+    for number in range(3):
+        given = {"things": ({"dataset": "gaits", "version": "main"},)}
+        job = gaits.desk.submit("square", inputs=given, into="made", cache="off")
+        lease = gaits.desk.claim(job=job)
+        gaits.desk.stage_outputs(lease, output("again", facts={"number": number}))
+        gaits.desk.complete(lease)
+    delete_gaits(gaits)
+    answer = preview(gaits)
+    assert [one.path for one in answer.holders if isinstance(one, ItemHolder)] == ["made/again"]
+    assert answer.others == 0
 
 
 def test_a_retry_after_the_preparation_holds_the_dataset(gaits: CommittingDesk) -> None:

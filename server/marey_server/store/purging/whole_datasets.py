@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Row, and_, delete, exists, func, select
+from sqlalchemy import Row, delete, exists, func, select
 
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, ItemHolder, JobHolder, words_of
@@ -197,17 +197,19 @@ def _holders(tx: Transaction, citing: Collection[str]) -> FoundHolders:
     """Return the citing jobs that have not ended, and the items that citing jobs made and that were not purged."""
     held = FoundHolders()
     ordered = sorted(citing)
+    items: set[str] = set()
     for some in in_lists(ordered):
         jobs = select(job.c.id, job.c.kind, job.c.state).where(
             job.c.id.in_(some), job.c.state.in_(UNFINISHED), job.c.parent_id.is_(None)
         )
         for row in tx.execute(jobs.order_by(job.c.id)):
             held.add(JobHolder(job=row.id, kind=row.kind, state=JobState(row.state)))
+        items.update(tx.execute(select(revision.c.item_id).where(revision.c.job_id.in_(some))).scalars())
+    for some in in_lists(sorted(items)):
         made = (
             select(item.c.id, item.c.kind, item.c.name, item.c.deleted_us, collection.c.path)
             .join(collection, collection.c.id == item.c.collection_id)
-            .where(item.c.purged_us.is_(None))
-            .where(exists().where(and_(revision.c.item_id == item.c.id, revision.c.job_id.in_(some))))
+            .where(item.c.id.in_(some), item.c.purged_us.is_(None))
         )
         for row in tx.execute(made.order_by(item.c.id)):
             path = f"{row.path}/{row.name}".lstrip("/")
