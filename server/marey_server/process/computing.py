@@ -21,25 +21,36 @@ T = TypeVar("T")
 THREAD_NAME = "marey-compute"
 RENDERING_THREADS = 3
 """Number of threads that render documents; one client, or all clients without a known token, may use all but one."""
+HOUSEKEEPING_THREADS = 3
+"""Number of threads for housekeeping: large commits, waiting merges, and garbage collection run at the same time."""
 BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class ComputeThreads:
-    """Two lanes (threads with a queue): one with a thread for each processor, and one for encoding answers."""
+    """Three lanes (threads with a queue).
+
+    One has a thread for each processor, and one encodes answers. One is for the long computations of housekeeping, so
+    that these do not delay requests.
+    """
 
     def __init__(self, threads: int | None = None) -> None:
         count = max(2, threads or os.cpu_count() or 2)
         self._lane = Lane(THREAD_NAME, count)
         self.rendering = Lane(f"{THREAD_NAME}-rendering", RENDERING_THREADS, most_each=RENDERING_THREADS - 1)
+        self._housekeeping = Lane(f"{THREAD_NAME}-housekeeping", HOUSEKEEPING_THREADS)
 
     @property
     def lanes(self) -> dict[str, Lane]:
         """The lanes by name."""
-        return {"computing": self._lane, "rendering": self.rendering}
+        return {"computing": self._lane, "rendering": self.rendering, "housekeeping": self._housekeeping}
 
     def submit(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Run a computation or file access of the server itself in a thread; return the future of its result."""
         return self._lane.submit(SERVER, function, *args, **kwargs)
+
+    def submit_housekeeping(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Run a computation of housekeeping in a thread; return the future of its result."""
+        return self._housekeeping.submit(SERVER, function, *args, **kwargs)
 
     def submit_for(self, client: Client, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Run a computation for a client in a thread; return the future of its result.
@@ -52,6 +63,7 @@ class ComputeThreads:
         """Start no more computations, and do not wait for running ones, because their clients have disconnected."""
         self._lane.close(wait=False)
         self.rendering.close(wait=False)
+        self._housekeeping.close(wait=False)
 
 
 def compute_on_one_thread_each() -> None:

@@ -161,7 +161,7 @@ async def _collect_garbage(services: Services, holder: str) -> None:
 
 
 async def _in_thread(services: Services, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    return await asyncio.wrap_future(services.compute_threads.submit(function, *args, **kwargs))
+    return await asyncio.wrap_future(services.compute_threads.submit_housekeeping(function, *args, **kwargs))
 
 
 async def _forget_tries(services: Services, holder: str) -> None:

@@ -1,6 +1,7 @@
 """Periodic work of a server."""
 
 import asyncio
+import os
 import threading
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from marey_server.process import housekeeping
 from marey_server.process.services import Services
 from marey_server.process.settings import Settings
 from marey_server.store.database.connections import Database
+from marey_server.store.database.lanes import Client
 from marey_server.store.datasets.proposals import WaitingMerges
 
 
@@ -58,3 +60,33 @@ def test_waiting_proposals_are_merged_again_and_again(
 
     assert asyncio.run(two_rounds())
     assert rounds[0] is rounds[1]
+
+
+def test_housekeeping_leaves_the_compute_threads_to_requests(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, may_end = threading.Semaphore(0), threading.Event()
+
+    def occupy(*_: object) -> int:
+        begun.release()
+        may_end.wait(120)
+        return 0
+
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(housekeeping, "LONGEST_TICK_S", 0.02)
+    monkeypatch.setattr(housekeeping, "FIRST_GARBAGE_S", 0.02)
+    monkeypatch.setattr(WaitingMerges, "attempt", occupy)
+    for name in ("commit_deferred", "retire"):
+        monkeypatch.setattr(housekeeping, name, occupy)
+    app = create_app(Settings(data=tmp_path, port=0), database)
+
+    async def compute_beside() -> int:
+        async with housekeeping.keeping_house(app.services):
+            try:
+                assert await asyncio.to_thread(lambda: all(begun.acquire(timeout=20) for _ in range(3)))
+                future = app.services.compute_threads.submit_for(Client("anna"), sum, (1, 2))
+                return await asyncio.wait_for(asyncio.wrap_future(future), 30)
+            finally:
+                may_end.set()
+
+    assert asyncio.run(compute_beside()) == 3
