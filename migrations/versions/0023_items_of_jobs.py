@@ -16,7 +16,8 @@ depends_on = None
 ID = sa.String(40)
 DOCUMENT = sa.JSON().with_variant(JSONB(), "postgresql")
 DELETED = sa.text("deleted_us IS NOT NULL AND purged_us IS NULL")
-PAGE = 500
+PAGE = 10  # few, because one job can name 100,000 items
+ROWS_AT_ONCE = 1000
 ITEM_ID = re.compile(
     r"\b(?:skeleton|clip|processed|annotation|model|graph|metric|evaluation|character|edit|study)"
     r"_[0123456789abcdefghjkmnpqrstvwxyz]{26}\b"
@@ -45,9 +46,11 @@ def upgrade() -> None:
     page = sa.select(job).order_by(job.c.id).limit(PAGE)
     while rows := connection.execute(page.where(job.c.id > behind)).all():
         behind = rows[-1].id
-        found = [{"job_id": row.id, "item_id": item} for row in rows for item in sorted(items_of(row))]
-        if found:
-            connection.execute(sa.insert(links), found)
+        for row in rows:
+            found = sorted(items_of(row))
+            for start in range(0, len(found), ROWS_AT_ONCE):
+                some = found[start : start + ROWS_AT_ONCE]
+                connection.execute(sa.insert(links), [{"job_id": row.id, "item_id": item} for item in some])
     op.create_index("ix_job_item_item_id", "job_item", ["item_id"])
     columns = ["project_id", "kind", "id"]
     op.create_index("ix_item_deleted", "item", columns, sqlite_where=DELETED, postgresql_where=DELETED)

@@ -1,5 +1,6 @@
 """The tables in the code equal those that migrations create, on both databases."""
 
+from collections.abc import Sized
 from pathlib import Path
 
 import pytest
@@ -160,6 +161,32 @@ def test_an_upgrade_records_the_items_that_jobs_name(desk: Desk, database_url: s
         command.downgrade(config, "0022")
     schema.upgrade_schema(database_url)
     assert desk.database.read(SYSTEM, recorded) == before
+
+
+def test_an_upgrade_records_many_items_of_jobs_in_portions(desk: Desk, database_url: str) -> None:
+    named = [{"item": f"study_{number:026}"} for number in range(2500)]
+    for number in range(12):
+        desk.submit("errand", message=str(number))
+    job, job_item = metadata.tables["job"], metadata.tables["job_item"]
+    with desk.database.engine.begin() as connection:
+        config = schema._config()
+        config.attributes["connection"] = connection
+        command.downgrade(config, "0022")
+        connection.execute(sqlalchemy.update(job).values(inputs={"things": named}))
+    portions: list[int] = []
+
+    def note(_c: object, _cursor: object, statement: str, parameters: Sized, *_: object) -> None:
+        if statement.startswith("INSERT INTO job_item"):
+            portions.append(len(parameters))
+
+    sqlalchemy.event.listen(sqlalchemy.Engine, "before_cursor_execute", note)
+    try:
+        schema.upgrade_schema(database_url)
+    finally:
+        sqlalchemy.event.remove(sqlalchemy.Engine, "before_cursor_execute", note)
+    assert max(portions) <= 1000
+    counted = sqlalchemy.select(sqlalchemy.func.count()).select_from(job_item)
+    assert desk.database.read(SYSTEM, lambda tx: tx.execute(counted).scalar_one()) == 12 * len(named)
 
 
 def test_an_upgrade_that_fails_leaves_the_database_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
