@@ -4,24 +4,36 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as StillRunning
+from typing import Any
 
 import pytest
-from tests.support.interleaving import Abandoned, Step, interleave
-from tests.support.store_fixtures import Lab, requiring, skeleton_tree
+from tests.support.interleaving import HEAD_START_S, Abandoned, Step, interleave
+from tests.support.store_fixtures import WRITE, Lab, declared, requiring, skeleton_tree
 
 from marey_schemas.access import EVERY_MEMBER, FolderRoleChange, Role
-from marey_schemas.items import CollectionChange, CollectionCreate, ItemCreate
+from marey_schemas.datasets.commits import CommitCreate
+from marey_schemas.datasets.merges import CheckoutRequest
+from marey_schemas.datasets.naming import DatasetCreate
+from marey_schemas.items import CollectionChange, CollectionCreate, ItemChange, ItemCreate
 from marey_schemas.kinds import Kind
+from marey_server.access.folder_rights import FolderRights
 from marey_server.access.roles import RequiredRole
-from marey_server.errors import ApiProblem
-from marey_server.store import collections, items, projects
+from marey_server.errors import ApiProblem, ForbiddenProblem
+from marey_server.store import collections, datasets, items, projects
 from marey_server.store.database.connections import Database
+from marey_server.store.datasets import checkout
 from marey_server.store.folder_roles import managing
 from marey_server.store.folder_roles.rights import rights_of_caller
-from marey_server.store.items import ItemFilters
+from marey_server.store.items import ItemFilters, changing
+from marey_server.store.projects import ProjectRow
 from marey_server.store.transaction import Transaction
 
 pytestmark = pytest.mark.every_database
+
+CREATE_ITEM = declared("POST", "/projects/{project}/{kind}")
+MAINTAIN = RequiredRole(Role.MAINTAINER, "write")
 
 Folders = dict[str, str]
 
@@ -120,3 +132,92 @@ def test_rights_that_were_read_before_a_rollback_to_a_savepoint_are_read_again(l
     if lab.database.is_sqlite:  # on which no other request can write meanwhile
         protect()
     assert lab.write(role_after_rollback, who=lab.contributor) is Role.READER
+
+
+def allow(lab: Lab, folder: str, who: str, role: str) -> None:
+    """Set the role of a user, or of all members, in a folder."""
+    change = FolderRoleChange.model_validate({"role": role})
+    lab.write(managing.put_folder_role, lab.name, folder, who, change, required=RequiredRole(Role.OWNER, "write"))
+
+
+def change_folder(kind: str, folder: str) -> Callable[[Transaction], object]:
+    """Return a function that moves a folder to `b/x`, or deletes or restores it."""
+    if kind == "move":
+        change = CollectionChange(path="b/x")
+        return lambda tx: collections.move_collection(tx, "lab", folder, change, expected_rev=None)
+    if kind == "delete":
+        return lambda tx: collections.delete_collection(tx, "lab", folder, expected_rev=None)
+    return lambda tx: collections.restore_collection(tx, "lab", folder)
+
+
+@pytest.mark.parametrize("kind", ["move", "delete", "restore"])
+def test_a_member_creates_an_item_with_the_role_in_the_folder_that_gets_it(
+    lab: Lab, other: Database, kind: str
+) -> None:
+    """An owner moves, deletes or restores a folder with roles, while a member creates an item at its path."""
+    folders = make(lab, "a", "b", "a/x")
+    member = lab.contributor
+    if kind == "delete":
+        allow(lab, folders["a"], EVERY_MEMBER, "reader")
+        allow(lab, folders["a/x"], str(member.user_name), "contributor")
+    else:
+        allow(lab, folders["a/x"], EVERY_MEMBER, "reader")
+    if kind == "restore":
+        lab.write(change_folder("delete", folders["a/x"]), required=MAINTAIN)
+    put = requiring(CREATE_ITEM, puts("b/x" if kind == "move" else "a/x"))
+    changed, refused = interleave(
+        Step(lab.database, lab.owner, change_folder(kind, folders["a/x"])), Step(other, member, put)
+    )
+    assert not isinstance(changed, ApiProblem)
+    assert isinstance(refused, ForbiddenProblem)
+    assert places(lab) == []
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+@pytest.mark.parametrize("act", ["put_part", "tag", "restore", "check_out"])
+def test_an_item_of_a_protected_folder_is_not_changed_while_the_folder_moves(
+    lab: Lab, other: Database, monkeypatch: pytest.MonkeyPatch, act: str, when: str
+) -> None:
+    """The folder begins to move just before or just after the member's rights are read."""
+    folders = make(lab, "a", "b", "a/x")
+    rig = lab.write(puts("a/x"))
+    which = ("lab", Kind.SKELETON, rig.id)
+    if act == "restore":
+        lab.write(items.delete_item, *which, expected_rev=None, required=MAINTAIN)
+    if act == "check_out":
+        lab.write(datasets.create_dataset, "lab", DatasetCreate(name="d", collection="a/x"))
+        prepared = lab.read(datasets.prepare_commit, "lab", "d", CommitCreate(message="m"), required=WRITE)
+        lab.write(datasets.record_commit, "lab", "d", prepared)
+    allow(lab, folders["a/x"], EVERY_MEMBER, "reader")
+    calls: dict[str, tuple[Any, ...]] = {
+        "put_part": (items.put_part, *which, "hierarchy", skeleton_tree(bone_m=0.7)),
+        "tag": (items.change_item, *which, ItemChange(tags=("t",))),
+        "restore": (items.restore_item, *which),
+        "check_out": (datasets.check_out, "lab", "d", CheckoutRequest(version="main", discard=True)),
+    }
+    function, *args = calls[act]
+    state = {} if act == "check_out" else {"expected_rev": None}
+    module = checkout if act == "check_out" else changing
+    moving: list[Future[Any]] = []
+
+    def move_meanwhile(pool: ThreadPoolExecutor) -> None:
+        if not moving:
+            moving.append(pool.submit(other.write, lab.owner, change_folder("move", folders["a/x"])))
+            with contextlib.suppress(StillRunning):
+                moving[0].exception(HEAD_START_S)
+
+    with ThreadPoolExecutor(1) as pool:
+
+        def slow_rights(tx: Transaction, project_row: ProjectRow) -> FolderRights:
+            if when == "before":
+                move_meanwhile(pool)
+            found = rights_of_caller(tx, project_row)
+            if when == "after":
+                move_meanwhile(pool)
+            return found
+
+        monkeypatch.setattr(module, "rights_of_caller", slow_rights)
+        with pytest.raises(ForbiddenProblem):
+            lab.write(function, *args, who=lab.maintainer, required=WRITE, **state)
+        moving[0].result(20)
+    assert "b/x" in living(lab)

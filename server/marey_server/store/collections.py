@@ -14,7 +14,12 @@ from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import listing, projects, quotas
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
-from marey_server.store.folder_roles.rights import forget_rights, rights_of_caller, rights_shown
+from marey_server.store.folder_roles.rights import (
+    forget_rights,
+    lock_places,
+    rights_of_caller,
+    rights_shown,
+)
 from marey_server.store.ids import new_id
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
@@ -166,11 +171,10 @@ def move_collection(
     Raises `ConflictProblem` if the new path is taken.
     """
     project_row = projects.require(tx, project)
-    rights_of_caller(tx, project_row)
+    lock_places(tx, project_row)
     old, new = _find(tx, project_row, collection_id, _ALIVE, lock=True).path, request.path
     _require_no_root(old)
     inside = _lock_inside(tx, project_row, old)
-    forget_rights(tx)
     rights = rights_of_caller(tx, project_row)
     rights.require_entry(old, Role.CONTRIBUTOR)
     rights.require(new.rpartition("/")[0], Role.CONTRIBUTOR)
@@ -220,11 +224,10 @@ def _lock_inside(tx: Transaction, project_row: ProjectRow, path: str) -> Sequenc
 def delete_collection(tx: Transaction, project: str, collection_id: str, *, expected_rev: ExpectedRev) -> None:
     """Hide a folder and its contents; `restore_collection` restores them."""
     project_row = projects.require(tx, project)
-    rights_of_caller(tx, project_row)
+    lock_places(tx, project_row)
     path = _find(tx, project_row, collection_id, _ALIVE, lock=True).path
     _require_no_root(path)
     _lock_inside(tx, project_row, path)
-    forget_rights(tx)
     rights_of_caller(tx, project_row).require_entry(path, Role.MAINTAINER)
     change_row(
         tx, collection, (collection.c.id == collection_id, collection.c.path == path, _ALIVE),
@@ -254,6 +257,7 @@ def restore_collection(
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
+    lock_places(tx, project_row)
     gone = _find(tx, project_row, collection_id, collection.c.deleted_us.is_not(None), lock=True)
     rights_of_caller(tx, project_row).require(gone.path, Role.MAINTAINER, gone.deleted_us)
     ensure(tx, project_row, gone.path.rpartition("/")[0])

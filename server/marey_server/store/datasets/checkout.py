@@ -47,8 +47,9 @@ def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
+    rights = rights_of_caller(tx, project_row)
     found = find_dataset(tx, project_row, name)
-    rights_of_caller(tx, project_row).require_below(found.path or "", Role.MAINTAINER)
+    rights.require_below(found.path or "", Role.MAINTAINER)
     digest = resolve(tx, found.id, request.version)
     state = read_folder(tx, project_row, found)
     store = StoredChunks(tx)

@@ -13,7 +13,7 @@ from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import collections, listing, projects
 from marey_server.store.collections import at_or_below
 from marey_server.store.database.clock import datetime_of
-from marey_server.store.folder_roles.rights import forget_rights, lock_name
+from marey_server.store.folder_roles.rights import lock_places
 from marey_server.store.members import lock_project
 from marey_server.store.projects import ProjectRow
 from marey_server.store.revs import ExpectedRev, at_rev, change_row, moved_on
@@ -148,14 +148,9 @@ def remove_folder_role(
 
 
 def _lock(tx: Transaction, project: str, collection_id: str) -> tuple[ProjectRow, str]:
-    """Lock the roles in folders of a project, then the folder; return the project and the path of the folder.
-
-    The lock waits for writes that have read these roles, and excludes new ones. It is acquired before that of the
-    folder, because such writes lock folders after they have read roles.
-    """
+    """Lock the roles in folders of a project, then the folder; return the project and the path of the folder."""
     project_row = lock_project(tx, project)
-    tx.lock(lock_name(project_row.id))
-    forget_rights(tx)
+    lock_places(tx, project_row)
     path = collections.find_collection(tx, project_row, collection_id, lock=True).path
     if not path:
         raise InvalidProblem(

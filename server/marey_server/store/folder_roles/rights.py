@@ -2,7 +2,7 @@
 
 Every function that changes something in a folder checks these rights. They are read once per transaction, or once per
 savepoint. The transaction then holds a lock until its end, or until the rollback to this savepoint, so that nobody
-changes the roles in folders in the meantime.
+changes the roles in folders in the meantime, and nobody moves, deletes or restores a folder.
 """
 
 from __future__ import annotations
@@ -41,8 +41,23 @@ def lock_name(project_id: str) -> str:
     return f"folder-roles:{project_id}"
 
 
+def lock_places(tx: Transaction, project: ProjectRow) -> None:
+    """Lock the roles in folders and the paths of the folders that have them, until the transaction ends.
+
+    Members who write compare the path of a folder with the paths at which they have roles. While another request moves,
+    deletes or restores a folder, one of the two could be out of date. So these requests and changes of roles take this
+    lock, before they lock any row. It waits for writes that have read roles, and excludes new ones.
+    """
+    tx.lock(lock_name(project.id))
+    forget_rights(tx)
+
+
 def rights_of_caller(tx: Transaction, project: ProjectRow) -> FolderRights:
-    """Return the caller's rights in the folders of a project, which stay the same until the transaction ends."""
+    """Return the caller's rights in the folders of a project, which stay the same until the transaction ends.
+
+    Must be called before the write reads the path of an item or a folder, because the path may change until then. It
+    must also be called before the write locks rows, because changes of roles lock rows after they lock the roles.
+    """
     return _kept(tx, project, tx.principal.user_id, project.role)
 
 

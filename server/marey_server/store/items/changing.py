@@ -200,8 +200,9 @@ def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, exp
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
+    rights = rights_of_caller(tx, project_row)
     gone = find_item(tx, project_row, kind, item_id, deleted=True)
-    rights_of_caller(tx, project_row).require_restoration(gone.path, gone.folder_deleted_us)
+    rights.require_restoration(gone.path, gone.folder_deleted_us)
     collection_id = collections.ensure(tx, project_row, gone.path)
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_not(None), item.c.purged_us.is_(None))
     values = {"deleted_us": None, "updated_us": tx.now_us, "collection_id": collection_id}
@@ -221,8 +222,9 @@ def _find_to_change(
     Raises `NotFoundProblem` if there is no such item, and `ForbiddenProblem` if the caller's role in its folder is
     lower than `needed`.
     """
+    rights = rights_of_caller(tx, project_row)
     found = find_item(tx, project_row, kind, item_id)
-    rights_of_caller(tx, project_row).require(found.path, needed)
+    rights.require(found.path, needed)
     return found
 
 
