@@ -216,15 +216,48 @@ class WritingProgram:
         folder.deleted, folder.deleted_at = allowed, folder.path
 
     def restore_folder(self, who: str) -> None:
-        alive = {id(one) for one in (self.top, *self._alive())}
-        gone = [one for one in self.folders if one.deleted and id(one.above) in alive and one.path == one.deleted_at]
+        gone = [one for one in self.folders if one.deleted and self._is_free(one)]
         if not gone:
             return
-        folder = self.chance.choice(gone)
+        inside = [one for one in gone if one.above is not None and any(up.deleted for up in one.above.line)]
+        folder = self.chance.choice(inside or gone)
+        was, above = folder.above, folder.path.rpartition("/")[0]
         allowed = self._entry_allows(who, folder, Role.MAINTAINER)
+        folder.above = self._nearest(above)
+        allowed = allowed and self._entry_allows(who, folder, Role.MAINTAINER)
+        folder.above = was
         path = f"{COLLECTIONS}/{{collection}}/restore"
         self._call(who, allowed, "POST", path, collections.restore_collection, folder.id)
-        folder.deleted = not allowed
+        if allowed:
+            folder.deleted, folder.above = False, self._made(above)
+
+    def _is_free(self, folder: Folder) -> bool:
+        """Return whether a deleted folder can be restored at its path, and no other deleted folder was at this path."""
+        alive = {id(one) for one in self._alive()}
+        line = {one.path: one for one in folder.line}
+        others = [one for one in self.folders if line.get(one.path, one) is not one]
+        taken = any(one.path == folder.path for one in others)
+        return folder.path == folder.deleted_at and not taken and all(id(one) in alive for one in others)
+
+    def _nearest(self, path: str) -> Folder:
+        """Return the folder at a path, or the nearest existing one above it."""
+        while path:
+            for one in self._alive():
+                if one.path == path:
+                    return one
+            path = path.rpartition("/")[0]
+        return self.top
+
+    def _made(self, path: str) -> Folder:
+        """Return the folder at a path; the restoration of a folder below has created it if it did not exist."""
+        found = self._nearest(path)
+        if found.path == path:
+            return found
+        above, _, name = path.rpartition("/")
+        shown = self.lab.read(collections.list_collections, "lab", path=path, limit=1).items[0]
+        made = Folder(shown.id, name, self._made(above))
+        self.folders.append(made)
+        return made
 
     def _folder(self) -> Folder | None:
         alive = self._alive()

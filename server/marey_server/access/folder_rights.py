@@ -7,7 +7,7 @@ who may write, not who may read: every member may read the whole project.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from marey_schemas.access import Role
@@ -40,15 +40,16 @@ class FolderRights:
     def role_in(self, path: str, deleted_us: FolderState = None) -> Role:
         """Return the role in the folder `path`; `deleted_us` is the time at which a deleted folder was deleted.
 
-        A new folder may have been created at the path of a deleted folder. If both folders have overrides, the lower
-        role counts.
+        The folders above a deleted folder may have been deleted later, and new folders may have been created at their
+        paths. So two roles are looked up, with the overrides of deleted folders only and with those of all folders at
+        these paths, and the lower one counts.
         """
-        states = {None, deleted_us}
-        for folder in with_ancestors(path):
-            found = [roles[folder] for state in states if folder in (roles := self.overrides.get(state, {}))]
-            if found:
-                return least_of(found)
-        return self.role
+        existing = self.overrides.get(None, {})
+        if deleted_us is None:
+            return _nearest(path, [existing]) or self.role
+        deleted = [roles for state, roles in self.overrides.items() if state is not None and state >= deleted_us]
+        found = [role for role in (_nearest(path, deleted), _nearest(path, [existing, *deleted])) if role is not None]
+        return least_of(found) if found else self.role
 
     def require(self, path: str, needed: Role, deleted_us: FolderState = None) -> None:
         """Raise `FolderRoleProblem` unless the role in the folder `path` is at least `needed`."""
@@ -95,6 +96,15 @@ class FolderRights:
             f"there is {held.value}. An owner of the project can change it.",
             context=context,
         )
+
+
+def _nearest(path: str, overrides: Sequence[Mapping[str, Role]]) -> Role | None:
+    """Return the lowest override of the folder `path`, or else of the nearest folder above; None if there is none."""
+    for folder in with_ancestors(path):
+        found = [roles[folder] for roles in overrides if folder in roles]
+        if found:
+            return least_of(found)
+    return None
 
 
 def with_ancestors(path: str) -> Iterator[str]:

@@ -259,8 +259,11 @@ def restore_collection(
     hold_off_purges(tx, project_row.id)
     lock_places(tx, project_row)
     gone = _find(tx, project_row, collection_id, collection.c.deleted_us.is_not(None), lock=True)
-    rights_of_caller(tx, project_row).require(gone.path, Role.MAINTAINER, gone.deleted_us)
-    ensure(tx, project_row, gone.path.rpartition("/")[0])
+    above = gone.path.rpartition("/")[0]
+    rights = rights_of_caller(tx, project_row)
+    for path in (gone.path, above):
+        rights.require(path, Role.MAINTAINER, gone.deleted_us)
+    ensure(tx, project_row, above)
     with taken(_path_taken(gone.path)):
         row = change_row(
             tx, collection, (collection.c.id == collection_id, collection.c.deleted_us == gone.deleted_us),

@@ -248,6 +248,25 @@ def test_an_item_is_restored_only_with_the_role_at_its_future_place(lab: Lab) ->
     assert back.collection == "a/b"
 
 
+@pytest.mark.parametrize("role_below", [None, "maintainer"])
+def test_a_folder_is_not_restored_out_of_a_folder_that_was_deleted_later(lab: Lab, role_below: str | None) -> None:
+    delete = declared("DELETE", "/projects/{project}/collections/{collection}")
+    restore = declared("POST", "/projects/{project}/collections/{collection}/restore")
+    inner, outer = make_folder(lab, "a/b/x"), folder_at(lab, "a")
+    put(lab, outer, EVERY_MEMBER, "reader")
+    if role_below is not None:
+        put(lab, inner, EVERY_MEMBER, role_below)
+    for folder in (inner, folder_at(lab, "a/b"), outer):
+        lab.write(collections.delete_collection, "lab", folder.id, expected_rev=None, required=delete)
+    put(lab, make_folder(lab, "a/b"), EVERY_MEMBER, "maintainer")  # new folders at the old paths
+    gone = lab.read(collections.list_collections, "lab", who=lab.maintainer, deleted=True).items
+    assert [one.role for one in gone if one.id == inner.id] == [role_below or "reader"]
+    with pytest.raises(ForbiddenProblem) as refused:
+        lab.write(collections.restore_collection, "lab", inner.id, who=lab.maintainer, required=restore)
+    assert refused.value.context["role"] == "reader"
+    lab.write(collections.restore_collection, "lab", inner.id, required=restore)
+
+
 # -- jobs -------------------------------------------------------------------------------------------------------------
 
 
