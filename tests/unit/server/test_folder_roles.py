@@ -180,6 +180,27 @@ def test_the_number_of_roles_is_limited(lab: Lab, monkeypatch: pytest.MonkeyPatc
     put(lab, folders[1], EVERY_MEMBER, "contributor")
 
 
+def test_roles_in_deleted_folders_have_a_limit_of_their_own(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A restoration may exceed the limit for existing folders."""
+    delete = declared("DELETE", "/projects/{project}/collections/{collection}")
+    monkeypatch.setattr(managing, "MOST_FOLDER_ROLES", 1)
+    monkeypatch.setattr(managing, "MOST_WITH_DELETED", 2)
+    folders = [make_folder(lab, path) for path in "abc"]
+    for folder in folders[:2]:
+        put(lab, folder, EVERY_MEMBER, "reader")
+        lab.write(collections.delete_collection, "lab", folder.id, expected_rev=None, required=delete)
+    with pytest.raises(ConflictProblem) as refused:
+        put(lab, folders[2], EVERY_MEMBER, "reader")
+    assert refused.value.error_code == "too-many-folder-roles"
+    for folder in folders[:2]:
+        lab.write(collections.restore_collection, "lab", folder.id, required=delete)
+    assert len(lab.read(managing.list_folder_roles, "lab", required=MEMBER).items) == 2
+    for folder in folders[:2]:
+        remove = (managing.remove_folder_role, "lab", folder.id, EVERY_MEMBER)
+        lab.write(*remove, expected_rev=None, required=OWNER)
+    put(lab, folders[2], EVERY_MEMBER, "reader")
+
+
 def test_a_guest_has_no_role_in_folders_and_cannot_see_those_of_others(lab: Lab) -> None:
     put(lab, make_folder(lab, "a"), EVERY_MEMBER, "contributor")
     lab.make_public()

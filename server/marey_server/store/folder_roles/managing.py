@@ -21,7 +21,9 @@ from marey_server.store.tables import collection, folder_role, member, user
 from marey_server.store.transaction import Transaction
 
 MOST_FOLDER_ROLES = 1000
-"""Greatest number of roles in the folders of one project, so that a request can read all that concern its caller."""
+"""Greatest number of roles in the folders of one project that are not deleted. A restoration may exceed it."""
+MOST_WITH_DELETED = 10_000
+"""Greatest number of roles in all folders of one project, so that a request can read all that concern its caller."""
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -187,9 +189,19 @@ def _find_member(tx: Transaction, project_row: ProjectRow, user_name: str) -> st
 
 
 def _require_room(tx: Transaction, project_row: ProjectRow) -> None:
-    held = tx.execute(select(func.count()).where(folder_role.c.project_id == project_row.id)).scalar_one()
-    if held >= MOST_FOLDER_ROLES:
+    existing = func.count().filter(collection.c.deleted_us.is_(None)).label("existing")
+    counts = select(existing, func.count().label("all")).join(
+        folder_role, folder_role.c.collection_id == collection.c.id
+    )
+    held: Row[Any] = tx.execute(counts.where(folder_role.c.project_id == project_row.id)).one()
+    if held.existing >= MOST_FOLDER_ROLES:
         raise ConflictProblem(
             f"A project can have at most {MOST_FOLDER_ROLES:,} roles in folders; remove one first.",
+            code="too-many-folder-roles",
+        )
+    if held.all >= MOST_WITH_DELETED:
+        raise ConflictProblem(
+            f"A project can have at most {MOST_WITH_DELETED:,} roles in folders, with those in deleted folders; "
+            "restore a deleted folder and remove its roles first.",
             code="too-many-folder-roles",
         )
