@@ -19,6 +19,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.purges import PurgeRequest
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import ItemInput, JobCreate
+from marey_schemas.queue.pipelines import PipelineCreate, PipelineStep
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.access.roles import RequiredRole
 from marey_server.errors import (
@@ -349,6 +350,41 @@ def test_a_reader_runs_jobs_that_write_to_the_readers_folder(studio: Studio) -> 
     studio.put("reader")
     with pytest.raises(ForbiddenProblem):
         studio.desk.database.write(studio.rob, requiring(RETRY, retrying.retry_job), again.id)
+
+
+@pytest.mark.parametrize("operation", ["submit", "pipeline", "retry"])
+def test_rights_are_read_before_items_are_read_and_jobs_are_locked(
+    studio: Studio, monkeypatch: pytest.MonkeyPatch, operation: str
+) -> None:
+    """Otherwise a submission could miss a move, or wait for a change of roles while others wait for its jobs."""
+    studio.put("contributor")
+    first = studio.submit(studio.rob, "errand", into="team")
+    last = studio.submit(studio.rob, "errand", into="team", after=(first,))
+    studio.desk.database.write(studio.rob, requiring(CANCEL, reading.cancel_job), last)
+    steps = {"one": PipelineStep(kind="errand"), "two": PipelineStep(kind="errand", after=("one",))}
+    pipeline = PipelineCreate(into="team", steps=steps)
+    acts: dict[str, tuple[Any, ...]] = {
+        "submit": (SUBMIT, submission.submit, "lab", (JobCreate(kind="errand", into="team", after=(first,)),)),
+        "pipeline": (SUBMIT, submission.submit_pipeline, "lab", pipeline),
+        "retry": (RETRY, retrying.retry_job, last),
+    }
+    seen: list[str] = []
+
+    def noted(name: str, function: Any) -> Any:
+        def run(*args: Any) -> Any:
+            seen.append(name)
+            return function(*args)
+
+        return run
+
+    for module in (submission, retrying):
+        for name in ("find_items", "lock_jobs", "rights_of_caller"):
+            if hasattr(module, name):
+                monkeypatch.setattr(module, name, noted(name, getattr(module, name)))
+    required, function, *args = acts[operation]
+    studio.desk.database.write(studio.rob, requiring(required, function), *args)
+    assert "lock_jobs" in seen
+    assert seen[0] == "rights_of_caller"
 
 
 def test_results_follow_the_inputs_into_their_folders(studio: Studio) -> None:

@@ -12,6 +12,7 @@ from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
 from marey_schemas.queue.jobs import FailureReason, Job, JobState
 from marey_server.access import roles
 from marey_server.errors import ConflictProblem
+from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.ids import new_id
 from marey_server.store.jobs import commits
 from marey_server.store.jobs.inputs import PinnedInputs
@@ -38,6 +39,7 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "retry")
     hold_off_purges(tx, project.id)  # before the inputs of the jobs are read
+    rights_of_caller(tx, project)  # here, because it must precede the locks of jobs
     if row.state not in UNSUCCESSFUL:
         raise ConflictProblem(
             f"Only a failed or cancelled job can be retried; this one is {row.state}.", code="not-failed"

@@ -62,6 +62,7 @@ def submit(tx: Transaction, project: str, requests: Sequence[JobCreate]) -> list
     """
     row = require(tx, project)
     hold_off_purges(tx, row.id)
+    rights_of_caller(tx, row)  # here, because it must precede the locks of jobs
     many = len(requests) > 1
     return submit_at(tx, row, {f"/jobs/{index}" if many else "": one for index, one in enumerate(requests)})
 
@@ -274,6 +275,7 @@ def submit_pipeline(tx: Transaction, project: str, pipeline: PipelineCreate) -> 
     """
     row = require(tx, project)
     hold_off_purges(tx, row.id)
+    rights_of_caller(tx, row)  # here, because it must precede the locks of jobs
     try:
         order = order_steps(pipeline)
     except PipelineError as error:
