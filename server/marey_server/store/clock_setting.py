@@ -17,7 +17,7 @@ from marey_server.store.tables import invitation, job, metadata, token
 PAST = frozenset(
     {
         "at_us", "cancel_requested_us", "created_us", "deleted_us", "delivered_us", "ended_us", "failing_since_us",
-        "finished_us", "last_used_us", "published_us", "purged_us", "since_us", "started_us", "updated_us",
+        "finished_us", "last_used_us", "purged_us", "since_us", "started_us", "updated_us",
     }
 )  # fmt: skip
 """Columns of moments that have passed; none may lie in the future."""
