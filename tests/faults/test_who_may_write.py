@@ -12,13 +12,13 @@ from tests.support.store_fixtures import WRITE, Lab, declared, requiring, skelet
 from tests.support.tiers import is_soak
 from tests.support.who_may_write import WritingProgram
 
-from marey_schemas.access import EVERY_MEMBER, FolderRoleChange, Role
+from marey_schemas.access import EVERY_MEMBER, FolderRoleChange, MemberChange, Role
 from marey_schemas.items import CollectionCreate, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access import folder_rights
 from marey_server.access.folder_rights import FolderRights
-from marey_server.errors import ForbiddenProblem
-from marey_server.store import collections, items, projects
+from marey_server.errors import ForbiddenProblem, NotFoundProblem
+from marey_server.store import collections, items, members, projects
 from marey_server.store.database.connections import Database
 from marey_server.store.folder_roles import managing, rights
 from marey_server.store.items import changing
@@ -102,6 +102,13 @@ def put_role(folder: str, role: str, user: str = EVERY_MEMBER) -> Callable[[Tran
     return lambda tx: managing.put_folder_role(tx, "lab", folder, user, change)
 
 
+def end_role(how: str, user: str) -> Callable[[Transaction], object]:
+    """Return a function that removes a member, or makes the member a reader."""
+    if how == "removed":
+        return lambda tx: members.remove_member(tx, "lab", user, expected_rev=None)
+    return lambda tx: members.put_member(tx, "lab", user, MemberChange(role=Role.READER))
+
+
 def create_item(tx: Transaction) -> object:
     request = ItemCreate(name="rig", collection="delivered/monday", parts={"hierarchy": skeleton_tree()})
     return requiring(WRITE, items.create_item)(tx, "lab", Kind.SKELETON, request)
@@ -144,3 +151,37 @@ def test_a_reader_writes_only_before_the_role_in_the_folder_is_withdrawn(lab: La
     steps = [Step(lab.database, lab.reader, create), Step(other, lab.owner, withdraw)]
     made, _ = interleave(*steps) if first == "the item" else reversed(interleave(*reversed(steps)))
     assert isinstance(made, ForbiddenProblem) == (first == "the role")
+
+
+@pytest.mark.parametrize("how", ["removed", "a reader"])
+def test_a_member_whose_role_ends_before_the_rights_are_read_writes_nothing(
+    lab: Lab, other: Database, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    """The request has found the member in the project, and then reads the roles in folders."""
+    lab.write(collections.create_collection, "lab", CollectionCreate(path="delivered"))
+    user = str(lab.contributor.user_name)
+    if lab.database.is_sqlite:  # on which no other request can write meanwhile
+        lab.database.write(lab.owner, end_role(how, user))
+
+    def late_rights(tx: Transaction, project_row: Any) -> FolderRights:
+        if tx.is_postgres:
+            other.write(lab.owner, end_role(how, user))
+        return rights.rights_of_caller(tx, project_row)
+
+    monkeypatch.setattr(changing, "rights_of_caller", late_rights)
+    with pytest.raises((ForbiddenProblem, NotFoundProblem)):
+        lab.database.write(lab.contributor, create_item)
+    assert lab.read(count_items) == 0
+
+
+@pytest.mark.parametrize("how", ["removed", "a reader"])
+def test_the_role_of_a_member_ends_after_the_writes_that_have_read_it(lab: Lab, other: Database, how: str) -> None:
+    seen: list[int] = []
+
+    def end(tx: Transaction) -> None:
+        end_role(how, str(lab.contributor.user_name))(tx)
+        seen.append(count_items(tx))
+
+    made, _ = interleave(Step(lab.database, lab.contributor, create_item), Step(other, lab.owner, end))
+    assert not isinstance(made, Exception)
+    assert seen == [1]

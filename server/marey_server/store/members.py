@@ -11,6 +11,7 @@ from marey_schemas.items import Page
 from marey_server.errors import ConflictProblem, NotFoundProblem, PreconditionFailedProblem
 from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
+from marey_server.store.folder_roles.rights import lock_places
 from marey_server.store.invitations.validity import withdraw_unauthorised
 from marey_server.store.projects import ProjectRow
 from marey_server.store.revs import ExpectedRev, at_rev, change_row, moved_on
@@ -54,6 +55,7 @@ def put_member(
     Raises `NotFoundProblem` if there is no such user, and `ConflictProblem` if the project would lose its last owner.
     """
     project_row = lock_project(tx, project_name)
+    lock_places(tx, project_row)
     user_id = tx.execute(select(user.c.id).where(user.c.name == user_name, user.c.disabled.is_(False))).scalar()
     if user_id is None:
         raise NotFoundProblem(f"There is no user {user_name!r}.", code="no-user")
@@ -113,6 +115,7 @@ def remove_member(tx: Transaction, project_name: str, user_name: str, *, expecte
     Raises `ConflictProblem` if the project would lose its last owner.
     """
     project_row = lock_project(tx, project_name)
+    lock_places(tx, project_row)
     which = (
         member.c.project_id == project_row.id,
         member.c.user_id.in_(select(user.c.id).where(user.c.name == user_name)),

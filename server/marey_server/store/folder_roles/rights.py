@@ -19,14 +19,21 @@ from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import collection, folder_role, member, user
 from marey_server.store.transaction import Transaction
 
-_OVERRIDES = Prepared(
-    select(collection.c.path, collection.c.deleted_us, folder_role.c.user_id, folder_role.c.role)
-    .join(collection, collection.c.id == folder_role.c.collection_id)
-    .where(
-        folder_role.c.project_id == bindparam("project_id"),
-        or_(folder_role.c.user_id == bindparam("user_id"), folder_role.c.user_id == bindparam("every_member")),
-    )
+_CONCERNED = and_(
+    folder_role.c.project_id == bindparam("project_id"),
+    or_(folder_role.c.user_id == bindparam("user_id"), folder_role.c.user_id == bindparam("every_member")),
 )
+_OVERRIDES = Prepared(
+    select(
+        member.c.role.label("project_role"),
+        collection.c.path, collection.c.deleted_us, folder_role.c.user_id, folder_role.c.role,
+    )
+    .select_from(
+        member.outerjoin(folder_role, _CONCERNED).outerjoin(collection, collection.c.id == folder_role.c.collection_id)
+    )
+    .where(member.c.project_id == bindparam("project_id"), member.c.user_id == bindparam("user_id"))
+)  # fmt: skip
+"""Role of a member in the project, in each row of the result, with the roles in folders that concern the member."""
 _AUTHOR = Prepared(
     select(user.c.administrator, user.c.disabled, member.c.role)
     .select_from(
@@ -45,8 +52,9 @@ def lock_places(tx: Transaction, project: ProjectRow) -> None:
     """Lock the roles in folders and the paths of the folders that have them, until the transaction ends.
 
     Members who write compare the path of a folder with the paths at which they have roles. While another request moves,
-    deletes or restores a folder, one of the two could be out of date. So these requests and changes of roles take this
-    lock, before they lock any row. It waits for writes that have read roles, and excludes new ones.
+    deletes or restores a folder, one of the two could be out of date. So these requests and changes of roles, in
+    folders or in the project, take this lock, before they lock an item, a folder or a job. It waits for writes that
+    have read roles, and excludes new ones.
     """
     tx.lock(lock_name(project.id))
     forget_rights(tx)
@@ -65,7 +73,7 @@ def rights_shown(tx: Transaction, project: ProjectRow) -> FolderRights:
     """Return the caller's rights in the folders of a project, read without a lock, only to show them in an answer."""
     if not _has_overrides(tx.principal.user_id, project.role) or project.guest:
         return FolderRights(project.name, project.role)
-    return tx.folder_rights.get((project.id, tx.principal.user_id)) or _read(tx, project, project.role)
+    return tx.folder_rights.get((project.id, tx.principal.user_id)) or _read(tx, project, tx.principal.user_id)
 
 
 def rights_of_author(tx: Transaction, project: ProjectRow, author_id: str | None) -> FolderRights:
@@ -103,15 +111,19 @@ def _kept(tx: Transaction, project: ProjectRow, user_id: str | None, role: Role)
     if known is not None:
         return known
     tx.lock(lock_name(project.id), shared=True)  # in a statement of its own, because the next one reads after it
-    found = _read(tx, project, role, user_id)
+    found = _read(tx, project, user_id)
     if not tx.connection.in_nested_transaction():  # whose rollback would release the lock
         tx.folder_rights[key] = found
     return found
 
 
-def _read(tx: Transaction, project: ProjectRow, role: Role, user_id: str | None = None) -> FolderRights:
-    which = {"project_id": project.id, "user_id": user_id or tx.principal.user_id, "every_member": EVERY_MEMBER}
-    return FolderRights(project.name, role, _by_state(tx.run(_OVERRIDES, which)))
+def _read(tx: Transaction, project: ProjectRow, user_id: str | None) -> FolderRights:
+    """Read the rights of a member; the role in the project, too, because it may have changed before the lock."""
+    rows = tx.run(_OVERRIDES, {"project_id": project.id, "user_id": user_id, "every_member": EVERY_MEMBER})
+    role = Role(rows[0].project_role) if rows else Role.READER  # of a user who is no member any more
+    if role is Role.OWNER:
+        return FolderRights(project.name, role)
+    return FolderRights(project.name, role, _by_state([row for row in rows if row.role is not None]))
 
 
 def _by_state(rows: Sequence[Row[Any]]) -> Mapping[FolderState, Mapping[str, Role]]:
