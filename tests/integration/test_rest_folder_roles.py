@@ -226,6 +226,22 @@ def test_folders_show_the_role_of_the_caller(house: Studio) -> None:
     assert folder.json()["role"] == "maintainer"
 
 
+def test_an_answer_with_another_role_of_the_caller_has_another_etag(house: Studio) -> None:
+    """The role in the project or in a folder changes without the `rev` of the project or the folder."""
+    raised, folder = house.members["raised"], f"{FOLDERS}/{house.folders['team']}"
+
+    def read(path: str, known: httpx.Response | None = None) -> httpx.Response:
+        return raised.get(path, headers={} if known is None else {"If-None-Match": known.headers["ETag"]})
+
+    in_project, in_folder = read("/projects/lab"), read(folder)
+    assert {read("/projects/lab", in_project).status_code, read(folder, in_folder).status_code} == {304}
+    for path in (f"{folder}/roles/raised", "/projects/lab/members/raised"):
+        assert house.owner.put(path, json={"role": "contributor"}, headers=ANY).status_code == 200
+    assert read("/projects/lab", in_project).json()["role"] == read(folder, in_folder).json()["role"] == "contributor"
+    state = {"If-Match": read(folder).headers["ETag"]}
+    assert house.owner.patch(folder, json={"path": "moved"}, headers=state).status_code == 200
+
+
 def test_a_token_for_a_project_uploads_for_a_member_with_one_folder(house: Studio) -> None:
     raised = house.members["raised"]
     made = raised.post("/tokens", json={"name": "t", "scopes": ["write!project=lab", "read!project=lab"]})

@@ -14,9 +14,11 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from marey_schemas.access import Project
 from marey_schemas.address import API
 from marey_schemas.encoding.codecs import JSON as JSON_NAME
 from marey_schemas.encoding.codecs import encode_tree
+from marey_schemas.items import Collection
 from marey_schemas.lru import LruCache
 from marey_server.http.caching import REVALIDATED
 from marey_server.http.etags import entity_tag, matches
@@ -61,7 +63,8 @@ Content = BaseModel | Mapping[str, Any] | bytes
 class Reply:
     """Answer of a handler: a model, a document tree, bytes with their media type, or nothing.
 
-    The ETag is made from `rev`; `location` is a path below the API's root.
+    The ETag is made from `rev`: the `rev` of a resource, perhaps with more after a full stop. `location` is a path
+    below the API's root.
     """
 
     content: Content | Lasting | Loaded | None = None
@@ -70,6 +73,11 @@ class Reply:
     location: str | None = None
     media_type: str | None = None
     headers: Mapping[str, str] = field(default_factory=dict)
+
+
+def with_role(content: Project | Collection) -> Reply:
+    """Return the answer with a document that shows the caller's role, which changes without its `rev`."""
+    return Reply(content, rev=f"{content.rev}.{content.role or 'guest'}")
 
 
 @dataclass(frozen=True, slots=True)
