@@ -20,11 +20,12 @@ from tests.support.furnished_house import MOTION
 from tests.support.rest_server import Server, running
 
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import ConflictProblem
+from marey_server.errors import ConflictProblem, QuotaExceededProblem
 from marey_server.process import housekeeping
 from marey_server.store.database.connections import Database
 from marey_server.store.datasets import proposals
-from marey_server.store.datasets.proposals import WaitingMerges
+from marey_server.store.datasets.merging import record_merge
+from marey_server.store.datasets.proposals import WaitingMerges, accepting
 from marey_server.store.datasets.proposals import waiting as waiting_module
 from marey_server.store.fsck import check_store
 from marey_server.store.tables import job, proposal
@@ -428,6 +429,33 @@ def test_a_right_that_is_lost_for_a_moment_is_no_lasting_obstacle(
         assert waiting.attempt() == 0
     ok(team.olga.put(f"{LAB}/members/ada", json={"role": "contributor"}))
     assert waiting.attempt() == 1
+
+
+@pytest.mark.parametrize("last", ["review", "check"])
+def test_a_refused_merge_does_not_refuse_the_review_or_check(
+    team: Team, server: Server, monkeypatch: pytest.MonkeyPatch, last: str
+) -> None:
+    """The merge is that of another user, whose quota it exceeds; nothing of it is stored."""
+    team.protect(**({"approvals": 1} if last == "review" else {"checks": ["evaluation"]}))
+    team.propose()
+    ok(team.ada.post(f"{PROPOSALS}/1/merge", json={"when_green": True}))
+    before = head(team, "main")
+
+    def record_and_refuse(*arguments: Any) -> Any:
+        record_merge(*arguments)
+        raise QuotaExceededProblem("The user who created the items has too many.")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(accepting, "record_merge", record_and_refuse)
+        if last == "review":
+            approve(team.ben, 1)
+        else:
+            ok(check(team.ben, 1, "succeeded"))
+    found = ok(team.rita.get(f"{PROPOSALS}/1"))
+    assert (found["state"], found["when_green"], head(team, "main")) == ("open", "ada", before)
+    assert found["mergeability"]["missing"] == []
+    assert WaitingMerges(server.database).attempt() == 1
+    assert not list(check_store(server.database))
 
 
 @on_sqlite

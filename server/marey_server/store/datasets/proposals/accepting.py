@@ -5,6 +5,7 @@ A read transaction prepares the merge. A short write transaction checks the requ
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -20,7 +21,7 @@ from marey_schemas.datasets.protection import Protection
 from marey_server.access import roles
 from marey_server.errors import ApiProblem, ConflictProblem, InvalidProblem
 from marey_server.store import projects
-from marey_server.store.datasets.committing import branch_moved
+from marey_server.store.datasets.committing import BRANCH_MOVED, branch_moved
 from marey_server.store.datasets.merging import LARGE_MERGE, PreparedMerge, prepare_merge, record_merge
 from marey_server.store.datasets.naming import find_dataset, find_ref
 from marey_server.store.datasets.proposals.opening import (
@@ -38,6 +39,8 @@ from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import member, proposal_comment, user
 from marey_server.store.transaction import Transaction
+
+log = logging.getLogger(__name__)
 
 MOST_PREVIEWED = 10_000
 """Greatest number of changed entries on each side of a merge that is previewed when its proposal is read."""
@@ -277,6 +280,23 @@ def merge_if_green(
         return WaitingOutcome.OBSTRUCTED
     _record(tx, project, name, row, prepared, mover, row.when_green_id)
     return WaitingOutcome.MERGED
+
+
+def merge_if_possible(
+    tx: Transaction, project: str, name: str, row: Row[Any], prepared: PreparedAcceptance | None
+) -> None:
+    """Call `merge_if_green`, and leave a merge that is refused, for example because of a quota, to housekeeping.
+
+    The merge is not the caller's, so its refusal must not undo what the caller has stored in this transaction. Raises
+    `ConflictProblem` if a branch has moved since the merge was prepared.
+    """
+    try:
+        with tx.connection.begin_nested():
+            merge_if_green(tx, project, name, row, prepared)
+    except ApiProblem as problem:
+        if problem.error_code == BRANCH_MOVED:
+            raise
+        log.info("proposal %d of %s is merged later: %s", row.number, row.dataset_id, problem.detail)
 
 
 def merge_basis(tx: Transaction, project_row: ProjectRow, row: Row[Any]) -> MergeBasis | None:

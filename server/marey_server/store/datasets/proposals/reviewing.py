@@ -13,7 +13,7 @@ from marey_schemas.queue.jobs import JobState, commits_of
 from marey_server.errors import ConflictProblem, NotFoundProblem
 from marey_server.store import listing, projects
 from marey_server.store.datasets.naming import find_dataset
-from marey_server.store.datasets.proposals.accepting import PreparedAcceptance, merge_if_green
+from marey_server.store.datasets.proposals.accepting import PreparedAcceptance, merge_if_possible
 from marey_server.store.datasets.proposals.discussing import next_number
 from marey_server.store.datasets.proposals.opening import find_proposal, lock_open, require_newest, touch
 from marey_server.store.datasets.proposals.requirements import checks_of, select_reviews, shown_review
@@ -30,7 +30,7 @@ def add_review(
     Raises `ConflictProblem` if the proposal has ended, or if its newest commit is not the one that the request names.
     """
     project_row = projects.require(tx, project)
-    hold_off_purges(tx, project_row.id)  # for `merge_if_green`
+    hold_off_purges(tx, project_row.id)  # for `merge_if_possible`
     found = find_dataset(tx, project_row, name)
     row = lock_open(tx, found.id, number)
     require_newest(tx, row, request.commit)
@@ -45,7 +45,7 @@ def add_review(
         "proposal.reviewed", found.id, project_id=project_row.id, number=number, verdict=request.verdict.value,
         commit=row.head_now,
     )  # fmt: skip
-    merge_if_green(tx, project, name, row, waiting)
+    merge_if_possible(tx, project, name, row, waiting)
     made = tx.execute(select_reviews(row).where(proposal_review.c.number == values["number"])).one()
     return shown_review(made, row.head_now)
 
@@ -69,7 +69,7 @@ def report_check(
     other versions of the dataset. Raises `NotFoundProblem` if the project has no such job.
     """
     project_row = projects.require(tx, project)
-    hold_off_purges(tx, project_row.id)  # for `merge_if_green`
+    hold_off_purges(tx, project_row.id)  # for `merge_if_possible`
     found = find_dataset(tx, project_row, name)
     row = lock_open(tx, found.id, number)
     require_newest(tx, row, request.commit)
@@ -81,7 +81,7 @@ def report_check(
         "proposal.checked", found.id, project_id=project_row.id, number=number, check=request.name,
         state=request.state.value, commit=row.head_now,
     )  # fmt: skip
-    merge_if_green(tx, project, name, row, waiting)
+    merge_if_possible(tx, project, name, row, waiting)
     return checks_of(tx, row)[request.name]
 
 
