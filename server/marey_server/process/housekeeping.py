@@ -27,7 +27,7 @@ from marey_server.store.jobs.finishing import commit_deferred
 from marey_server.store.jobs.reaper import StartGrace
 from marey_server.store.retention import retire
 from marey_server.store.transaction import Transaction
-from marey_server.store.wakeups import OUTPUTS_TO_COMMIT, wakeups
+from marey_server.store.wakeups import OUTPUTS_TO_COMMIT, Listener, wakeups
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -51,22 +51,23 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
     holder = secrets.token_hex(8)
     tick_s = min(LONGEST_TICK_S, services.queue_policy.lease_ttl_s / 4)
     merges = WaitingMerges(services.database)
-    chores = (
-        (tick_s, tick_s, _reap),
-        (tick_s, tick_s, _share_results),
-        (tick_s, tick_s, partial(_merge_waiting, merges=merges)),
-        (0.0, 0.0, partial(_commit_outputs, longest_wait_s=tick_s)),
-        (FORGET_TRIES_EVERY_S, FORGET_TRIES_EVERY_S, _forget_tries),
-        (FIRST_GARBAGE_S, GARBAGE_EVERY_S, _collect_garbage),
-    )
-    tasks = [asyncio.create_task(_repeat(services, holder, *chore)) for chore in chores]
-    try:
-        yield
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        await _give_up_lead(services, holder)
+    with wakeups.listen([OUTPUTS_TO_COMMIT]) as listener:  # all the time, so that no job is missed during a commit
+        chores = (
+            (tick_s, tick_s, _reap),
+            (tick_s, tick_s, _share_results),
+            (tick_s, tick_s, partial(_merge_waiting, merges=merges)),
+            (0.0, 0.0, partial(_commit_outputs, listener=listener, longest_wait_s=tick_s)),
+            (FORGET_TRIES_EVERY_S, FORGET_TRIES_EVERY_S, _forget_tries),
+            (FIRST_GARBAGE_S, GARBAGE_EVERY_S, _collect_garbage),
+        )
+        tasks = [asyncio.create_task(_repeat(services, holder, *chore)) for chore in chores]
+        try:
+            yield
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            await _give_up_lead(services, holder)
 
 
 async def _give_up_lead(services: Services, holder: str) -> None:
@@ -140,10 +141,9 @@ async def _merge_waiting(services: Services, holder: str, merges: WaitingMerges)
         await _in_thread(services, merges.attempt)
 
 
-async def _commit_outputs(services: Services, holder: str, *, longest_wait_s: float) -> None:
+async def _commit_outputs(services: Services, holder: str, *, listener: Listener, longest_wait_s: float) -> None:
     """Wait at most `longest_wait_s` for jobs with many outputs to commit; then commit the outputs, and end the jobs."""
-    with wakeups.listen([OUTPUTS_TO_COMMIT]) as listener:
-        await listener.wait(longest_wait_s)
+    await listener.wait(longest_wait_s)
     if await _write(services, _leads, holder):
         await _in_thread(services, commit_deferred, services.database)
 

@@ -14,6 +14,8 @@ from marey_server.process.settings import Settings
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import Client
 from marey_server.store.datasets.proposals import WaitingMerges
+from marey_server.store.jobs.policy import QueuePolicy
+from marey_server.store.wakeups import OUTPUTS_TO_COMMIT, wakeups
 
 
 def test_garbage_is_collected_soon_after_the_start_and_again_later(
@@ -73,8 +75,8 @@ def test_housekeeping_leaves_the_compute_threads_to_requests(
         return 0
 
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    monkeypatch.setattr(housekeeping, "LONGEST_TICK_S", 0.02)
-    monkeypatch.setattr(housekeeping, "FIRST_GARBAGE_S", 0.02)
+    for name in ("LONGEST_TICK_S", "FIRST_GARBAGE_S", "GARBAGE_EVERY_S"):
+        monkeypatch.setattr(housekeeping, name, 0.02)
     monkeypatch.setattr(WaitingMerges, "attempt", occupy)
     for name in ("commit_deferred", "retire"):
         monkeypatch.setattr(housekeeping, name, occupy)
@@ -90,3 +92,31 @@ def test_housekeeping_leaves_the_compute_threads_to_requests(
                 may_end.set()
 
     assert asyncio.run(compute_beside()) == 3
+
+
+def test_outputs_that_wait_since_the_last_commit_began_are_committed_at_once(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls, second = list[Database](), threading.Event()
+
+    def commit(committing: Database) -> int:
+        calls.append(committing)
+        if len(calls) == 2:
+            second.set()
+        else:
+            wakeups.announce([OUTPUTS_TO_COMMIT])
+        return 0
+
+    monkeypatch.setattr(housekeeping, "LONGEST_TICK_S", 3600)
+    monkeypatch.setattr(housekeeping, "commit_deferred", commit)
+    app = create_app(Settings(data=tmp_path, port=0), database)
+    app.services.queue_policy = QueuePolicy(lease_ttl_s=4 * 3600)
+
+    async def two_commits() -> bool:
+        async with housekeeping.keeping_house(app.services):
+            for _ in range(10):
+                await asyncio.sleep(0)  # until housekeeping waits
+            wakeups.announce([OUTPUTS_TO_COMMIT])
+            return await asyncio.to_thread(second.wait, 30)
+
+    assert asyncio.run(two_commits())
