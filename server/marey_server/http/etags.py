@@ -1,8 +1,8 @@
 """Entity tags and preconditions (RFC 9110, section 13).
 
 A tag is `"<state>.<form>"`: the state of a resource and the form it was sent in. The state of a resource that can be
-changed begins with its `rev`. After a dot, it can contain the caller's role, if the answer depends on it, or a digest of
-members that change without a new `rev`. Preconditions of writes compare only the `rev`, so that a resource read as
+changed begins with its `rev`. After a dot, it can contain the caller's role, if the answer depends on it, or a digest
+of members that change without a new `rev`. Preconditions of writes compare only the `rev`, so that a resource read as
 MessagePack can be changed with JSON.
 """
 
