@@ -406,6 +406,7 @@ TREE = KindDeclaration(
     },
     outputs={"model": Kind.MODEL},
     place_counts=True,
+    named_after="model",
     unclear_place=job_params.TreeParams.unclear_place,
 )
 

@@ -18,6 +18,7 @@ from marey_schemas.items import Collection, CollectionCreate, ItemChange, ItemCr
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import PurgeRequest
 from marey_schemas.queue.commits import OutputsCommit
+from marey_schemas.queue.job_kinds import find_kind
 from marey_schemas.queue.jobs import ItemInput, JobCreate
 from marey_schemas.queue.pipelines import PipelineCreate, PipelineStep
 from marey_server.access.principal import SYSTEM, Principal
@@ -35,6 +36,7 @@ from marey_server.store.database.prepared import Prepared
 from marey_server.store.folder_roles import managing, rights
 from marey_server.store.items import Draft, ItemFilters
 from marey_server.store.jobs import reading, retrying, submission
+from marey_server.store.jobs.result_places import result_folders
 from marey_server.store.tables import collection, folder_role
 from marey_server.store.transaction import Transaction
 
@@ -396,6 +398,35 @@ def test_results_follow_the_inputs_into_their_folders(studio: Studio) -> None:
     studio.submit(studio.rob, "square", **fields, into="elsewhere")
     with pytest.raises(ForbiddenProblem):
         studio.submit(studio.rob, "square", **fields, into="team/made")
+
+
+@pytest.mark.parametrize(
+    ("kind", "params", "named", "into", "folders"),
+    [
+        ("tree", {}, {"model": "team"}, "", ["team"]),
+        ("tree", {}, {"model": "team/below"}, "", ["team/below"]),
+        ("tree", {}, {"model": None}, "", []),
+        ("edit", {"in_place": True}, {"clips": "team"}, "", ["team"]),
+        ("edit", {"in_place": True}, {"clips": None}, "", []),
+        ("edit", {"suffix": "x"}, {"clips": None}, "", []),
+        ("edit", {}, {"clips": None}, "made", ["made"]),
+        ("edit", {}, {"clips": "team"}, "made", ["made/team"]),
+        ("edit", {}, {"clips": "team/below"}, "made", ["made/below"]),
+        ("model", {}, {"aligned": "team"}, "", [""]),
+    ],
+)
+def test_the_folders_of_results_are_those_that_are_known_before_the_job(
+    kind: str, params: dict[str, Any], named: dict[str, str | None], into: str, folders: list[str]
+) -> None:
+    """An input that is None is the result of another job; one in `team/below` was such a result in an earlier try."""
+
+    def pin(folder: str | None) -> dict[str, Any]:
+        if folder is None:
+            return {"job": "job_1"}
+        return {"collection": folder, "name": "n"} | ({"below": "below"} if folder == "team/below" else {})
+
+    pins = {name: [pin(folder)] for name, folder in named.items()}
+    assert result_folders(find_kind(kind), params, pins, into) == folders
 
 
 def test_a_job_fails_if_its_author_loses_the_role_before_its_end(studio: Studio) -> None:

@@ -42,14 +42,17 @@ def find_clash(kind: KindDeclaration, params: Any, pins: PinnedInputs, into: str
 
 
 def result_folders(kind: KindDeclaration, params: Mapping[str, Any], pins: PinnedInputs, into: str) -> list[str]:
-    """Return the folders of a job's results, as far as they are known before the job runs; at least one.
+    """Return the folders of a job's results, as far as they are known before the job runs.
 
-    When the results are published, their real folders are checked again.
+    If results follow the places of inputs that other jobs create, only `into` is known, or nothing. When the results
+    are published, their real folders are checked again.
     """
-    named = pins.get(kind.named_after or "", ())
-    if named and not any("job" in pin for pin in named):
+    if named := pins.get(kind.named_after or "", ()):
         in_place = kind.in_place is not None and params.get(kind.in_place)
-        return sorted({pin["collection"] if in_place else _path(into, _folder(pin)) for pin in named})
+        stays = in_place or not (into or kind.inputs[kind.named_after or ""].many)  # as a tree in its model
+        known = [pin for pin in named if "job" not in pin]
+        folders = {pin["collection"] if stays else _path(into, _folder(pin)) for pin in known}
+        return sorted(folders | ({into} if into and len(known) < len(named) else set()))
     return [_path(into, params.get("collection", "") if issubclass(kind.params, ImportParams) else "")]
 
 
