@@ -79,7 +79,7 @@ def write_role(
 ) -> Row[Any]:
     """Add a member, or change the member's role, without a check of rights; return the row.
 
-    The caller must have locked the project.
+    A member who becomes an owner loses all roles in folders. The caller must have locked the project.
     """
     which = (member.c.project_id == project_id, member.c.user_id == user_id)
     row = {"project_id": project_id, "user_id": user_id, "role": role.value, "since_us": tx.now_us}
@@ -94,6 +94,8 @@ def write_role(
     changed = added or change_row(
         tx, member, which, {"role": role.value}, expected_rev=expected_rev, absent=_no_member(user_name)
     )
+    if role is Role.OWNER:
+        _forget_folder_roles(tx, project_id, user_name)
     details = {"user": user_name, "role": role.value}
     if added is not None:
         tx.audit("member.added", project_id, about=user_name, project_id=project_id, **details)
@@ -125,14 +127,14 @@ def remove_member(tx: Transaction, project_name: str, user_name: str, *, expecte
         current = tx.execute(select(member.c.rev).where(*which)).scalar()
         raise _no_member(user_name) if current is None else moved_on(current)
     _require_owner(tx, project_row)
-    _forget_folder_roles(tx, project_row, user_name)
+    _forget_folder_roles(tx, project_row.id, user_name)
     tx.audit("member.removed", project_row.id, about=user_name, project_id=project_row.id, user=user_name, was=was)
     _withdraw_invitations(tx, project_row, user_name)
 
 
-def _forget_folder_roles(tx: Transaction, project_row: ProjectRow, user_name: str) -> None:
+def _forget_folder_roles(tx: Transaction, project_id: str, user_name: str) -> None:
     mine = folder_role.c.user_id.in_(select(user.c.id).where(user.c.name == user_name))
-    tx.execute(delete(folder_role).where(folder_role.c.project_id == project_row.id, mine))
+    tx.execute(delete(folder_role).where(folder_role.c.project_id == project_id, mine))
 
 
 def _withdraw_invitations(tx: Transaction, project_row: ProjectRow, user_name: str) -> None:

@@ -172,6 +172,18 @@ def test_roles_end_with_the_membership_and_with_the_purge_of_the_folder(lab: Lab
     assert lab.read(lambda tx: tx.execute(select(func.count()).select_from(folder_role)).scalar_one()) == 0
 
 
+def test_roles_end_when_a_member_becomes_an_owner(lab: Lab) -> None:
+    """They would have no effect, and return unnoticed when the owner becomes a member with fewer rights again."""
+    folder = make_folder(lab, "a")
+    reader = name_of(lab.reader)
+    for user in (reader, EVERY_MEMBER):
+        put(lab, folder, user, "contributor")
+    for role, left in ((Role.MAINTAINER, [EVERY_MEMBER, reader]), (Role.OWNER, [EVERY_MEMBER])):
+        lab.write(members.put_member, "lab", reader, MemberChange(role=role), required=OWNER)
+        page = lab.read(managing.list_folder_roles, "lab", required=MEMBER)
+        assert [one.user for one in page.items] == left
+
+
 def test_the_number_of_roles_is_limited(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(managing, "MOST_FOLDER_ROLES", 2)
     folders = [make_folder(lab, path) for path in "abc"]
