@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from marey_schemas.encoding.canonical import document_digest
+from marey_server.store import datasets
 from marey_server.store.database.connections import Database
 from marey_server.store.fsck import check_store
 from marey_versions.records import CommitRecord, key_of, revision_content
@@ -108,6 +109,29 @@ def test_commits_from_elsewhere_keep_digest_author_and_time(client: httpx.Client
     assert [one["path"] for one in ok(client.get(f"{GAITS}/entries"))["items"]] == ["a/rig", "b"]
     ok(client.post(f"{GAITS}/checkout", json={"version": "main"}))
     assert sorted(items_of(client)) == ["gaits/a/rig", "gaits/b"]
+
+
+def test_a_commit_is_not_recorded_in_another_dataset_of_the_same_name(
+    client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The dataset is replaced between the preparation, which finds the commit in it, and the record."""
+    one = skeleton("Hips")
+    send(client, one)
+    body, digest = commit({"rig": one})
+    receive(client, body)
+    prepare = datasets.prepare_receipt
+
+    def prepare_and_replace(*arguments: Any) -> Any:
+        prepared = prepare(*arguments)
+        assert client.delete(GAITS, headers={"If-Match": "*"}).status_code == 204
+        ok(client.post(f"{LAB}/datasets", json={"name": "gaits"}), 201)
+        return prepared
+
+    with monkeypatch.context() as patch:
+        patch.setattr(datasets, "prepare_receipt", prepare_and_replace)
+        refused(client.post(f"{GAITS}/received-commits", json=body), 409, "branch-moved")
+    refused(client.get(f"{GAITS}/commits/{digest}"), 404, "no-version")
+    assert (receive(client, body)["digest"], receive(client, body)["entries"]) == (digest, 1)
 
 
 def test_a_revision_that_is_no_entry_gets_an_item_that_stays(client: httpx.Client) -> None:

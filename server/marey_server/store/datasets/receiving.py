@@ -18,7 +18,14 @@ from marey_schemas.datasets.contents import ReceivedCommit, ReceivedRevision, St
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import items, projects
 from marey_server.store.datasets.chunks import StoredChunks, store_chunks
-from marey_server.store.datasets.committing import PreparedCommit, author_of, head_of, insert_commit, move_branch_to
+from marey_server.store.datasets.committing import (
+    BRANCH_MOVED,
+    PreparedCommit,
+    author_of,
+    head_of,
+    insert_commit,
+    move_branch_to,
+)
 from marey_server.store.datasets.history import read_commit, revisions_with, tree_of
 from marey_server.store.datasets.naming import find_dataset
 from marey_server.store.datasets.protection import Mover
@@ -121,6 +128,7 @@ def store_revisions(
 class PreparedReceipt:
     """Commit from an archive or another server; its tree was computed, and has the digest that the commit names."""
 
+    dataset_id: str
     record: CommitRecord
     entries: int
     chunks: Mapping[str, bytes]
@@ -139,7 +147,7 @@ def prepare_receipt(tx: Transaction, project: str, name: str, request: ReceivedC
     record = CommitRecord(request.tree, request.parents, request.author, request.message, request.at)
     last = last_purge(tx, project_row.id)
     if _is_known(tx, found, record.digest):
-        return PreparedReceipt(record, 0, {}, last)
+        return PreparedReceipt(found.id, record, 0, {}, last)
     _require_parents(tx, found, record)
     changes = {key_of(one.path, one.kind): _value(one.parts, one.tags) for one in request.changes}
     contents = {revision_content(one.kind, one.parts) for one in request.changes if one.parts is not None}
@@ -151,7 +159,7 @@ def prepare_receipt(tx: Transaction, project: str, name: str, request: ReceivedC
         raise InvalidProblem(
             f"The changes give a version with the tree {tree}, but the commit names {record.tree}.", code="other-tree"
         )
-    return PreparedReceipt(record, len(Tree(store, tree)), store.new, last)
+    return PreparedReceipt(found.id, record, len(Tree(store, tree)), store.new, last)
 
 
 def _value(parts: Mapping[str, str] | None, tags: Iterable[str]) -> Value | None:
@@ -164,11 +172,17 @@ def record_receipt(
     """Record a commit from an archive or another server; recording it again has no effect.
 
     If the request names a branch without commits, the branch is set to this commit. Raises `ConflictProblem` if the
-    branch has other commits or items were purged since the receipt was prepared, and the errors of `require_move`.
+    branch has other commits, or if items were purged or the dataset was replaced since the receipt was prepared, and
+    the errors of `require_move`.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
     found = find_dataset(tx, project_row, name)
+    if found.id != prepared.dataset_id:
+        raise ConflictProblem(
+            f"The dataset {name!r} was deleted, and another one with its name was created; send the request again.",
+            code=BRANCH_MOVED,
+        )
     digest = prepared.record.digest
     if not _is_known(tx, found, digest):
         _require_parents(tx, found, prepared.record)
