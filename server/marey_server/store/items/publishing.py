@@ -55,10 +55,11 @@ def publish(
     In a document, `{"output": name}` refers to another draft and is replaced by the item and revision published from
     it. If the draft of a model has a sample tree, the tree's `model_digest` may be a reference, too, and is replaced by
     the digest of the draft's model. With `refer_to_deleted`, documents may refer to items that are deleted. If an item
-    already has the content of a draft, no new revision is created. The caller must have checked that the user may
-    write.
+    already has the content of a draft, no new revision is created. `rights` are those of the user who publishes; they
+    may be None only if all drafts are hidden.
 
-    Raises `InvalidProblem` for a draft that is not valid, `ConflictProblem` for a name that is taken.
+    Raises `InvalidProblem` for a draft that is not valid, `ConflictProblem` for a name that is taken, and
+    `ForbiddenProblem` if `rights` do not allow to write to the folder of a new item or revision.
     """
     by_name = {draft.name_in_batch: draft for draft in drafts}
     if len(by_name) != len(drafts):

@@ -195,7 +195,7 @@ def publish_outputs(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]
     """Publish the drafts of a job, and commit them if the request for the job asks for a commit.
 
     A task only publishes its drafts, which its parent job commits later. If the commit is refused, or the author of the
-    job may not write to a folder of the outputs any more, nothing is published, and the result contains the failure.
+    job may not write to a folder of the outputs, nothing is published, and the result contains the failure.
     `row` has the columns `JOB_COLUMNS`.
     """
     if row.commit_to is None and not drafts:
@@ -212,7 +212,7 @@ def publish_outputs(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]
         return PublishedOutputs(failure=error.failure)
     except FolderRoleProblem as error:
         folder = error.context["folder"]
-        detail = f"The author of the job may not write to the folder {folder!r} of the results any more."
+        detail = f"The author of the job may not write to the folder {folder!r} of the results."
         return PublishedOutputs(failure=failure_document(FailureReason.ERROR, AUTHOR_LOST, detail))
 
 
