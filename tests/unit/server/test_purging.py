@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,10 +25,11 @@ from marey_schemas.purges import DatasetHolder, HeldItem, ItemHolder, JobHolder,
 from marey_schemas.queue.jobs import JobState
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ApiProblem, ConflictProblem, GoneProblem, InvalidProblem, NotFoundProblem
-from marey_server.store import blobs, collections, datasets, events, fsck, garbage, items, purging, quotas
+from marey_server.store import blobs, collections, datasets, events, fsck, garbage, items, purging, quotas, transaction
 from marey_server.store import projects as store_projects
 from marey_server.store.blobs import GRACE_US
 from marey_server.store.database.clock import DAY_US
+from marey_server.store.database.prepared import Prepared
 from marey_server.store.datasets import proposals
 from marey_server.store.items.drafts import Draft
 from marey_server.store.jobs import retrying
@@ -679,6 +680,21 @@ def test_fsck_finds_a_job_whose_items_are_not_recorded(house: House) -> None:
     job = house.desk.submit("square", inputs={"things": ({"item": house.add("thing")},)})
     house.write(lambda tx: tx.execute(job_item.delete()))
     assert [(fault.code, fault.subject) for fault in house.faults()] == [("job-reference", job)]
+
+
+def test_the_items_that_many_tasks_name_are_recorded_in_portions(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    portions: list[int] = []
+    things = tuple({"item": house.add(f"s{n}", n)} for n in range(5))
+
+    def note(tx: Transaction, statement: Prepared, many: Sequence[Mapping[str, Any]]) -> None:
+        portions.extend([len(many)] if many[0].keys() == {"job_id", "item_id"} else [])
+        statement.run_each(tx.connection, many)
+
+    monkeypatch.setattr(transaction, "_MOST_IN_LIST", 4)
+    monkeypatch.setattr(Transaction, "run_each", note)
+    house.desk.submit("survey", inputs={"things": things}, params={"number": 3})
+    assert (sum(portions), max(portions)) == (4 * len(things), 4)
+    assert house.faults() == []
 
 
 def test_chunks_are_read_once_however_many_versions_share_them(house: House, monkeypatch: pytest.MonkeyPatch) -> None:

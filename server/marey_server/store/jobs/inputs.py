@@ -300,9 +300,9 @@ def record_named_items(tx: Transaction, jobs: Iterable[NamingJob], *, new: bool 
     Every write that stores inputs, parameters or outputs in the row of a job must call this. `new` says that the same
     write has inserted the jobs, so that they have no earlier records.
     """
-    rows = [{"job_id": one.id, "item_id": item} for one in jobs for item in sorted(one.items())]
-    if new and rows:
-        tx.run_each(_INSERT, rows)
-        return
-    for some in in_lists(rows):
-        tx.execute(tx.insert_or_ignore(job_item), some)
+    rows = ({"job_id": one.id, "item_id": item} for one in jobs for item in sorted(one.items()))
+    for some in in_lists(rows):  # the tasks of one job can have millions of rows
+        if new:
+            tx.run_each(_INSERT, some)
+        else:
+            tx.execute(tx.insert_or_ignore(job_item), some)
