@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import pytest
+from sqlalchemy import select
 from tests.support.interleaving import Step, interleave
 from tests.support.store_fixtures import WRITE, Lab, requiring
 
@@ -14,11 +15,14 @@ from marey_schemas.datasets.naming import MAIN, DatasetCreate, RefCreate, RefKin
 from marey_schemas.datasets.proposal_states import CheckState, Verdict
 from marey_schemas.datasets.proposals import CheckReport, ProposalCreate, ProposalMerge, ReviewCreate
 from marey_schemas.datasets.protection import ProtectionRule
-from marey_server.access.principal import Principal
+from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ApiProblem
 from marey_server.store import datasets
 from marey_server.store.database.connections import Database
-from marey_server.store.datasets import proposals
+from marey_server.store.datasets import committing, proposals
+from marey_server.store.datasets.chunks import store_chunks
+from marey_server.store.tables import dataset_ref
+from marey_server.store.transaction import Transaction
 
 GAITS = ("lab", "gaits")
 RULE = ProtectionRule(approvals=1)
@@ -109,6 +113,21 @@ def test_an_approval_and_a_check_at_once_merge_a_waiting_proposal(team: Team) ->
     )
     found = team.lab.read(proposals.read_proposal, *GAITS, number)
     assert (found.state, found.merged) == ("merged", team.main)
+
+
+@on_postgres
+def test_a_commit_locks_its_branch_before_it_stores_chunks(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A job that commits does the same, so that the two never wait for each other."""
+    free: list[list[str]] = []
+
+    def store(tx: Transaction, chunks: Mapping[str, bytes]) -> None:
+        branch = select(dataset_ref.c.name).where(dataset_ref.c.name == MAIN).with_for_update(skip_locked=True)
+        free.append(team.other.write(SYSTEM, lambda other: list(other.execute(branch).scalars())))
+        store_chunks(tx, chunks)
+
+    monkeypatch.setattr(committing, "store_chunks", store)
+    team.commit(MAIN, "c")
+    assert free == [[]]
 
 
 @pytest.mark.soak

@@ -128,11 +128,12 @@ def record_commit(
         return read_commit(tx, project, name, recorded)
     require_no_purge_since(tx, project_row.id, prepared.last_purge)
     mover = mover or Mover(author_of(tx), project_row.role, user_id=tx.principal.user_id)
-    store_chunks(tx, prepared.chunks)
     store_contents(tx, prepared.contents)
     if prepared.combined:
         author_id, message = mover.user_id, prepared.message
         store_combined(tx, project_row, found.path, prepared.combined, prepared.documents, message, author_id=author_id)
+    find_ref(tx, found.id, prepared.branch, lock=True)  # in the order of jobs that commit: revisions, branch, chunks
+    store_chunks(tx, prepared.chunks)
     digest = prepared.existing or _insert(tx, prepared, mover.name)
     if prepared.existing is not None and prepared.write_id is not None:
         tx.execute(insert(fast_forward).values(dataset_id=found.id, write_id=prepared.write_id, digest=digest))
