@@ -108,8 +108,8 @@ class ArchiveAndImport(Transfer):
 class CheckOut(OnDataset):
     """Checkout of a version into the folder of a dataset.
 
-    The server chooses which items it changes, restores and creates, so the model learns the items of the folder anew,
-    after a check that the folder has the entries of the version.
+    The server chooses which items it changes, restores and creates, so the model reads all items of the folder
+    again, after a check that the folder has the entries of the version.
     """
 
     role = Role.MAINTAINER
