@@ -38,11 +38,19 @@ class _Fault:
             raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)} (fault point {self.name})")
 
 
-_faults = [_Fault(text) for text in os.environ.get(FAULT_VARIABLE, "").split(",") if text]
+_faults: list[_Fault] = []
+
+
+def plan(texts: str) -> None:
+    """Plan the faults that `texts` lists, in the form of the variable, in place of those planned before."""
+    _faults[:] = [_Fault(text) for text in texts.split(",") if text]
+
+
+plan(os.environ.get(FAULT_VARIABLE, ""))
 
 
 def point(name: str) -> None:
-    """Trigger the fault that the environment requests for this point, if any."""
+    """Trigger the fault that is planned for this point, if any."""
     for fault in _faults:
         if fault.name == name:
             fault.act()

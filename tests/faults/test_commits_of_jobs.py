@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import pytest
 from sqlalchemy import update
-from tests.support import store_writer
 from tests.support.committing_desk import CommittingDesk
 from tests.support.interleaving import Step, interleave
 from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import WRITE, requiring
+from tests.support.store_writer import StoreWriter
 
 from marey_schemas.datasets.commits import CommitCreate, PutEntry
 from marey_schemas.datasets.naming import RefCreate, RefKind
@@ -74,20 +70,9 @@ def seen(gaits: CommittingDesk, job_id: str, branch: str = "main") -> Seen:
     )  # fmt: skip
 
 
-def dies_when_it_completes(desk: Desk, url: str, lease: Lease, fault: str) -> bool:
-    """Complete an attempt in a process that is killed at a fault point; return whether it was killed there."""
-    return dies(desk, url, f"complete {lease.job} {lease.fence}", fault)
-
-
 def dies(desk: Desk, url: str, work: str, fault: str) -> bool:
     """Do some work in a process that is killed at a fault point; return whether it was killed there."""
-    arguments = [url, desk.user.user_id, "ann", work, ""]
-    done = subprocess.run(
-        [sys.executable, store_writer.__file__, *map(str, arguments)],
-        env={**os.environ, "MAREY_FAULT": f"{fault}:kill"}, capture_output=True, timeout=60,
-    )  # fmt: skip
-    assert done.returncode in (0, -signal.SIGKILL), done.stderr.decode()
-    return done.returncode != 0
+    return StoreWriter(url, desk.user.user_id, "ann").run(work, f"{fault}:kill") != 0
 
 
 @pytest.mark.parametrize("place", [*BEFORE, *AFTER])
@@ -111,7 +96,8 @@ def test_a_server_that_dies_at_a_completion_leaves_all_or_nothing(
     assert before == Seen("running", 2 * tasks, 4 * tasks, 0, 0, False)
 
     passed = not (way == "own-branch" and place == "job_commit.after_move")
-    assert dies_when_it_completes(gaits.desk, database_url, leases[-1], place) == passed
+    work = f"complete {leases[-1].job} {leases[-1].fence}"
+    assert dies(gaits.desk, database_url, work, place) == passed
     after = Seen("succeeded", both, 2 * both if way == "fan-out" else both, 1, both, True)
     visible = place in AFTER or not passed
     assert seen(gaits, made, branch) == (after if visible else before)

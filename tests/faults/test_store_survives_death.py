@@ -1,39 +1,19 @@
 """A process that is killed while it writes leaves all of the write or nothing; repeated, it has the same result."""
 
-import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from tests.support import store_writer
 from tests.support.store_fixtures import Lab
-from tests.support.store_writer import FILES, LARGE_FILES
+from tests.support.store_writer import FILES, LARGE_FILES, StoreWriter
 
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import Principal
 from marey_server.store import blobs, fsck, garbage, items
 from marey_server.store.blobs import digest_of
 
-
-class Writer:
-    """Process that does one kind of work, with a fault or without."""
-
-    def __init__(self, lab: Lab, url: str, folder: str) -> None:
-        self._args = [sys.executable, store_writer.__file__, url, lab.owner.user_id, lab.owner.user_name]
-        self._folder = folder
-        self.lines: list[str] = []
-        """Lines that the last process printed."""
-
-    def run(self, work: str, fault: str = "") -> int:
-        """Run `work` in a process; return its exit status: 0, or minus the number of the signal that killed it."""
-        environment = {**os.environ, "MAREY_FAULT": fault}
-        done = subprocess.run([*self._args, work, self._folder], env=environment, capture_output=True, timeout=60)
-        assert done.returncode in (0, -signal.SIGKILL), done.stderr.decode()
-        self.lines = done.stdout.decode().split()
-        return done.returncode
-
+ALL_US = -60_000_000
+"""Grace period with which all garbage is deleted. On SQLite, the clock of each process starts up to a second ahead."""
 
 in_rows_and_in_files = pytest.mark.parametrize("backing", ["rows", "files"])
 
@@ -49,12 +29,12 @@ def folder(backing: str, tmp_path: Path) -> str:
 
 
 @pytest.fixture
-def writer(lab: Lab, database_url: str, folder: str) -> Writer:
+def writer(lab: Lab, database_url: str, folder: str) -> StoreWriter:
     from marey_server.store.blob_backings import DirectoryBlobs
 
     if folder:
         lab.database.blobs = DirectoryBlobs(Path(folder))
-    return Writer(lab, database_url, folder)
+    return StoreWriter(database_url, lab.owner.user_id, lab.owner.user_name, folder)
 
 
 def stored(lab: Lab) -> list[bool]:
@@ -79,7 +59,7 @@ def assert_sound(lab: Lab) -> None:
     ],
 )
 def test_a_sender_that_dies_leaves_whole_blobs(
-    lab: Lab, writer: Writer, fault: str, left: list[bool], backing: str
+    lab: Lab, writer: StoreWriter, fault: str, left: list[bool], backing: str
 ) -> None:
     assert writer.run("send", fault) == -signal.SIGKILL
     assert stored(lab) == left
@@ -91,7 +71,9 @@ def test_a_sender_that_dies_leaves_whole_blobs(
 
 @pytest.mark.every_database
 @pytest.mark.parametrize(("fault", "left"), [("publish.before_commit:kill", 0), ("publish.after_commit:kill", 3)])
-def test_a_publisher_that_dies_leaves_everything_or_nothing(lab: Lab, writer: Writer, fault: str, left: int) -> None:
+def test_a_publisher_that_dies_leaves_everything_or_nothing(
+    lab: Lab, writer: StoreWriter, fault: str, left: int
+) -> None:
     writer.run("send")
     assert writer.run("publish", fault) == -signal.SIGKILL
     assert len(published(lab)) == left
@@ -103,7 +85,7 @@ def test_a_publisher_that_dies_leaves_everything_or_nothing(lab: Lab, writer: Wr
 
 
 @in_rows_and_in_files
-def test_a_collector_that_dies_deletes_nothing_it_did_not_finish(lab: Lab, writer: Writer, backing: str) -> None:
+def test_a_collector_that_dies_deletes_nothing_it_did_not_finish(lab: Lab, writer: StoreWriter, backing: str) -> None:
     writer.run("send")
     assert writer.run("collect", "garbage.before_commit:kill") == -signal.SIGKILL
     assert stored(lab) == [True, True, True]
@@ -123,7 +105,9 @@ def purged(lab: Lab) -> list[str]:
 
 @pytest.mark.every_database
 @pytest.mark.parametrize(("fault", "gone"), [("purge.before_commit@2:kill", 1), ("purge.after_commit@2:kill", 2)])
-def test_a_purger_that_dies_leaves_each_item_whole_or_purged(lab: Lab, writer: Writer, fault: str, gone: int) -> None:
+def test_a_purger_that_dies_leaves_each_item_whole_or_purged(
+    lab: Lab, writer: StoreWriter, fault: str, gone: int
+) -> None:
     writer.run("send")
     writer.run("publish")
     ids = [one.id for one in lab.read(items.list_items, "lab", Kind.STUDY).items]
@@ -131,14 +115,14 @@ def test_a_purger_that_dies_leaves_each_item_whole_or_purged(lab: Lab, writer: W
         lab.write(items.delete_item, "lab", Kind.STUDY, one, expected_rev=None)
     assert writer.run("purge", fault) == -signal.SIGKILL
     assert (left_deleted(lab), len(purged(lab))) == (3 - gone, gone)
-    garbage.collect_garbage(lab.database, grace_us=-1)
+    garbage.collect_garbage(lab.database, grace_us=ALL_US)
     assert_sound(lab)
     for one in set(ids) - set(purged(lab)):
         assert lab.write(items.restore_item, "lab", Kind.STUDY, one).parts["study"].size_bytes > 0
         lab.write(items.delete_item, "lab", Kind.STUDY, one, expected_rev=None)
     assert writer.run("purge") == 0
     assert sorted(purged(lab)) == sorted(ids)
-    garbage.collect_garbage(lab.database, grace_us=-1)
+    garbage.collect_garbage(lab.database, grace_us=ALL_US)
     assert stored(lab) == [False, False, False]
     assert_sound(lab)
 
@@ -147,25 +131,25 @@ def test_a_purger_that_dies_leaves_each_item_whole_or_purged(lab: Lab, writer: W
 @pytest.mark.every_database
 @pytest.mark.parametrize("place", ["before_copy", "after_copy"])
 def test_a_process_that_dies_while_it_copies_its_log_loses_nothing(
-    lab: Lab, writer: Writer, place: str, tmp_path: Path
+    lab: Lab, writer: StoreWriter, place: str, tmp_path: Path
 ) -> None:
     assert writer.run("send-large", f"log.{place}:kill") == -signal.SIGKILL
-    acknowledged = set(writer.lines)
+    acknowledged = set(writer.digests)
     assert acknowledged
     assert lab.read(blobs.readable, acknowledged) == acknowledged
     assert_sound(lab)
     assert writer.run("send-large") == 0
-    assert lab.read(blobs.readable, writer.lines) == {digest_of(data) for data in LARGE_FILES}
+    assert lab.read(blobs.readable, writer.digests) == {digest_of(data) for data in LARGE_FILES}
     assert_sound(lab)
     lab.database.close()
     assert not list(tmp_path.rglob("*-wal"))
 
 
-def test_without_a_fault_nobody_dies(lab: Lab, writer: Writer) -> None:
+def test_without_a_fault_nobody_dies(lab: Lab, writer: StoreWriter) -> None:
     assert [writer.run(work) for work in ("send", "publish", "collect")] == [0, 0, 0]
     assert len(published(lab)) == 3
     assert stored(lab) == [True, True, True]
-    garbage.collect_garbage(lab.database, grace_us=-1)
+    garbage.collect_garbage(lab.database, grace_us=ALL_US)
     assert_sound(lab)
     stranger = Principal("user", lab.stranger.user_id, "stranger", scopes=("read",))
     assert not lab.read(blobs.readable, [digest_of(FILES[0])], who=stranger)

@@ -1,15 +1,18 @@
-"""A process that writes to a database, for tests that kill it: `store_writer.py URL USER_ID USER_NAME WORK FOLDER`.
+"""A process that writes to a database, for tests that kill it."""
 
-The work `complete JOB FENCE` completes an attempt, `commit-deferred` commits the outputs of jobs with many outputs.
-"""
+from __future__ import annotations
 
-import sys
+import contextlib
+import multiprocessing
+import signal
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import PurgeRequest
 from marey_schemas.queue.worker_protocol import CompleteRequest
+from marey_server import faults
 from marey_server.access.principal import Principal
 from marey_server.store import blobs, garbage, items, projects, purging
 from marey_server.store.blob_backings import DirectoryBlobs
@@ -21,6 +24,7 @@ from marey_server.store.transaction import Transaction
 
 LARGE_FILES = [bytes([number]) * 2**20 for number in range(12)]
 """Files that together make the write-ahead log of SQLite long."""
+LONGEST_S = 60.0
 FILES = [f"file {number}".encode() * 1000 for number in range(3)]
 
 
@@ -41,34 +45,68 @@ def purge(database: Database, who: Principal) -> None:
         database.write(who, purging.record_purge, "lab", request, prepared)
 
 
-def main(url: str, user_id: str, user_name: str, work: str, folder: str) -> None:
-    """Send the files, publish, purge, or collect garbage. After each large file, its digest is printed.
+class StoreWriter:
+    """Does work in processes, each of which may have a fault; blobs are in `folder`, or in the database if it is empty.
 
-    Blobs are in `folder`, or in the database if `folder` is empty.
+    The processes are forked from one that has loaded the server, because loading it takes longer than most of the work.
     """
+
+    def __init__(self, url: str, user_id: str, user_name: str, folder: str = "") -> None:
+        self._arguments = (url, Principal("user", user_id, user_name, scopes=("read", "write")), folder)
+        self.digests: list[str] = []
+        """Digests of the large files that the last process has stored."""
+
+    def run(self, work: str, fault: str = "") -> int:
+        """Do `work` in a process; return its exit status: 0, or minus the number of the signal that killed it.
+
+        The work `send` or `send-large` stores files, `publish` and `purge` call the functions of these names,
+        `complete JOB FENCE` completes an attempt, `commit-deferred` commits the outputs of jobs with many outputs, and
+        `collect` collects garbage.
+        """
+        fork_server = multiprocessing.get_context("forkserver")
+        fork_server.set_forkserver_preload([__name__])
+        receiver, sender = fork_server.Pipe(duplex=False)
+        process = fork_server.Process(target=_do, args=(*self._arguments, work, fault, sender))
+        process.start()
+        sender.close()
+        self.digests = []
+        with contextlib.suppress(EOFError):
+            while receiver.poll(LONGEST_S):
+                self.digests.append(receiver.recv())
+        process.join(LONGEST_S)
+        status = process.exitcode
+        process.kill()
+        assert status in (0, -signal.SIGKILL), f"{work} with the fault {fault!r} ended with {status}"
+        process.close()
+        return status
+
+
+def _do(url: str, who: Principal, folder: str, work: str, fault: str, sender: Connection) -> None:
+    faults.plan(fault)
     database = Database(url, blobs=DirectoryBlobs(Path(folder)) if folder else None)
-    who = Principal("user", user_id, user_name, scopes=("read", "write"))
-    if work == "send":
+    name, *arguments = work.split()
+    if name == "send":
         for data in FILES:
             database.write(who, blobs.put_blob, data)
-    elif work == "send-large":
+    elif name == "send-large":
         for data in LARGE_FILES:
-            print(database.write(who, blobs.put_blob, data), flush=True)
-    elif work == "publish":
+            sender.send(database.write(who, blobs.put_blob, data))
+    elif name == "publish":
         database.write(who, publish)
-    elif work == "purge":
+    elif name == "purge":
         purge(database, who)
-    elif work.startswith("complete "):
-        _, job_id, fence = work.split()
-        attempt = Principal("attempt", job_id=job_id, fence=int(fence), scopes=("read",))
-        request = CompleteRequest(write_id=f"write-{job_id}-{fence}")
-        database.write(attempt, completion.complete, job_id, int(fence), request)
-    elif work == "commit-deferred":
+    elif name == "complete":
+        complete(database, arguments[0], int(arguments[1]))
+    elif name == "commit-deferred":
         commit_deferred(database)
     else:
-        garbage.collect_garbage(database, grace_us=-1)
+        assert name == "collect"
+        garbage.collect_garbage(database, grace_us=-60_000_000)
     database.close()
 
 
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+def complete(database: Database, job_id: str, fence: int) -> None:
+    """Complete an attempt."""
+    attempt = Principal("attempt", job_id=job_id, fence=fence, scopes=("read",))
+    request = CompleteRequest(write_id=f"write-{job_id}-{fence}")
+    database.write(attempt, completion.complete, job_id, fence, request)

@@ -6,6 +6,7 @@ a tier leaves out is counted, with the reason, at the end of the run.
 
 from __future__ import annotations
 
+import functools
 import os
 import zlib
 from collections import Counter, defaultdict
@@ -39,7 +40,12 @@ class Tier:
 
 
 def _folder(item: pytest.Item) -> str:
-    return item.path.relative_to(item.config.rootpath / "tests").as_posix()
+    return _below_tests(item.path, item.config.rootpath)
+
+
+@functools.cache
+def _below_tests(path: Path, root: Path) -> str:
+    return path.relative_to(root / "tests").as_posix()
 
 
 def backend_of(item: pytest.Item) -> str | None:
