@@ -1,6 +1,7 @@
 """A process that writes to a database, for tests that kill it: `store_writer.py URL USER_ID USER_NAME WORK FOLDER`.
 
-The work `complete JOB FENCE` completes an attempt, `commit-deferred` commits the outputs of jobs with many outputs.
+WORK is `send`, `send-large`, `publish`, `purge`, `complete JOB FENCE` (complete an attempt), `commit-deferred` (commit
+the outputs of jobs with many outputs), or anything else to collect garbage.
 """
 
 import sys
@@ -33,7 +34,7 @@ def publish(tx: Transaction) -> Any:
 
 
 def purge(database: Database, who: Principal) -> None:
-    """Purge all deleted items of `lab`, each in a transaction of its own."""
+    """Purge all deleted studies of `lab`, each in a transaction of its own."""
     deleted = database.read(who, items.list_items, "lab", Kind.STUDY, items.ItemFilters(deleted=True))
     for one in deleted.items:
         request = PurgeRequest(item=one.id)
@@ -42,9 +43,9 @@ def purge(database: Database, who: Principal) -> None:
 
 
 def main(url: str, user_id: str, user_name: str, work: str, folder: str) -> None:
-    """Send the files, publish, purge, or collect garbage. After each large file, its digest is printed.
+    """Do `work` as this user. `send-large` prints the digest of each file after it is stored.
 
-    Blobs are in `folder`, or in the database if `folder` is empty.
+    Blobs are stored in `folder`, or in the database if `folder` is empty.
     """
     database = Database(url, blobs=DirectoryBlobs(Path(folder)) if folder else None)
     who = Principal("user", user_id, user_name, scopes=("read", "write"))
