@@ -1,1 +1,1 @@
-"""Benchmarks that compare Marey with other libraries: each runs both in turn, in one process, and prints ratios."""
+"""Benchmarks that compare Marey with other libraries: both run in turn, in one process, and ratios are printed."""

@@ -1,4 +1,4 @@
-"""Tornado server that answers every request with the same bytes, as a limit for the speed of Marey's server.
+"""Tornado server that answers every request with the same bytes: an upper limit for the speed of Marey's server.
 
 `python -m benchmarks.bare_server PORT BYTES`
 """
@@ -29,7 +29,7 @@ class _Bytes(RequestHandler):
         self.write(self.body)
 
     def compute_etag(self) -> None:
-        """Return None, so that Tornado does not hash the body, which would take longer than sending it."""
+        """Return None, so that Tornado does not hash the body: hashing would take longer than sending."""
 
 
 async def _serve(port: int, size: int) -> None:
@@ -40,7 +40,7 @@ async def _serve(port: int, size: int) -> None:
 
 @contextmanager
 def bare_server(size: int) -> Iterator[int]:
-    """Run the server in a process while the `with` block runs; yield its port.
+    """Run the server in a process while the `with` block runs; yield the port of the server.
 
     `size` is the number of bytes of an answer.
     """

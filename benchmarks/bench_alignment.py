@@ -54,7 +54,7 @@ def _require_same_totals() -> None:
 
 
 def _peers_given_costs(costs: Floats) -> dict[str, Callable[[], float]]:
-    """Return, by library, a function that computes the path for these costs and returns its total cost."""
+    """Return, by library, a function that computes the cheapest path for these costs and returns the total cost."""
     return {
         "librosa": lambda: float(librosa.sequence.dtw(C=costs)[0][-1, -1]),
         "dtw-python": lambda: float(dtw_python.dtw(costs, step_pattern="symmetric1").distance),
@@ -62,9 +62,9 @@ def _peers_given_costs(costs: Floats) -> dict[str, Callable[[], float]]:
 
 
 def _peers_of_points(a: Floats, b: Floats) -> dict[str, Callable[[], float]]:
-    """Return, by library, a function that computes the costs and the path for points, and returns the total cost.
+    """Return, by library, a function that computes costs and the cheapest path, and returns the total cost.
 
-    The costs are squared distances of flat vectors.
+    The costs are squared distances between the points of a frame of `a` and of `b`, as flat vectors.
     """
     return {
         "librosa": lambda: float(librosa.sequence.dtw(a.T, b.T, metric="sqeuclidean")[0][-1, -1]),
@@ -106,7 +106,7 @@ def _against(
     calls: int,
     goal: float | None = None,
 ) -> Row:
-    """Time a function of Marey and those of other libraries; return a row with the ratio to librosa, the fastest."""
+    """Time a function of Marey and its peers; return a row with the ratio to librosa, the fastest peer."""
     own, *theirs = _each(calls, repeats, ours, *peers.values())
     by_name = dict(zip(peers, theirs, strict=True))
     ratio = by_name["librosa"].median_s / own.median_s
@@ -170,9 +170,10 @@ def _large_set() -> Row:
 
 
 def _examples(count: int, frames: tuple[int, int]) -> tuple[list[SourceExample], MatchingBody]:
-    """Return variants of one walk, and its body.
+    """Return variants of one walk, and the body of the walker.
 
-    The variants differ in timing (a sine of 0.08), size (0.9 to 1.1) and joint drift (0.002).
+    The variants differ in timing (by a sine of up to 0.08 of the duration), in the scale of the root's path (0.9 to
+    1.1), and in a random drift of the joint rotations (0.002 per frame).
     """
     random = np.random.default_rng(5)
     walk = generate_gait(1.3, 0.2, 50 / 60)

@@ -1,8 +1,8 @@
-"""Time to send a clip as JSON, and ranges of its frames, over HTTP, compared with Tiled, which serves the same array.
+"""Time to send a clip as JSON, and a range of its frames as bytes, over HTTP, compared with Tiled.
 
-Times are processor time of the server per answer. Tiled runs in a Python environment of its own, whose interpreter
-`MAREY_BENCH_TILED` names: it needs SQLAlchemy below 2.1 and pydantic-settings below 2.12, but Marey needs newer
-versions. CONTRIBUTING.md describes how to create this environment.
+Both servers send the same array. Times are processor time of the server per answer. Tiled runs in a Python environment
+of its own, because Tiled needs SQLAlchemy below 2.1 and pydantic-settings below 2.12, but Marey needs newer versions.
+The variable `MAREY_BENCH_TILED` names the interpreter of this environment; CONTRIBUTING.md describes how to create it.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def _row(job: str, size: str, rounds: tuple[tuple[float, float | None], ...], go
 
 @contextmanager
 def _tiled() -> Iterator[tuple[int, int] | None]:
-    """Run Tiled with the array of the clip while the `with` block runs; yield its process id and port.
+    """Run Tiled with the array of the clip while the `with` block runs; yield the process id and port of Tiled.
 
     Yields None if no interpreter for Tiled is named.
     """

@@ -1,8 +1,8 @@
 """Conversion of BVH files to quaternions, one file and many, compared with pymotion and a simple loader in numpy.
 
-Marey is timed twice. Reading alone (`read_bvh`) parses the numbers, computes quaternions and checks the text; the other
-loaders do the same, and the goals refer to it. Importing (`read_motion`) also finds the landmarks of the body,
-determines unit and axes, and searches for faults of the capture.
+Marey is timed twice. Reading alone (`read_bvh`) parses the numbers, computes quaternions and checks the text, as the
+other loaders do; the goals refer to reading alone. Importing (`read_motion`) also finds the landmarks of the body,
+determines the unit and the axes, and searches for faults of the capture.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def _is_read(path: Path) -> bool:
 
 
 def _check_agreement(path: Path) -> int:
-    """Check that the three loaders find the same rotations in a file; return its number of frames."""
+    """Check that the three loaders find the same rotations in a file; return the file's number of frames."""
     ours = read_bvh(path.read_bytes(), path.name).rotations
     assert ours is not None
     for theirs in (load_with_pymotion(path), load_plainly(path)):

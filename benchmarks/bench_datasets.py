@@ -1,7 +1,7 @@
 """Versions of a dataset with as many entries as the largest public collection, and with a million.
 
-In the same run, Git commits one changed file of equally many small files, by commands that change only the index and
-the objects of its repository.
+For comparison, the same run times commits by Git of one changed file, in a repository with as many small files as the
+dataset has entries. The commands write only to the index, the objects and the branch, not to a working tree.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def _ok(response: httpx.Response) -> Any:
 
 
 def _times(action: Callable[[], object], repeats: int = REPEATS) -> list[float]:
-    """Return the milliseconds of each call; the first of several calls warms up and is left out."""
+    """Return the duration of each call in milliseconds; the first of several calls is a warm-up and is left out."""
     taken = []
     for _ in range(repeats + (repeats > 1)):
         begun = time.perf_counter()
@@ -171,7 +171,7 @@ def _row(
 
 
 def _git_commits(files: int) -> float | None:
-    """Return the median milliseconds in which Git commits one of `files` small files; None if Git is not installed."""
+    """Return the median time in ms for a commit by Git of one of `files` small files; None if Git is not installed."""
     git = shutil.which("git")
     if git is None:
         return None

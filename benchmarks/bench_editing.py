@@ -106,10 +106,10 @@ def _beside(walk: Clip, name: str, peer: str, command: AnyCommand, theirs: Calla
 
 
 def _peers(walk: Clip) -> list[tuple[str, str, AnyCommand, Callable[[], Any]]]:
-    """Return the edits that scipy offers, too: name, function of scipy, our command, and a call of the function.
+    """Return the edits that scipy can also do: name, function of scipy, our command, and a call of the function.
 
-    The calls convert from and to single precision. The filter of scipy smooths components: it ignores sign changes of
-    quaternions and does not keep the ends.
+    The calls convert from and to single precision. The filter of scipy smooths each quaternion component separately:
+    it ignores sign changes of quaternions, and it does not keep the first and the last frame.
     """
 
     def slerped() -> list[NDArray[np.float32]]:

@@ -15,7 +15,7 @@ MOST_MB = 2000
 
 
 def run() -> list[Row]:
-    """Measure on one thread and on two, each in a separate process, so that memory is measured separately, too."""
+    """Measure on one thread and on two, each in a separate process, so that the memory of each is measured."""
     return [_row(threads) for threads in (1, 2)]
 
 

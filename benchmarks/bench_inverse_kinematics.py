@@ -1,7 +1,8 @@
 """Inverse kinematics of one arm and of whole bodies, compared with scipy's least squares and Marey's predecessor.
 
 The times of the predecessor are published times for a walk of 47 frames and 78 joints. The same setup is repeated here
-with a generated walk; the targets of the wrist are 8 cm (standard deviation per axis) from its position.
+with a generated walk. A target for the wrist is the position of the wrist with random noise of 8 cm (standard deviation
+per axis).
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ Solver = Callable[..., SolvedPoses]
 
 
 def run() -> list[Row]:
-    """Measure all of these on one thread."""
+    """Run all measurements of this module on one thread."""
     clip = generate_gait(1.3, 0.2, BATCH / 60.0)
     skeleton = clip.skeleton
     motion = Motion.of(clip)
@@ -174,7 +175,7 @@ def _batch(skeleton: Skeleton, motion: Motion, near: Floats, freedom: Freedom) -
 
 
 def _edit(skeleton: Skeleton, motion: Motion, near: Floats) -> Row:
-    """Measure a constraint in one frame of a walk with fingers, whose change is blended over the whole walk."""
+    """Measure a constraint in one frame of a walk with fingers; the correction is blended over the whole walk."""
     body = with_fingers(skeleton, 78, skeleton.joint_names[map_joints(skeleton).indices(skeleton, ("left_wrist",))[0]])
     rotations = np.asarray(quaternions.identity(FRAMES, body.joint_count), dtype=np.float64)
     rotations[:, [body.index_of(name) for name in skeleton.joint_names]] = motion.rotations[:FRAMES]

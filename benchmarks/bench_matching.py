@@ -34,14 +34,14 @@ FLOAT32_EXCESS = 1e-5
 
 @dataclass(frozen=True)
 class _Play:
-    """Queries (Q, D) of characters that motion matching controls, and the row (Q,) that each shows at its query."""
+    """Queries (Q, D) of characters that motion matching controls, and the row (Q,) displayed at each query."""
 
     queries: Floats
     shown: Rows
 
 
 def run() -> list[Row]:
-    """Measure on one thread. All libraries answer the same queries; those that use float64 must find the same rows."""
+    """Measure on one thread. All libraries answer the same queries; in float64, they must find the same rows."""
     faiss.omp_set_num_threads(1)
     return [_race(*size, hard) for size in SIZES for hard in (False, True)]
 
@@ -103,10 +103,10 @@ def _peers(rows: Floats, selectable: NDArray[np.bool_]) -> dict[str, Callable[[F
 
 
 def _database(row_count: int) -> tuple[Floats, Rows, Floats]:
-    """Return normalised rows (N, D), the first row of each clip followed by N, and trajectories of other clips.
+    """Return normalised rows (N, D), where each clip starts (row indices, with N at the end), and trajectories.
 
-    The rows are those of all available clips, then of copies with random changes of proportion and place, until there
-    are `row_count` rows.
+    The trajectories come from clips that are held out. The rows are those of all other clips, and then of copies of
+    these clips with random changes of scale and offset, until there are `row_count` rows.
     """
     clips = matching_features()
     rng = np.random.default_rng(row_count)
@@ -129,9 +129,10 @@ def _database(row_count: int) -> tuple[Floats, Rows, Floats]:
 
 
 def _play(index: SearchIndex, starts: Rows, desired: Floats, hard: bool) -> _Play:
-    """Return the queries of trials. In each, a character searches for a row that continues its pose towards a goal.
+    """Return the queries of trials: a character searches again and again for a row that leads it towards a goal.
 
-    The next query starts from a row shortly after the row that was found.
+    A query has the pose of the displayed row and the trajectory to the goal. After a search, the character plays on
+    from the row that was found, until the next query.
     """
     rng = np.random.default_rng(1)
     stops = np.repeat(starts[1:], np.diff(starts))

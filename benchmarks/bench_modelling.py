@@ -25,14 +25,14 @@ Floats = NDArray[np.float64]
 
 CLIPS, FRAMES, CHANNELS, COEFFICIENTS, COMPONENTS = 100, 150, 255, 30, 20
 PUBLISHED_S = 12.7 + 0.26 + 0.50
-"""Seconds of the published system for 30 clips, on two similar cores: alignment, components and mixtures."""
+"""Published time in seconds for 30 clips, on two similar cores: sum of alignment, components and mixtures."""
 
 GOAL_S = 0.5
 WITHOUT_REPORT = ModelOptions(leave_one_out=False, folds=0, report_samples=0)
 
 
 def run() -> list[Row]:
-    """Measure all of these on one thread. Other libraries must find the same shares of variance."""
+    """Run all measurements of this module on one thread. Other libraries must find the same shares of variance."""
     with one_thread():
         return [_one_channel(), _all_channels(), _mixtures(), _whole_model(), _report()]
 
@@ -142,7 +142,7 @@ def _smooth(channels: int) -> Floats:
 
 
 def _examples(count: int) -> tuple[list[SourceExample], MatchingBody]:
-    """Return generated walks of many speeds and turn rates, 42 to 53 frames long, and their body."""
+    """Return generated walks of many speeds and turn rates, 42 to 53 frames long, and the walker's body."""
     random = np.random.default_rng(5)
     examples = []
     for number in range(count):

@@ -1,4 +1,4 @@
-"""Queries over as many clips as the largest public collection of motion has, and the cost of their indexes."""
+"""Queries over as many clips as the largest public collection of motion has, and the cost of indexes for queries."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ QUERIES = {
     "no clip": "subject = nobody and frames > 120 and not warning = foot-slide",
     "no value of an index": "duration > 5 and not select = best and not warning = foot-slide",
 }
-"""Queries of three conditions, by what they select."""
+"""Queries of three conditions each; the keys describe what a query selects."""
 REQUESTS = 30
 GOAL_MS = 50.0
 ROWS_PER_WRITE = 10_000
 
 
 def run() -> list[Row]:
-    """Measure the first page of each query, by name and by time."""
+    """Measure the first page of each query, ordered by time and ordered by name."""
     with local_server(_prepare) as server, Connection(server.port, server.token) as connection:
         orders = {"": "", ", by name": "&sort=name"}
         return [
@@ -66,7 +66,7 @@ def _prepare(data: Path) -> None:
 
 
 def _copy_clips(tx: Transaction, numbers: range) -> None:
-    """Insert copies of the first clip whose summaries state other facts."""
+    """Insert copies of the first clip; their summaries state other facts."""
     first = tx.execute(select(item).where(item.c.kind == "clip").order_by(item.c.id).limit(1)).one()._mapping
     parts = tx.execute(select(revision_part).where(revision_part.c.item_id == first["id"])).all()
     ids = sorted(new_id("clip") for _ in numbers)
@@ -84,7 +84,7 @@ def _copy_clips(tx: Transaction, numbers: range) -> None:
 
 
 def _summary(of_first: dict[str, Any], number: int) -> dict[str, Any]:
-    """Return the summary of a clip: 712 performers with about 200 takes each, who mostly walk."""
+    """Return the summary of the clip `number`; in all clips together, each performer has 200 takes, mostly walks."""
     mixed = number * 2_654_435_761 % 2**32 >> 8  # a fixed value that looks random
     frames = 24 + number * 7 % 600
     return {

@@ -1,8 +1,8 @@
 """Jobs that retarget clips and write them to BVH files with one worker, compared with pymotion in one process.
 
-The worker runs one job at a time, then two, each in its own process. Marey's times are those that a person waits, from
-the submission until the job has ended: clips are read from the server, computed by the worker, sent back, checked and
-published. pymotion computes from arrays in memory.
+The worker runs one job at a time, then two, each in its own process. Marey's times are as long as a person waits, from
+the submission to the end of the job: the worker reads clips from the server, computes and sends the results, and the
+server checks and publishes them. pymotion computes from arrays in memory.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from marey_schemas.queue.jobs import CollectionInput, Job, JobCreate
 
 CLIPS, FRAMES, JOINTS = 328, 287, 31
 WARMING_CLIPS = 64
-"""Number of clips that are retargeted first, so that all processes of the worker have done such a job before."""
+"""Number of clips that are retargeted first, so that all processes of the worker have warmed up."""
 GOAL_POSES_PER_S = 50_000
 
 Floats = NDArray[np.floating]
 
 
 def run() -> list[Row]:
-    """Measure a worker with one slot and a worker with two, each with a server of its own."""
+    """Measure a worker that runs one job at a time, and one that runs two, each with a server of its own."""
     clips = [captured_walk(FRAMES, JOINTS, seed) for seed in range(CLIPS)]
     ours = {slots: _measure(clips, slots) for slots in (1, 2)}
     plan = _plan(clips[0].skeleton, game_skeleton())
@@ -60,7 +60,7 @@ def run() -> list[Row]:
 
 
 def _measure(clips: list[Clip], slots: int) -> tuple[float, float]:
-    """Return the seconds in which one worker retargets the clips, and writes the results to BVH files."""
+    """Return how many seconds one worker takes to retarget the clips, and to write the results to BVH files."""
     with local_server() as server, one_worker(server, slots=slots), server.client() as marey:
         project = marey.create_project(ProjectCreate(name=PROJECT))
         target = _seed(project, clips)
@@ -72,7 +72,7 @@ def _measure(clips: list[Clip], slots: int) -> tuple[float, float]:
 
 
 def _seed(project: ProjectHandle, clips: list[Clip]) -> str:
-    """Store the clips in the folder `takes`, other clips in `first`, and a skeleton to retarget to; return its id."""
+    """Store `clips` in the folder `takes`, other clips in `first`, and a target skeleton; return the skeleton's id."""
     skeletons = []
     for name, skeleton in (("studio", clips[0].skeleton), ("game", game_skeleton())):
         mapping = map_joints(skeleton)
@@ -91,7 +91,7 @@ def _seed(project: ProjectHandle, clips: list[Clip]) -> str:
 
 
 def _timed(marey: Marey, submit: Callable[[], Job]) -> float:
-    """Return the seconds from the submission of a job to its end."""
+    """Submit a job and wait for its end; return how many seconds this takes."""
     started = time.perf_counter()
     ended = marey.jobs.wait(submit().id)
     seconds = time.perf_counter() - started
@@ -106,7 +106,7 @@ def _plan(source: Skeleton, target: Skeleton) -> RetargetPlan:
 
 
 def _retarget_with_pymotion(clips: list[Clip], plan: RetargetPlan) -> tuple[list[Floats], float]:
-    """Return the local rotations of the target's joints for each clip, and the total seconds."""
+    """Return the local rotations of the target's joints for each clip, and the total time in seconds."""
     offsets, parents = clips[0].skeleton.offsets.astype(np.float32), clips[0].skeleton.parents.copy()
     target_parents = plan.target.parents.copy()
     parents[0] = target_parents[0] = 0  # pymotion's mark of the root
@@ -127,7 +127,7 @@ def _retarget_with_pymotion(clips: list[Clip], plan: RetargetPlan) -> tuple[list
 
 
 def _write_with_pymotion(moved: list[Floats], target: Skeleton) -> float:
-    """Return the seconds in which pymotion writes clips as BVH files."""
+    """Return how many seconds pymotion takes to write clips as BVH files."""
     rest = np.tile(np.concatenate([target.offsets[0], target.rest_rotations.ravel()]), (FRAMES, 1)).astype(np.float32)
     with tempfile.TemporaryDirectory(prefix="marey-bench-") as folder:
         template = Path(folder, "template.bvh")

@@ -21,7 +21,7 @@ FRAMES, JOINTS = 1040, 63
 CONNECTIONS = 8
 SECONDS = 6.0
 ROUNDS = 4
-"""Number of rounds in which Marey and the bare server are read in turn."""
+"""Number of rounds; each reads from the bare server, then from Marey."""
 BATCH = 250
 PREDECESSOR_MS = 160
 GOAL_READS_PER_S, GOAL_OF_BARE, GOAL_P99_MS = 999, 0.7, 20
@@ -31,7 +31,7 @@ Start = Callable[..., Future[Any]]
 
 
 def run() -> list[Row]:
-    """Measure one server; reads that it answers from memory are also measured on a server that stores no answers."""
+    """Measure a server that answers repeated reads from memory; then the same reads on a server without this cache."""
     with load.in_processes(2) as start:
         with local_server() as server:
             seeded = seed(server, FRAMES, JOINTS)
@@ -103,7 +103,7 @@ def _size(seeded: Seeded) -> str:
 def _with_processor_ms(server: LocalServer, measure: Callable[[], Load]) -> tuple[Load, float]:
     """Return a measurement, and the processor time of the server in milliseconds per request.
 
-    Requests of the warm-up count in the processor time.
+    The processor time includes the requests of the warm-up.
     """
     before_s = server.processor_s()
     measured = measure()

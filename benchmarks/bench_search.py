@@ -59,7 +59,7 @@ class _Material(NamedTuple):
 
 
 def run() -> list[Row]:
-    """Measure all of these on one thread."""
+    """Run all measurements of this module on one thread."""
     return [*_trees(), *_searches(), _refinement()]
 
 
@@ -121,7 +121,7 @@ def _trees() -> list[Row]:
 
 
 def _sklearn_tree(samples: NDArray[np.float32]) -> int:
-    """Divide samples by k-means into four groups, and these again, up to leaves; return the number of leaves."""
+    """Divide samples by k-means into four groups, and each group in the same way, down to leaves; count the leaves."""
     if len(samples) <= LEAF:
         return 1
     labels = KMeans(4, n_init=1, random_state=0).fit_predict(samples)

@@ -1,7 +1,8 @@
 """Upload of a folder of motion files with the client, compared with pymotion, which only reads the BVH files.
 
-Marey's time is what a person waits for `marey upload`: hashing, sending, reading, checking and storing every file, with
-its original. pymotion reads the BVH files in one process and stores nothing; it has no reader for other formats.
+Marey's time is how long a person waits for `marey upload`: for each file, it includes hashing and sending the file,
+reading and checking the motion, and storing both. pymotion reads the BVH files in one process and stores nothing; it
+has no reader for other formats.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def run() -> list[Row]:
 def _upload(files: tuple[LocalFile, ...]) -> tuple[float, float, list[ImportEntry]]:
     """Upload files to a new server that has read one file before.
 
-    Returns the seconds, the seconds of processor time of the server, and the entries of the import.
+    Returns the duration and the processor time of the server, both in seconds, and the entries of the import.
     """
     with local_server() as server, one_worker(server), server.client() as marey:
         marey.create_project(ProjectCreate(name="warm"))

@@ -60,9 +60,9 @@ def _without_numbers(size: str) -> str:
 
 
 def _take(left: list[Row], row: Row, form: Callable[[str], str]) -> Row | None:
-    """Remove from `left` the first row of the same job whose size is equal after conversion by `form`; return it.
+    """Remove the first row of the same job and size from `left`, and return this row, or None.
 
-    Returns None if there is no such row.
+    The sizes are compared after conversion by `form`.
     """
     found = next((one for one in left if one.job == row.job and form(one.size) == form(row.size)), None)
     if found is not None:

@@ -1,4 +1,4 @@
-"""One evaluation in a separate process: `python -m benchmarks.evaluation_run ROWS THREADS` prints its measurements."""
+"""One evaluation in a separate process: `python -m benchmarks.evaluation_run ROWS THREADS` prints the measurements."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from marey_schemas.options.evaluation import EvaluationOptions
 ONE_SKELETON = ("bandai-namco-1/*.bvh", "bandai-namco-2/*.bvh")
 LEAST_ROWS = 30
 PACE = 0.1
-"""A repeated take is played up to so much quicker or slower."""
+"""Greatest relative change of speed, up or down, of a take that is used again."""
 
 
 def main(row_count: int, threads: int) -> dict[str, float | str]:
-    """Return the seconds of building the database and of the evaluation, and the peak memory of the process in MiB."""
+    """Return how many seconds the database and the evaluation take, and the peak memory of the process in MiB."""
     sources = list(_sources(row_count))
     options = EvaluationOptions()
     # Kernels load and the machine's caches warm up on something small.
@@ -73,7 +73,7 @@ def _evaluate(database: MatchingDatabase, options: EvaluationOptions, threads: i
 
 
 def _sources(row_count: int) -> Iterator[SourceClip]:
-    """Yield clips of one skeleton with `row_count` rows in total: all takes, then the same at other speeds."""
+    """Yield clips of one skeleton with `row_count` rows in total: all takes, then the same takes at other speeds."""
     rng = np.random.default_rng(row_count)
     takes = _takes()
     left = row_count

@@ -1,7 +1,7 @@
-"""A job whose tasks made many outputs, which are committed to a dataset when the last task ends.
+"""Measurement of a job with many outputs, which are committed to a dataset when the last task of the job ends.
 
-The outputs are written to the database directly, in the form in which tasks leave them. While the job ends, another
-writer makes one small write after another.
+The outputs are written directly to the database, in the form in which tasks leave them. While the job ends, another
+client makes one small write after another.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class EndOfJob:
 
     seconds: float
     longest_wait_ms: float
-    """Longest duration of a small write of somebody else."""
+    """Longest duration of a small write by another client."""
     memory_mb: float
-    """Growth of the greatest memory of the process."""
+    """Growth of the peak memory of the process, in MiB."""
 
 
 def measure_end(database: Database, size: int) -> EndOfJob:
@@ -69,9 +69,9 @@ def measure_end(database: Database, size: int) -> EndOfJob:
 
 
 def measure_plain_commit(database: Database) -> float:
-    """Commit the folder with the outputs by a request of a user, after `measure_end`; return the seconds that it takes.
+    """After `measure_end`, commit the same folder as a user would; return how many seconds this commit takes.
 
-    Raises `RuntimeError` if the two commits differ.
+    Raises `RuntimeError` if this commit and the commit of the job have different entries.
     """
     administrator = database.read(SYSTEM, users.administrator_principal)
     create = datasets.create_dataset

@@ -1,4 +1,4 @@
-"""Functions that put the load of clients and workers on a server; `in_processes` runs each in a separate process."""
+"""Functions that load a server as clients and workers do; `in_processes` runs each function in a separate process."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Load:
         return len(self.latencies_s) / self.seconds
 
     def percentile_ms(self, percent: int) -> float:
-        """Return the time in milliseconds that `percent` of the requests did not exceed."""
+        """Return the time in milliseconds that `percent` % of the requests did not exceed."""
         return statistics.quantiles(self.latencies_s, n=100, method="inclusive")[percent - 1] * 1e3
 
 
@@ -57,7 +57,7 @@ def in_processes(count: int) -> Iterator[Callable[..., Future[Any]]]:
 
 
 def read_steadily(port: int, token: str, path: str, *, accept: str, connections: int, seconds: float) -> Load:
-    """Request one path again and again by GET, on each of `connections`; return the durations."""
+    """Request one path by GET again and again, over each of several connections; return the durations."""
 
     def once(connection: Connection) -> None:
         connection.exchange(connection.head("GET", path, Accept=accept))
@@ -66,7 +66,7 @@ def read_steadily(port: int, token: str, path: str, *, accept: str, connections:
 
 
 def upload_steadily(port: int, token: str, skeleton: RevisionRef, *, frames: int, joints: int, seconds: float) -> Load:
-    """Create clips on one connection, all of them different, with arrays encoded as the client sends them."""
+    """Create clips, all of them different, over one connection, with arrays encoded as the client encodes them."""
     clip = noisy_clip(frames, joints)
     sideways = np.eye(1, clip.poses.shape[1], dtype=np.float32)
     run = secrets.token_hex(4)
@@ -84,7 +84,7 @@ def upload_steadily(port: int, token: str, skeleton: RevisionRef, *, frames: int
 
 
 def cycle_jobs(port: int, token: str, job: dict[str, Any], *, connections: int, seconds: float) -> Load:
-    """Submit a job, claim it and complete it, again and again; each step is on the disk before its answer."""
+    """Submit, claim and complete one job, again and again; the server writes each step to the disk, then answers."""
 
     def once(connection: Connection) -> None:
         connection.call(f"/projects/{PROJECT}/jobs", job)

@@ -134,7 +134,7 @@ def _wait_until_ready(server: LocalServer, process: subprocess.Popen[bytes]) -> 
 
 
 def _wait_until_warm(server: LocalServer) -> None:
-    """Wait until the process that compiles kernels beside a new server has ended, because it would distort times."""
+    """Wait until a new server has compiled its kernels in a child process, because compiling would distort times."""
     compiling = [one for one in psutil.Process(server.pid).children() if "marey_motion.warm_up" in one.cmdline()]
     _, running = psutil.wait_procs(compiling, timeout=WARM_S)
     if running:
@@ -151,7 +151,7 @@ def free_port() -> int:
 
 @dataclass(frozen=True)
 class Seeded:
-    """Content of a project after `seed`: a clip and its skeleton."""
+    """What `seed` has created in a project: a clip and the clip's skeleton."""
 
     clip: str
     stored_bytes: int

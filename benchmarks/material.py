@@ -88,7 +88,7 @@ def chain_skeleton(joints: int, rng: np.random.Generator) -> Skeleton:
 def captured_walk(frames: int, joints: int, seed: int = 0) -> Clip:
     """Return a generated walk at 120 Hz like one from a capture system: with fingers, and noise on every channel.
 
-    The fingers have the joints that the generated body lacks to have `joints` joints.
+    The number of finger joints is `joints` minus the number of joints of the generated body.
     """
     walk = generate_gait(1.3, 0.2, frames / 120.0, 120.0)
     skeleton = with_fingers(walk.skeleton, joints, "LeftHand")

@@ -1,7 +1,7 @@
 """Check that a pipeline whose workers are killed at random moments gives the same bytes as an undisturbed one.
 
 `python -m benchmarks.pipeline_under_fire [TAKES [KILLS [SEED]]]` makes a model of 200 generated takes three times: with
-one worker, with two, and with one that is killed ten times. It prints the duration of each.
+one worker, with two workers, and with one worker that is killed ten times. It prints the duration of each time.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Outcome:
 def write_takes(folder: Path, count: int, seconds: float = SECONDS) -> Path:
     """Write walks of different speeds and turns as BVH files; return their folder.
 
-    The file `game.bvh` beside this folder contains a skeleton to retarget them to.
+    The file `game.bvh` beside this folder contains a skeleton to which the walks can be retargeted.
     """
     takes = folder / "takes"
     takes.mkdir(parents=True)
@@ -197,7 +197,7 @@ class _Fire:
         self._seen: set[tuple[str, int]] = set()
 
     def shoot(self) -> str:
-        """Kill all workers a moment after one has begun a step, and start them again; return which step that was."""
+        """Kill all workers a moment after one has begun a step, and start them again; return the pause and the step."""
         deadline = time.monotonic() + PATIENCE_S
         while not (begun := [step for step in self._begun() if self._left[step] > 0]):
             if self._run.ended or time.monotonic() > deadline:
@@ -212,7 +212,7 @@ class _Fire:
         return f"{pause_s:.2f} s after {' and '.join(sorted(begun))} had begun"
 
     def _begun(self) -> list[str]:
-        """Return the steps of which workers have begun jobs since the last call."""
+        """Return the steps in which a worker has begun a job since the last call."""
         begun = []
         for name, job in self._run.refresh().items():
             if job.state != "running":
@@ -248,7 +248,7 @@ def main(takes: int = TAKES, kills: int = KILLS, seed: int = SEED) -> None:
 
 
 def _differing(one: Outcome, other: Outcome) -> list[str]:
-    """Return the places of arrays that differ in two results, or that only one of them has."""
+    """Return the places of arrays that differ between two outcomes, or that only one outcome has."""
     places = sorted(one.digests.keys() | other.digests.keys())
     return [place for place in places if one.digests.get(place) != other.digests.get(place)]
 

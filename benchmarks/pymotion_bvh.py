@@ -19,7 +19,7 @@ def load_with_pymotion(path: Path) -> NDArray[np.float64]:
 
 
 def loaded_with_pymotion(paths: Iterable[Path]) -> dict[Path, int]:
-    """Return the number of frames of each file that pymotion can read; print the names of the other files."""
+    """Return the number of frames of each file that pymotion can read; print the names of files that it cannot read."""
     frames = {}
     for path in paths:
         try:

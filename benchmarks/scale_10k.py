@@ -1,8 +1,8 @@
 """Measurement of a server with ten thousand uploaded clips: `python -m benchmarks.scale_10k`.
 
-Uploads clips of 300 frames with the client, several at a time, into one project of a new server on SQLite, and samples
-the memory of the server meanwhile. Then measures pages of lists, and checks every digest and reference of the database.
-This takes minutes and leaves no data behind. The exit status is 1 if a goal was missed.
+It uploads clips of 300 frames with the client, several at a time, into one project of a new server on SQLite, and
+samples the memory of the server meanwhile. Then it measures pages of lists, and checks every digest and reference of
+the database. All of this takes minutes and leaves no data behind. The exit status is 1 if a goal was missed.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def _page_times_ms(server: LocalServer) -> Iterator[float]:
 
 
 def _check(server: LocalServer) -> tuple[bool, str]:
-    """Run `marey db fsck`; return whether it passes, and its output."""
+    """Run `marey db fsck`; return whether the command succeeds, and its output."""
     run = subprocess.run(
         [sys.executable, "-m", "marey_client.cli", "db", "fsck"],
         env=clean_environment() | {"MAREY_DATA": str(server.data)},

@@ -1,6 +1,6 @@
-"""A server of Tiled with one array, for comparison; it needs an interpreter that has `tiled[server]`.
+"""A Tiled server with one array, for comparison: `python benchmarks/tiled_server.py PORT FILE.npy`.
 
-`python benchmarks/tiled_server.py PORT FILE.npy`, where no other package of this repository is needed.
+The interpreter needs `tiled[server]`, and no package of this repository.
 """
 
 from __future__ import annotations

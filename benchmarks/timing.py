@@ -1,7 +1,7 @@
 """Timing of several functions in turn, so that a change of the machine's speed affects all of them.
 
-Functions in this process are measured by their processor time, of all threads together: on a machine that others use,
-wall time depends on the other users.
+Functions in this process are measured by their processor time, summed over all threads, because wall time would also
+depend on other programs on the machine.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Timing:
     median_s: float
 
     def shown(self, per_second: float, unit: str, digits: int = 1) -> str:
-        """Return the median as text, with the best in parentheses, in a unit of which a second has `per_second`."""
+        """Return the median as text, with the best in parentheses; one second equals `per_second` of the unit."""
         return f"{self.median_s * per_second:.{digits}f} ({self.best_s * per_second:.{digits}f}) {unit}"
 
 
@@ -29,8 +29,8 @@ class Timing:
 class Row:
     """One line of the report.
 
-    `ratio` is the comparison with another library in the same run, above 1 if Marey is better; None without another
-    library. `met` is None if there is no goal.
+    `ratio` compares Marey with another library in the same run; it is above 1 if Marey is better, and None if there is
+    no other library. `met` is None if there is no goal.
     """
 
     job: str
@@ -43,7 +43,7 @@ class Row:
 
 
 def time_in_turn(*contenders: Callable[[], object], repeats: int = 7) -> list[Timing]:
-    """Call each function `repeats` times, in turn, after one call of each as warm-up; return their timings."""
+    """Call each function once as a warm-up, then all functions in turn, `repeats` times; return timings by function."""
     for call in contenders:
         call()
     seconds: list[list[float]] = [[] for _ in contenders]

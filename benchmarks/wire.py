@@ -28,7 +28,7 @@ class Connection:
         self._socket.close()
 
     def head(self, method: str, path: str, *, length: int = 0, token: str | None = None, **headers: str) -> bytes:
-        """Return the head of a request, which may be sent many times."""
+        """Return the head of a request; the same head may be sent many times."""
         fields = {"Host": "127.0.0.1", "Authorization": f"Bearer {token or self._token}"}
         fields |= {name.replace("_", "-"): text for name, text in headers.items()}
         if length or method != "GET":
@@ -37,7 +37,7 @@ class Connection:
         return ("\r\n".join(lines) + "\r\n\r\n").encode()
 
     def exchange(self, request: bytes) -> memoryview:
-        """Send a request and return the body of the answer, which is valid until the next request.
+        """Send a request and return a view of the answer's body, which is valid until the next request.
 
         Raises `RuntimeError` if the status is not a success.
         """

@@ -1,4 +1,4 @@
-"""Generates reference pages from the code: `python -m docs.generate`, or with `--check` only compares the pages."""
+"""Generates reference pages from the code: `python -m docs.generate`; with `--check`, only compares the pages."""
 
 from __future__ import annotations
 
@@ -253,7 +253,7 @@ def _cell(text: object) -> str:
 
 
 def main() -> int:
-    """Write the pages that are out of date, or with `--check` only name them, and return 1 if there are any."""
+    """Write the pages that are out of date; with `--check`, only name these pages, and return 1 if there are any."""
     stale = [name for name, text in pages().items() if not _is(REFERENCE / name, text)]
     if "--check" in sys.argv[1:]:
         for name in stale:

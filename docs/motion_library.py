@@ -18,7 +18,7 @@ _HEAD = re.compile(r"^(\w+)\n-+\n", re.MULTILINE)
 
 
 def library_page() -> str:
-    """Return the page: each exported name with its whole docstring, then for each module a table of its functions."""
+    """Return the page: each exported name with its whole docstring, then a table of the functions of each module."""
     text = (
         "# Motion library\n\n"
         "`marey_motion` works on arrays in memory and needs no server. Axes are right-handed with Y up;\n"
@@ -131,7 +131,7 @@ def _items(content: str) -> Iterator[str]:
 
 
 def _item(line: str) -> str:
-    """Format an entry of a docstring section: its name as code, then its type, a colon and its meaning."""
+    """Format an entry of a docstring section as name (in code style), type, colon and meaning."""
     head, _, meaning = line.partition("    ")
     name, colon, kind = head.partition(" : ")
     shown = f"`{name}`, {kind}" if colon else f"`{name}`"

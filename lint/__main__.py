@@ -23,7 +23,7 @@ RULES: Mapping[str, Callable[[House], Iterator[Offence]]] = {
     "lists": lists.find,
     "constants": constants.find,
 }
-"""By name in `exceptions.toml`; the wording has its baseline instead."""
+"""Rules by their names in `exceptions.toml`; the rule on wording is missing, because it has a baseline instead."""
 
 
 def check(house: House, root: Path) -> Iterator[tuple[str, Offence]]:

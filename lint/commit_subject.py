@@ -1,6 +1,6 @@
 """Rule: the subject of a commit is `area: imperative`, at most 72 characters, without a full stop.
 
-As a hook: `python -m lint.commit_subject .git/COMMIT_EDITMSG`. Without a file it checks the newest commit.
+As a hook: `python -m lint.commit_subject .git/COMMIT_EDITMSG`. Without a file, the newest commit is checked.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def faults_of(subject: str) -> list[str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Check the subject in the named file, or that of the newest commit; return the exit status."""
+    """Check the subject in the named file, or the subject of the newest commit; return the exit status."""
     if arguments:
         message = Path(arguments[0]).read_text("utf-8")
     else:

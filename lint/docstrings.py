@@ -1,7 +1,7 @@
 """Rule: public functions of the motion library document what they take and return, with shapes, units and frames.
 
-Functions of kernel modules take what their callers prepare, and are left out. The words are for people to judge; the
-rule compares names of parameters, and asks for a section on results.
+Functions of kernel modules (compiled code) are left out: other functions of the library prepare their arguments. The
+rule checks that every parameter has an entry and that there is a section on results; people judge the wording.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ def read_exceptions(path: Path = EXCEPTIONS) -> dict[str, dict[str, str]]:
 
 
 def apply_exceptions(rule: str, offences: Iterable[Offence], reasons: Mapping[str, str]) -> Iterator[Offence]:
-    """Yield the offences without a reason, and an offence for each reason that no offence needs any more.
+    """Yield the offences that have no reason, and a further offence for each reason that belongs to no offence.
 
     The keys of `reasons` are subjects, or patterns of them such as "marey_server.handlers.*".
     """
@@ -40,7 +40,7 @@ def read_baseline(path: Path = BASELINE) -> dict[str, int]:
 
 
 def apply_baseline(offences: Iterable[Offence], allowed: Mapping[str, int], root: Path) -> Iterator[Offence]:
-    """Yield the offences of files that have more than they may, and counts that are larger than necessary."""
+    """Yield the offences of each file that has more than `allowed`, and an offence for each count that is too large."""
     by_file: dict[str, list[Offence]] = {}
     for offence in offences:
         by_file.setdefault(shown(offence.path, root), []).append(offence)
@@ -54,7 +54,10 @@ def apply_baseline(offences: Iterable[Offence], allowed: Mapping[str, int], root
 
 
 def shrink_baseline(offences: Iterable[Offence], root: Path, path: Path = BASELINE) -> None:
-    """Lower the counts of the baseline to what is left. A count rises only with texts that another file has lost."""
+    """Lower the counts of the baseline to the present numbers of offences.
+
+    The count of a file rises only if the total does not, for example after texts have moved to this file.
+    """
     allowed = read_baseline(path)
     counts = Counter(shown(offence.path, root) for offence in offences)
     if counts.total() > sum(allowed.values()):

@@ -26,7 +26,7 @@ def find(house: House) -> Iterator[Offence]:
 
 
 def _vocabularies(house: House) -> Iterator[tuple[tuple[str, str], set[str]]]:
-    """Yield every enumeration of texts in the schemas: its module and name, and its words."""
+    """Yield every enumeration of texts in the schemas: module and name, then the words."""
     for module in house.modules.values():
         if not module.name.startswith("marey_schemas"):
             continue

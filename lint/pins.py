@@ -1,8 +1,8 @@
 """Pins: the version and the hashes of every package that is installed, in one file for each layer of packages.
 
 `python -m lint.pins [--upgrade | --upgrade-package NAME]` resolves `pyproject.toml` again and writes the files. Each
-file starts with the one of the layer below, so that every version has one home. Hashes are those of all files of a
-version, for every platform.
+file includes the file of the layer below, so that every version is written in one file only. A version has the hashes
+of its files for all platforms.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 FOLDER = "pins"
 BELOW = {"build": None, "all": "build", "dev": "all", "bench": "dev", "audit": "dev"}
-"""Layers of packages, each with the one that it extends: the build backend, then extras of `pyproject.toml`."""
+"""Layers of packages, each with the layer that it extends.
+
+`build` is the build backend; the other layers are extras of `pyproject.toml`.
+"""
 _PIN = re.compile(
     r"(?P<name>[a-z0-9][a-z0-9.-]*)(?:\[[^\]]*\])?==(?P<version>[^\s;\\]+)[^\n]*"
     r"(?:\n    --hash=sha256:[0-9a-f]{64}[^\n]*)*"
@@ -41,13 +44,13 @@ def layers_of(layer: str | None) -> Iterator[str]:
 
 
 def requirements_of(layer: str, pyproject: dict[str, object]) -> list[str]:
-    """Return what a layer requires, with the layers below it."""
+    """Return the requirements of a layer and of the layers below it."""
     build: list[str] = pyproject["build-system"]["requires"]  # type: ignore[index]
     return [*build, *(f"{ROOT}[{extra}]" for extra in layers_of(layer) if extra != "build")]
 
 
 def split(every: dict[str, str], needed: dict[str, set[str]]) -> dict[str, list[str]]:
-    """Return the names that belong to each layer: a package belongs to the highest layer below all that need it."""
+    """Return the names of packages by layer: a package is in the highest layer shared by all layers that need it."""
     homes: dict[str, list[str]] = {layer: [] for layer in BELOW}
     for name in sorted(every):
         users = [list(layers_of(layer)) for layer, names in needed.items() if name in names]

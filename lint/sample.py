@@ -30,7 +30,7 @@ def draw(house: House, seed: int) -> dict[str, list[tuple[str, str]]]:
 
 
 def _docstrings(module: Module) -> Iterator[tuple[str, str]]:
-    """Yield every docstring after what surrounds it in the code: module, enclosing classes, signature."""
+    """Yield every docstring, preceded by its context in the code: module, enclosing classes, signature."""
     if text := ast.get_docstring(module.tree):
         yield module.name, text
     introduction = f"In {module.name}: {_first_paragraph(module.tree)}"

@@ -1,4 +1,4 @@
-"""Rule: a module of fewer than 60 lines is imported by at least two modules; otherwise it belongs into its importer."""
+"""Rule: a module of fewer than 60 lines is imported by at least two modules; otherwise it belongs in its importer."""
 
 from __future__ import annotations
 

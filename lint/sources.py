@@ -21,7 +21,7 @@ PACKAGES = {
 """Folder of each package of the product, and its name."""
 
 GENERATED = "<!-- Written by `make docs`"
-"""Pages that begin so repeat texts of the code."""
+"""Beginning of pages that are generated from texts in the code."""
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
 
@@ -104,7 +104,7 @@ def _imported(module: Module, known: dict[str, Module]) -> Iterator[str]:
 
 
 def read_house(root: Path) -> House:
-    """Return all modules and pages of the product in a checkout, and the other files that may use its names."""
+    """Return all modules and pages of the product in a checkout, and other files that may use names of the product."""
     modules = [
         read_module(path, root / folder)
         for folder, package in PACKAGES.items()

@@ -1,8 +1,8 @@
-"""Rule: no code is used by tests alone: other code of the product names every function, class and method.
+"""Rule: tests are not the only users of any code: other code of the product names every function, class and method.
 
-Names count, not bindings: a method is used when any code names an attribute like it. Names in the docs' code blocks
-and in benchmarks count, too: their readers are users of the SDK and of the library. Only the function that contains a
-local function can name it.
+The rule compares only names: a method counts as used if any code names an attribute like this method. Names in
+benchmarks and in code blocks of the docs count, too. A local function counts as used only if the function that contains
+it names it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _ENTRY_DECORATORS |= {"writes", "overload", "field_serializer", "model_serialize
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Yield the definitions that no code but tests names."""
+    """Yield the definitions that no code except tests names."""
     named = _named(house)
     for module in house.modules.values():
         for name, node in module.definitions:
@@ -44,7 +44,7 @@ def find(house: House) -> Iterator[Offence]:
 
 
 def _unused_locals(module: Module, name: str, outer: Function) -> Iterator[Offence]:
-    """Yield the functions inside a function that this function does not name."""
+    """Yield the local functions of `outer` that `outer` does not name."""
     named = {node.id for node in ast.walk(outer) if isinstance(node, ast.Name)}
     for node in _locals(outer):
         if node.name not in named and not node.decorator_list:
@@ -52,7 +52,7 @@ def _unused_locals(module: Module, name: str, outer: Function) -> Iterator[Offen
 
 
 def _locals(node: ast.AST) -> Iterator[Function]:
-    """Yield the functions that a function contains, without those of local functions and classes."""
+    """Yield the local functions of a function, but not functions inside these or inside local classes."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, Function):
             yield child
@@ -72,7 +72,7 @@ def _is_entry(node: Definition) -> bool:
 
 
 def _is_of_format(module: Module, node: Definition) -> bool:
-    """Return whether a definition is the reader or writer of a format, which is found by the name of its module."""
+    """Return whether a definition is the reader or writer of a format, which callers find by the module's name."""
     folder, _, name = module.name.rpartition(".")
     return folder == "marey_motion.formats" and node.name in (f"read_{name}", f"write_{name}")
 

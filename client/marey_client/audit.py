@@ -22,9 +22,9 @@ class AuditConditions(TypedDict, total=False):
     subject: str | None
     """Name or id of the user or object that was changed."""
     since: datetime | None
-    """Earliest time; without a time zone, a local time."""
+    """Earliest time of the change; a value without a time zone is local time."""
     until: datetime | None
-    """Time before which the change was made; without a time zone, a local time."""
+    """Time before which the change was made; a value without a time zone is local time."""
 
 
 def read_audit(transport: Transport, path: str, **conditions: Unpack[AuditConditions]) -> Iterator[AuditEntry]:

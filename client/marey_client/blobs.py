@@ -1,4 +1,4 @@
-"""Blobs (bytes identified by their digest): find those that the server does not have, upload and download them."""
+"""Blobs (bytes identified by their digest): upload, download, and search for blobs that the server lacks."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Blobs:
     transport: Transport
 
     def missing(self, digests: str | Iterable[str]) -> set[str]:
-        """Return those of `digests` that the server does not have."""
+        """Return the digests whose blobs the server does not have."""
         wanted = list(dict.fromkeys(several(digests)))
         lacking: set[str] = set()
         for some in batched(wanted, DIGESTS_PER_QUESTION):

@@ -33,8 +33,8 @@ LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
 class TokenFile:
     """File that contains a token; the file is read again whenever it has changed.
 
-    So a program continues to work after its token was rotated. If the changed file cannot be read or contains no token,
-    the token that was read last stays in use.
+    A program therefore continues to work after its token was rotated. If the changed file cannot be read or contains no
+    token, the last token that was read stays in use.
     """
 
     def __init__(self, path: Path) -> None:
@@ -76,7 +76,7 @@ class Credential:
 
     @property
     def bearer(self) -> str | TokenFile | None:
-        """The token; or, if `file` is given, a `TokenFile`, which is read again when the token in the file changes."""
+        """The token; if `file` is given, a `TokenFile`, which is read again whenever the file changes."""
         return self.token if self.file is None else TokenFile(self.file)
 
 
@@ -102,7 +102,7 @@ def resolve(
 def resolve_other(url: str, token_file: Path | None = None, environment: Mapping[str, str] | None = None) -> Credential:
     """Return the token for a second server, from a file or from `marey login`.
 
-    Tokens in the environment or in the data folder are for the first server, and are never sent to another one.
+    Tokens in the environment or in the data folder are for the first server, and are never sent to another server.
     """
     chosen = url.rstrip("/")
     require_address(chosen)
@@ -137,7 +137,7 @@ def as_token(text: str) -> str:
 
 
 def read_secret(path: Path) -> str:
-    """Return the token in a file. Raises `BadCredentialFile` if it contains none, or other users can read it."""
+    """Return the token in a file. Raises `BadCredentialFile` if it has no token, or if other users can read it."""
     try:
         mode = path.stat().st_mode
         text = path.read_text(encoding="ascii").strip()
@@ -201,7 +201,7 @@ def forget_login(path: Path, url: str) -> bool:
 
 
 def replace_token(credential: Credential, token: str) -> None:
-    """Replace a token in the file that contains it, in one step. Raises `BadCredentialFile` if no file contains it."""
+    """Replace a token in its file, in one step. Raises `BadCredentialFile` if the token does not come from a file."""
     if credential.file is not None:
         write_private(credential.file, f"{token}\n")
     elif credential.logins is not None:
@@ -236,7 +236,7 @@ def write_private(path: Path, text: str) -> None:
 
 
 def _keep_owner(handle: int, path: Path) -> None:
-    """Give a new file the owner of the file that it will replace, such as when root rotates a service's token."""
+    """Give a new file the owner of the file that it will replace, for example if root rotates a service's token."""
     if os.name != "posix" or not path.exists():
         return
     before, now = path.stat(), os.fstat(handle)

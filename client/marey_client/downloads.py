@@ -63,7 +63,7 @@ class TakenPaths:
         self._lock = threading.Lock()
 
     def take(self, target: Path) -> Path:
-        """Return `target`, or the path with a number added if `target` is taken already.
+        """Return `target`, or `target` with a number added if this path is taken already.
 
         Upper and lower case count as equal, as on many file systems.
         """
@@ -87,8 +87,8 @@ def download(
 ) -> Path:
     """Download a file to `folder` under the name that the server gives it, by default `name`; return its path.
 
-    `beside` contains the paths of files that were written before as part of the same download; if one of them has the
-    same name, a number is added to the name. All other existing files of that name are replaced.
+    `beside` contains the paths of files that were written before as part of the same download; if one of these files
+    has the same name, a number is added to the new name. Any other existing file of this name is replaced.
     """
     places = TakenPaths() if beside is None else beside
     target: Path | None = None

@@ -1,6 +1,6 @@
 """Access to the server, worker and motion packages for the commands `serve`, `worker`, `demo` and `db`.
 
-Only this module imports them, and only when such a command runs, so that the client can be installed alone.
+Only this module imports these packages, and only when such a command runs, so that the client can be installed alone.
 """
 
 from __future__ import annotations

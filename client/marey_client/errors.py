@@ -8,7 +8,7 @@ from marey_schemas.problems import FieldError, Problem
 
 
 class MareyError(Exception):
-    """Base class of all errors of Marey's client; their texts are written for people."""
+    """Base class of all errors of Marey's client; the texts of the errors are written for people."""
 
 
 # Nobody answered, or somebody else did

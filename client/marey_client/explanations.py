@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def explain_job(marey: Marey, job_id: str, *, now: datetime | None = None) -> list[str]:
-    """Explain what a job waits for, who works on it, or how it ended; the main reason first."""
+    """Explain what a job waits for, which worker runs it, or how it ended; the main reason comes first."""
     job = marey.jobs.get(job_id)
     attempts = list(marey.jobs.attempts(job_id))
     running = list(marey.jobs.list(job.project, filters={"state": JobState.RUNNING.value}))

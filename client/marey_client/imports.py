@@ -45,7 +45,7 @@ Notice = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class LocalFile:
-    """File to import. Its name is its path relative to the searched folder in which it was found."""
+    """File to import. `name` is the path of the file relative to the searched folder in which it was found."""
 
     name: str
     path: Path
@@ -54,14 +54,14 @@ class LocalFile:
 
 @dataclass(frozen=True)
 class FoundFiles:
-    """Files in the searched places: those to import, and those that are left out."""
+    """Files in the searched places: the files to import, and the files that are left out."""
 
     files: tuple[LocalFile, ...]
     left_out: tuple[Path, ...]
     exported: Mapping[str, ExportedClip] = field(default_factory=dict)
     """Clips whose files an export of a dataset wrote, by the names of the files."""
     unit: LengthUnit | None = None
-    """Unit of length of the files, known if all of them come from one export."""
+    """Unit of length of the files; known if all files come from one export, otherwise None."""
     changed_tables: tuple[Path, ...] = ()
     """Tables of take records that differ from the sidecars in their folders; imports use only the sidecars."""
 
@@ -158,7 +158,7 @@ def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
 
 
 def _companions(files: Sequence[LocalFile]) -> dict[str, list[LocalFile]]:
-    """Return, for each folder with AMC files, its ASF files; likewise for other formats that need a second file."""
+    """Return the ASF files of each folder with AMC files; likewise for other formats that need a second file."""
     wanted: defaultdict[str, set[str]] = defaultdict(set)
     for file in files:
         for row in FORMATS:
@@ -188,7 +188,7 @@ class Imports:
     def upload(
         self, files: Sequence[LocalFile], options: ImportOptions | None = None, *, notice: Notice | None = None
     ) -> list[ImportEntry]:
-        """Import files; return one entry for each file, in order. A refused file does not affect others."""
+        """Import files; return one entry for each file, in order. A refused file does not affect the other files."""
         notify = notice or _ignore_notice
         named = [file for file in files if _may_travel(file.name)]
         entries = {file.name: _refused_name(file.name) for file in files if not _may_travel(file.name)}
@@ -218,7 +218,7 @@ class Imports:
         return changed
 
     def run(self, files: tuple[ImportFile, ...], options: ImportOptions | None = None) -> tuple[ImportEntry, ...]:
-        """Import up to 1000 files whose bytes the server has; if the server imports them in a job, wait for its end."""
+        """Import up to 1000 files whose bytes the server has; if the server does so in a job, wait for it."""
         given = options.model_dump(exclude_unset=True) if options else {}
         request = ImportRequest(files=files, **given)
         response = self.transport.send(
@@ -254,7 +254,7 @@ class Imports:
 
 
 def _may_travel(name: str) -> bool:
-    """Return whether a file name can be sent in a request; file systems allow names for which this is impossible."""
+    """Return whether a file name can be sent in a request; some names that file systems allow cannot be sent."""
     try:
         _FILE_NAME.validate_python(name)
     except ValidationError:

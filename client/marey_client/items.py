@@ -135,11 +135,11 @@ class ItemHandle:
         plot: bool = False,
         **options: float,
     ) -> Difference:
-        """Return how the revision `after` differs from the revision `before`; by default the newest two.
+        """Return how the revision `after` differs from the revision `before`; by default, the two newest revisions.
 
-        With `other`, `after` is a revision of the item `other`, and the newest revisions of both items are the default.
-        `options` are those of `DifferenceOptions`, such as `threshold_deg=5`; `plot` requests values to draw. Raises
-        `NotFound` if there is no such revision.
+        With `other`, `after` is a revision of the item `other`; by default, the newest revisions of both items are
+        compared. `options` are those of `DifferenceOptions`, such as `threshold_deg=5`; `plot` requests values to draw.
+        Raises `NotFound` if there is no such revision.
         """
         request = DifferenceRequest.model_validate(
             {"from": before, "to": after, "to_item": None if other is None else other.id, "plot": plot, **options}
@@ -161,7 +161,7 @@ class ItemHandle:
         """Write a revision of the item, by default the newest, to `folder` as a file of `format`; return its path.
 
         If several items are exported with the same `beside`, files of the same name get numbers. If the consent for a
-        clip has ended, raises `Conflict`, unless `allow_expired_consent` gives the reason why the clip is exported
+        clip has ended, raises `Conflict`, unless `allow_expired_consent` gives a reason to export the clip
         nevertheless. The server records the reason; the caller must be a maintainer or owner.
         """
         if allow_expired_consent is not None:
@@ -214,10 +214,10 @@ class Items(Generic[Handle]):
     ) -> Iterator[Handle]:
         """Yield items in order, requested page by page.
 
-        `collection` selects the items in a folder and below it, `directly_in` those in a folder itself ("" is the
-        root), and `path` one item. `query` selects items that meet conditions, such as `subject = 02 and frames > 120`.
-        `deleted` selects deleted items, which `restore` can restore. `filters` are query parameters of the REST API,
-        such as `{"frames.gte": 120}`.
+        `collection` selects the items in a folder and below it, `directly_in` only the items directly in a folder (""
+        is the root), and `path` one item. `query` selects items that meet conditions, such as `subject = 02 and frames
+        > 120`. `deleted` selects deleted items, which `restore` can restore. `filters` are query parameters of the REST
+        API, such as `{"frames.gte": 120}`.
         """
         params = {
             "collection": collection or None, "directly_in": directly_in, "path": path, "sort": sort, "query": query,
@@ -226,7 +226,7 @@ class Items(Generic[Handle]):
         return (self._handle(item) for item in pages(self.transport, Item, self.url, params))
 
     def explain(self, query: str, *, collection: str | None = None) -> QueryExplanation:
-        """Count the items that a query selects, and those that each of its conditions excludes.
+        """Count the items that a query selects, and the items that each condition of the query excludes.
 
         `collection` is a folder; without it, all items of the kind in the project are counted.
         """
@@ -238,7 +238,7 @@ class Items(Generic[Handle]):
         return self._handle(self.transport.get(Item, f"{self.url}/{item_id}"))
 
     def count(self, *, collection: str | None = None, filters: Params | None = None) -> int:
-        """Count the items in a folder and below it, or in the whole project."""
+        """Count the items in the folder `collection` and below it; without `collection`, in the whole project."""
         params = {"collection": collection or None, "count": "exact", "limit": 1, **(filters or {})}
         return self.transport.get(Page, self.url, params).count or 0
 

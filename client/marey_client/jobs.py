@@ -51,7 +51,7 @@ class Jobs:
         return pages(self.transport, Job, f"/projects/{project}/jobs", params)
 
     def get(self, job_id: str, *, wait_s: float = 0.0) -> Job:
-        """Return the current state of a job, after waiting up to `wait_s` for its end."""
+        """Wait up to `wait_s` seconds for the end of a job, and return its current state."""
         if wait_s <= 0:
             return self.transport.get(Job, f"/jobs/{job_id}")
         return self.transport.get(
@@ -106,7 +106,7 @@ class Jobs:
         return pages(self.transport, JobOutput, f"/jobs/{job_id}/outputs")
 
     def log(self, job_id: str, *, follow: bool = False) -> Iterator[bytes]:
-        """Yield the log of the job's attempts, piece by piece; with `follow`, wait for more until the job ends."""
+        """Yield the log of the job's attempts, piece by piece; with `follow`, continue until the job has ended."""
         offset = 0
         while True:
             response = self.transport.send(

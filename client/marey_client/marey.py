@@ -79,7 +79,7 @@ class Marey:
         return self.transport.post(SignedUp, "/sign-up", request, repeatable=True)
 
     def accept_invitation(self, code: str) -> AcceptedInvitation:
-        """Become a member of a project by the code of an invitation.
+        """Become a member of a project with the code of an invitation.
 
         The request is sent again if its answer is lost. Raises `NotFound` if the code is not valid.
         """

@@ -15,20 +15,20 @@ from marey_schemas.queue.jobs import CollectionInput, DatasetInput, ExistingInpu
 Handle = TypeVar("Handle", bound=ItemHandle)
 
 Place: TypeAlias = str | ExistingInput | Handle
-"""Folder given by its path, item given by its handle, or an input of jobs."""
+"""Path of a folder, handle of an item, or an input of jobs."""
 
 Places: TypeAlias = Place[Handle] | Sequence[Place[Handle]]
 
 
 def as_inputs(places: Places[Handle]) -> tuple[ExistingInput, ...]:
-    """Return one or several folders or items as inputs of jobs; a handle becomes the revision that it has read."""
+    """Return one or several folders or items as inputs of jobs; a handle gives the revision in which it was read."""
     return tuple(map(_as_input, _as_list(places)))
 
 
 def items_at(items: Items[Handle], places: Places[Handle], *, sort: str | None = None) -> Iterator[Item]:
-    """Yield the items in one or several inputs, at the revisions that the inputs name; by default, at the newest ones.
+    """Yield the items in one or several inputs, at the revisions that the inputs name, or at the newest revisions.
 
-    Items in a version of a dataset have the tags that they have in this version.
+    Items from a version of a dataset get the tags that this version contains.
     """
     for place in _as_list(places):
         if isinstance(place, ItemHandle):

@@ -137,7 +137,7 @@ class ProjectHandle(ProjectItems):
         return Jobs(self.transport).submit(self.name, job)
 
     def pipeline(self, pipeline: PipelineCreate) -> PipelineRun:
-        """Submit jobs that read each other's outputs; either all of them are submitted or none."""
+        """Submit jobs that read each other's outputs; either all jobs are submitted, or none is."""
         return submit_pipeline(self.transport, self.name, pipeline)
 
     def build_model(
@@ -192,7 +192,7 @@ class ProjectHandle(ProjectItems):
         commit: CommitTo = None,
         **options: Any,
     ) -> Job:
-        """Submit a job that annotates clips by a method and its options; the results go below the folder `into`.
+        """Submit a job that annotates clips with the method `proposal`; the results go below the folder `into`.
 
         Methods are `steps`, `velocity_minima` and `wrist_contact`, as in `{"method": "steps", "most_turn_deg": 45}`;
         `options` are the other fields of `AnnotateParams`.
@@ -233,8 +233,8 @@ class ProjectHandle(ProjectItems):
     ) -> Job:
         """Submit a job that aligns clips of one skeleton, all of which show the same action.
 
-        `options` are those of `AlignParams`, for example `rate_hz=30` or `layer="steps"`. If a layer or labels are
-        named and no annotations are given, the annotations of the clips are used.
+        `options` are those of `AlignParams`, for example `rate_hz=30` or `layer="steps"`. If `options` name a layer or
+        labels, the default for `annotations` is the annotations of the clips.
         """
         request = align_request(self, clips, annotations, AlignParams.model_validate(options))
         chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
@@ -251,10 +251,11 @@ class ProjectHandle(ProjectItems):
         commit: CommitTo = None,
         **options: Any,
     ) -> Job:
-        """Submit a job that edits clips, or folders given by path, by commands or a stored edit.
+        """Submit a job that edits clips, or folders given by path, with commands or with a stored edit.
 
-        The results are new clips in the folder `into`, or, with the option `suffix`, beside the edited clips. With
-        `in_place=True`, they are new revisions of these clips instead. `options` are those of `EditParams`.
+        The results are new clips in the folder `into`, or, with the option `suffix`, in the folders of the edited
+        clips. With `in_place=True`, the results are new revisions of the edited clips instead. `options` are those of
+        `EditParams`.
         """
         request = edit_request(self, clips, commands, options)
         chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
@@ -274,14 +275,15 @@ class ProjectHandle(ProjectItems):
         """Submit a job that evaluates clips of one skeleton, or folders of them given by path.
 
         `options` are those of `EvaluateParams`, for example `name="walks-eval"` or `database={"mirroring": "add"}`;
-        `normaliser` is an evaluation, or its id, with which the result will be comparable.
+        `normaliser` is another evaluation, or the id of one: its scaling of features is used, so that both results can
+        be compared.
         """
         request = evaluate_request(self, clips, EvaluateParams.model_validate(options), normaliser)
         chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
         return self.submit(request.model_copy(update=chosen))
 
     def evaluation(self, job: Job, *, on_progress: OnProgress | None = None) -> EvaluationHandle:
-        """Return the evaluation created by a job, after waiting for its end. Raises `JobUnsuccessful`."""
+        """Wait for a job, and return the evaluation that it created. Raises `JobUnsuccessful` if the job failed."""
         return self.evaluations.get(self._made_by(job, on_progress))
 
     def bisect(
@@ -302,7 +304,7 @@ class ProjectHandle(ProjectItems):
         on_measured: OnMeasured | None = None,
         **options: Any,
     ) -> Crossing:
-        """Find the first version of a dataset, between `good` and `bad`, at which a metric has crossed a value.
+        """Find the first bad version of a dataset between `good` and `bad`: the first one whose metric exceeds a limit.
 
         Evaluates the clips below `path` at both ends, then at few versions between them. A version is bad if `metric`,
         one of `HEADLINE_METRICS`, exceeds `limit`, for example `Limit(0.3)` or `Limit(0.5, above=False)`; by default,
@@ -311,8 +313,8 @@ class ProjectHandle(ProjectItems):
         search is interrupted, the same call continues it, because existing evaluations are reused.
 
         `options` are those of `EvaluateParams`. Raises `CannotBisect` if there is no such metric, if `good` is not
-        among the versions before `bad`, if one of these two versions cannot be evaluated, if by `limit` the version
-        `good` is bad or `bad` is good, or if no `limit` is given and both versions have the same value.
+        among the versions before `bad`, if one of these two versions cannot be evaluated, if `good` turns out to be bad
+        or `bad` to be good, or if no `limit` is given and both versions have the same value.
         """
         handle = self.datasets.at(dataset)
         evaluations = VersionEvaluations(
@@ -341,7 +343,7 @@ class ProjectHandle(ProjectItems):
         return self.submit(request.model_copy(update={"seed": seed, **chosen}))
 
     def model(self, job: Job, *, on_progress: OnProgress | None = None) -> ModelHandle:
-        """Return the model created by a job, after waiting for its end. Raises `JobUnsuccessful`."""
+        """Wait for a job, and return the model that it created. Raises `JobUnsuccessful` if the job failed."""
         return self.models.get(self._made_by(job, on_progress))
 
     def jobs(self, *, filters: Params | None = None) -> Iterator[Job]:

@@ -56,7 +56,7 @@ class ProjectItems:
 
     @cached_property
     def processed(self) -> Items[ProcessedHandle]:
-        """The processed data of the project: clips aligned to a reference, with their time functions."""
+        """The processed data of the project: clips aligned to a reference, with their time functions (time warps)."""
         return Items(self.transport, self.name, Kind.PROCESSED, ProcessedHandle)
 
     @cached_property
@@ -90,8 +90,8 @@ class ProjectItems:
         """Delete deleted items for good, so that garbage collection frees their bytes. For owners of the project.
 
         `conditions` are the fields of `PurgeRequest`, such as `collection="raw", older_than_days=30`; with
-        `preview=True`, nothing changes. Items that something still needs are not purged; the answer lists them
-        with what needs them. Raises `Conflict` if `item` names a single item that something needs.
+        `preview=True`, nothing changes. Items that something still needs are not purged; the answer lists these items,
+        each with the objects that need it. Raises `Conflict` if `item` names a single item that something needs.
         """
         return purge_items(self.transport, self.name, PurgeRequest.model_validate(conditions))
 
@@ -126,12 +126,12 @@ class Collections:
     def list(
         self, *, path: str | None = None, deleted: bool = False, filters: Params | None = None
     ) -> Iterator[Collection]:
-        """List the folders by path: all, or the folder `path` and those below it; with `deleted`, the deleted ones."""
+        """List folders by path: all folders, or `path` and the folders below it; with `deleted`, deleted folders."""
         params = {"path": path or None, "deleted": "true" if deleted else None, **(filters or {})}
         return pages(self.transport, Collection, self.url, params)
 
     def at(self, path: str, *, deleted: bool = False) -> Collection | None:
-        """Return the folder with this path, or None; with `deleted`, the one that was deleted last at this path."""
+        """Return the folder with this path, or None; with `deleted`, the folder at this path that was deleted last."""
         found = [one for one in self.list(path=path, deleted=deleted) if one.path == path]
         return max(found, key=lambda one: one.deleted_at or one.created_at, default=None)
 

@@ -1,4 +1,4 @@
-"""Job requests for each kind of job. Their inputs are looked up on the server where necessary.
+"""Job requests for each kind of job. Where necessary, the inputs are looked up on the server.
 
 Every request uses the newest joint mapping of each skeleton.
 """
@@ -59,7 +59,7 @@ def annotate_request(project: ProjectItems, clips: Clips, params: AnnotateParams
 
 
 def cut_request(project: ProjectItems, annotations: Annotations, params: CutParams) -> JobCreate:
-    """Return the job request to cut the clips of annotations along their segments."""
+    """Return the job request to cut the annotated clips along the segments of the annotations."""
     found = {
         one.id: one
         for one in items_at(project.annotations, annotations, sort="id")
@@ -78,8 +78,8 @@ def align_request(
 ) -> JobCreate:
     """Return the job request to align clips with each other.
 
-    If `params` name a layer or labels and no annotations are given, the annotations of these clips are used; if a layer
-    is named, only those of this layer.
+    If `annotations` is None and `params` name a layer or labels, the annotations of these clips are used. If `params`
+    name a layer, only annotations in this layer are used.
     """
     found = {item.id: item for item in items_at(project.clips, clips)}
     inputs: dict[str, Any] = {"clips": as_inputs(clips)}
@@ -93,7 +93,7 @@ def align_request(
 
 
 def edit_request(project: ProjectItems, clips: Clips, commands: Commands, options: Mapping[str, Any]) -> JobCreate:
-    """Return the job request to edit clips; clips that the commands name are inputs, too.
+    """Return the job request to edit clips; further clips that the commands name become inputs, too.
 
     `options` are those of `EditParams`.
     """
@@ -143,9 +143,9 @@ def plan_model(
 ) -> ModelPlan:
     """Plan the jobs that build a model from takes. Files are uploaded, and the jobs import them with `options`.
 
-    With a `layer`, clips are cut along their annotations in this layer, or aligned by them. The `choices` are fields of
-    `ModelPlan`; by default, results are stored in a folder with the model's name. Raises `NoAnnotations` if no clip has
-    an annotation in the layer.
+    With a `layer`, clips on the server are cut along their annotations in this layer, or aligned by these annotations.
+    The `choices` are fields of `ModelPlan`; by default, results are stored in a folder with the model's name. Raises
+    `NoAnnotations` if no clip has an annotation in the layer.
     """
     files = [one for one in takes if isinstance(one, LocalFile)] if isinstance(takes, Sequence) else []
     known = _of_files(project, files, options, notice) if files else _of_clips(project, takes, layer)  # type: ignore[arg-type]
@@ -171,7 +171,7 @@ def _of_clips(project: ProjectItems, clips: Clips, layer: str | None) -> dict[st
 
 
 def _annotations_of(project: ProjectItems, clips: Mapping[str, Item], layer: str | None) -> tuple[ItemInput, ...]:
-    """Return the annotations of these clips, given by id; if `layer` is not None, only those of this layer."""
+    """Return the annotations of these clips, given by id; if `layer` is not None, only annotations in this layer."""
     listed: Iterable[AnnotationHandle] = project.annotations.list(sort="id")
     return tuple(
         one.as_input()

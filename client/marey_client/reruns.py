@@ -14,7 +14,7 @@ from marey_schemas.queue.job_kinds import job_kinds
 from marey_schemas.queue.jobs import ItemInput, Job, JobCreate, JobKind, JobOutput, JobState
 
 RERUNS = "reruns"
-"""Folder that receives repeated results, in a folder with the id of the job."""
+"""Folder that receives repeated results; each job has a subfolder, named by its id."""
 
 Agreement = Literal["identical", "other bytes", "missing", "deleted"]
 """Comparison of an output with its repetition.
@@ -30,7 +30,7 @@ class CannotRerun(ValueError):
 
 @dataclass(frozen=True)
 class ComparedOutput:
-    """Output of a job and the corresponding output of the repetition; None if only one of the jobs has the output."""
+    """Output of a job (`first`) and the same output of its repetition (`second`); None if a job lacks the output."""
 
     name: str
     agreement: Agreement
@@ -45,8 +45,8 @@ def rerun_request(job: Job, kind: JobKind, tasks: Iterable[Job] = (), *, into: s
 
     `tasks` are the tasks of the job. If an input was distributed over the tasks, only the records of the tasks name the
     items of this input. The results are stored in the folder `into`, by default `reruns/` and the id of the job. Raises
-    `CannotRerun` for a job that has not succeeded, a task of another job, and a job that wrote new revisions of its
-    inputs.
+    `CannotRerun` for a job that has not succeeded, for a task of another job, and for a job that wrote new revisions of
+    its inputs.
     """
     if job.state is not JobState.SUCCEEDED:
         raise CannotRerun(f"the job {job.id} has no result to repeat; its state is {job.state.value}")
@@ -79,7 +79,7 @@ def _inputs(pins: Sequence[Mapping[str, Any]], *, many: bool) -> Any:
 def compare_outputs(
     project: ProjectHandle, first: Sequence[JobOutput], second: Sequence[JobOutput]
 ) -> Iterator[ComparedOutput]:
-    """Compare each output of a job with the output of the repetition that has the same kind and name."""
+    """Compare each output of a job with the output of the same kind and name from the repetition."""
     left: dict[tuple[Kind, str], list[JobOutput]] = {}
     for one in second:
         left.setdefault((one.kind, one.name), []).append(one)

@@ -25,7 +25,7 @@ class Retries:
     Parameters
     ----------
     tries : greatest number of times that a request is sent
-    first_s : longest wait before the second try, in seconds; it doubles with each further try
+    first_s : longest wait before the second try, in seconds; the wait doubles with each further try
     longest_s : limit of the doubled wait, in seconds
     total_s : longest time between the first try and the start of the last one, in seconds
     sleep, random_unit : replaceable in tests; `random_unit` draws from [0, 1)

@@ -1,4 +1,4 @@
-"""HTTP connections to a server: requests with authentication and retries, and their answers as models or errors."""
+"""HTTP connections to a server: requests with authentication and retries; answers as models or errors."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class BearerToken(httpx.Auth):
 
 
 def trusted_authorities() -> ssl.SSLContext:
-    """Return a TLS context that trusts public certificate authorities, this machine's, and those in `SSL_CERT_FILE`."""
+    """Return a TLS context that trusts public certificate authorities and those of this machine and `SSL_CERT_FILE`."""
     context = httpx.create_ssl_context(trust_env=False)
     context.load_default_certs()
     return context
@@ -97,7 +97,7 @@ class Transport:
         return self._auth is None
 
     def with_token(self, token: str, *, retries: Retries | None = None) -> Transport:
-        """Return a transport that sends another token over the same connections; closing either one closes both."""
+        """Return a transport that sends another token over the same connections; closing one also closes the other."""
         other = self.with_retries(retries or self.retries)
         other._auth = BearerToken(token)
         return other
@@ -136,7 +136,7 @@ class Transport:
         return read_model(answer, self.send("GET", path, params=params, headers=headers))
 
     def post(self, answer: type[Model], path: str, body: BaseModel | None = None, **options: Any) -> Model:
-        """Send a JSON document by POST, with an idempotency key; return the answer's document."""
+        """Send a JSON document by POST, with an idempotency key; return the document in the answer."""
         return read_model(answer, self.send("POST", path, content=as_json(body), **options))
 
     def send(
@@ -246,7 +246,7 @@ def _quoted(path: str) -> str:
 
 
 def as_json(model: BaseModel | None) -> bytes | None:
-    """Return the fields of `model` that were set, as JSON with plain secrets, which pydantic's own JSON would hide."""
+    """Return the fields of `model` that were set, as JSON. Secrets are in plain text; pydantic would hide them."""
     if model is None:
         return None
     return encode_tree(_revealed(model.model_dump(exclude_unset=True, by_alias=True)), JSON)
@@ -265,7 +265,7 @@ def read_model(answer: type[Model], response: httpx.Response) -> Model:
     if response.status_code == 204:
         raise UnexpectedAnswer(
             f"{response.request.method} {response.request.url.path}: the server made the change, but does not show the "
-            "result, because the token lacks the scope read; use a token that has it"
+            "result, because the token lacks the scope read; use a token with this scope"
         )
     try:
         return answer.model_validate_json(response.content)

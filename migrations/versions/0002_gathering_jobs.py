@@ -1,4 +1,4 @@
-"""Gathering jobs that a worker runs."""
+"""Mark of jobs for which a worker gathers the results of the tasks."""
 
 import sqlalchemy as sa
 from alembic import op

@@ -1,4 +1,4 @@
-"""Inputs of jobs that other jobs will produce."""
+"""Job inputs that other jobs will produce."""
 
 import sqlalchemy as sa
 from alembic import op

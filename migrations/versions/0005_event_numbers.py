@@ -1,4 +1,4 @@
-"""Numbers of events that do not depend on transaction ids of Postgres."""
+"""Event numbers that do not depend on transaction ids of Postgres."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -26,7 +26,7 @@ SELECT 'last_event_number', to_jsonb(greatest(coalesce(max(number), 0), coalesce
 
 
 def upgrade() -> None:
-    """Replace `xid` by `number`; on Postgres, number all events. On SQLite `seq` is the number."""
+    """Replace `xid` by `number`. On Postgres, number all events; on SQLite, `seq` serves as the number."""
     op.add_column("event", sa.Column("number", sa.BigInteger(), nullable=True))
     if op.get_bind().dialect.name == "postgresql":
         op.execute(NUMBER_EVENTS)

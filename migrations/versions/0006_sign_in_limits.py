@@ -1,4 +1,4 @@
-"""Limits on sign-ins that all servers share; sessions, and the creator of each token."""
+"""Limits on sign-ins, shared by all servers; a mark of tokens that sign-ins created; the creator of each token."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -10,7 +10,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Create the table, and mark the tokens that sign-ins created."""
+    """Create the table and the columns, and mark the tokens that sign-ins created."""
     op.create_table(
         "sign_in_limit",
         sa.Column("key", sa.String(64), nullable=False),

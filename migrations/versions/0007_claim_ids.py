@@ -1,4 +1,4 @@
-"""Claims that can be repeated, and attempts that count from their first write."""
+"""Claims that can be repeated, and attempts that do not count before their first write."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -10,7 +10,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Add the columns; attempts of earlier versions were counted when they were claimed."""
+    """Add the columns. Mark earlier attempts as counted, because each was counted when it was claimed."""
     op.add_column("job", sa.Column("unstarted", sa.Integer(), nullable=False, server_default=sa.text("0")))
     op.add_column("job", sa.Column("counted_fence", sa.Integer(), nullable=False, server_default=sa.text("0")))
     op.execute("UPDATE job SET counted_fence = fence WHERE fence > 0")

@@ -1,4 +1,4 @@
-"""Possession of blobs by project and by attempt."""
+"""Records of who possesses a blob, by project and by attempt."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -34,11 +34,11 @@ FOR_EVERY_PROJECT = """
 
 
 def upgrade() -> None:
-    """Add the project to possessions, and a table of what attempts possess.
+    """Add the project to each record of possession, and create a table of the blobs that attempts possess.
 
-    What was sent before the upgrade belongs to its user in every project: tokens without binding use it as before.
-    Bound tokens use what their projects refer to, and send other bytes again. What running attempts have sent stays
-    theirs.
+    A blob that a user sent before the upgrade belongs to the user in every project, so tokens that are not bound to
+    projects can use the blob as before. Tokens that are bound to projects can use only the blobs to which these
+    projects refer; clients must send other blobs again. Running attempts keep the blobs that they have sent.
     """
     op.create_table(
         "attempt_blob",
@@ -63,7 +63,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Give everything back to its user in every project."""
+    """Let each user possess the same blobs in every project again, and drop the table and the columns."""
     for column in ("project_ids", "fence", "job_id"):
         op.drop_column("upload", column)
     op.execute(FOR_EVERY_PROJECT)

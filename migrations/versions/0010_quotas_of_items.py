@@ -1,4 +1,4 @@
-"""Counters of what projects and users hold."""
+"""Counters of the items and bytes of projects and users."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -52,7 +52,7 @@ HELD = """
 
 
 def upgrade() -> None:
-    """Add the counters, and count what existing projects and users hold."""
+    """Add the counters, and count the items and bytes that exist."""
     op.create_table(
         "holding",
         sa.Column("owner_id", ID, nullable=False),

@@ -1,4 +1,4 @@
-"""Index of the unfinished jobs of each user, which counts them for the quota `user_jobs`."""
+"""Index of the unfinished jobs of each user, used to count these jobs for the quota `user_jobs`."""
 
 import sqlalchemy as sa
 from alembic import op

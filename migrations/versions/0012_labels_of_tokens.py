@@ -1,4 +1,4 @@
-"""Labels of workers to which a token is bound; null: any labels, as before."""
+"""Worker labels to which a token is bound; null: the token allows any labels, as before."""
 
 import sqlalchemy as sa
 from alembic import op

@@ -1,4 +1,4 @@
-"""Rotation of tokens: which token a token replaces, and whether it was replaced itself."""
+"""Rotation of tokens: the token that each token replaced, and a hash of the id of the rotation that replaced it."""
 
 import sqlalchemy as sa
 from alembic import op

@@ -1,4 +1,4 @@
-"""Datasets: branches, tags, commits and the trees of their entries; digests of content that all servers share."""
+"""Datasets: branches, tags, commits and trees of entries; content digests, which are equal on all servers."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -15,7 +15,7 @@ ALIVE = sa.text("deleted_us IS NULL")
 
 
 def upgrade() -> None:
-    """Create the tables, and the columns of digests, which commits fill."""
+    """Create the tables, and the columns for digests, which commits fill."""
     op.add_column("revision", sa.Column("content", DIGEST, nullable=True))
     op.create_index("ix_revision_content", "revision", ["content"])
     op.add_column("revision_part", sa.Column("content", DIGEST, nullable=True))

@@ -17,7 +17,7 @@ COMMIT = ["dataset_commit.dataset_id", "dataset_commit.digest"]
 
 
 def upgrade() -> None:
-    """Create the tables, and the column of rules."""
+    """Create the tables, and the column for rules."""
     op.add_column("dataset_ref", sa.Column("protection", DOCUMENT, nullable=True))
     op.create_table(
         "proposal",

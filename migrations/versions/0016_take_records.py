@@ -11,7 +11,7 @@ depends_on = None
 
 DOCUMENT = sa.JSON().with_variant(JSONB(), "postgresql")
 RECORDED = ("subject", "action", "licence", "capture_system")
-"""Fields of the take record that descriptions of clips had before this revision."""
+"""Fields of a take record that descriptions of clips already had before this revision."""
 BATCH = 1000
 
 ITEM = sa.table("item", sa.column("id"), sa.column("kind"), sa.column("head"), sa.column("summary", DOCUMENT))

@@ -1,4 +1,4 @@
-"""Fast-forward merges, so that a repeated request gets the answer of the first one."""
+"""Records of fast-forward merges, so that a repeated request gets the same answer as the first request."""
 
 import sqlalchemy as sa
 from alembic import op

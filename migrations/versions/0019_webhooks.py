@@ -1,4 +1,4 @@
-"""Webhooks, and those of their deliveries that failed or were requested."""
+"""Webhooks, and their deliveries that failed or that users requested."""
 
 import sqlalchemy as sa
 from alembic import op

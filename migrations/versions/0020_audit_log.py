@@ -1,4 +1,4 @@
-"""Audit log: events about access and deletion, with the name of what they are about, and the token that was used."""
+"""Audit log: events about access and deletion, each with the name of its subject and the token that was used."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -36,7 +36,7 @@ event = sa.table("event", *map(sa.column, ("kind", "subject", "actor", "about", 
 
 
 def upgrade() -> None:
-    """Add the columns and indexes, and make the earlier events of these kinds entries of the audit log."""
+    """Add the columns and indexes, and make earlier events about access and deletion part of the audit log."""
     op.add_column("event", sa.Column("about", sa.String(1024), nullable=True))
     op.add_column("event", sa.Column("token_id", sa.String(40), nullable=True))
     for kinds, name in (
@@ -58,20 +58,20 @@ def upgrade() -> None:
 
 
 def _name_in(table: str) -> sa.ScalarSelect[str]:
-    """Return the name of the row of a table that is the subject of an event."""
+    """Return an expression for the name of an event's subject, which is a row of `table`."""
     named = sa.table(table, sa.column("id"), sa.column("name"))
     return sa.select(named.c.name).where(named.c.id == event.c.subject).scalar_subquery()
 
 
 def _creator() -> sa.ScalarSelect[str]:
-    """Return the actor of the event at which the subject was created, if it is stored."""
+    """Return an expression for the actor of the event that created the token; null if that event is not stored."""
     creation = event.alias("creation")
     same = creation.c.subject == event.c.subject, creation.c.kind == "token.created"
     return sa.select(creation.c.actor).where(*same).limit(1).scalar_subquery()
 
 
 def _in_body(key: str) -> sa.ColumnElement[str]:
-    """Return the text of a key in the body of an event."""
+    """Return an expression for the value of a key in the body of an event, as text."""
     if op.get_bind().dialect.name == "postgresql":
         return event.c.body.op("->>")(key)
     return sa.func.json_extract(event.c.body, f"$.{key}")

@@ -1,4 +1,4 @@
-"""Invitations to projects, and to create an account, and who has used them."""
+"""Invitations to join a project or to create an account, and the users who have used them."""
 
 import sqlalchemy as sa
 from alembic import op

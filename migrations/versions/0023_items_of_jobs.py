@@ -1,4 +1,4 @@
-"""Items that jobs name, and an index of deleted items, so that a purge need not read all jobs and items."""
+"""Items to which jobs refer, and an index of deleted items, so that a purge need not read all jobs and items."""
 
 import json
 import re

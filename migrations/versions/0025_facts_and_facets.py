@@ -1,4 +1,4 @@
-"""Indexes over facts about takes in summaries, and numbers that jobs publish about items."""
+"""Indexes of the facts about takes in item summaries, and a table of the numbers that jobs publish about items."""
 
 import sqlalchemy as sa
 from alembic import op

@@ -12,7 +12,7 @@ from marey_motion.errors import ClipError
 from marey_motion.skeleton import UNIT_TOLERANCE, Skeleton
 
 _SURELY_UNIT = 1.9 * UNIT_TOLERANCE
-"""Permitted deviation of a squared length from 1, minus a margin larger than any rounding error of float32."""
+"""Deviation of a squared length from 1 that is surely permitted, whatever the rounding errors of float32."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class Clip:
 
     Raises
     ------
-    ClipError    naming the invalid field, frame and joint
+    ClipError    if a value is invalid; the error names the field, frame and joint
 
     Examples
     --------
@@ -95,7 +95,7 @@ class Clip:
         if self.translations is None:
             if joints:
                 raise ClipError(
-                    "translated_joints names joints, so translations must be an array, not None", where=where
+                    "translated_joints is not empty, so translations must be an array, not None", where=where
                 )
             return
         if self.translations.shape != (self.frame_count, len(joints), 3):

@@ -19,7 +19,7 @@ from marey_schemas.documents.references import OutputRef, RevisionRef
 
 
 def skeleton_to_document(skeleton: Skeleton) -> skeletons.SkeletonHierarchy:
-    """Convert a skeleton to a `hierarchy` document, in which a skeleton's joints are stored.
+    """Convert a skeleton to a `hierarchy` document, which stores the joints of a skeleton.
 
     Parameters
     ----------
@@ -78,12 +78,12 @@ def skeleton_from_document(document: skeletons.SkeletonHierarchy) -> Skeleton:
 
 
 def clip_to_document(clip: Clip, skeleton: RevisionRef | OutputRef) -> clips.MotionDocument:
-    """Convert a clip to a `motion` document, in which a clip's frames are stored.
+    """Convert a clip to a `motion` document, which stores the frames of a clip.
 
     Parameters
     ----------
     clip : Clip    F frames
-    skeleton : RevisionRef or OutputRef    reference to its stored skeleton
+    skeleton : RevisionRef or OutputRef    reference to the stored skeleton of the clip
 
     Returns
     -------
@@ -261,7 +261,7 @@ def mapping_from_document(
     for standard, name in document.joints.items():
         if standard not in STANDARD_JOINTS:
             raise MappingError(
-                f"the mapping names {standard!r}, which is not a standard joint", where=f"joints.{standard}"
+                f"the mapping contains {standard!r}, which is not a standard joint", where=f"joints.{standard}"
             )
         if name not in skeleton:
             raise MappingError(f"the skeleton has no joint {name!r}", where=f"joints.{standard}")

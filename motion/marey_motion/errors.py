@@ -1,6 +1,7 @@
 """Errors in motion data, all derived from `MotionError`.
 
-Each error has a stable `code`, a slug by which clients can distinguish errors, and may name its place in the input.
+Each error has a stable `code`, a slug by which clients can distinguish errors. It may also have `where`, the place of
+the error in the input.
 """
 
 from __future__ import annotations

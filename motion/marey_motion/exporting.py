@@ -29,7 +29,7 @@ class ExportedFile:
     Parameters
     ----------
     data : bytes    the content
-    suffix : str    ending of its name, with the dot
+    suffix : str    suffix for the name of the file, with the dot
     media_type : str    media type for HTTP
     """
 
@@ -47,8 +47,8 @@ def write_clip_file(
     ----------
     clip : Clip    the motion
     file_format : str    name of the format
-    unit : str or float    unit of length by name or in metres, for formats without a fixed unit
-    info : mapping, optional    the clip's `info` document; Euler angles are written in the rotation orders of the file
+    unit : str or float    unit of length, by name or in metres; used by formats without a fixed unit
+    info : mapping, optional    the clip's `info` document; from it, Euler angles get the rotation orders of the file
         from which the clip was imported
 
     Returns
@@ -82,7 +82,7 @@ def write_motion_file(
     ----------
     source : ItemToExport    the item's documents; `hierarchy` is needed unless `skeleton` is given
     file_format : str    one of `marey_schemas.formats.MOTION_FORMATS`
-    unit : str or float    unit of length by name or in metres, for formats without a fixed unit
+    unit : str or float    unit of length, by name or in metres; used by formats without a fixed unit
     time : str    for an aligned clip: "canonical" writes the aligned frames, "source" the restored original clip
     skeleton : Skeleton, optional    the skeleton, if it was already made from `hierarchy`
 
@@ -108,7 +108,7 @@ def write_motion_file(
 def _source(clip: Clip, info: Mapping[str, Any]) -> SourceInfo | None:
     """Return the channels of the file from which a clip was imported, as stored in its document `info`.
 
-    Returns None if `info` does not contain them, or if the number of joints has changed since.
+    Returns None if `info` does not contain the channels, or if the number of joints has changed since the import.
     """
     details = info.get("source", {}).get("details", {})
     channels = tuple(tuple(names) for names in details.get("channels", ()))

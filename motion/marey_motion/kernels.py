@@ -1,7 +1,8 @@
 """Compiler options and rotation arithmetic that every compiled function shares.
 
-Only modules of kernels import this one: importing it loads numba. A compiled caller contains a copy of the functions of
-this module that it calls, so `marey_motion.warm_up` discards all compiled code when this module changes.
+Only modules of compiled functions (kernels) import this module, because the import loads numba. A compiled caller
+contains a copy of the functions of this module that it calls, so `marey_motion.warm_up` discards all compiled code when
+this module changes.
 
 Rotations are quaternions (w, x, y, z), given as tuples or as rows of an array. Stored results depend on the order of
 the operations, because another order rounds differently.
@@ -26,7 +27,7 @@ inlined = _options(forceinline=True)
 def product(a, b):  # type: ignore[no-untyped-def]
     """Return the rotation that applies `b`, then `a`.
 
-    The function is inlined before types are inferred, so that the caller's rules of arithmetic apply to it.
+    The function is inlined before types are inferred, so that the caller's rules of arithmetic apply to the function.
     """
     return (
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],

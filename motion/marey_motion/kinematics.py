@@ -266,14 +266,14 @@ def ground_projection(positions: AnyFloats) -> AnyFloats:
 def forward_directions(positions: AnyFloats, left: Sequence[int], right: Sequence[int]) -> NDArray[np.float64]:
     """Compute the direction that the body faces on the ground.
 
-    The direction is the cross product of the sum of the vectors from right to left joints and the upward direction. If
-    the sum is vertical, a frame has no direction of its own, and the direction of the frame before it is used. Frames
-    before the first direction have the first direction.
+    In each frame, the vectors from the right to the left joints are summed. The direction is the cross product of this
+    sum and the upward direction. If the sum is vertical or nearly so, the frame has no direction of its own and gets
+    the direction of the frame before. Frames before the first direction get the first direction.
 
     Parameters
     ----------
     positions : (F, J, 3)    metres, Y up
-    left, right : sequence of int    matching joints of both sides, best the hips and the shoulders
+    left, right : sequence of int    matching joints of both sides, preferably the hips and the shoulders
 
     Returns
     -------
@@ -307,7 +307,7 @@ def forward_directions(positions: AnyFloats, left: Sequence[int], right: Sequenc
 
 
 def forward_vectors(positions: AnyFloats, left: Sequence[int], right: Sequence[int]) -> NDArray[np.float64]:
-    """Compute `forward_directions` before they are scaled to length 1.
+    """Compute the vectors that `forward_directions` scales to length 1.
 
     Parameters
     ----------

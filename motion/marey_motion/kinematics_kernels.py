@@ -23,7 +23,7 @@ VECTOR = 3 * ROW
 def _turn(parent, joint):  # type: ignore[no-untyped-def]
     """Replace local rotations of a joint by rotations in the world: joint = parent · joint.
 
-    `parent` and `joint` (4, frames) are rotations of the parent, in the world, and of the joint.
+    `parent` (4, frames) contains rotations of the parent in the world. `joint` (4, frames) is overwritten.
     """
     for f in range(BLOCK):
         aw, ax, ay, az = parent[f], parent[ROW + f], parent[2 * ROW + f], parent[3 * ROW + f]
@@ -36,7 +36,8 @@ def _turn(parent, joint):  # type: ignore[no-untyped-def]
 def _place(rotation, origin, point):  # type: ignore[no-untyped-def]
     """Replace offsets of a point by positions in the world: point = origin + rotation · point.
 
-    `rotation` (4, frames) and `origin` (3, frames) are those of the point's parent; `point` (3, frames) is changed.
+    `rotation` (4, frames) and `origin` (3, frames) are the rotation and position of the point's parent in the world.
+    `point` (3, frames) is overwritten.
     """
     for f in range(BLOCK):
         w, x, y, z = rotation[f], rotation[ROW + f], rotation[2 * ROW + f], rotation[3 * ROW + f]

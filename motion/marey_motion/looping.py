@@ -15,7 +15,7 @@ from marey_motion.motion import Motion
 
 
 class LoopSeam(NamedTuple):
-    """Movement on the ground from each round of a loop to the next round: a turn about the origin, then a shift.
+    """Movement on the ground from each round (repetition) of a loop to the next: a turn about the origin, then a shift.
 
     Parameters
     ----------
@@ -31,8 +31,8 @@ def loop_seam(positions: Floats, headings: Floats) -> LoopSeam:
     """Compute the seam of a loop that moves on the ground.
 
     The step from the last frame to the first frame of the next round is not in the data. It is estimated as the mean of
-    the clip's last and first step, each relative to the heading at its start. So velocities are continuous across the
-    seam.
+    the clip's last and first step, each relative to the heading at its start. Therefore, velocities are continuous
+    across the seam.
 
     Parameters
     ----------

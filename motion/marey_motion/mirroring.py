@@ -29,10 +29,10 @@ class _Mirror:
 
     Parameters
     ----------
-    sources : (J,) index of the joint from which each joint gets its motion
-    frames : (J, 3, 3) improper matrices that map the local axes of the source to those of the joint
+    sources : (J,) index of the joint (the source) from which each joint gets its motion
+    frames : (J, 3, 3) improper matrices that map the local axes of the source to the local axes of the joint
     outer, inner : (J, 4) rotations to multiply the source's local rotation with, from the left and from the right
-    carried : (J,) joints that have no counterpart and keep their local motion
+    carried : (J,) True for joints that have no counterpart and keep their local motion
     """
 
     sources: NDArray[np.int64]
@@ -127,7 +127,7 @@ def _mirror_of(skeleton: Skeleton, pairing: tuple[int, ...]) -> _Mirror:
 def _frame(skeleton: Skeleton, sources: NDArray[np.int64], carried: NDArray[np.bool_], joint: int) -> Floats:
     """Return the improper matrix (3, 3) that maps the local axes of a joint's source to those of the joint.
 
-    The source is the joint from which the joint gets its motion. `sources` and `carried` are those of `_Mirror`.
+    The source is the joint from which the joint gets its motion. `sources` and `carried` are described in `_Mirror`.
     """
     source = sources[joint]
     rest = quaternions.as_matrix(skeleton.rest_global_rotations[[joint, source]])
@@ -142,9 +142,9 @@ def _frame(skeleton: Skeleton, sources: NDArray[np.int64], carried: NDArray[np.b
 
 
 def _frame_of_bones(by_rest: Floats, bones: Floats, partners: Floats) -> Floats:
-    """Find the improper matrix (3, 3) nearest to `by_rest` that maps the bones of a joint's source to its own bones.
+    """Find the improper matrix (3, 3) nearest to `by_rest` that maps the bones of a source to the bones of a joint.
 
-    `bones` and `partners` (n, 3) are the offsets of the children of the joint and of its source.
+    `bones` (n, 3) are the offsets of the joint's children, `partners` (n, 3) the offsets of the source's children.
     """
     seen = partners @ by_rest.T
     lengths = np.linalg.norm(bones, axis=1) * np.linalg.norm(seen, axis=1)

@@ -1,4 +1,4 @@
-"""Motions in double precision, which are used between the steps of a computation."""
+"""Motions in double precision, for use between the steps of a computation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Motion(NamedTuple):
     rotations : (F, J, 4) float64    local, of unit length, continuous in sign
     translations : (F, k, 3) float64    metres in the parent's frame, in place of the offsets of k translated joints; k
         may be 0
-    translated_joints : tuple of int    increasing indices of those joints
+    translated_joints : tuple of int    increasing indices of the k joints
     """
 
     root_translations: Floats
@@ -55,7 +55,7 @@ class Motion(NamedTuple):
 
     @property
     def poses(self) -> Floats:
-        """Root translations and rotations side by side, (F, 3 + 4·J) float64."""
+        """Root translations and rotations in one array, (F, 3 + 4·J) float64."""
         return np.concatenate((self.root_translations, self.rotations.reshape(self.frame_count, -1)), axis=1)
 
     def as_clip(self, skeleton: Skeleton, frame_rate_hz: float) -> Clip:

@@ -27,13 +27,13 @@ SHORTEST_BONE_M = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class FollowedBones:
-    """Rotations of a clip whose bones point in the directions given by its joint positions.
+    """Rotations of a clip, corrected so that bones point in the directions given by the clip's joint positions.
 
     Parameters
     ----------
     rotations : (F, 4·J) float32    local rotations; the clip's own rotations if no bone has moved
-    largest_turn_deg : mapping of str to float    largest turn of each turned joint over all frames, in degrees, by the
-        name of the joint
+    largest_turn_deg : mapping of str to float    by joint name, the largest correction of each corrected joint over all
+        frames, in degrees
     """
 
     rotations: NDArray[np.float32]
@@ -59,7 +59,7 @@ def follow_moved_bones(clip: Clip, joints: Mapping[str, int]) -> FollowedBones:
     """Turn joints so that bones keep their directions when the translations of the clip are removed.
 
     Each joint is turned by the shortest rotation from the direction that its bone has without the translations to the
-    direction that it has with them.
+    direction that the bone has with the translations.
 
     Parameters
     ----------

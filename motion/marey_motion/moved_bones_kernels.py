@@ -51,8 +51,8 @@ def shortest_turns(rigid, moved, starts, ends, shortest_bone, nearly_opposite, t
 def turn_joints(world, parents, joints, turns, out):  # type: ignore[no-untyped-def]
     """Apply rotations in world axes to B joints, and fill `out` (F, 4·J) with the new local rotations of all J joints.
 
-    `world` (F, J, 4) are the global rotations of all joints before. Rotation b of `turns` (B, F, 4) is applied to joint
-    b of `joints` (B,). `parents` (J,) are the indices of the joints' parents.
+    `world` (F, J, 4) are the global rotations of all joints before the turns. Rotation b of `turns` (B, F, 4) is
+    applied to joint b of `joints` (B,). `parents` (J,) are the indices of the joints' parents.
     """
     turned = np.empty((parents.shape[0], 4))
     for f in range(world.shape[0]):

@@ -31,11 +31,11 @@ def resample_clip(clip: Clip, frame_rate_hz: float, *, seam: LoopSeam | None = N
     frame_rate_hz : float    frames per second
     seam : LoopSeam, optional    the transition from the end of a loop to its start (`looping.loop_seam`); None if the
         clip is not a loop. The samples of a loop are evenly spaced; if the loop does not last a whole number of sample
-        intervals, its duration is rounded to the nearest whole number of them.
+        intervals, its duration is rounded to the nearest whole number of intervals.
 
     Returns
     -------
-    Clip    the same motion at that rate
+    Clip    the same motion at the new rate
 
     Raises
     ------
@@ -53,7 +53,7 @@ def resample_motion(motion: Motion, from_hz: float, to_hz: float, *, seam: LoopS
     Parameters
     ----------
     motion : Motion    F frames
-    from_hz, to_hz : float    its frame rate and the wanted one
+    from_hz, to_hz : float    frame rates of the motion and of the result
     seam : LoopSeam, optional    as for `resample_clip`
 
     Returns

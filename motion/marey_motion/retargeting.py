@@ -60,15 +60,15 @@ class RetargetPlan:
     Parameters
     ----------
     source, target : Skeleton    the skeletons
-    scale : float    target metres per source metre of pelvis translation
+    scale : float    metres that the target's pelvis moves per metre that the source's pelvis moves
     pairs : tuple of JointPair    joints that follow the source
     carried : tuple of str    target joints outside the mapping that copy the local rotation of the source joint with
         the same name, because both skeletons are copies of one rig
     at_rest : tuple of str    target joints that are neither paired nor carried; they keep their rest rotation
     missing : tuple of str    standard joints that only one of the skeletons has
-    sources : (K,) int32    source joint that each target joint follows, -1 for none
+    sources : (K,) int32    source joint that each of the K target joints follows, -1 for none
     corrections : (K, 4) float64    constant rotation S·Tᵀ of each mapped joint (see the description of this module) as
-        (w, x, y, z), identity for the others
+        (w, x, y, z), identity for the other joints
 
     Examples
     --------
@@ -95,7 +95,7 @@ class RetargetPlan:
 
     @cached_property
     def changes_no_pose(self) -> bool:
-        """Whether both skeletons are the same and no correction turns a joint."""
+        """True if both skeletons are the same and no correction turns a joint."""
         turned = quaternions.angle_between(self.corrections, quaternions.identity(len(self.corrections)))
         return same_hierarchy(self.source, self.target, tolerance_m=SAME_SKELETON_M) and bool(np.all(turned < SAME_RAD))
 
@@ -116,11 +116,13 @@ def plan_retarget(
     ----------
     source : Skeleton    the skeleton that clips come from
     source_mapping : JointMapping    its standard joints
-    source_axes : mapping of str to JointAxes    its twist and swing axes by joint name, at least of the mapped joints
+    source_axes : mapping of str to JointAxes    twist and swing axes of the source by joint name, at least of the
+        mapped joints
     target : Skeleton    the skeleton to which clips are transferred
     target_mapping : JointMapping    its standard joints
-    target_axes : mapping of str to JointAxes    its axes
-    scale : float, optional    target metres per source metre of travel; the ratio of the hip heights if None
+    target_axes : mapping of str to JointAxes    twist and swing axes of the target, like `source_axes`
+    scale : float, optional    metres that the target's pelvis moves per metre that the source's pelvis moves; the ratio
+        of the hip heights if None
 
     Returns
     -------
@@ -175,10 +177,10 @@ def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None)
     """Retarget a clip to the plan's target skeleton.
 
     A mapped joint takes the orientation of its source joint. Any other joint keeps its rest rotation or, if both
-    skeletons are copies of one rig, copies the local rotation of the source joint with its name. Bones keep the lengths
-    of the target. If the clip translates joints, the target's bones point in the directions of the clip's translated
-    bones; if the target is the source skeleton itself, the clip keeps its translations. The path of the pelvis is the
-    source's path times the plan's scale; a root above the pelvis moves with the pelvis without turning.
+    skeletons are copies of one rig, copies the local rotation of the source joint with the same name. Bones keep the
+    lengths of the target. If the clip translates joints, the target's bones point in the directions of the clip's
+    translated bones; if the target is the source skeleton itself, the clip keeps its translations. The path of the
+    pelvis is the source's path times the plan's scale; a root above the pelvis moves with the pelvis without turning.
 
     Parameters
     ----------
@@ -192,7 +194,7 @@ def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None)
 
     Raises
     ------
-    ClipError    if the clip belongs to another skeleton than the plan's source
+    ClipError    if the clip's skeleton differs from the plan's source skeleton
 
     Examples
     --------
@@ -238,7 +240,7 @@ def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None)
 
 
 def moved_bones(clip: Clip, plan: RetargetPlan) -> FollowedBones:
-    """Correct the rotations of a clip so that its bones keep their directions when its translations are removed.
+    """Correct the rotations of a clip so that bones keep their directions when the clip's translations are removed.
 
     Parameters
     ----------
@@ -317,8 +319,8 @@ def _hip_height_ratio(
 ) -> float:
     """Compute the height of the target's pelvis above its toes, divided by the same height of the source.
 
-    The heights of upright bodies are sums of bone lengths, because many files have a rest pose that is not upright. If
-    a part of the height is known for only one of the skeletons, both sums omit it.
+    The heights are those of upright bodies, computed as sums of bone lengths, because the rest pose of many files is
+    not upright. If a part of the height is known for only one of the skeletons, both sums omit this part.
     """
     parts = []
     for skeleton, axes, which in ((source, source_axes, "source"), (target, target_axes, "target")):

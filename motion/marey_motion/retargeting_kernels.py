@@ -17,11 +17,11 @@ def rotations(local, parents, ways, sources, corrections, rests, target_parents,
     """Fill `out` (F, 4·K) with local rotations of the K target joints, continuous in sign from frame to frame.
 
     `local` (F, 4·J) are the local rotations of the source joints, `parents` (J,) the indices of their parents. The
-    other arrays describe the target joints. `ways` (K,) is AT_REST for a joint that keeps its rest rotation, MAPPED for
-    one that follows the global rotation of its source joint, and CARRIED for one that copies the local rotation of its
-    source joint. `sources` (K,) are the source joints. `corrections` (K, 4) are multiplied from the right to the global
-    rotations of the source joints. `rests` (K, 4) are the rest rotations, and `target_parents` (K,) the indices of the
-    parents.
+    other arrays describe the target joints. `ways` (K,) is `AT_REST` for a joint that keeps its rest rotation, `MAPPED`
+    for a joint that follows the global rotation of its source joint, and `CARRIED` for a joint that copies the local
+    rotation of its source joint. `sources` (K,) are the source joints. Their global rotations are multiplied by
+    `corrections` (K, 4) from the right. `rests` (K, 4) are the rest rotations of the target joints, and
+    `target_parents` (K,) the indices of their parents.
     """
     joints, targets = parents.shape[0], target_parents.shape[0]
     source = np.empty((joints, 4))

@@ -1,9 +1,9 @@
 """Handling of joints above the joint that carries the body (the carrier, usually the pelvis).
 
 Examples are a static reference on the floor and a root that moves with the body. Joints above the carrier move the
-whole body, and the motion of the carrier may cancel theirs. If the root and the carrier are blended separately, their
-motions no longer cancel, and the body leaves its path. These functions therefore swap the two: the carrier becomes the
-first joint, and the root follows it.
+whole body, and the motion of the carrier may cancel the motion of these joints. If the root and the carrier are blended
+separately, their motions no longer cancel, and the body leaves its path. These functions therefore swap the two: the
+carrier becomes the first joint, and the root follows it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 
 STILL = 1e-5
-"""Variation of the components of a rotation below which it counts as constant; rounding to float32 causes less."""
+"""A rotation whose components vary by less than this counts as constant; rounding to float32 causes less variation."""
 
 
 def carried_at(motion: Motion, skeleton: Skeleton, carrier: int, places: Floats, spins: Floats) -> Motion:
@@ -94,12 +94,12 @@ def body_first(motion: Motion, skeleton: Skeleton, carrier: int, *, root_stays: 
     motion : Motion    F frames
     skeleton : Skeleton    its joints
     carrier : int    joint that carries the body
-    root_stays : bool    whether the root is a static reference, whose rotation does not depend on the body; if False,
+    root_stays : bool    True if the root is a static reference, whose rotation does not depend on the body; False if
         the root turns with the body
 
     Returns
     -------
-    Motion    the carrier in the root's place and the root in the carrier's
+    Motion    the motion with the root and the carrier swapped
     """
     if not carrier:
         return motion
@@ -124,7 +124,7 @@ def root_first(motion: Motion, skeleton: Skeleton, carrier: int, *, root_stays: 
 
     Returns
     -------
-    Motion    the motion with the root and the carrier in their own places
+    Motion    the motion with the root and the carrier in their original places
     """
     if not carrier:
         return motion

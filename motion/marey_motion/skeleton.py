@@ -20,9 +20,9 @@ from marey_motion.errors import SkeletonError, UnknownJoint
 UNIT_TOLERANCE = 1e-3
 
 SAME_OFFSET_M = 1e-3
-"""Largest difference of bone offsets, in metres, that is attributed to rounding if several files have one skeleton."""
+"""Bone offsets of two files may differ by this much, in metres, and still be those of one skeleton."""
 SAME_SKELETON_M = 1e-5
-"""Largest difference of bone offsets, in metres, that is attributed to rounding if one file is written and read."""
+"""Bone offsets may change by this much, in metres, due to rounding when a file is written and read again."""
 
 _Vector: TypeAlias = tuple[float, float, float]
 _Rotation: TypeAlias = tuple[float, float, float, float]
@@ -63,7 +63,8 @@ class Skeleton:
     joint_names : tuple of str    unique names; joint 0 is the root
     parents : (J,) int32    index of the parent, smaller than the joint's own; -1 for the root
     offsets : (J, 3) float64    metres, in the parent's frame; for the root its rest position
-    rest_rotations : (J, 4) float64    unit local rotation (w, x, y, z) at rest. A clip's rotation replaces it.
+    rest_rotations : (J, 4) float64    unit local rotation (w, x, y, z) at rest, which is replaced by the rotation in a
+        clip
     end_sites : tuple of EndSite    tips of chains
     display_names : tuple of str    names as in the source file, where they may repeat; `joint_names` when left out
 
@@ -164,7 +165,7 @@ class Skeleton:
 
         Raises
         ------
-        UnknownJoint    with the nearest names, when no joint has this one
+        UnknownJoint    with the most similar names, if no joint has this name
         """
         joint = self._indices.get(name)
         if joint is None:

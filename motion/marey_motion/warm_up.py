@@ -1,4 +1,4 @@
-"""Compilation of all kernels in advance, so that first uses do not wait for it: `python -m marey_motion.warm_up`.
+"""Compilation of all kernels in advance, so that first uses need not wait: `python -m marey_motion.warm_up`.
 
 The compiled code is kept on disk; later processes load it in a fraction of a second.
 """
@@ -57,7 +57,7 @@ _AMC = b":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 16 0 0 0 0\nfemur 10\n2\nroot 0 1
 
 
 def kernel_sources() -> list[Path]:
-    """List the modules of the package that contain compiled functions, which are the modules that import the compiler.
+    """List the modules of the package that contain compiled functions: all modules that import the compiler.
 
     Returns
     -------
@@ -67,7 +67,7 @@ def kernel_sources() -> list[Path]:
 
 
 def discard_outdated_kernels() -> None:
-    """Remove all compiled code if it was compiled from other sources or by another compiler than those installed.
+    """Remove all compiled code if the installed sources or the installed compiler have changed since the compilation.
 
     The compiler's cache detects only changes in the file that defines a kernel. A compiled kernel also contains copies
     of the kernels that it calls and the names of the types of its arguments, which other files may define. Modification
@@ -92,7 +92,7 @@ def _origin() -> str:
 
 
 def _recorded_origin() -> str:
-    """Return the digest of compiler and sources that is stored with the compiled code; empty if there is none."""
+    """Return the digest of compiler and sources that is stored with the compiled code; empty if no digest is stored."""
     return STAMP.read_text("utf-8").partition(" ")[0] if STAMP.is_file() else ""
 
 
@@ -108,7 +108,7 @@ def _record(state: str) -> None:
 
 
 def compile_kernels(stages: Sequence[str], processes: int = 1) -> None:
-    """Run stages of `STAGES`, the first one before the others, which run in parallel.
+    """Run the first of the given stages (names in `STAGES`), then run the other stages in parallel.
 
     Parameters
     ----------
@@ -286,7 +286,7 @@ STAGES: Mapping[str, Callable[[Clip], None]] = {
 }
 """Functions that use kernels, by name.
 
-The first function compiles kernels that the other functions need, too. The others are in order of their duration, the
+The first function compiles kernels that the other functions need, too. The other functions are sorted by duration, the
 longest first.
 """
 

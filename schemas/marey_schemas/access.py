@@ -113,18 +113,19 @@ class TokenCreate(Request):
         ge=60,
         le=10 * 365 * 86400,
         description="Seconds until the token ends; null: it never ends. A token cannot end later than the token that "
-        "creates it. If absent, the token ends after 90 days, or with the token that creates it if that ends sooner.",
+        "creates it. If absent, the token ends after 90 days, or when the token that creates it ends, whichever is "
+        "sooner.",
     )
     labels: dict[str, str] | None = Field(
         None,
         description="Labels that a worker with this token may announce, by name; only for tokens with the scope "
         "`work`. Jobs that require other labels cannot be claimed with this token. Null: the labels of the token that "
-        "creates this one if that is bound to labels, else any labels.",
+        "creates this token; any labels if the creating token is not bound to labels.",
     )
 
 
 class TokenRotation(Request):
-    """Request to replace the token that authenticates this request by a new one with the same rights and expiry."""
+    """Request to replace the token that authenticates the request by a new token with the same rights and expiry."""
 
     rotation_id: str = Field(
         pattern=r"^[A-Za-z0-9_-]{32,64}$",
@@ -132,7 +133,10 @@ class TokenRotation(Request):
         "gets the same new token. Keep it as secret as the token until you have the answer.",
     )
     grace_s: int = Field(
-        3600, ge=60, le=7 * 86400, description="Seconds for which the replaced token remains valid, at most to its end."
+        3600,
+        ge=60,
+        le=7 * 86400,
+        description="Seconds for which the replaced token remains valid, but never beyond its expiry.",
     )
 
 
@@ -150,13 +154,13 @@ class Token(Answer):
     session: bool = Field(False, description="Whether a sign-in created the token.")
     created_by: str | None = Field(
         None,
-        description="The id of the token that authorised the creation of this one; null if a sign-in or the server "
+        description="The id of the token that authorised the creation of this token; null if a sign-in or the server "
         "created this token.",
     )
     labels: dict[str, str] | None = Field(
         None, description="The labels that a worker with this token may announce; null: any."
     )
-    successor_of: str | None = Field(None, description="The id of the token that this one replaced by a rotation.")
+    successor_of: str | None = Field(None, description="The id of the token that this token replaced in a rotation.")
 
 
 class NewToken(Token):
@@ -247,7 +251,7 @@ class Member(Answer):
 
 
 EVERY_MEMBER = "*"
-"""User name that means all members, in a role for a folder."""
+"""User name that stands for all members when a role in a folder is set."""
 
 
 class FolderRoleChange(Request):
@@ -257,7 +261,7 @@ class FolderRoleChange(Request):
 
 
 class FolderRole(Answer):
-    """Role of a member in a folder and everything below it, which differs from the role in the project."""
+    """Role of a member in a folder and everything below it; it replaces the member's role in the project there."""
 
     user: str = Field(
         description="The name of the member; `*` stands for all members without a role of their own in this folder, "

@@ -68,13 +68,15 @@ class AuditEntry(Answer):
     )
     token: str | None = Field(None, description="Id of the token that the actor used; null: none, as in a sign-in.")
     about: str = Field(
-        description="Name, at that time, of the user or of the object that was changed; for an item that was purged "
-        "since, its id."
+        description="Name that the changed user or object had at the time of the change. For an item that has been "
+        "purged since, the id of the item."
     )
-    subject: str = Field(description="Id of the object; for members, of the project.")
+    subject: str = Field(
+        description="Id of the object that was changed; for a change of a member, the id of the project."
+    )
     body: dict[str, Any] = Field(default_factory=dict, description="Details, such as the new role.")
 
     @property
     def words(self) -> str:
-        """The words of `AUDIT_WORDS` for this entry, such as "added the member"; the kind itself if it has no words."""
+        """The words of `AUDIT_WORDS` for this entry, such as "added the member"; for a kind without words, the kind."""
         return next((words for kind, words in AUDIT_WORDS.items() if kind == self.kind), self.kind)

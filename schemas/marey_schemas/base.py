@@ -24,8 +24,8 @@ class Answer(BaseModel):
 class Options(Request):
     """Base of the options of a computation.
 
-    Subclasses declare the type, range, default and description of each option. Parameters of jobs embed or extend
-    these classes, and functions of `marey_motion` take their instances. A value out of range raises
+    Subclasses declare the type, range, default and description of each option. The parameters of a job embed or extend
+    these classes, and functions of `marey_motion` accept instances of them. A value out of range raises
     `pydantic.ValidationError`, which names the field. Instances are frozen, and hashable if their values are.
     """
 
@@ -45,10 +45,10 @@ def require_tag(schema: dict[str, Any], model: type[Any]) -> None:
 
 
 class Tagged(Options):
-    """Base of options that are one of several alternative classes; the value of a field, the tag, identifies the class.
+    """Base of alternative classes of options. The value of one field, the tag, identifies the class.
 
-    `tag` is the name of this field. Documents must contain the field. In Python it may be omitted, because its default
-    in each class is the value of this class.
+    `tag` is the name of this field. Documents must contain the field. In Python the field may be omitted, because its
+    default is the value that identifies the class.
     """
 
     model_config = ConfigDict(json_schema_extra=require_tag)
@@ -56,5 +56,5 @@ class Tagged(Options):
 
     @model_serializer(mode="wrap")
     def _with_tag(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Include the tag in documents from which default values or unset fields are omitted."""
+        """Include the tag even in documents that omit default values or unset fields."""
         return {**serialise(self), self.tag: getattr(self, self.tag)}

@@ -43,7 +43,7 @@ def _spanned(values: tuple[float, ...]) -> str:
 
 
 class CoverageStreamCreate(Request):
-    """Request to create a stream: frame rate and skeleton of its frames, and the speeds and turn rates to cover."""
+    """Request to create a stream: the frame rate and skeleton of its frames, and the speeds and turn rates to cover."""
 
     frame_rate_hz: float = Field(
         ge=LEAST_FRAME_RATE_HZ,
@@ -51,7 +51,9 @@ class CoverageStreamCreate(Request):
         allow_inf_nan=False,
         description="Frame rate of the frames that will be sent, in hertz.",
     )
-    skeleton: ItemId | None = Field(None, description="Skeleton of the poses that will be sent; not needed for roots.")
+    skeleton: ItemId | None = Field(
+        None, description="Skeleton of the poses that will be sent; not needed if only `roots` are sent."
+    )
     evaluation: ItemId | None = Field(
         None, description="Evaluation whose grid and coverage are the initial state of the stream."
     )
@@ -206,7 +208,7 @@ class CoverageStream(Answer):
     least_s: float
     target_count: int
     path_s: float
-    offset: int = Field(description="Number of frames received so far, which is the offset of the next ones.")
+    offset: int = Field(description="Number of frames received so far, which is the offset of the next frames.")
     created_at: datetime
     updated_at: datetime
     expires_at: datetime = Field(description="Time at which the stream is deleted if no frames arrive.")
@@ -220,7 +222,9 @@ class CoverageStreamState(CoverageStream, CoverageNow):
     deficit_s: tuple[tuple[float, ...], ...] = Field(
         description="[speeds, turn rates]: seconds of data that each cell still needs."
     )
-    delay_s: float = Field(description="Seconds from a frame to the end of the window that measures it.")
+    delay_s: float = Field(
+        description="Seconds between a frame and the end of the window of frames in which it is measured."
+    )
 
 
 # --- what a stream takes of an evaluation's document -----------------------------------------------------------------

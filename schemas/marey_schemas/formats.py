@@ -14,7 +14,7 @@ ORIGINAL = "original"
 """Export format that returns the imported file itself, independent of its format."""
 OCTETS = "application/octet-stream"
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""The earliest time in a ZIP archive; every file gets it, so that the same content gives the same bytes."""
+"""The earliest time that a ZIP archive can store. Every file gets it, so that equal content gives equal bytes."""
 
 MOST_UNPACKED_BYTES = 1 << 29
 """Greatest unpacked size in bytes of a compressed file; readers stop unpacking there."""
@@ -22,10 +22,10 @@ MOST_UNPACKED_BYTES = 1 << 29
 Content = Literal["motion", "skeleton", "model", "tree", "graph", "annotation", "alignment", "item"]
 
 AnnotationForm = Literal["labels", "list", "frames"]
-"""Forms of annotations in the predecessor's format: sections by label, a list of sections, or frames by label."""
+"""Forms of annotations of Marey's predecessor: sections by label, a list of sections, or frames by label."""
 DEFAULT_FORM: AnnotationForm = "labels"
 EndIndex = Literal["inclusive", "exclusive"]
-"""Meaning of the last index of a section in the predecessor's format: inside the section, or just after it."""
+"""Meaning of the last index of a section in the format of Marey's predecessor: inside the section, or just after it."""
 DEFAULT_END_INDEX: EndIndex = "inclusive"
 
 UNITS_M = {
@@ -47,8 +47,8 @@ class FileFormat:
     Parameters
     ----------
     name : name of the format in options, and of its module in `marey_motion.formats`
-    endings : endings of file names in lower case; the first is that of written files, and a search of a folder for
-        files to import uses all of them
+    endings : endings of file names in lower case; written files get the first one, and a search of a folder for files
+        to import uses all of them
     media_type : media type of written files
     reads, writes : contents that the reader understands, and contents that can be written
     units : units of length in which files can be written; if there are several, the caller chooses one

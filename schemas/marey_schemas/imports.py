@@ -16,7 +16,7 @@ FileName = Annotated[str, StringConstraints(min_length=1, max_length=1024, patte
 
 
 class ImportFile(Request):
-    """File to import whose bytes the server has already."""
+    """File to import; the server already has its bytes."""
 
     name: FileName
     blob: Digest

@@ -33,8 +33,8 @@ class Collection(Answer):
     path: str
     role: Role | None = Field(
         None,
-        description="The caller's role in the folder, by the role in the project and the roles in folders; null for a "
-        "guest of a public project.",
+        description="The caller's role in the folder, which results from the role in the project and the roles in "
+        "folders; null for a guest of a public project.",
     )
     created_at: datetime
     updated_at: datetime
@@ -197,7 +197,7 @@ class Page(Answer):
 
 
 class BlobsQuery(Request):
-    """Query for those of the given blobs that the server does not have, or that the caller may not read."""
+    """Question which of the given blobs are missing: the server does not have them, or the caller may not read them."""
 
     digests: tuple[str, ...] = Field(max_length=10_000)
 

@@ -40,7 +40,7 @@ class PartSpec:
     schema: str
     required: bool
     made_from: str | None = None
-    """Part that this part describes or was computed from. A merge takes both from the same side."""
+    """Part that this part describes or was computed from. A merge takes both parts from the same side."""
 
 
 PARTS: dict[Kind, dict[str, PartSpec]] = {

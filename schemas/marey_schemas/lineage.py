@@ -1,4 +1,4 @@
-"""Lineage as a graph: revisions, the jobs that created them, and the commits that jobs took inputs from."""
+"""Lineage as a graph: revisions, the jobs that created them, and the commits from which the jobs took inputs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class LineageOptions(Options):
         MOST_REVISIONS,
         ge=1,
         le=MOST_REVISIONS,
-        description="Greatest number of jobs between the start and a revision that the graph contains.",
+        description="Greatest number of jobs between the start of the graph and any of its revisions.",
     )
 
 
@@ -68,7 +68,7 @@ class LineageRevision(Answer):
 
 
 class LineageLink(Answer):
-    """A revision that a job used in order to create another one."""
+    """A revision that a job used in order to create another revision."""
 
     source: int = Field(description="Index, in `revisions`, of the revision that was used.")
     result: int = Field(description="Index, in `revisions`, of the revision that was created.")
@@ -97,7 +97,7 @@ class LineageGraph(Answer):
 
 
 class LineageGroup(NamedTuple):
-    """Revisions of one kind that one job created, and that the same jobs used for the same inputs.
+    """Revisions that are shown as one: of one kind, created by one job, and used by the same jobs for the same inputs.
 
     Parameters
     ----------

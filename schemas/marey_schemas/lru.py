@@ -17,8 +17,8 @@ class LruCache(Generic[Key, Value]):
     Parameters
     ----------
     max_entries : largest number of values; None for no limit
-    max_bytes : largest sum of `size_of` over all values; None for any sum. The newest value is kept even if it alone
-        is larger, unless it exceeds `largest_bytes`.
+    max_bytes : largest sum of `size_of` over all values; None for no limit. The newest value is kept even if it alone
+        exceeds this limit, unless it exceeds `largest_bytes`.
     largest_bytes : values larger than this are not stored, so that a single value does not displace all others
     size_of : bytes of a value; needed only with a bound in bytes
     """

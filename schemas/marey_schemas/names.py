@@ -52,5 +52,5 @@ def is_digest(text: str) -> bool:
 
 
 def base_name(file: str) -> str:
-    """Return the name of a file without its folders, which end in `/` or `\\`."""
+    """Return the name of a file without its folders; both `/` and `\\` separate folders."""
     return file.replace("\\", "/").rpartition("/")[2]

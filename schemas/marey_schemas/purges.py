@@ -39,7 +39,7 @@ class PurgeRequest(Request):
     older_than_days: int | None = Field(
         None, ge=0, le=100_000, description="Only items that were deleted at least this number of days ago."
     )
-    preview: bool = Field(False, description="Answer what a purge would do, but change nothing.")
+    preview: bool = Field(False, description="Report what a purge would do, but change nothing.")
     after: str | None = Field(
         None, max_length=64, description="Value of `next` in the last answer, to continue a purge of many items."
     )
@@ -91,7 +91,8 @@ class PurgedItem(Answer):
     item: str
     kind: Kind
     path: str = Field(
-        description="Folder and name that the item had; empty after the purge, because answers are stored for repeats."
+        description="Folder and name that the item had; empty after the purge, because the answer is stored for "
+        "repeated requests and must not keep the name."
     )
 
 
@@ -106,15 +107,15 @@ class HeldItem(Answer):
 
 
 class PurgeAnswer(Answer):
-    """Outcome of a purge: the items that it deleted for good, or would delete, and those that it refused."""
+    """Outcome of a purge: items that it deleted for good, or would delete, and items that it refused to delete."""
 
     preview: bool
     purged: tuple[PurgedItem, ...]
     refused: tuple[HeldItem, ...]
     freed_bytes: int = Field(
-        description="Bytes that the next garbage collection can free: those of the documents, and of the arrays and "
-        "files, that nothing else in the project refers to. An estimate: content that other projects have, too, is not "
-        "freed, and the rows around the content are not counted."
+        description="Bytes that the next garbage collection can free: those of the documents, arrays and files to "
+        "which nothing else in the project refers. This is an estimate: content that other projects also have is not "
+        "freed, and the database rows that refer to the content are not counted."
     )
     next: str | None = Field(None, description="Send it as `after` to examine further items; null: there are none.")
 
@@ -125,9 +126,10 @@ class DatasetPurgeRequest(Request):
     dataset: str = Field(
         min_length=1,
         max_length=64,
-        description="Id of a deleted dataset, or its name; of several with this name, the one that was deleted last.",
+        description="Id or name of a deleted dataset. A name that several deleted datasets have means the one that was "
+        "deleted last.",
     )
-    preview: bool = Field(False, description="Answer what the purge would do, but change nothing.")
+    preview: bool = Field(False, description="Report what the purge would do, but change nothing.")
 
 
 class DatasetPurgeAnswer(Answer):
@@ -136,14 +138,16 @@ class DatasetPurgeAnswer(Answer):
     preview: bool
     dataset: str = Field(description="Id of the dataset.")
     name: str
-    commits: int = Field(description="Number of its versions.")
-    proposals: int = Field(description="Number of its proposals.")
+    commits: int = Field(description="Number of versions of the dataset.")
+    proposals: int = Field(description="Number of proposals of the dataset.")
     holders: tuple[Annotated[ItemHolder | JobHolder, Field(discriminator="type")], ...] = Field(
         description=f"What cites a version of the dataset and prevents the purge, at most {MOST_HOLDERS}: items that "
         "jobs made from a version, and jobs that have not ended."
     )
     others: int = Field(0, description="Number of further holders that are not listed.")
-    freed_bytes: int = Field(description="Bytes of the trees of entries that no other version has.")
+    freed_bytes: int = Field(
+        description="Bytes of the trees of entries, without the chunks that other datasets also have."
+    )
     same_name: int = Field(description="Number of other deleted datasets of the project that have the same name.")
 
 

@@ -23,7 +23,7 @@ MOST_CONSTRAINTS = 64
 MOST_STEPS = 16
 MOST_CANDIDATES = 256
 MOST_CANDIDATE_CONSTRAINTS = 4096
-"""Greatest product of the numbers of candidates and constraints; such a search takes some seconds of one thread."""
+"""Greatest product of the numbers of candidates and constraints; a search at this limit takes some seconds."""
 
 SearchConstraints = Annotated[tuple[SearchConstraint, ...], Field(max_length=MOST_CONSTRAINTS)]
 
@@ -71,8 +71,8 @@ class SearchRequest(RefineOptions):
     refine: bool = Field(True, description="Improve the result of the tree by numerical optimisation.")
     transition_tolerance_m: Distance = Field(
         TRANSITION_TOLERANCE_M,
-        description="Distance, in metres, by which hands, feet and the height of the pelvis may jump between two "
-        "steps; it counts as an error of 1.",
+        description="Size of a jump between two steps that counts as an error of 1, in metres; jumps of hands, feet "
+        "and the height of the pelvis are measured.",
     )
     transition_tolerance_cm: Tolerance | None = in_centimetres("transition_tolerance_m")
     finish: bool = Field(False, description="Remove the remaining errors of joint positions by inverse kinematics.")

@@ -1,7 +1,7 @@
-"""Constraints on a motion at a moment: position or orientation of a joint, place and heading of the body, and time.
+"""Constraints on a motion at one time: joint position or orientation, place and heading of the body, or keyframe time.
 
-Positions and directions are in the world. The error of each constraint is divided by the tolerance of the constraint,
-and weighted by its weight, before the errors of several constraints are added up.
+Positions and directions are in the world. The error of each constraint is divided by the tolerance of the constraint
+and weighted before the errors of several constraints are added up.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from marey_schemas.names import Label
 from marey_schemas.old_units import in_centimetres, read_old_unit
 
 Moment = Label | Annotated[float, Field(allow_inf_nan=False)]
-"""Moment of a motion: the label of a keyframe, `start`, `end`, or a canonical frame, which may be a fraction."""
+"""Time in a motion: the label of a keyframe, `start`, `end`, or a canonical frame, which may be fractional."""
 
 Joint = Annotated[Label, Field(description="Name of the joint, its own or its standard name.")]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
@@ -25,8 +25,8 @@ Positive = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
 Tolerance = Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)]
 """Tolerance of a constraint.
 
-The smallest tolerance is finer than the accuracy of any motion capture. It is large enough that squared errors stay
-finite when they are divided by it.
+The smallest tolerance is finer than the accuracy of any motion capture. It is also large enough that squared errors,
+divided by the tolerance, stay finite.
 """
 Distance = Annotated[float, Field(ge=1e-5, le=1e4, allow_inf_nan=False)]
 Degrees = Annotated[float, Field(ge=-36_000, le=36_000, allow_inf_nan=False)]

@@ -14,12 +14,12 @@ from marey_schemas.names import Message
 
 MAX_URL_LENGTH = 2048
 KEY_PREFIX = "whsec_"
-"""Prefix of the secrets of webhooks, which is that of the specification Standard Webhooks."""
+"""Prefix of the secrets of webhooks, as the specification Standard Webhooks requires."""
 DAY_S = 86400
 
 
 def _is_web_address(url: str) -> str:
-    """Return `url` if a webhook can have it. Raises `ValueError`."""
+    """Return `url` if it is allowed as the address of a webhook. Raises `ValueError`."""
     if not url.isascii() or any(not "!" <= char <= "~" for char in url):
         raise ValueError("the URL must consist of printable ASCII characters; write other host names in Punycode")
     try:
@@ -67,7 +67,10 @@ class WebhookChange(Request):
     url: WebhookUrl | None = None
     kinds: EventKinds | None = None
     description: Message | None = None
-    paused: bool | None = Field(None, description="Whether nothing is sent; events are sent after the pause.")
+    paused: bool | None = Field(
+        None,
+        description="Whether the webhook is paused: nothing is sent, and the events of the pause are sent after it.",
+    )
 
 
 class WebhookRotation(Request):
@@ -98,7 +101,7 @@ class Webhook(Answer):
     last_status: int | None = Field(None, description="HTTP status of the last answer.")
     last_error: str | None = Field(None, description="Reason why the last attempt has failed.")
     missed: int = Field(0, description="Number of events that were deleted before delivery and not yet reported.")
-    dead: int = Field(0, description="Number of deliveries that were given up.")
+    dead: int = Field(0, description="Number of deliveries that failed and will not be sent again.")
 
 
 class NewWebhook(Webhook):
@@ -113,8 +116,8 @@ DeliveryState = Literal["waiting", "retrying", "delivered", "dead"]
 class WebhookDelivery(Answer):
     """Delivery that a user requested, or that has failed at least once.
 
-    A `waiting` delivery will be sent once, soon. A `retrying` delivery is sent again until it succeeds or is given up;
-    it is then `delivered` or `dead`.
+    A `waiting` delivery will be sent once, soon. A `retrying` delivery is sent again until it succeeds or too many
+    attempts have failed; its state is then `delivered` or `dead`.
     """
 
     id: str
@@ -132,7 +135,7 @@ class WebhookDelivery(Answer):
 class WebhookMessage(Answer):
     """Document that a webhook sends. The event itself is read at the address in `links`, with a token."""
 
-    id: str = Field(description="Id of the delivery, which stays the same when it is repeated.")
+    id: str = Field(description="Id of the delivery, which stays the same when the delivery is repeated.")
     kind: str = Field(description="Kind of the event, `webhook.test`, or `webhook.events_missed`.")
     seq: int | None = Field(None, description="Number of the event in the feed; absent for a test.")
     project: str

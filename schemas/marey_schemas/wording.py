@@ -9,7 +9,7 @@ NAMES_SHOWN = 5
 
 
 def counted(number: int, noun: str) -> str:
-    """Return a number with its noun, in the plural unless it is 1: "1 frame", "103,568 trajectories"."""
+    """Return a number with its noun, in the plural unless the number is 1: "1 frame", "103,568 trajectories"."""
     if number == 1:
         return f"1 {noun}"
     plural = f"{noun[:-1]}ies" if noun.endswith("y") and noun[-2] not in "aeou" else f"{noun}s"

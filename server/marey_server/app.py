@@ -71,7 +71,7 @@ FIRST_COMMAND = "marey project create lab"
 
 
 class CannotListen(Exception):
-    """Error of a server that cannot listen on its address or port; the text contains both and the reason."""
+    """Error of a server that cannot listen on its address or port; the text contains address, port and reason."""
 
 
 class Application(TornadoApplication):
@@ -138,8 +138,8 @@ class Running:
 async def listening(app: Application) -> AsyncIterator[Running]:
     """Accept requests while the `async with` block runs.
 
-    At its end, new requests are refused, and everything is closed after the running requests have ended, at the latest
-    after `drain_s` seconds. Raises `CannotListen`.
+    At the end of the block, new requests are refused. Everything is closed when the running requests have ended, at the
+    latest after `drain_s` seconds. Raises `CannotListen`.
     """
     settings = app.services.settings
     try:
@@ -269,7 +269,7 @@ async def warming(children: Children) -> AsyncIterator[None]:
 
 @asynccontextmanager
 async def serving(settings: Settings) -> AsyncIterator[Running]:
-    """Run a server with its database and local workers while the `async with` block runs; the workers stop first."""
+    """Run a server with its database and local workers while the `async with` block runs; then stop, workers first."""
     database = open_database(settings)
     async with (
         listening(create_app(settings, database)) as running,

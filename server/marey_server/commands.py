@@ -145,7 +145,7 @@ def fsck(*, repair: bool = False, as_json: bool = False, **settings: Any) -> Non
 
 
 def clock(*, set_now: bool = False, **settings: Any) -> None:
-    """Compare the stored time of an SQLite database with the clock of this machine.
+    """Print the clock stored in an SQLite database and the clock of this machine.
 
     With `set_now`, set the stored clock to the time of this machine.
     """
@@ -214,7 +214,7 @@ def admin_token(*, user: str | None = None, **settings: Any) -> None:
 
 @contextmanager
 def _database_of(settings: Settings) -> Iterator[str]:
-    """Yield the URL of the database; if it cannot be used, convert the error in the `with` block to `CommandFailed`."""
+    """Yield the URL of the database; convert `DatabaseUnusable`, raised in the `with` block, to `CommandFailed`."""
     from marey_server.store.database.opening import DatabaseUnusable, opening
 
     try:

@@ -42,9 +42,9 @@ class ApiProblem(Exception):
 def forget_origin(error: BaseException) -> None:
     """Remove the traceback and the causes from an `ApiProblem`, which is sent to the client and never logged.
 
-    If a function stores an error in a future, the function refers to the error, and the traceback of the error refers
-    to the function. Such reference cycles would keep the whole body of a refused request in memory until the next
-    garbage collection, which stops all threads.
+    If a function stores an error in a future, the stack frame of the function refers to the error, and the traceback of
+    the error refers to the frame. Such reference cycles would keep the whole body of a refused request in memory until
+    the next garbage collection, which stops all threads.
     """
     if isinstance(error, ApiProblem):
         error.__traceback__ = error.__context__ = error.__cause__ = None

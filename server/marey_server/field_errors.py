@@ -26,8 +26,8 @@ def field_errors(
 ) -> list[FieldError]:
     """Return the first `MAX_ERRORS` validation errors of `tree`; `pointer` converts the location of each to text.
 
-    pydantic counts only the valid items of a list, so it also calls a list too short if an item is invalid; this
-    error is left out.
+    pydantic counts only the valid items of a list, so it also reports that a list with an invalid item is too short;
+    such a report is left out.
     """
     entries = error.errors(include_url=False, include_context=False, include_input=False)
     wrong = {entry["loc"][:length] for entry in entries for length in range(len(entry["loc"]))}
@@ -43,7 +43,7 @@ def field_errors(
 
 
 def _steps(location: tuple[int | str, ...], tree: Any, *, may_lack_last: bool) -> list[str]:
-    """Return the steps of an error's location that exist in the document, and the name of a missing field.
+    """Return the steps of an error's location that exist in the document; the last step may be a missing field.
 
     The other steps are left out: they are names of union members, which pydantic inserts.
     """

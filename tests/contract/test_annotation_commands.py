@@ -1,4 +1,4 @@
-"""Commands of annotations: those in documents are those that can be applied."""
+"""Commands of annotations: each command that documents may contain can be applied, and the reverse."""
 
 import inspect
 from typing import get_args

@@ -137,7 +137,7 @@ class BlobBackingContract:
         assert store.read(blobs.read_blob, digest) == b"still here"
 
     def test_bytes_sent_again_while_strays_are_swept_survive(self, store: Lab, clock: AdjustableClock) -> None:
-        """Whichever of the two is first, the blob exists at the end."""
+        """The blob exists at the end, in whichever order the garbage collection and the second upload run."""
         data = b"swept and sent"
         for _ in range(5):
             store.write(blobs.put_blob, data)

@@ -1,4 +1,4 @@
-"""Every format in the table of file formats has a reader, a writer and endings of its own, as the table says."""
+"""Every format in the table of file formats has a reader, a writer and its own file name endings, as the table says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Jobs that commit their outputs while processes are killed: all outputs of a job are visible once, or none."""
+"""Jobs that commit their outputs while processes are killed: all outputs of a job are visible, each once, or none."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ BEFORE = (
     "job_commit.after_move",
     "complete.before_commit",
 )
-"""Fault points inside the completing transaction."""
+"""Fault points inside the transaction that completes a job, before its commit."""
 AFTER = ("publish.after_commit", "complete.after_commit")
-"""Fault points after it."""
+"""Fault points after the commit of this transaction."""
 
 
 class Seen(NamedTuple):
@@ -148,7 +148,7 @@ def complete_each(gaits: CommittingDesk, leases: list[Lease], database: Database
 
 
 def submitted(gaits: CommittingDesk, count: int) -> tuple[list[str], list[Lease]]:
-    """Submit jobs that all start from the present commit, and stage outputs of each; return their ids and leases."""
+    """Submit jobs that all start from the present commit, and stage outputs of each job; return job ids and leases."""
     jobs = [gaits.submit(into=f"made{number}", cache="off", params={"number": number}) for number in range(count)]
     leases = gaits.desk.claim_many()
     for number, lease in enumerate(leases):
@@ -185,7 +185,7 @@ def do_not_lock(patch: pytest.MonkeyPatch) -> None:
 def test_without_the_lock_and_the_check_of_the_branch_commits_would_be_lost(
     gaits: CommittingDesk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Check that the test of commits at once fails without the lock and the check."""
+    """Check that the test of simultaneous commits would fail without the lock and the check of the branch."""
     do_not_lock(monkeypatch)
     for _ in range(20):
         before = len(gaits.log()) if gaits.head() else 0

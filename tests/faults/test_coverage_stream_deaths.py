@@ -1,4 +1,4 @@
-"""A server that is killed during a recording: every frame counts once, and the coverage equals that without a kill."""
+"""A server that is killed during a recording: every frame counts once, and a kill does not change the coverage."""
 
 from __future__ import annotations
 

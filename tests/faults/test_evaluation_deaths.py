@@ -29,7 +29,7 @@ LONG: dict[str, Any] = {
     "baseline": False,
     "report": False,
 }
-"""80 trials in 10 tasks."""
+"""Arguments of an evaluation of 80 trials in 10 tasks."""
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def tasks_of(lab: ProjectHandle, job: Job) -> list[Job]:
 
 
 def warm_up(marey: Marey, lab: ProjectHandle) -> Job:
-    """Run a short evaluation of two tasks to its end, so that every worker has started; return its job."""
+    """Run a short evaluation of two tasks to its end, so that every worker has started; return the job."""
     options = {**LONG, "name": "warm-up", "speeds_m_s": (1.0,), "turn_rates_deg_s": LONG["turn_rates_deg_s"]}
     job = lab.evaluate("walks", cache="off", **{**options, "duration_s": 1.0})
     return marey.jobs.wait(job.id)

@@ -69,7 +69,7 @@ def require_whole_trees(lab: Lab) -> None:
 
 
 def puts(path: str) -> Callable[[Transaction], object]:
-    """Return a function that creates a skeleton in a folder, which it creates if necessary."""
+    """Return a function that creates a skeleton at a path, and also its folder if this does not exist."""
     request = ItemCreate(name="rig", collection=path, parts={"hierarchy": skeleton_tree()})
     return lambda tx: items.create_item(tx, "lab", Kind.SKELETON, request)
 
@@ -112,7 +112,7 @@ def test_what_is_put_into_a_folder_while_it_moves_goes_along_or_stands_in_a_new_
 
 
 def test_rights_that_were_read_before_a_rollback_to_a_savepoint_are_read_again(lab: Lab, other: Database) -> None:
-    """The rollback releases the lock that keeps the roles in folders as they are, so another request may set one."""
+    """The rollback releases the lock on the roles in folders, so another request may then set a role."""
     protected = make(lab, "a")["a"]
     change = FolderRoleChange.model_validate({"role": "reader"})
     put = requiring(RequiredRole(Role.OWNER, "write"), managing.put_folder_role)
@@ -154,7 +154,7 @@ def change_folder(kind: str, folder: str) -> Callable[[Transaction], object]:
 def test_a_member_creates_an_item_with_the_role_in_the_folder_that_gets_it(
     lab: Lab, other: Database, kind: str
 ) -> None:
-    """An owner moves, deletes or restores a folder with roles, while a member creates an item at its path."""
+    """An owner moves, deletes or restores a folder with roles, while a member creates an item at the folder's path."""
     folders = make(lab, "a", "b", "a/x")
     member = lab.contributor
     if kind == "delete":

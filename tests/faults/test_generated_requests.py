@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.soak, pytest.mark.timeout(7200)]
 
 LONGEST_ANSWER_S = 10.0
 AT_ONCE = 3
-"""Number of requests to an operation before the next operation has its turn."""
+"""Number of requests that are sent to one operation before it is the turn of the next operation."""
 MOST_FAULTS = 20
 PROBES = list(probes())
 
@@ -43,7 +43,7 @@ class Round:
         self._faults: list[str] = []
 
     def run(self, seconds: float) -> None:
-        """Send requests, and fail if an answer differs from its declaration or takes too long."""
+        """Send requests; fail if an answer contradicts the OpenAPI document or takes too long."""
         end = time.monotonic() + seconds
         for of_seed in itertools.count():
             for operation, mode, name in random.Random(f"{self._caller} {of_seed}").sample(PROBES, len(PROBES)):

@@ -1,4 +1,4 @@
-"""Attacks on every route, as every kind of caller: the server refuses them, keeps running and changes nothing."""
+"""Attacks on every route, as every kind of caller: the server refuses all attacks, keeps running, changes nothing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SEED = 20261123
 SHOTS = 5_000 if is_soak() else 250
 OUTSIDERS = tuple(person.name for person in PEOPLE.values() if person.rank < 0 and person.standing != "attempt")
 MOST_MB = 1_200
-"""Twice what the server and its children may take, because this bound must hold on a busy machine."""
+"""Most memory of the server with its children: twice the real limit, so that the test passes on a busy machine."""
 OWN_BUSINESS = {"leader", "server_state", "event"}
 """Tables that the server changes by itself."""
 

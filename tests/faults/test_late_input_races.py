@@ -1,4 +1,4 @@
-"""Concurrent transactions on late inputs: a job gets all of them once, or has ended before."""
+"""Concurrent transactions on late inputs (outputs of other jobs): a job gets all its inputs once, or ends before."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def completes(desk: Desk, database: Database, lease: Lease) -> Step:
 
 
 def claimed_maker(desk: Desk, number: int = 0, made: int = 3) -> Lease:
-    """Claim a job of the kind `sum` and stage its results; return its lease."""
+    """Claim a job of the kind `sum` and stage results of the job; return the lease."""
     lease = desk.claim(job=desk.submit("sum", params={"number": number}, into=f"made{number}"))
     desk.stage(lease, *(f"thing{n}" for n in range(made)))
     return lease
 
 
 def work_off(desk: Desk) -> list[str]:
-    """Complete all jobs that can be claimed; return the paths of their inputs, sorted."""
+    """Complete all jobs that can be claimed; return the paths of the inputs of these jobs, sorted."""
     seen: list[str] = []
     while leases := desk.claim_many():
         for lease in leases:
@@ -89,7 +89,7 @@ def test_a_job_submitted_while_its_maker_completes_gets_its_inputs(desk: Desk, o
 
 
 def test_identical_jobs_that_get_their_inputs_side_by_side_are_computed_once(desk: Desk, other: Database) -> None:
-    """Two jobs create the same items in the same folder, and another job reads the items of each."""
+    """Two jobs complete side by side; two identical jobs wait for the items of both, and only one is computed."""
     first, second = claimed_maker(desk, 0, made=1), claimed_maker(desk, 1, made=1)
     (one,) = desk.submit_many(squares_of(first.job))
     (two,) = desk.submit_many(squares_of(second.job))

@@ -1,4 +1,4 @@
-"""Servers and workers that are killed during a pipeline: it continues, and its results are the same."""
+"""Servers and workers that are killed during a pipeline: the pipeline continues, and has the same results."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def start_worker(tmp_path: Path, server: ServerProcess) -> Iterator[StartWorker]
 
 
 def game_rig(lab: ProjectHandle, folder: Path) -> str:
-    """Import a clip on another skeleton; return the id of this skeleton, to which walks are retargeted."""
+    """Import a clip on another skeleton, the target of retargeting; return the id of this skeleton."""
     skeleton = game_skeleton()
     at_rest = np.concatenate([skeleton.offsets[0], skeleton.rest_rotations.ravel()]).astype(np.float32)
     file = folder / "game.bvh"

@@ -79,7 +79,7 @@ def import_game_skeleton(lab: ProjectHandle, folder: Path) -> str:
 
 
 def children_of(server: ServerProcess) -> list[str]:
-    """Return the names of the modules that the child processes of a server run."""
+    """Return the names of the Python modules that run as child processes of a server."""
     assert server.process is not None
     return [child.cmdline()[2] for child in psutil.Process(server.process.pid).children()]
 

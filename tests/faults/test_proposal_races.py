@@ -31,7 +31,7 @@ Act = Callable[..., Any]
 
 
 class Team:
-    """Users of the dataset `gaits`, whose branch `trial` has one commit more than `main`, with two connections."""
+    """Users of the dataset `gaits`, who have two connections. The branch `trial` has one commit more than `main`."""
 
     def __init__(self, lab: Lab, other: Database) -> None:
         self.lab, self.other = lab, other
@@ -59,7 +59,7 @@ class Team:
         return lambda tx: datasets.protect_branch(tx, *GAITS, MAIN, rule, expected_rev=None)
 
     def merge(self, number: int, **fields: Any) -> Act:
-        """Return the function and arguments of a write that merges a proposal; the merge is prepared at once."""
+        """Prepare the merge of a proposal; return a function that records the merge in a transaction."""
         request = ProposalMerge(**fields)
         prepared = self.lab.read(proposals.prepare_acceptance, *GAITS, number, request, required=WRITE)
         return lambda tx: proposals.merge_proposal(tx, *GAITS, number, request, prepared)
@@ -117,7 +117,7 @@ def test_an_approval_and_a_check_at_once_merge_a_waiting_proposal(team: Team) ->
 
 @on_postgres
 def test_a_commit_locks_its_branch_before_it_stores_chunks(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A job that commits does the same, so that the two never wait for each other."""
+    """A job that commits takes its locks in the same order, so that it and a user's commit never form a deadlock."""
     free: list[list[str]] = []
 
     def store(tx: Transaction, chunks: Mapping[str, bytes]) -> None:

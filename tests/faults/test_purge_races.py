@@ -1,6 +1,6 @@
-"""Purges beside other writes: in whichever order they commit, nothing refers to what was purged.
+"""Purges at the same time as other writes: in any order of commits, nothing refers afterwards to what was purged.
 
-Either the purge names what holds the item, or the other request is refused with an error that says why.
+Either the purge is refused and names what holds the item, or the other write is refused with an error that says why.
 """
 
 from __future__ import annotations
@@ -80,19 +80,19 @@ class Scene:
         self.write(items.delete_item, "lab", kind, item, expected_rev=None)
 
     def of_user(self, function: Any, *args: Any, **kwargs: Any) -> Act:
-        """Return the function as a request of the user that may write."""
+        """Return an act that calls a function with these arguments, with the right to write."""
         return lambda tx: requiring(WRITE, function)(tx, *args, **kwargs)
 
     def purge_of(self, item: str) -> Act:
-        """Prepare the purge of a deleted item, and return its write."""
+        """Prepare the purge of a deleted item, and return an act that records the purge."""
         request = PurgeRequest(item=item)
         prepared = self.desk.database.read(self.desk.user, requiring(WRITE, purging.prepare_purge), "lab", request)
         return self.of_user(purging.record_purge, "lab", request, prepared)
 
     def race(self, order: str, act: Act, purge: Act, who: Principal | None = None) -> tuple[Any, Any]:
-        """Run both interleaved; return the results or errors of the act and of the purge.
+        """Interleave an act and a purge; return the result or error of the act, then that of the purge.
 
-        Each must run only once: a transaction that was part of a deadlock runs again.
+        Fails if a transaction runs twice, which happens after a deadlock.
         """
         runs: list[str] = []
 
@@ -115,9 +115,10 @@ class Scene:
     def race_half_way(
         self, act: Act, purge: Act, *, before: tuple[Any, str] = (events, "forget_names")
     ) -> tuple[Any, Any]:
-        """Let `act` begin before the purge calls a function of a module; return both results.
+        """Pause a purge before it calls a function, and let `act` begin meanwhile; return both results.
 
-        By default, the purge has then locked the items, and has deleted nothing yet.
+        `before` is the module and the name of the function. By default, the purge has locked the items at this point,
+        and has deleted nothing yet.
         """
         paused, may_go_on = threading.Event(), threading.Event()
         runs: list[str] = []
@@ -152,10 +153,11 @@ class Scene:
     def race_after_deletion(
         self, item: str, act: Act, who: Principal | None = None, *, while_publishing: bool = False
     ) -> tuple[Any, Any]:
-        """Let others delete and purge `item` while `act` has read it and has not committed yet.
+        """Delete `item` and begin its purge after `act` has read it, but before `act` commits; return both results.
 
-        On SQLite, where there is no such moment, they do this after `act`. With `while_publishing`, they delete it
-        before `act` counts what it has added to the project; from then on, deletions wait for `act`.
+        On SQLite, where transactions do not overlap, the item is deleted and purged after `act`. With
+        `while_publishing`, the item is deleted just before `act` counts what it has added to the project; after this
+        count, a deletion would wait for `act`.
         """
 
         def delete_and_hold(*args: Any) -> None:
@@ -233,7 +235,7 @@ def test_an_item_is_restored_or_purged(scene: Scene, order: str) -> None:
 
 
 def test_a_folder_is_not_restored_while_half_of_a_purge_is_done(scene: Scene) -> None:
-    """The purge locks the item before the folder, and the restoration locks the folder before the item."""
+    """A purge locks the item before the folder; the restoration of a folder locks the folder before the item."""
     thing = scene.add("thing")
     (raw,) = scene.folders("raw")
     scene.write(collections.delete_collection, "lab", raw, expected_rev=None)
@@ -245,7 +247,7 @@ def test_a_folder_is_not_restored_while_half_of_a_purge_is_done(scene: Scene) ->
 
 
 def test_a_folder_that_is_deleted_during_a_purge_keeps_its_items_and_roles(scene: Scene) -> None:
-    """Deletions do not wait for purges; the new folder has the path of the one that the purge removes."""
+    """Deletions do not wait for purges. The kept folder is new and has the path of the folder that is purged."""
     thing = scene.add("thing")
     (raw,) = scene.folders("raw")
     scene.write(collections.delete_collection, "lab", raw, expected_rev=None)
@@ -384,7 +386,7 @@ def test_a_job_that_ends_while_its_input_is_purged_ends_once(scene: Scene, order
 
 
 def test_a_late_input_that_is_deleted_while_it_is_pinned_is_held(scene: Scene) -> None:
-    """A job completes, which pins an item that it reuses as the input of another job; others delete this item."""
+    """A completed job gives an existing item to another job as its input, while a user deletes and purges the item."""
     thing = scene.add("thing")
     (maker,) = scene.desk.submit_many(JobCreate(kind="sum", into="raw"))
     (reader,) = scene.desk.submit_many(
@@ -420,7 +422,7 @@ def test_a_cached_result_is_shared_or_its_item_is_purged(scene: Scene, order: st
 
 
 def test_a_job_that_awaits_a_purged_result_is_queued_once(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The server shares results while a purge, half of which is done, deletes the result that it would share."""
+    """The server looks for a result to share with the job, while a purge that is half done deletes this result."""
     source = scene.add("source")
     (first,) = scene.desk.submit_many(square_of(source, into="made"))
     lease = scene.desk.claim()
@@ -441,7 +443,7 @@ def test_a_job_that_awaits_a_purged_result_is_queued_once(scene: Scene, monkeypa
 @ORDERS
 @pytest.mark.parametrize("ends", ["cancel", "fail", "reap", "share"])
 def test_a_job_whose_result_others_await_ends_beside_a_purge(scene: Scene, order: str, ends: str) -> None:
-    """Each end of a job can publish, or pin inputs of others; none of them and the purge wait for each other."""
+    """However a job ends, it may publish items or pin inputs of other jobs. This must form no deadlock with a purge."""
     thing, kept = scene.add("thing"), scene.add("kept", n=2)
     (job,) = scene.desk.submit_many(square_of(kept, max_attempts=1))
     lease = scene.desk.claim()
@@ -561,7 +563,7 @@ def test_a_merge_of_a_proposal_and_a_purge_do_not_hinder_each_other(scene: Scene
 
 @pytest.mark.parametrize("does", ["tag", "comment", "commit"])
 def test_what_is_added_to_a_dataset_while_it_is_deleted_is_purged_with_it(scene: Scene, does: str) -> None:
-    """Others delete and purge the dataset when the request has found it and has not committed yet."""
+    """The dataset is deleted and purged after a request has found it, and before the request commits."""
     thing = scene.add("thing")
     scene.gaits.change(PutEntry(path="kept", item=scene.add("kept", n=2)))
     scene.write(datasets.create_ref, "lab", "gaits", RefCreate(name="more", kind=RefKind.BRANCH, at="main"))

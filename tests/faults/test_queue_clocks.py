@@ -26,7 +26,7 @@ def _now_us(tx: Transaction) -> int:
 
 
 def jump_of_wall_clock(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    """Set the wall clock of this machine forward or back, as an administrator could."""
+    """Let the wall clock of this machine jump forward or back, as if an administrator had set it."""
     real = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: real() + round(seconds * 1e9))
 

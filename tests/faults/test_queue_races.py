@@ -1,4 +1,4 @@
-"""Two concurrent transactions at every step of a job: in whichever order they commit, the job ends once."""
+"""Two concurrent transactions at every step of a job: in any order of commits, the job ends once."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _ends_told(tx: Transaction, job_id: str) -> int:
 
 
 class Bout:
-    """A claimed job whose lease is about to expire, and the writes that can happen to it."""
+    """A claimed job whose lease is about to expire, and the writes that can concern this job."""
 
     def __init__(self, desk: Desk, other: Database) -> None:
         self.desk = desk
@@ -76,7 +76,7 @@ class Bout:
         return self.lease.job, self.lease.fence
 
     def assert_sound(self) -> None:
-        """Check that the job has ended at most once, with one event and with the consequences of this end."""
+        """Check that the job has ended at most once, with one event and with the consequences of ending in this way."""
         job = self.desk.job(self.job)
         told = self.desk.database.read(SYSTEM, _ends_told, self.job)
         assert told == (1 if job.state.terminal else 0)
@@ -302,7 +302,7 @@ def test_two_that_want_to_lead_at_once_make_one_leader(desk: Desk, other: Databa
 
 
 def stale_worker_story(desk: Desk, act: Callable[[Desk, Lease], object]) -> None:
-    """Let a worker lose its lease to another worker, and then try to complete the job."""
+    """Let a worker lose its lease to another worker; check that the first one can no longer `act` for the job."""
     job = desk.submit()
     slept = desk.claim()
     desk.clock.advance(61)
@@ -334,7 +334,7 @@ def test_a_worker_that_slept_through_its_lease_is_refused_everywhere(desk: Desk,
 
 @pytest.mark.parametrize("act", STALE_ACTS)
 def test_without_the_fence_the_stale_worker_gets_through(desk: Desk, act: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Check that the test above fails without the fence in the condition, and only because of it."""
+    """Check that the test above would fail if statements did not compare the fence, and for no other reason."""
 
     def no_fence(_fence: int) -> ColumnElement[bool]:
         return true()

@@ -50,7 +50,7 @@ CANCELS_AT_ONCE = 64
 TAKES = 20
 PATIENCE_S = 180.0
 SLEEP_S = 4.0
-"""Time for which a process is stopped; longer than a lease."""
+"""Time for which a process is suspended; longer than a lease."""
 
 
 @dataclass
@@ -167,7 +167,7 @@ def _creations(client: httpx.Client, kind: str) -> Counter[str]:
 
 @pytest.fixture
 def processes(tmp_path: Path, database_url: str) -> Iterator[tuple[list[ServerProcess], list[WorkerProcess]]]:
-    """Two servers with the same database, and workers that are not started."""
+    """Two servers with the same database, and workers; nothing is started yet."""
     servers = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
@@ -218,7 +218,7 @@ def test_two_servers_and_workers_that_are_killed_and_stopped_publish_each_job_on
 def _starts(
     folder: Path, servers: list[ServerProcess], workers: list[WorkerProcess], token: str
 ) -> list[Callable[[], object]]:
-    """Return functions that start each server and worker; half of the workers use each server."""
+    """Return one function for each server and worker that starts it; each server gets half of the workers."""
 
     def start_worker(number: int) -> Callable[[], object]:
         cache, url = folder / f"cache{number}", servers[number % len(servers)].url
@@ -229,7 +229,7 @@ def _starts(
 
 
 def _kill_or_stop(process: MareyProcess, start: Callable[[], object], *, stops: bool) -> None:
-    """Stop a process for longer than a lease lasts, or kill it and start it again."""
+    """Suspend a process for longer than a lease lasts, or kill it and start it again."""
     if stops and isinstance(process, WorkerProcess):
         process.send(signal.SIGSTOP)
         time.sleep(SLEEP_S)
@@ -288,7 +288,7 @@ def test_a_job_whose_cancellation_is_acknowledged_never_succeeds(
         return True
 
     def complete(lease: Lease) -> bool:
-        """Complete the job unless it is cancelled; return False, because this cancels nothing."""
+        """Complete the job unless it was cancelled; return False, because no cancellation was acknowledged."""
         with contextlib.suppress(ConflictProblem):
             worker.complete(lease)
         return False

@@ -1,4 +1,4 @@
-"""A process that is killed while it writes leaves all of the write or nothing; repeated, it has the same result."""
+"""Processes that are killed while they write: all of the write is stored or nothing, and a repeated write succeeds."""
 
 import signal
 from pathlib import Path

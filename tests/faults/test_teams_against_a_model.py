@@ -38,7 +38,7 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def databases(database_url: str, sqlite_template: Path, tmp_path: Path) -> Iterator[Databases]:
-    """The databases of two servers, with their addresses; the second one is always SQLite."""
+    """The databases of two servers, with addresses; the second server always uses SQLite."""
     folder = tmp_path / "partner-database"
     folder.mkdir()
     urls = {STUDIO: database_url, PARTNER: copied_sqlite(sqlite_template, folder)}
@@ -54,7 +54,7 @@ EXPECTED = (
     "DeleteItem", "DeleteRef", "Merge", "merge-conflicts", "Resolved", "Purge", "still-held", "Rename", "Reset",
     "RestoreItem", "Revert", "Revise", "UploadFile", "overtaken",
 )  # fmt: skip
-"""Texts in the names of operations and events that a long run must contain, or it would not show much."""
+"""Texts, each of which must occur in a name that a long run counts; otherwise the run would test too little."""
 
 
 @pytest.mark.every_database
@@ -77,12 +77,12 @@ def test_nothing_that_several_users_do_on_two_servers_diverges_from_the_model(
 
 
 def drop_their_side(patch: pytest.MonkeyPatch) -> None:
-    """Let merges ignore what their side has changed."""
+    """Let merges ignore all changes of the version that is merged (`theirs`)."""
     patch.setattr(merging, "merge_entries", lambda ours, _theirs, take, merge: merge_entries(ours, [], take, merge))
 
 
 def move_whatever_the_head_is(patch: pytest.MonkeyPatch) -> None:
-    """Let commits move a branch without a comparison of its newest commit."""
+    """Let commits move a branch without a check that its newest commit is the expected one."""
 
     def move(tx: Transaction, prepared: Any, digest: str, _mover: Any) -> None:
         which = (dataset_ref.c.dataset_id == prepared.dataset_id, dataset_ref.c.name == prepared.branch)
@@ -124,7 +124,7 @@ PLANTS: dict[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]] = {
     revert_only_one_entry: ("commit", "revert"),
     forget_write_ids: ("commit", "repeat"),
 }
-"""Faults, and the kinds of steps of the programs that search for each of them."""
+"""Faults that are planted, and for each the kinds of steps in the programs that must find it."""
 
 
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)

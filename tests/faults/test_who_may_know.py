@@ -1,4 +1,4 @@
-"""Random calls by callers of every kind, compared with a model of their rights, and defects that this must find."""
+"""Random calls by callers of every kind, compared with a model of their rights; planted defects must be found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Roles in folders: random calls compared with a model, defects that it must find, and races with changes of roles."""
+"""Roles in folders: random calls compared with a model, planted defects to find, and races with changes of roles."""
 
 from __future__ import annotations
 
@@ -157,7 +157,10 @@ def test_a_reader_writes_only_before_the_role_in_the_folder_is_withdrawn(lab: La
 def test_a_member_whose_role_ends_before_the_rights_are_read_writes_nothing(
     lab: Lab, other: Database, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    """The request has found the member in the project, and then reads the roles in folders."""
+    """The role ends after the request has found the member in the project, and before the request reads the rights.
+
+    On SQLite, where nobody else can write during the request, the role ends before.
+    """
     lab.write(collections.create_collection, "lab", CollectionCreate(path="delivered"))
     user = str(lab.contributor.user_name)
     if lab.database.is_sqlite:  # on which no other request can write meanwhile

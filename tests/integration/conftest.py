@@ -13,7 +13,7 @@ __all__ = ["open_receiver", "owner", "server", "worker"]
 
 @pytest.fixture
 def decoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Sizes of the bodies that the server decodes."""
+    """List to which the size of each body is added that the server decodes."""
     sizes: list[int] = []
 
     def note(data: bytes, media_type: str, **options: Any) -> Any:

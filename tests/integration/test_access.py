@@ -25,7 +25,7 @@ REFUSALS = {
     "administrators-only", "attempt-only", "not-for-attempts", "users-only", "forbidden", "no-user", "no-job",
     "no-blob", "no-attempt", "not-yours", "lease-lost",
 }  # fmt: skip
-"""Problem codes that say: you may not, or you may not know."""
+"""Codes of problems which mean that the caller may not do something, or may not know about it."""
 GUESSES = 3
 
 
@@ -102,7 +102,7 @@ def test_a_store_that_checks_no_role_is_found(house: House, monkeypatch: pytest.
 
 
 def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
-    """The list repeats the declarations, so that lowering the role of an operation also needs a change here."""
+    """The list repeats declarations of the routes, so that a role that is lowered there must also be changed here."""
     high = {
         f"{route.operation.method} {route.resource.path}": route.operation.access.value
         for route in ROUTES
@@ -162,7 +162,7 @@ def test_a_change_cannot_be_declared_for_readers() -> None:
 
 
 def is_about_nobody(person: Person, route: Route) -> bool:
-    """Return whether a refusal does not concern rights: a wrong password, or a credential where none is needed."""
+    """Return whether a refusal is not about rights, but about a wrong password or an unneeded credential."""
     operation = route.operation
     useless = person.standing == "refused" or not person.has(operation.scope)
     return operation.access is Access.ANYONE and (useless or route.template.endswith("/login"))

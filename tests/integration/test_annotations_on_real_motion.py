@@ -22,7 +22,7 @@ SUBJECTS = ("02", "05", "07", "09", "16")
 
 
 def annotate(folder: Path, pattern: str, propose: Callable[..., Any]) -> dict[str, tuple[float, Layer]]:
-    """Annotate every take with `propose`; return its frame rate in Hz and its layer, by file name."""
+    """Annotate every take with `propose`; return, by file name, the frame rate in Hz and the annotation layer."""
     names = sorted(str(path.relative_to(folder)) for path in folder.glob(pattern))
     companions = {pairing.file: pairing.companion for pairing in pair_companions(names)}
     layers = {}

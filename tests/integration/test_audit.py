@@ -1,4 +1,4 @@
-"""Audit log over HTTP: which request makes which entry, who may read them, filters, and no secrets."""
+"""Audit log over HTTP: the entries that each request makes, who may read entries, filters, and no secrets."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LAB = "/projects/lab"
 GAITS = f"{LAB}/datasets/gaits"
 
 Made = tuple[str, str, str, str | None]
-"""Kind, actor and `about` of an entry, and the project."""
+"""Expected audit entry: its kind, actor, `about` and project."""
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Story:
     def send(
         self, client: httpx.Client, method: str, path: str, body: Any, *made: Made, headers: dict[str, str] = ANY_STATE
     ) -> Any:
-        """Send a request that must succeed, note its secret and the entries that it must make; return its answer."""
+        """Send a request that must succeed, and return its answer; record the secret in the answer, and `made`."""
         answer = client.request(method, path, json=body, headers=headers)
         assert answer.is_success, (method, path, answer.text)
         self.expected += made
@@ -137,7 +137,7 @@ def delete_and_restore(story: Story) -> None:
 
 
 def purge(story: Story) -> None:
-    """Purge an item, which also replaces its name in the entry about its deletion."""
+    """Purge an item; this also replaces the item's name in the audit entry about its deletion."""
     owner = story.owner
     hierarchy = {"schema": "marey/skeleton@1", "joints": [{"name": "Hips", "parent": -1, "offset": [0, 1, 0]}]}
     body = {"name": "gone", "collection": "raw", "parts": {"hierarchy": hierarchy}}
@@ -216,7 +216,7 @@ CHAPTERS = (
 
 
 def tell(story: Story) -> list[dict[str, Any]]:
-    """Send all requests, none of which may change an entry that exists; return the entries before them."""
+    """Send all requests, check that none changes an existing entry, and return the entries from before."""
     before = known = story.entries()
     for chapter in CHAPTERS:
         chapter(story)

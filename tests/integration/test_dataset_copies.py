@@ -1,4 +1,4 @@
-"""Copies of versions to another project: documents may refer to content that other entries, or later versions, have."""
+"""Copies of versions to another project: documents may refer to content of other entries, or of later versions."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_labels_may_refer_to_a_revision_of_a_clip_that_a_later_version_adds(
 
 
 def test_a_checkout_creates_labels_of_a_deleted_clip(lab: ProjectHandle) -> None:
-    """The clip is no entry of the version, but its content is kept."""
+    """The clip is not an entry of the version, but the content of the clip is kept."""
     gaits = lab.datasets.create("gaits", collection="gaits")
     clip = make_clip(lab, make_rig(lab))
     labels = label(lab, clip)

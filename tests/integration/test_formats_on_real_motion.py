@@ -149,9 +149,9 @@ def test_written_bvh_puts_every_joint_where_another_loader_saw_it_in_the_origina
 
 
 def test_a_take_in_both_formats_is_the_same_take(collection: Collection) -> None:
-    """The BVH file of 11_01 has another skeleton and smoothed motion, and begins with one frame more.
+    """The BVH file of the take 11_01 has another skeleton and smoothed motion, and one more frame at the start.
 
-    Its root turns exactly as in the AMC file, and its hips travel the same path after scaling by the size of the body.
+    The root turns exactly as in the AMC file, and the hips travel the same path after scaling by the size of the body.
     """
     motions = collection.motions()
     amc, bvh = motions["cmu-amc/11/11_01.amc"], motions["cmu-bvh/11_01.bvh"]
@@ -174,7 +174,7 @@ def test_a_take_in_both_formats_is_the_same_take(collection: Collection) -> None
 
 
 def _rigid_and_scale(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return the rotation (from the right) and the scale that bring points a (n, 3) nearest to points b.
+    """Return the rotation r (3, 3) and the scale s that bring the points s · a @ r (n, 3) nearest to the points b.
 
     The method is that of Umeyama (1991), equations 40 to 42.
     """

@@ -1,4 +1,4 @@
-"""Matching databases of real takes: some at 120 Hz, some whose hips move relative to a root that does not move."""
+"""Matching databases of real takes: some takes are at 120 Hz, in some the hips move relative to a static root."""
 
 import csv
 from pathlib import Path
@@ -52,7 +52,7 @@ def database(takes: list[SourceClip]) -> MatchingDatabase:
 
 
 def courses(database: MatchingDatabase, clip: DatabaseClip) -> tuple[np.ndarray, np.ndarray]:
-    """Return the velocities (F - 1, 2) of a clip's root to the left and forward in m/s, and its turn rates in rad/s."""
+    """Return the root's velocities (F - 1, 2) to the left and forward in m/s, and the root's turn rates in rad/s."""
     steps = database.root_motion.steps[clip.start : clip.stop - 1] * database.options.rate_hz
     return steps[:, :2], steps[:, 2]
 
@@ -93,7 +93,7 @@ def test_feet_stand_about_as_long_as_feet_do(database: MatchingDatabase) -> None
 
 
 def test_mirrored_takes_are_the_takes_in_a_mirror(takes: list[SourceClip]) -> None:
-    """Measured bodies are not exactly symmetric, but their roots agree to a centimetre."""
+    """Measured bodies are not exactly symmetric, but a take and its mirrored copy have the same roots to 1 cm."""
     body = body_of(takes[0].clip)
     plain = build_database(takes[:6], body)
     mirrored = build_database(takes[:6], body, DatabaseOptions(mirroring="only"))
@@ -134,7 +134,7 @@ def test_takes_go_where_their_names_and_turn_as_far_as_the_manifest_say(mocap: P
 
 
 def test_poses_hung_from_their_roots_are_the_takes(takes: list[SourceClip]) -> None:
-    """Pose points equal the joint positions of the clip, wherever the hips are in the hierarchy."""
+    """Pose points, moved to the root of their row, equal the joint positions of the clip for every hierarchy."""
     body = body_of(takes[0].clip)
     for take in takes[:4]:
         database = build_database([take], body)

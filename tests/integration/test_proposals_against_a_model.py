@@ -28,7 +28,7 @@ BRANCHES = ("trial", "other")
 VERDICTS = (Verdict.APPROVE, Verdict.APPROVE, *Verdict)
 STATES = (CheckState.SUCCEEDED, *CheckState)
 UNMERGEABLE = {"already-merged", "several-bases"}
-"""Refusals that depend on the history alone, which the model does not know."""
+"""Codes of refusals that depend only on the history of commits, which the model does not know."""
 
 STEPS = 400
 """Number of steps of each program."""
@@ -46,7 +46,7 @@ class Model:
     checks: dict[str, CheckState] = field(default_factory=dict)
     """State of the check by commit."""
     waiting: tuple[str, str] | None = None
-    """User for whom it is to be merged, and the commit."""
+    """User for whom the proposal is merged as soon as possible, and the commit to merge; None if it does not wait."""
 
     def lacks_nothing(self, head: str, rule: ProtectionRule | None) -> bool:
         if any(verdict is Verdict.REQUEST_CHANGES for verdict, _ in self.verdicts.values()):
@@ -91,7 +91,7 @@ class Program:
             act(self.chance.choice(sorted(ROLES)))
 
     def attempt(self, who: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> str | None:
-        """Run a write; return the code of its error, or None."""
+        """Run a write as the user `who`; return the code of its error, or None if it succeeds."""
         try:
             self.lab.write(function, *self.gaits, *args, who=self.users[who], **kwargs)
         except ApiProblem as error:
@@ -148,7 +148,7 @@ class Program:
         assert code == ("branch-protected" if refused else None)
 
     def open_proposal(self, who: str) -> None:
-        """Commit to a branch and propose it, unless there are several open proposals."""
+        """Commit to a branch and propose this branch, unless there are several open proposals."""
         if sum(one.state == "open" for one in self.models.values()) < 2:
             source = self.chance.choice(BRANCHES)
             assert self.commit(who, source) is None
@@ -172,7 +172,7 @@ class Program:
         self.settle(who, number, proposals.report_check, report, lambda: one.checks.__setitem__(head, state))
 
     def settle(self, who: str, number: int, act: Any, request: Any, note: Callable[[], None]) -> None:
-        """Send a review or a check, which may merge a proposal that waits."""
+        """Send a review or a check; if the proposal waits to be merged, this may merge it."""
         one, before = self.models[number], self.head(MAIN)
         prepared = self.look_up(who, proposals.prepare_waiting, number)
         code = self.attempt(who, act, number, request, prepared)
@@ -207,7 +207,7 @@ class Program:
         return old and self.rule is not None and self.rule.up_to_date
 
     def compare(self, number: int, before: str, ready: bool) -> None:
-        """Check that a proposal was merged only if the model allows it, and that only this moved `main`."""
+        """Check that the proposal was merged only if the model allows it, and that `main` moved only by this merge."""
         one, found = self.models[number], self.lab.read(proposals.read_proposal, *self.gaits, number)
         merged = found.state == "merged"
         assert ready or not merged
@@ -231,7 +231,7 @@ class Program:
             one.state = "closed"
 
     def delete(self, _who: str) -> None:
-        """Try to delete a branch that an open proposal is about; others are kept for the next steps."""
+        """Try to delete the source branches of all open proposals; each attempt must be refused."""
         for one in self.models.values():
             if one.state == "open":
                 assert self.attempt("mia", datasets.delete_ref, one.source, expected_rev=None) == "proposal-open"

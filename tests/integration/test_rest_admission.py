@@ -1,4 +1,4 @@
-"""Bodies of callers who may not send them, which are refused before any of their bytes is decoded."""
+"""Request bodies from callers without the necessary rights: refused before any byte of a body is decoded."""
 
 import gc
 import threading
@@ -33,7 +33,7 @@ def packed(array: np.ndarray[Any, Any]) -> bytes:
 
 
 def in_chunks(body: bytes) -> Iterator[bytes]:
-    """Yield a body without its length, as a chunked request sends it."""
+    """Yield the bytes of a body, so that the client sends a chunked request without Content-Length."""
     yield body
 
 
@@ -138,7 +138,7 @@ def test_a_token_that_was_revoked_writes_nothing_though_its_body_is_decoded_for_
 )
 @pytest.mark.parametrize("path", ["/login", "/projects/lab/clips", "/nowhere"])
 def test_a_refused_request_leaves_nothing_for_the_garbage_collector(server: Server, path: str, body: bytes) -> None:
-    """The garbage collector stops all threads, for longer if more requests wait for it."""
+    """The garbage collector stops all threads, the longer the more refused requests it must free."""
     client = server.client(server.make_project())
     gc.collect()
     gc.disable()

@@ -30,7 +30,7 @@ def made(client: httpx.Client, url: str, body: dict[str, Any]) -> str:
 
 @pytest.fixture
 def annotation(owner: httpx.Client) -> str:
-    """An annotation with one segment, a 0:50."""
+    """An annotation whose only segment labels the frames 0:50 as `a`."""
     skeleton = Skeleton(("root",), np.array([-1]), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))
     poses = np.tile(np.array([0, 1, 0, 1, 0, 0, 0], dtype=np.float32), (FRAMES, 1))
     hierarchy = skeleton_to_document(skeleton).model_dump(mode="json", by_alias=True)
@@ -59,7 +59,7 @@ def segments(client: httpx.Client, annotation: str) -> list[str]:
 
 
 def meanwhile(monkeypatch: pytest.MonkeyPatch, name: str, action: Callable[[], None]) -> None:
-    """Run a function once, while commands with this name are being applied."""
+    """Run `action` once, while commands are being applied by the server's function with this name."""
     carry_out, left = commands.COMMANDS[name], [action]
 
     def interrupted(layer: layers.Layer, **arguments: Any) -> layers.Layer:

@@ -1,4 +1,4 @@
-"""Attempts and bound tokens over HTTP: what they may read and publish, and when they end."""
+"""Tokens of attempts, and tokens bound to a project, over HTTP: what they may read and publish, when they end."""
 
 import hashlib
 from collections.abc import Iterator
@@ -242,7 +242,7 @@ def test_a_batch_of_completions_publishes_nothing_of_an_author_who_was_disabled(
 
 
 def in_chunks(body: bytes) -> Iterator[bytes]:
-    """Yield a body without its length, as a chunked request sends it."""
+    """Yield the bytes of a body, so that the client sends a chunked request without Content-Length."""
     yield body
 
 

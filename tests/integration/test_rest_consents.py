@@ -248,7 +248,7 @@ def test_a_permission_without_a_reason_is_refused(studio: Studio, export: Export
 
 @pytest.fixture
 def check(studio: Studio) -> Callable[..., httpx.Response]:
-    """Function that checks the entries of all versions of the dataset `raw`, which it creates."""
+    """Function that sends an export check, by default for all entries of the new dataset `raw`; returns the answer."""
     ok(studio.owner.post(f"{LAB}/datasets", json={"name": "raw", "collection": "raw"}), 201)
 
     def send(client: httpx.Client | None = None, contents: list[str] | None = None, **fields: Any) -> httpx.Response:

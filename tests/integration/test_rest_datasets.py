@@ -59,7 +59,7 @@ def clip(used: str, place: float) -> dict[str, Any]:
 
 @pytest.fixture
 def gaits(owner: httpx.Client) -> Callable[..., Any]:
-    """Create the dataset `gaits` with skeletons `a` and `b` in its folder; return a function to commit the folder."""
+    """Function that commits the folder of the new dataset `gaits`; the folder contains the skeletons `a` and `b`."""
     for name in ("a", "b"):
         ok(owner.post(f"{LAB}/skeletons", json=skeleton(name, f"Joint {name}")), 201)
     ok(owner.post(f"{LAB}/datasets", json={"name": "gaits", "collection": "gaits"}), 201)
@@ -259,7 +259,7 @@ def test_a_checkout_swaps_names(owner: httpx.Client, gaits: Callable[..., Any]) 
 def two_branches(
     owner: httpx.Client, gaits: Callable[..., Any]
 ) -> Callable[[Callable[[], Any], Callable[[], Any]], None]:
-    """Function that commits one change to the branch `trial` and another to `main`, and leaves the folder at `main`."""
+    """Function that commits one change to the branch `trial` and one to `main`; in the end, `main` is checked out."""
 
     def diverge(on_trial: Callable[[], Any], on_main: Callable[[], Any]) -> None:
         ok(owner.post(f"{GAITS}/refs", json={"name": "trial", "kind": "branch"}), 201)

@@ -47,7 +47,7 @@ def motion_of(clip: Clip, skeleton: str) -> dict[str, Any]:
 
 @pytest.fixture
 def clip(owner: httpx.Client, skeleton: str, walk: Clip) -> str:
-    """A clip with three revisions: the walk, its frames from 12 on, and another description."""
+    """The id of a clip with three revisions: the walk, its frames from frame 12 on, and a changed description."""
     info = {"schema": "marey/clip-info@1", "action": "walk"}
     made = make(owner, CLIPS, {"name": "walk", "parts": {"motion": motion_of(walk, skeleton), "info": info}})
     put(owner, f"{CLIPS}/{made}/parts/motion", motion_of(walk.sliced(12, walk.frame_count), skeleton))

@@ -1,4 +1,4 @@
-"""Roles in folders over REST: every operation that such a role extends or limits, and the resource of the roles."""
+"""Roles in folders over REST: every operation that a role in a folder allows or forbids, and the roles themselves."""
 
 from __future__ import annotations
 
@@ -133,9 +133,9 @@ REQUESTS: dict[str, Sends] = {
         f"/jobs/{cancelled(house, who if at == 'team' else house.owner)}/retry"
     ),
 }
-"""For every operation that a role in a folder extends or limits, its request for something in a folder.
+"""For each operation that a role in a folder allows or forbids: a function that sends the operation for a folder.
 
-A job belongs to no folder: instead of one in `other`, the last two requests name a job of the owner.
+Jobs belong to no folder, so the last two functions use a job of `who` for `team`, and a job of the owner for `other`.
 """
 
 

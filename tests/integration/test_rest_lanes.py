@@ -1,4 +1,4 @@
-"""Lanes of requests: those on which servers and workers depend never wait behind long requests of others."""
+"""Lanes of requests: requests on which servers and workers depend never wait behind long requests of others."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STUDY = {"schema": "marey/document@1", "answer": 42}
 
 @contextmanager
 def busy(server: Server) -> Iterator[None]:
-    """Occupy all threads for ordinary reads, and their queue, with reads of many clients during the `with` block."""
+    """During the `with` block, occupy all threads for ordinary reads, and fill the queue for these threads."""
     done = threading.Event()
     clients = [Client(f"192.0.2.{number}", known=False) for number in range(40)]
     reads = [server.database.queue_read(one, SYSTEM, lambda _tx: done.wait(PATIENCE_S)) for one in clients]

@@ -1,4 +1,4 @@
-"""Long bodies, which are stored as blobs in short transactions so that writes of others do not wait."""
+"""Long request bodies: stored as blobs in short transactions, so that writes of other clients do not wait."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BODY = os.urandom(LONG_BODY_BYTES + 1_000_000)
 
 
 def counts(database: Database) -> list[int]:
-    """Return the numbers of blobs, of their rows, of uploads, and of their pieces."""
+    """Return the number of rows of four tables: blobs, chunks of blobs, uploads, and chunks of uploads."""
 
     def count(tx: Transaction) -> list[int]:
         tables = (blob, blob_chunk, upload, upload_chunk)

@@ -1,4 +1,4 @@
-"""Documents that a client has already: sent again only to callers who may read them."""
+"""Documents that are read again: answers are the same, show changes, and go only to callers who may still read."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def reader(server: Server) -> httpx.Client:
 
 @pytest.fixture
 def owner(server: Server, reader: httpx.Client) -> httpx.Client:
-    """The client of the owner of `lab`, which `rita` may read."""
+    """The client of the owner of the project `lab`; `rita` may read this project."""
     return server.client(server.make_project(rita=Role.READER))
 
 

@@ -38,7 +38,7 @@ MAIN = f"{GAITS}/refs/main"
 PROPOSALS = f"{GAITS}/proposals"
 ANY = {"If-Match": "*"}
 on_sqlite = pytest.mark.parametrize("server", ["sqlite"], indirect=True)
-"""For rules that do not depend on the database."""
+"""Mark of tests of rules that do not depend on the kind of database."""
 
 
 def ok(response: httpx.Response, status: int = 200) -> Any:
@@ -53,7 +53,7 @@ def refused(response: httpx.Response, status: int, code: str) -> Any:
 
 @dataclass(frozen=True)
 class Team:
-    """Clients of users with each role in the project and of a stranger (eve), and items for commits."""
+    """Clients of the members, one or more for each role, and of a stranger (`eve`); also items for commits."""
 
     olga: httpx.Client
     mia: httpx.Client
@@ -89,7 +89,7 @@ def skeleton(name: str) -> dict[str, Any]:
 def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """A server that all tests with one kind of database share; each test has its own project `lab`.
 
-    Its housekeeping merges no waiting proposals, so that tests decide when this happens.
+    The server's housekeeping does not merge waiting proposals, so that tests decide when these are merged.
     """
     folder = tmp_path_factory.mktemp("server")
     with contextlib.ExitStack() as after:
@@ -291,7 +291,7 @@ def test_a_proposal_is_merged_when_the_last_thing_arrives(team: Team, server: Se
 
 
 def test_a_waiting_proposal_is_merged_when_its_rule_changes(team: Team, server: Server) -> None:
-    """No request about the proposal tries the merge; housekeeping does, for the user who requested it."""
+    """Housekeeping, not a request about the proposal, then makes the merge, for the user who requested the merge."""
     team.protect(approvals=2)
     team.propose()
     approve(team.ben, 1)
@@ -358,7 +358,7 @@ def test_more_proposals_wait_than_one_attempt_examines(
 
 
 def wait_on_branches(team: Team, *branches: str) -> None:
-    """Propose new branches, and ask for their merges, which wait for an approval; then require none any more."""
+    """Propose new branches and request merges that wait for an approval; then require approvals no longer."""
     team.protect(approvals=1)
     for branch in branches:
         ok(team.ada.post(f"{GAITS}/refs", json={"name": branch, "kind": "branch"}), 201)
@@ -435,7 +435,7 @@ def test_a_right_that_is_lost_for_a_moment_is_no_lasting_obstacle(
 def test_a_refused_merge_does_not_refuse_the_review_or_check(
     team: Team, server: Server, monkeypatch: pytest.MonkeyPatch, last: str
 ) -> None:
-    """The merge is that of another user, whose quota it exceeds; nothing of it is stored."""
+    """Another user requested the merge, and it exceeds the quota of that user; nothing of the merge is stored."""
     team.protect(**({"approvals": 1} if last == "review" else {"checks": ["evaluation"]}))
     team.propose()
     ok(team.ada.post(f"{PROPOSALS}/1/merge", json={"when_green": True}))
@@ -468,7 +468,7 @@ def test_a_merge_that_waits_is_prepared_again_if_a_branch_moves(
     prepare, earlier = proposals.prepare_waiting, list[Any]()
 
     def prepare_late(*arguments: Any) -> Any:
-        """Return at the second call the result of the first call, as if the branch had moved after it."""
+        """Return the result of the first call at the second call, too, as if the branch moved after the preparation."""
         earlier.append(prepare(*arguments))
         return earlier[0 if len(earlier) == 2 else -1]
 

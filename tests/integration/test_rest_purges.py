@@ -44,7 +44,7 @@ def purge(owner: httpx.Client, **body: Any) -> httpx.Response:
 
 
 def bytes_in_database(tx: Transaction) -> int:
-    """Return the number of bytes of the used pages of SQLite, or of the rows that content takes in Postgres."""
+    """Return the size in bytes of the used pages of SQLite, or of the rows with content in Postgres."""
     if not tx.is_postgres:
         pages, free, size = (
             tx.execute(sqlalchemy.text(f"PRAGMA {name}")).scalar_one()

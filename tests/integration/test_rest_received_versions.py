@@ -1,4 +1,4 @@
-"""Versions from other servers over HTTP: their revisions and commits keep their digests, or are refused."""
+"""Versions received from other servers over HTTP: revisions and commits keep their digests, or are refused."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def parts_of(one: dict[str, Any]) -> dict[str, str]:
 def commit(entries: dict[str, dict[str, Any]], *parents: str, before: dict[str, dict[str, Any]] | None = None) -> Any:
     """Return a received commit whose version has these entries, by path.
 
-    `before` are the entries of its first parent.
+    `before` are the entries of the commit's first parent.
     """
     before = before or {}
     values = {key_of(path, one["kind"]): {"parts": parts_of(one), "tags": []} for path, one in entries.items()}
@@ -114,7 +114,7 @@ def test_commits_from_elsewhere_keep_digest_author_and_time(client: httpx.Client
 def test_a_commit_is_not_recorded_in_another_dataset_of_the_same_name(
     client: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The dataset is replaced between the preparation, which finds the commit in it, and the record."""
+    """The dataset is replaced after the preparation has found the commit there, and before the commit is recorded."""
     one = skeleton("Hips")
     send(client, one)
     body, digest = commit({"rig": one})

@@ -34,7 +34,7 @@ def deleted_project(client: httpx.Client) -> str:
 
 
 def send_twice(client: httpx.Client, url: str, **options: Any) -> tuple[Any, Any]:
-    """Return status, body and ETag of both answers."""
+    """Send a POST request twice; return the status, the body and the ETag of each answer."""
     found = [client.post(url, **options) for _ in range(2)]
     first, second = ((one.status_code, one.content, one.headers.get("ETag")) for one in found)
     return first, second

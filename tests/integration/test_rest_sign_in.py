@@ -84,7 +84,7 @@ def test_an_unknown_user_gets_the_answer_of_a_wrong_password_for_the_same_work(
 
 @pytest.fixture
 def going_on(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
-    """Event that must be set before checks of wrong passwords continue."""
+    """Event for which checks of wrong passwords wait; the test sets it to let them continue."""
     event = threading.Event()
     matches = passwords.password_matches
 

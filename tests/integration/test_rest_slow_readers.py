@@ -1,4 +1,4 @@
-"""Clients that do not read their answers: the memory and the time that they use are limited."""
+"""Clients that do not read answers: the memory and the time that such clients cost the server are limited."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ MEMORY_MB = 96
 
 
 def bson_bomb(elements: int) -> bytes:
-    """Return a compressed document with a list of empty objects; each takes ten times its bytes in memory."""
+    """Return a compressed document with a list of empty objects; decoded, they take ten times as much memory."""
     members = b"\x03\x00\x05\x00\x00\x00\x00" * elements
     listed = struct.pack("<i", len(members) + 5) + members + b"\x00"
     fields = b"\x04frames\x00" + listed
@@ -62,7 +62,7 @@ def until(condition: Callable[[], Any]) -> None:
 
 
 def upload(client: httpx.Client, files: dict[str, bytes]) -> list[dict[str, Any]]:
-    """Import files and return their entries."""
+    """Import files and return the entries of the import, one for each file."""
     answer = client.post("/projects/lab/imports", files=[("files", one) for one in files.items()])
     assert answer.status_code == 200, answer.text
     return answer.json()["entries"]
@@ -125,7 +125,7 @@ def test_a_client_that_leaves_ends_the_work_for_it(
 
 
 def begin_import(server: Server, token: str, noted: Path) -> http.client.HTTPConnection:
-    """Send a file for which a child process waits, and return the connection as soon as it waits."""
+    """Import a file that makes a child process wait; return the connection as soon as the child waits."""
     connection = http.client.HTTPConnection(server.address.removeprefix("http://"), timeout=PATIENCE_S)
     body = f'--b\r\nContent-Disposition: form-data; name="files"; filename="a.bvh"\r\n\r\n{noted}\r\n--b--\r\n'
     headers = {"Authorization": f"Bearer {token}", "Content-Type": "multipart/form-data; boundary=b"}

@@ -74,7 +74,7 @@ class ItemsMachine(RuleBasedStateMachine):
         return self.lab.write(function, self.lab.name, Kind.STUDY, item_id, *args, **kwargs)
 
     def attempt(self, item_id: str, expected: str, change: Callable[..., Any], *, blocked: bool = False) -> bool:
-        """Run `change(expected_rev)`; return whether it succeeded. The model decides which error is expected."""
+        """Run `change(expected_rev)`; return whether the change succeeded. The model states the expected error."""
         model = self.world.items[item_id]
         expected_rev = {"any": None, "right": model.rev, "wrong": model.rev + 7}[expected]
         error: type[Exception] | None = None

@@ -1,4 +1,4 @@
-"""Webhooks: deliveries to real receivers on this machine: order, retries, requests, pauses, and refused addresses."""
+"""Deliveries of webhooks to real receivers on this machine: order, retries, requests, pauses, refused addresses."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_events_are_delivered_in_order_with_signatures(owner: httpx.Client, open
 
 @pytest.fixture
 def quick_retries(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Repeat failed deliveries after some milliseconds, and give them up after three attempts."""
+    """Repeat failed deliveries after some milliseconds, and stop after three attempts."""
     monkeypatch.setattr(outbox, "RETRY", Backoff(first_s=0.02, longest_s=0.1))
     monkeypatch.setattr(outbox, "MOST_ATTEMPTS", 3)
 
@@ -338,7 +338,7 @@ def test_deliveries_continue_after_the_server_could_not_renew_its_lead(
 def test_a_delivery_that_is_interrupted_during_a_search_for_work_is_sent(
     owner: httpx.Client, open_receiver: Open, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The search has read the database before the interruption, so what it found does not name the webhook."""
+    """The search has read the database before the interruption, so the work that it finds lacks the webhook."""
     monkeypatch.setattr(delivering, "RENEW_EVERY_S", 0.2)
     receiver = open_receiver()
     make_webhook(owner, receiver.url)

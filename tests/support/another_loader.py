@@ -25,7 +25,7 @@ def positions_by_another_loader(path: Path) -> NDArray[np.float64]:
 
 
 def files_to_compare(names: list[str]) -> list[str]:
-    """Return the files of the collection that a test reads with the other loader, which is slow.
+    """Return those files of the collection that tests read with this loader, which is slow.
 
     Files of the folders `bandai-namco-*` differ in the motion alone, so every sixth of them is enough outside of the
     tier `soak`.

@@ -19,9 +19,10 @@ def python_path() -> str:
 
 
 class AttachedWorker:
-    """A worker process that ends when its standard input is closed; its log is a file in `folder`.
+    """A worker process that reads its token from its standard input, and ends when this input is closed.
 
-    With a `token_file`, it reads its token there instead, and is not attached.
+    Its log is a file in `folder`. With a `token_file`, the worker reads the token from this file instead, and does not
+    end with its standard input.
     """
 
     LOG = "worker.log"
@@ -61,4 +62,4 @@ class AttachedWorker:
 
 
 StartWorker = Callable[..., AttachedWorker]
-"""Starts a worker with the given options; `env` adds variables to its environment."""
+"""Function that starts a worker with the given options; `env` adds variables to the worker's environment."""

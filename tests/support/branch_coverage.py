@@ -1,4 +1,4 @@
-"""Branch coverage of each package, compared with its minimum, from the data of the last run with `--cov`.
+"""Comparison of the branch coverage of each package with a minimum, from the data of the last run with `--cov`.
 
 `python -m tests.support.branch_coverage` exits with 1 if a package is below its floor. Branches in compiled functions
 and in processes that tests start are not measured.
@@ -23,8 +23,10 @@ FLOORS = {
     "marey_server": 89,
     "marey_worker": 44,
 }
-"""Percent of branches, 2 to 3 below those of a whole run of `make test`. Most of the worker, and of the limits and the
-fork server in `marey_schemas.processes`, runs in child processes, which are not measured.
+"""Minimum coverage in percent, by package: 2 to 3 percentage points below the coverage of a whole run of `make test`.
+
+The worker, and the limits and the fork server in `marey_schemas.processes`, mostly run in child processes, which are
+not measured.
 """
 
 
@@ -46,7 +48,7 @@ def branch_coverage() -> dict[str, float]:
 
 
 def main() -> int:
-    """Print a line for each package; return 1 if any is below its floor."""
+    """Print a line for each package; return 1 if the coverage of a package is below its floor."""
     found = branch_coverage()
     for package, percent in found.items():
         floor = FLOORS[package]

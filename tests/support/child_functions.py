@@ -19,7 +19,7 @@ def environment(_payload: bytes) -> bytes:
 
 
 def refuse(_payload: bytes) -> bytes:
-    """Raise `InvalidProblem`, as a function does that refuses its input."""
+    """Raise `InvalidProblem`, as a function that refuses its input does."""
     raise InvalidProblem("no walk", code="no-walk")
 
 
@@ -29,7 +29,7 @@ def fail(_payload: bytes) -> bytes:
 
 
 def eat(_payload: bytes) -> bytes:
-    """Allocate more memory than there is."""
+    """Try to allocate more memory than the process may use."""
     return b"x" * (1 << 40)
 
 
@@ -40,7 +40,7 @@ def burn(_payload: bytes) -> bytes:
 
 
 def note_and_call(payload: bytes) -> bytes:
-    """Write the process id to a file, and call a function of this module; the payload has the path and the name."""
+    """Write the process id to a file, and call a function of this module; `payload` is "<path> <function>"."""
     path, name = payload.decode().rsplit(" ", 1)
     Path(path).write_text(str(os.getpid()))
     answer: bytes = globals()[name](b"")
@@ -48,7 +48,7 @@ def note_and_call(payload: bytes) -> bytes:
 
 
 def wait_for(payload: bytes) -> bytes:
-    """Write the process id to the file named by `payload`, and wait until the file with the ending `.go` exists."""
+    """Write the process id to the file named by `payload`; wait until a file with the same stem and `.go` exists."""
     noted = Path(payload.decode())
     noted.with_suffix(".part").write_text(str(os.getpid()))
     noted.with_suffix(".part").rename(noted)
@@ -58,7 +58,7 @@ def wait_for(payload: bytes) -> bytes:
 
 
 def wait_in_import(order: bytes) -> bytes:
-    """Wait as `wait_for` does; the content of the file to import is the path."""
+    """Do as `wait_for` does for an import, with the content of the imported file as the path."""
     from marey_server.motions.reading import FileOrder  # which loads far more than the other functions need
 
     return wait_for(FileOrder.unpack(order).content)

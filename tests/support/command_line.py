@@ -19,12 +19,12 @@ from tests.support.server_process import ServerProcess
 from marey_client.cli import main
 
 WIDTH = "80"
-"""Columns of the terminal that help texts are wrapped for, whichever terminal runs the tests."""
+"""Width in columns to which help texts are wrapped, independent of the terminal in which tests run."""
 
 
 @dataclass(frozen=True)
 class CommandLine:
-    """`marey` in `folder`, with `server` named by the environment."""
+    """The command `marey`, run in `folder`; environment variables name the address of `server`."""
 
     server: ServerProcess
     folder: Path
@@ -87,5 +87,5 @@ def _logging_restored() -> Iterator[None]:
 
 
 def _hear_interrupts() -> None:
-    """Restore the default reaction to Ctrl-C, which processes inherit and which may be to ignore it."""
+    """Let Ctrl-C end this process, also if the parent process ignored Ctrl-C, which child processes inherit."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

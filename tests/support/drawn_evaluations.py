@@ -1,6 +1,6 @@
 """Figures of synthetic evaluations for tests. Each is drawn once per process, to be read only.
 
-Drawing all figures of an evaluation takes seconds: the files of tests that do are in the group `DRAWN_EVALUATIONS`.
+Drawing all figures of an evaluation takes seconds, so test files that do this are in the group `DRAWN_EVALUATIONS`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def usual() -> EvaluationResult:
 
 @functools.cache
 def changed() -> EvaluationResult:
-    """Return an evaluation to compare with the usual one: a clip came, three went, and the errors are smaller."""
+    """Return an evaluation to compare with the usual one: one clip is new, three are missing, errors are smaller."""
     after = synthetic_result(seed=4, clips=10, turns_deg_s=(-90.0, 20.0), sway_m=0.05)
     return replace(after, clips=(replace(after.clips[0], uid="new@1", name="newcomer"), *after.clips[1:]))
 
@@ -48,14 +48,14 @@ def figure_of(name: str, trial: str | None = None) -> DrawnFigure:
 
 @functools.cache
 def drawn_both() -> Mapping[str, DrawnFigure]:
-    """Return the figures of the usual evaluation beside the changed one."""
+    """Return figures that compare the usual evaluation with the changed one."""
     return MappingProxyType(draw_figures(usual(), other=changed(), labels=("old", "new")))
 
 
 def tiny(
     clips: tuple[DatabaseClip, ...], options: EvaluationOptions = SMALL, seed: int = 0, covered: bool = True
 ) -> EvaluationResult:
-    """Return an evaluation of these clips, with or without windows of them."""
+    """Return an evaluation of these clips; only if `covered`, its coverage contains windows of the clips."""
     random = np.random.default_rng(seed)
     trials = suite_trials(options)
     records = tuple(wandering(trial, clips, 0.1, random) for trial in trials)
@@ -84,7 +84,7 @@ def _of(**options: Any) -> Callable[[], EvaluationResult]:
 
 
 def _unmeasured(every: int) -> EvaluationResult:
-    """Return the usual evaluation with no number for one of so many trials."""
+    """Return the usual evaluation, in which one in `every` trials has no measured values."""
     trials = tuple(
         each if index % every else replace(each, metrics=dict.fromkeys(each.metrics))
         for index, each in enumerate(usual().trials)
@@ -126,7 +126,7 @@ SHOWS = {
     "nothing used": USE_FIGURES,
     "no trials": ("offsets", *USE_FIGURES),
 }
-"""Of evaluations that differ from the usual one in some data only, the figures that show this data."""
+"""For evaluations that differ from the usual one in some data only: the names of the figures that show this data."""
 
 
 @functools.cache
@@ -137,7 +137,7 @@ def little(name: str) -> EvaluationResult:
 
 @functools.cache
 def drawn_of_little(name: str) -> Mapping[str, DrawnFigure]:
-    """Return the figures of an evaluation of little that differ from those of the usual one; in soak, all figures."""
+    """Return those figures of the evaluation `little(name)` that differ from the usual ones; in soak, all figures."""
     if name not in SHOWS or is_soak():
         return draw_figures(little(name))
     return {figure: draw_figure(figure, little(name)) for figure in SHOWS[name]}
@@ -145,7 +145,7 @@ def drawn_of_little(name: str) -> Mapping[str, DrawnFigure]:
 
 @functools.cache
 def drawn_beside_little(name: str) -> Mapping[str, DrawnFigure]:
-    """Return the figures of an evaluation of little before the usual one, chosen as by `drawn_of_little`."""
+    """Return figures that compare `little(name)` with the usual evaluation, selected as in `drawn_of_little`."""
     if name not in SHOWS or is_soak():
         return draw_figures(little(name), other=usual())
     return {figure: draw_figure(figure, little(name), other=usual()) for figure in SHOWS[name]}
@@ -163,7 +163,7 @@ HOSTILE_NAMES = (
 
 @functools.cache
 def hostile() -> EvaluationResult:
-    """Return an evaluation of clips whose names are markup, formulas, signs that cannot be drawn, long or empty."""
+    """Return an evaluation of clips whose names are markup, formulas, unprintable characters, very long or empty."""
     return synthetic_result(names=HOSTILE_NAMES, unused=10, seed=2)
 
 

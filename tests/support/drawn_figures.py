@@ -24,14 +24,14 @@ def is_sound(figure: DrawnFigure) -> DrawnFigure:
 def is_sound_svg(figure: DrawnFigure) -> DrawnFigure:
     """Check that the SVG can be read, and what `has_sound_data` checks; return the figure.
 
-    The SVG takes less than the PNG, and writing it computes the layout of all texts as well.
+    Drawing an SVG takes less time than drawing a PNG, and also computes the layout of all texts.
     """
     assert ElementTree.fromstring(figure.svg).tag.endswith("svg")
     return has_sound_data(figure)
 
 
 def has_sound_data(figure: DrawnFigure) -> DrawnFigure:
-    """Check that columns of a table are equally long and the caption is a sentence; return the figure."""
+    """Check that the columns of each table are equally long and that the caption is a sentence; return the figure."""
     assert figure.caption.endswith(".")
     assert "nan" not in figure.caption
     for columns in figure.data["tables"].values():
@@ -46,7 +46,7 @@ def rows_of(figure: DrawnFigure, table: str) -> list[Any]:
 
 
 def cut_off(figure: Figure) -> list[Any]:
-    """Return the texts of a matplotlib page that extend beyond its borders."""
+    """Return the texts of a matplotlib figure that extend beyond the borders of the figure."""
     canvas = FigureCanvasAgg(figure)
     figure.draw_without_rendering()  # places every text, as drawing does
     page = figure.bbox.padded(1.0)
@@ -57,7 +57,7 @@ def cut_off(figure: Figure) -> list[Any]:
 
 
 def _labels_beyond(axes: Axes) -> Iterator[Any]:
-    """Yield the labels of ticks that lie outside the limits of their axis, which are not drawn."""
+    """Yield the labels of ticks outside the limits of an axis; matplotlib does not draw these labels."""
     for axis in (axes.xaxis, axes.yaxis):
         low, high = sorted(axis.get_view_interval())
         for tick in axis.get_major_ticks():

@@ -1,6 +1,6 @@
-"""Trained models for tests of reports and figures. Those of the usual walks are made once per process, to be read only.
+"""Trained models for tests of reports and figures. The model of generated walks is made once per process; only read it.
 
-Training a model and drawing its figures takes seconds: the files of tests that do are in the group `DRAWN_MODELS`.
+Training a model and drawing its figures takes seconds, so test files that do this are in the group `DRAWN_MODELS`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ QUICK = ModelOptions(report_samples=20, starts=1)
 
 
 def trained_on(aligned: AlignedSet, options: ModelOptions = QUICK) -> tuple[TrainedPrimitive, ModelSubject]:
-    """Train a model of these examples; return it, and the data that its figures show."""
+    """Train a model of these examples; return the model, and the data that its figures show."""
     trained = train_primitive(aligned, options, name="walk")
     return trained, ModelSubject(trained.primitive, aligned, trained.report, seed=3)
 

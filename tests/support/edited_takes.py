@@ -29,7 +29,7 @@ def make_breathing_walk(**given: float) -> Clip:
 
 
 def under_static_root(clip: Clip, away: ArrayLike = (0.3, 0.9, -4.0)) -> Clip:
-    """Return the clip on a skeleton with a static root on the floor and translated hips that are `away` from it."""
+    """Return the same motion with a new root on the floor that does not move; the hips move at the offset `away`."""
     own = clip.skeleton
     skeleton = Skeleton(
         ("reference", *own.joint_names),

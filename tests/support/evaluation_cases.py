@@ -20,7 +20,7 @@ RATE_HZ = 60.0
 
 
 def closed_reference(trial: Trial) -> Reference:
-    """Return the trial's reference with an additional final tick, so that the circle lasts whole seconds."""
+    """Return the trial's reference path with one more tick at the end, so that the circle lasts its full duration."""
     asked = reference(trial, RATE_HZ)
     return replace(asked, tick_count=asked.tick_count + 1)
 
@@ -72,7 +72,7 @@ def walked_record(rows: Sequence[int], status: Sequence[Status] | None = None) -
 
 
 def clips_of(*frame_counts: int, loop: bool = False) -> tuple[DatabaseClip, ...]:
-    """Return clips `a`, `b`, `c` and so on with these numbers of frames, whose rows follow one another."""
+    """Return clips `a`, `b`, `c` and so on with these numbers of frames; their rows are consecutive."""
     stops = np.cumsum(frame_counts).tolist()
     return tuple(
         DatabaseClip(chr(97 + index), f"clip {index}", "", stop - frames, stop, loop)
@@ -81,14 +81,14 @@ def clips_of(*frame_counts: int, loop: bool = False) -> tuple[DatabaseClip, ...]
 
 
 def arc(speed_m_s: float, turn_rate_deg_s: float, duration_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions (F, 2) and headings (F,) of a circle from the origin, including its end."""
+    """Return positions (F, 2) and headings (F,) on a circle that begins at the origin; the last tick is included."""
     trial = Trial("circle", speed_m_s, np.radians(turn_rate_deg_s), approach_s=0.0, duration_s=duration_s)
     asked = closed_reference(trial)
     return asked.positions[: asked.tick_count], asked.headings[: asked.tick_count]
 
 
 def trajectory_database(*roots: tuple[NDArray[np.float64], NDArray[np.float64]]) -> MatchingDatabase:
-    """Return a database whose rows differ only in the paths of roots; futures end at the clip's last frame."""
+    """Return a database whose rows differ only in root paths; trajectories ahead stop at the clip's last frame."""
     database = root_database(*roots)
     ahead = np.round(np.array(database.options.horizons_s) * RATE_HZ).astype(np.int64)
     features = [np.concatenate([_futures(*root, ahead) for root in roots])]
@@ -107,7 +107,7 @@ def trajectory_database(*roots: tuple[NDArray[np.float64], NDArray[np.float64]])
 def _futures(
     positions: NDArray[np.float64], headings: NDArray[np.float64], ahead: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return positions, then directions, (F, 12) at each future time, relative to the root of each row."""
+    """Return (F, 12): positions at three future times, then directions, both relative to the root of each row."""
     frames = len(headings)
     later = np.minimum(np.arange(frames)[:, None] + ahead, frames - 1)
     step = positions[later] - positions[:, None]

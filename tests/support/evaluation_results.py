@@ -1,4 +1,4 @@
-"""Synthetic evaluations for tests: without searches and clips, but measured like real ones."""
+"""Synthetic evaluations for tests: made without searches and without motion, but measured like real evaluations."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,11 +29,11 @@ class Making:
 
     Parameters
     ----------
-    clips, frames : how many clips, of about how many frames each
+    clips, frames : number of clips, and approximate number of frames of each clip
     sway_m : distance of the character from its path at high speed and turn rate
-    turns_deg_s : the clips turn at rates within this range
-    unused : so many of the last clips are never displayed
-    names : of the first clips
+    turns_deg_s : range of the turn rates of the clips
+    unused : number of clips, counted from the last one, that are never displayed
+    names : names of the first clips
     """
 
     clips: int = 12
@@ -99,7 +99,7 @@ def some_clips(how: Making, random: Generator) -> tuple[DatabaseClip, ...]:
 
 
 def wandering(trial: Trial, clips: tuple[Any, ...], sway_m: float, random: Generator) -> TrialRecord:
-    """Return the record of a character that sways about its path and plays ranges of clips, most often the first."""
+    """Return the record of a character that sways about its path and plays ranges of clips, early clips most often."""
     guide = reference(trial, RATE_HZ)
     ticks = guide.tick_count
     times = np.arange(ticks) / RATE_HZ
@@ -116,7 +116,7 @@ def wandering(trial: Trial, clips: tuple[Any, ...], sway_m: float, random: Gener
 
 
 def _stretches(ticks: int, clips: tuple[Any, ...], random: Generator) -> tuple[Ints32, Ints]:
-    """Return the row of each tick, and the ticks at which another range begins."""
+    """Return the row of each tick, and the ticks at which the character starts to play another range of a clip."""
     favour = 1.0 / np.arange(1, len(clips) + 1)
     rows, tick = np.empty(ticks, dtype=np.int32), 0
     entered: list[int] = []
@@ -131,7 +131,7 @@ def _stretches(ticks: int, clips: tuple[Any, ...], random: Generator) -> tuple[I
 
 
 def some_coverage(options: EvaluationOptions, clips: tuple[Any, ...], how: Making, random: Generator) -> Coverage:
-    """Return windows of clips with about one speed and turn rate each; a tenth of the clips goes backwards."""
+    """Return the coverage by clips that each have about one speed and turn rate; about a tenth goes backwards."""
     counts = [max(0, clip.frame_count - round(RATE_HZ)) for clip in clips]
     owner = np.repeat(np.arange(len(clips)), counts).astype(np.int32)
     speed = random.uniform(0.6, 3.0, len(clips))[owner] + 0.15 * random.normal(size=len(owner))

@@ -23,7 +23,7 @@ BLOB = re.compile(r"/api/v1/blobs/(sha256:[0-9a-f]{64})")
 
 @dataclass(frozen=True, kw_only=True)
 class FakeJob:
-    """Job of the fake server, with the values of its lease."""
+    """Job of the fake server; the fields are values of the lease that workers get."""
 
     name: str
     kind: str
@@ -49,10 +49,13 @@ class FakeJob:
 class FakeServer:
     """Jobs to claim, documents to read, and everything that workers sent, by job.
 
-    A job in `lost` has lost its lease; requests about one in `silent` get the answer that the server is away, and are
-    counted in `refused`. Results of a job in `slow` are not answered while it is there; those of one in `unwelcome` are
-    refused, and one in `over_quota` cannot complete. `order` lists claims and ends of jobs. `claimants` are the tokens
-    with which each claim was sent; if `valid_tokens` are given, claims with others are refused.
+    Tests add names of jobs to sets that change the answers. A job in `lost` has lost its lease. Requests about a job in
+    `silent` are answered as if the server were unavailable, and counted in `refused`. Results of a job in `slow` are
+    answered only after the job is removed from `slow`. Results of a job in `unwelcome` are refused. A job in
+    `over_quota` cannot complete.
+
+    `order` lists claims and ends of jobs. `claimants` contains, for each claim, the tokens with which it was sent. If
+    `valid_tokens` is set, claims with other tokens are refused.
     """
 
     def __init__(self) -> None:

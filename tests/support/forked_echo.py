@@ -1,4 +1,4 @@
-"""Fork server for tests: depending on the message, its children answer with process ids or end."""
+"""Fork server for tests, whose child processes answer messages with process ids, or exit if a message says so."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ from marey_schemas.processes.child_process import READY, connect_to_parent
 from marey_schemas.processes.forking import fork_children
 
 LOADED = os.getpid()
-"""Process that loaded this module."""
+"""Id of the process that loaded this module."""
 
 
 def answer(pipe: Connection) -> None:
-    """Answer each message with process ids, until the pipe closes; the messages `fail` and `exit N` end the process."""
+    """Answer each message with four ids, until the pipe closes; the messages `fail` and `exit N` end the process.
+
+    The ids are those of the process that loaded this module, the parent, this process, and its session.
+    """
     while True:
         try:
             message = pipe.recv_bytes()

@@ -120,7 +120,7 @@ BODIES = {
     "EditPreviewRequest": {"commands": [{"command": "trim", "start": 0, "stop": 1}]},
     "SearchRequest": {"constraints": [{"type": "root_heading", "at": "end", "heading_deg": 0}]},
 }
-"""A body for every model that a route takes; a route with a new one fails here until it gets one."""
+"""A body for every request model of the routes. A route with a new model fails in tests until a body is added here."""
 
 
 _OTHER_THINGS = {
@@ -130,14 +130,14 @@ _OTHER_THINGS = {
     "/search": {"kind": "models", "item": "model_of_nobody"},
     "{project}/restore": {"project": "gone"},
 }
-"""Variables of routes for other things than the clip, by a piece of their paths."""
+"""Path variables of routes that are not about the clip, by a part of the path."""
 _QUERIES = {
     "{item}/export": "?format=original",
     "{item}/difference": "?from=1&to=1",
     "explanations/{kind}": "?query=has%20tag",
     "{dataset}/blame": f"?entry={CANARY}&kind=graph",
 }
-"""Queries of routes that need one, by the endings of their paths."""
+"""Query strings of routes that need one, by the end of the path."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ class House:
     variables: dict[str, str]
 
     def plan(self, route: Route, **changed: str) -> Planned:
-        """Return the request of a route; `changed` contains other values of variables of the path."""
+        """Return the request of a route; `changed` replaces values of path variables."""
         operation, template = route.operation, route.template
         variables = self.variables | changed
         for piece, values in _OTHER_THINGS.items():
@@ -216,7 +216,7 @@ def build_house(people: People) -> House:
 
 
 def start_attempt(people: People, tokens: Mapping[str, str | None], clip: str) -> dict[str, Any]:
-    """Submit a job of the contributor that exports a clip of `lab`, and return the lease of such a job."""
+    """Submit a job as the contributor that exports a clip of `lab`; claim an export job, and return its lease."""
     body = {"kind": "export", "inputs": {"clips": [{"item": clip}]}, "cache": "refresh", "priority": 5}
     job = people.client(tokens["contributor"]).post("/projects/lab/jobs", json=body)
     assert job.status_code == 202, job.text
@@ -243,7 +243,7 @@ def _tokens_of_users(people: People) -> dict[str, str | None]:
 
 
 def _furnish(owner: Any) -> dict[str, str]:
-    """Create a skeleton, a clip, a blob and an annotation in `lab`; return their names by variables of paths."""
+    """Create a skeleton, a clip, a blob, an annotation and more in `lab`; return values of path variables by name."""
     etag = owner.get("/projects/lab").headers["ETag"]
     assert owner.patch("/projects/lab", json={"description": CANARY}, headers={"If-Match": etag}).is_success
     assert owner.put(f"/blobs/{SECRET_DIGEST}", content=SECRET_BYTES).is_success

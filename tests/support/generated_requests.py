@@ -33,7 +33,7 @@ from marey_server.http.routes import RouteTable
 from marey_server.store.database.connections import Database
 
 LONGEST_QUERY = 50_000
-"""Of a longer head the server takes no notice but to close the connection."""
+"""Longest query string to send: if the head of a request is longer, the server closes the connection unanswered."""
 CHECKS = [
     not_a_server_error,
     status_code_conformance,
@@ -63,7 +63,7 @@ class FuzzedServer:
         return answer.status_code, answer.elapsed - _requested_wait_s(case)
 
     def _headers(self, name: str, case: AnyCase) -> dict[str, str]:
-        """Return the credential of a caller; a request that signs out gets a token of its own."""
+        """Return the headers with the caller's credential; a request that signs out gets a new token."""
         token = self.house.tokens[name]
         if case.operation.label.endswith("/logout"):
             wanted = {"name": "fuzz", "scopes": ["read"]}
@@ -72,7 +72,7 @@ class FuzzedServer:
         return {"Authorization": f"Bearer {token}"} if token else {}
 
     def requests(self, operation: AnyOperation, mode: GenerationMode) -> Iterator[Any]:
-        """Yield strategies of requests for contents of the project, and for objects that do not exist."""
+        """Yield two strategies: one generates requests for contents of the project, one for random ids."""
         names = {parameter.name for parameter in operation.path_parameters}
         nothing: dict[str, str] = {}
         for known in (self.house.variables, nothing):
@@ -109,7 +109,7 @@ def operations() -> list[AnyOperation]:
 
 
 def probes() -> Iterator[tuple[AnyOperation, GenerationMode, str]]:
-    """Yield operations with valid requests, and with invalid ones if the operation has anything to get wrong."""
+    """Yield each operation for valid requests, and again for invalid ones if it has a query or a body; with a name."""
     for operation in operations():
         yield operation, GenerationMode.POSITIVE, f"{operation.label} fitting"
         if operation.query or operation.body:

@@ -1,6 +1,6 @@
-"""A malicious client: for every route and every kind of caller, it sends requests that cost much or confuse.
+"""A malicious client: to every route, as every kind of caller, it sends requests that cost much or confuse the server.
 
-It keeps no list of routes of its own. A shot is a request as bytes and the manner in which they are sent.
+The routes come from the server's table of routes. A shot is a request as bytes, with the manner of sending these bytes.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from marey_schemas.encoding import blocks
 from marey_server.http.routes import Route
 
 SMALL_BYTES = 10_000
-"""Size of the requests whose cost is bounded."""
+"""Largest size in bytes of a request whose cost is limited by the tests."""
 ATTACKED = {"MAREY_LEASE_TTL_S": "3600", "MAREY_BODY_TIMEOUT_S": "5", "MAREY_HEADER_TIMEOUT_S": "5"}
-"""Variables of a server under attack: short timeouts, so that refused connections soon end, and leases that last."""
+"""Environment of a server under attack: short timeouts, so that refused connections soon end, and long leases."""
 HANGS_S = 120.0
 """Time without an answer after which a test says that the server hangs; much longer than any busy machine takes."""
 ENDS_CREDENTIALS = ("/logout", "/complete", "/fail", "/leases/completions")
-"""Ends of routes after which the credential of the caller may do nothing more; they are sent last."""
+"""Endings of routes that end the credential of the caller; requests to these routes are sent last."""
 
 
 class Manner(StrEnum):
@@ -60,7 +60,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Shot:
-    """Malicious request as bytes; `refusal` contains the statuses of a refusal of its caller."""
+    """Malicious request as bytes; `refusal` contains the statuses with which the server may refuse the caller."""
 
     route: str
     person: str
@@ -77,7 +77,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Answer to a malicious request: its status, None if the connection closed without one, and its time in seconds."""
+    """Answer to a malicious request: status (None if the connection closed without an answer) and time in seconds."""
 
     shot: Shot
     status: int | None
@@ -140,7 +140,7 @@ _BODIES = {
     "a compressed body": (_JSON, gzip.compress(b"[" * 8_000_000)),
     **{f"a {name} that unpacks": ("multipart/form-data; boundary=b", content) for name, content in _bombs()},
 }
-"""Bodies of up to 10 kB that cost much where they are decoded without a limit, with their media types."""
+"""Media types and bodies of up to 10 kB; a server that decodes them without a limit uses much time or memory."""
 _BIG = b'{"name":"' + b"x" * 3_000_000 + b'"}'
 
 
@@ -193,7 +193,7 @@ def _bytes_of(plan: Planned, shape: Shape, token: str | None) -> bytes:
 def shots(
     house: House, people: Iterable[str] = tuple(PEOPLE), *, routes: Callable[[Route], bool] = lambda _route: True
 ) -> list[Shot]:
-    """Return every attack on every route by each of the callers; those that may end a credential are last."""
+    """Return every attack on every route by each of the callers; attacks that may end a credential are last."""
     found = []
     for route in sorted(filter(routes, ROUTES), key=lambda route: route.template.endswith(ENDS_CREDENTIALS)):
         plan = house.plan(route)
@@ -207,7 +207,7 @@ def shots(
 
 
 def some(every: list[Shot], count: int, seed: int) -> list[Shot]:
-    """Return a part of the attacks, in their order, that contains every route and every kind of attack."""
+    """Return about `count` attacks in the given order; at most one, by a random caller, for each route and attack."""
     chance = random.Random(seed)
     by_attack: dict[tuple[str, str], list[int]] = {}
     for number, shot in enumerate(every):

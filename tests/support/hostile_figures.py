@@ -1,9 +1,11 @@
 """Measurement of a server under attack, and of its effects on other clients: `python -m tests.support.hostile_figures`.
 
-Options: `--seconds` of the crowd of 200 connections, 0 for none, `--shots` of those that are sent one after another to
-measure their cost, `--database` for another database than SQLite. Figures to reach on two processors: no request of up
-to 10 kB takes more than 50 ms of processor time or 20 MB; the server stays below 600 MB; 99 of 100 answers to a
-well-behaved client come within 250 ms, heartbeats within 2 s, and `/readyz` within 1 s.
+Options: `--shots` is the number of requests that are sent one after another to measure their cost, `--seconds` the
+duration of the attack over 200 connections (0 for none), `--database` the address of a database other than SQLite.
+
+Goals on two processors: no request of up to 10 kB takes more than 50 ms of processor time or 20 MB; the server stays
+below 600 MB; a well-behaved client gets 99 of 100 answers within 250 ms, the answer to a heartbeat within 2 s, and the
+answer of `/readyz` within 1 s.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ CONNECTIONS = 200
 SEED = 20261123
 WORST = 12
 STARTING_S = 120.0
-"""Time in seconds in which the children of a new server have loaded their modules."""
+"""Longest time in seconds to wait until the children of a new server have loaded their modules."""
 _EVERY_S = 0.05
 Row = tuple[float, float, Outcome]
 """Processor time in milliseconds and memory in MB that a shot cost, and its outcome."""
@@ -122,7 +124,7 @@ def _said(outcome: Outcome) -> str:
 
 
 def attack(url: str, every: Sequence[Shot], seconds: float, nice: int, begun: Event) -> None:
-    """Send malicious requests over 200 connections for a time; print the faults, and the processor time of sending."""
+    """Send malicious requests over 200 connections for `seconds`; print faults, and how busy this program was."""
     os.nice(nice)
     begun.set()
     start, processor = time.monotonic(), time.process_time()
@@ -143,7 +145,7 @@ def attack(url: str, every: Sequence[Shot], seconds: float, nice: int, begun: Ev
 def companions_of(house: House) -> list[Companion]:
     """Return a reader, a worker that sends heartbeats, and a client that requests `/readyz`.
 
-    Reader and attempt have tokens of their own, which no hostile client has.
+    The reader and the worker have tokens of their own, which no hostile client uses.
     """
     people = house.people
     reader = people.client(people.make_user("visitor"))

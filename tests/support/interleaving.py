@@ -16,10 +16,10 @@ from marey_server.store.database.connections import Database
 from marey_server.store.transaction import Transaction
 
 Action = Callable[..., Any]
-"""Takes the transaction in which it runs."""
+"""Function that runs in a transaction, which is its argument."""
 
 HEAD_START_S = 0.1
-"""How long the second transaction may run, or wait for the first one's locks, before the first commits."""
+"""Time for which the second transaction may run, or wait for locks of the first, before the first one commits."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Abandoned(Exception):
 
 
 def interleave(first: Step, second: Step, *, commit: bool = True) -> tuple[Any, Any]:
-    """Run two transactions interleaved; return their results or errors. Without `commit`, the first rolls back."""
+    """Interleave two transactions; return the result or error of each. Without `commit`, the first rolls back."""
     wrote, may_end = threading.Event(), threading.Event()
 
     def held_open(tx: Transaction) -> Any:

@@ -13,7 +13,7 @@ HZ = 60.0
 
 
 def chain(joints: int = 4) -> Skeleton:
-    """Return an upright chain of bones of 30 cm above a root, with a tip at its end."""
+    """Return an upright chain of bones of 30 cm each above a root; the chain ends with a tip."""
     offsets = np.zeros((joints, 3))
     offsets[1:, 1] = 0.3
     parents = np.arange(-1, joints - 1, dtype=np.int32)
@@ -37,7 +37,7 @@ def as_motion(poses: Floats) -> Motion:
 def aligned_set(
     skeleton: Skeleton, poses: Floats, time_functions: Floats | None = None, keyframes: dict[str, int] | None = None
 ) -> AlignedSet:
-    """Return a set of examples with these poses (m, N, 3 + 4·J) and time functions (m, N), by default the identity."""
+    """Return examples with these poses (m, N, 3 + 4·J) and time warps (m, N); by default, times are not warped."""
     clips = []
     for index, one in enumerate(poses):
         times = np.arange(len(one), dtype=float) if time_functions is None else time_functions[index]
@@ -48,7 +48,7 @@ def aligned_set(
 
 
 def warps(count: int, frames: int, seed: int = 0) -> Floats:
-    """Return time functions (count, N), each with its own varying slope."""
+    """Return time warps (count, N), each with its own varying slope."""
     random = np.random.default_rng(seed)
     phase = np.linspace(0.0, np.pi, frames - 1)
     slopes = np.exp(
@@ -69,7 +69,7 @@ def bending_chains(count: int = 20, frames: int = 30, seed: int = 0, joints: int
 
 
 def walks(count: int = 16, frames: int = 40, seed: int = 0) -> AlignedSet:
-    """Return a set of generated walks of many speeds and turn rates, which begin in the same phase."""
+    """Return a set of generated walks of many speeds and turn rates; all begin in the same phase of the gait."""
     random = np.random.default_rng(seed)
     clips = [generate_gait(0.9 + 0.7 * random.random(), 0.3 * random.standard_normal(), 1.0) for _ in range(count)]
     poses = np.stack([Motion.of(clip).at_frames(np.arange(frames)).poses for clip in clips])

@@ -37,7 +37,7 @@ def bvh(
     frames: int | str | None = None,
     frame_time: str = "0.01",
 ) -> bytes:
-    """Return a BVH file with these lines of numbers; the header declares their count, or `frames`."""
+    """Return a BVH file with `rows` as lines of numbers; its header declares `frames` frames, or one for each row."""
     declared = len(rows) if frames is None else frames
     return (
         hierarchy + f"MOTION\nFrames: {declared}\nFrame Time: {frame_time}\n" + "".join(f"{r}\n" for r in rows)

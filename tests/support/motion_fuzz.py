@@ -1,7 +1,7 @@
 """Fuzzing of readers: randomly broken motion files must give a motion or an error of the reader, in bounded time.
 
-As a program it runs for the given seconds of processor time: `python -m tests.support.motion_fuzz 3600 [seed]`. A file
-that makes a reader fail otherwise is kept in the current folder.
+As a program, `python -m tests.support.motion_fuzz SECONDS [SEED]` runs for this many seconds of processor time. A file
+for which a reader does anything else is kept in the current folder.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class TooSlow(BaseException):
 
 @functools.cache
 def seeds() -> tuple[Seed, ...]:
-    """Return one valid file for each format and form: (name, file, companion)."""
+    """Return one valid file for each format and variant: (name, file, companion file or None)."""
     clip = generate_gait(1.2, 0.0, 0.2, 30.0)
     skeleton = write_predecessor_skeleton(clip.skeleton)
     six = f"{POSITIONS} {ZXY}"
@@ -63,7 +63,7 @@ def seeds() -> tuple[Seed, ...]:
 
 
 def broken(data: bytes, source: random.Random) -> bytes:
-    """Return the file with one to eight pieces removed, doubled, swapped, overwritten or inserted."""
+    """Return the file with one to eight random changes: pieces are removed, repeated, copied, replaced or inserted."""
     text = bytearray(data)
     for _ in range(source.randint(1, 8)):
         start = source.randint(0, len(text))
@@ -120,8 +120,6 @@ def main(seconds: float, seed: int) -> None:
     """Break files for the given processor time, and print the number of each outcome.
 
     Processor time is measured because wall time says nothing about the reader on a busy machine.
-
-    Processor time, since on a busy machine the clock on the wall says nothing about the reader.
     """
     source, files, outcomes = random.Random(seed), seeds(), Counter[str]()
     signal.signal(signal.SIGPROF, _stop)

@@ -1,4 +1,4 @@
-"""Models in every layout of the predecessor, made of random numbers with a fixed seed."""
+"""Models in every file layout of Marey's predecessor, made of random numbers with a fixed seed."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -18,7 +18,7 @@ FRAMES, SPATIAL, TEMPORAL = 48, 5, 3
 COEFFICIENTS, TIME_COEFFICIENTS = 9, 8
 SKELETON = generate_gait(1.0, 0.0, 1.0).skeleton
 ANIMATED = SKELETON.joint_names[:12]
-"""The others of the skeleton rest."""
+"""Joints that move; the other joints of the skeleton keep their rest pose."""
 
 
 def knots(coefficients: int) -> list[float]:
@@ -38,7 +38,7 @@ def space(generator: Generator, joints: tuple[str, ...]) -> tuple[list[float], l
 
 
 def time(generator: Generator) -> tuple[list[float], list[list[float]]]:
-    """Return the mean and the components of the logarithms of time steps, with one component in each row."""
+    """Return the mean and the components of the logarithms of time steps; each row is a component."""
     steps = np.diff(np.linspace(0.0, FRAMES - 1.0, TIME_COEFFICIENTS) + 1.0, prepend=0.0)
     mean = np.log(steps) + generator.normal(scale=0.05, size=TIME_COEFFICIENTS)
     mean[0] = 0.0
@@ -91,7 +91,7 @@ def flat(seed: int = 1, joints: tuple[str, ...] = ANIMATED) -> dict[str, Any]:
 
 
 def layout_2(seed: int = 1, *, by_columns: bool = True) -> dict[str, Any]:
-    """Return a document of layout 2, by the first trainer, with components of time in columns, or by the later one."""
+    """Return a document of layout 2. With `by_columns`, components of time are columns, as from the first trainer."""
     mean, vectors = time(np.random.default_rng(seed + 100))
     if by_columns:
         mean = (0.02 * np.random.default_rng(seed).normal(size=TIME_COEFFICIENTS)).tolist()
@@ -130,7 +130,7 @@ LAYOUTS: dict[str, Callable[[], dict[str, Any]]] = {
 
 
 def tree(generator: Any = None) -> dict[str, Any]:
-    """Return a cluster tree over 40 samples in which each node has up to four children, and each leaf one sample."""
+    """Return a cluster tree of 40 samples; each inner node has up to four children, and each leaf has one sample."""
     generator = generator or np.random.default_rng(7)
     data = generator.normal(size=(40, SPATIAL + TEMPORAL))
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 _TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 _QUIET_S = 0.0005
-"""Processor time within two hundredths of a second below which a process is idle."""
+"""A process is idle if it uses less processor time than this within 0.02 s."""
 
 
 class ProcessCost:
@@ -19,7 +19,7 @@ class ProcessCost:
         self.pid = pid
 
     def processor_s(self) -> float:
-        """Return the processor time used so far in seconds, including that of ended children."""
+        """Return the processor time used so far in seconds, including the time used by children that have ended."""
         total = self._ended_children_s()
         for pid in self._family():
             for task in Path(f"/proc/{pid}/task").glob("*/schedstat"):
@@ -28,11 +28,11 @@ class ProcessCost:
         return total
 
     def peak_mb(self) -> float:
-        """Return the greatest resident memory since `reset_peak` in MB, summed over the processes that live."""
+        """Return the sum of the greatest resident memory of each running process since `reset_peak`, in MB."""
         return sum(self._status_kb(pid, "VmHWM") for pid in self._family()) / 1e3
 
     def resident_mb(self) -> float:
-        """Return the resident memory of the process in MB."""
+        """Return the resident memory of the process and its children in MB."""
         return sum(self._status_kb(pid, "VmRSS") for pid in self._family()) / 1e3
 
     def own_peak_mb(self) -> float:
@@ -40,13 +40,13 @@ class ProcessCost:
         return self._status_kb(self.pid, "VmHWM") / 1e3
 
     def reset_peak(self) -> None:
-        """Start to measure the peak of the memory from the present value."""
+        """Set the measured peak of the memory to the present value."""
         for pid in self._family():
             with contextlib.suppress(OSError):
                 Path(f"/proc/{pid}/clear_refs").write_text("5")
 
     def wait_until_idle(self, longest_s: float = 1.0) -> None:
-        """Wait until the process does nothing, so that work after the answer is measured, too."""
+        """Wait until the process is idle, so that work that the server does after its answer is measured, too."""
         deadline = time.monotonic() + longest_s
         before = self.processor_s()
         while time.monotonic() < deadline:
@@ -80,5 +80,5 @@ class ProcessCost:
 
 
 def _fields(stat: Path) -> list[str]:
-    """Return the fields of a line of /proc that follow the name of the process."""
+    """Return the fields of a `/proc/<pid>/stat` file that follow the name of the process."""
     return stat.read_text().rpartition(")")[2].split()

@@ -1,4 +1,4 @@
-"""Project in memory for tests of the functions of job kinds, and a small evaluation."""
+"""Project in memory for tests of the functions that run jobs, and a small evaluation."""
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence

@@ -57,7 +57,7 @@ ERRAND = KindDeclaration(
 )
 SUM = KindDeclaration(
     name="sum",
-    description="Computes the same from the same.",
+    description="Computes equal results from equal inputs.",
     params=Params,
     implementation="tests:sum",
     version=1,
@@ -119,7 +119,7 @@ KINDS = {kind.name: kind for kind in (*job_kinds.BUILT_IN, ERRAND, SUM, SQUARE, 
 
 @dataclass
 class Desk:
-    """User who submits jobs to the project `lab` and also runs them."""
+    """User who submits jobs to the project `lab` and also runs these jobs."""
 
     database: Database
     clock: AdjustableClock
@@ -252,7 +252,7 @@ def _as_attempt(lease: Lease) -> Principal:
 
 
 def document(**facts: Any) -> dict[str, Any]:
-    """Return a small document with these members, whose schema allows any member."""
+    """Return a small document with these members; its schema allows any member."""
     return {"schema": "marey/document@1", **facts}
 
 

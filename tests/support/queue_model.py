@@ -35,12 +35,12 @@ class ModelJob:
     cancel_requested: bool = False
     signatures: set[str] = field(default_factory=set)
     answers: dict[tuple[int, str], str] = field(default_factory=dict)
-    """Answers of `complete` and `fail`, the new state of the job, by fence and write id."""
+    """Answers to the requests `complete` and `fail` (the new state of the job), by fence and write id."""
 
 
 @dataclass
 class ModelQueue:
-    """All jobs of the model and the operations on them. Callers pass the time."""
+    """All jobs of the model, and the operations on jobs. Callers pass the present time."""
 
     jobs: dict[str, ModelJob] = field(default_factory=dict)
 
@@ -81,7 +81,7 @@ class ModelQueue:
         job.lease_expires_us = min(now_us + TTL_US, job.deadline_us + GRACE_US)
 
     def write(self, job_id: str) -> None:
-        """Count the attempt of a running job as a try when it writes for the first time."""
+        """Count the attempt that holds a running job as a try, if this is its first write."""
         job = self.jobs[job_id]
         job.attempt += not job.started
         job.started = True
@@ -92,7 +92,7 @@ class ModelQueue:
         self.renew(job_id, now_us)
 
     def complete(self, job_id: str, fence: int, write_id: str) -> str:
-        """End a job that is held, with success unless it was cancelled; return its state."""
+        """Complete a job that an attempt holds; return the new state, `succeeded` or `cancelled`."""
         job = self.jobs[job_id]
         state = "cancelled" if job.cancel_requested else "succeeded"
         if not job.cancel_requested:
@@ -112,7 +112,7 @@ class ModelQueue:
         interrupted: bool,
         signature: str | None,
     ) -> None:
-        """End an attempt that is held, without success."""
+        """End the attempt that holds a job, without success."""
         self.write(job_id)
         job = self.jobs[job_id]
         state = self._after_failure(job, now_us, retryable, interrupted, signature)

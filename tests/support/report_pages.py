@@ -12,7 +12,7 @@ HOSTILE = (
     "\x00\u202egnp",
     "",
 )
-"""Names that would do harm where they were not escaped."""
+"""Names that would do harm in a page that does not escape them."""
 
 
 class Page(HTMLParser):
@@ -62,7 +62,7 @@ class Page(HTMLParser):
 
 
 def is_sound(source: str) -> Page:
-    """Check a page and return it: tags are balanced, ids are unique, and there are no external resources or scripts."""
+    """Check that a page has balanced tags, unique ids, no external resources and one script; return it parsed."""
     page = Page(source)
     assert set(page.ids.values()) == {1}
     for link in page.links:

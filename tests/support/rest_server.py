@@ -24,7 +24,7 @@ from marey_server.store.database.connections import Database
 ALL_SCOPES = ("read", "write", "jobs", "work", "admin")
 USER_SCOPES = ("read", "write", "jobs")
 PATIENCE_S = 240
-"""Longest wait for an answer, a little shorter than a test may take: machines do other things at the same time."""
+"""Longest wait for an answer in seconds: long, because machines may be busy, but shorter than the limit of a test."""
 
 
 @dataclass
@@ -56,7 +56,7 @@ class People:
         return self.database.write(principal, tokens.create_token, TokenCreate(name="test", scopes=scopes)).secret
 
     def make_project(self, name: str = "lab", *, owner: str = "olga", **others: Role) -> str:
-        """Create a project, with the users in `others` as members; return the token of its owner."""
+        """Create an owner and a project, with the existing users in `others` as members; return the owner's token."""
         token = self.make_user(owner)
         person = self.database.read(SYSTEM, tokens.resolve_token, token)
         self.database.write(person, projects.create_project, ProjectCreate(name=name))

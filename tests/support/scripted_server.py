@@ -16,7 +16,7 @@ Answer = httpx.Response | Exception | Callable[[httpx.Request], httpx.Response]
 def problem(
     status: int, code: str, *, retry_after: int | None = None, detail: str = "the reason", **members: Any
 ) -> httpx.Response:
-    """Return a refusal in the form of the server's problem documents, with further members."""
+    """Return an error response with a problem document, as the server sends it; `members` are further members."""
     document = {
         "type": "about:blank", "title": "t", "status": status, "detail": detail, "instance": "req-1", "code": code,
     }  # fmt: skip
@@ -27,7 +27,7 @@ def problem(
 
 
 class ScriptedServer:
-    """Prepared answers, which are sent one after another, and the received requests with the waits between them."""
+    """Answers that are sent one after another, the received requests, and the seconds that a real client would wait."""
 
     def __init__(self) -> None:
         self.answers: list[Answer] = []

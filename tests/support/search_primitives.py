@@ -45,7 +45,7 @@ def walk_poses(speed_m_s: float, turn_rate_rad_s: float) -> tuple[Skeleton, Floa
 
 @cache
 def walking(components: int = 6, mixtures: int = 2) -> tuple[MotionPrimitive, Floats]:
-    """Return a model of walks that differ in speed and turn rate, and the latent vectors (m, L) of its examples."""
+    """Return a model of walks that differ in speed and turn rate, and the latent vectors (m, L) of the examples."""
     rng = np.random.default_rng(5)
     speeds, turns = rng.uniform(0.8, 1.6, 40), rng.uniform(-0.6, 0.6, 40)
     made = [walk_poses(speed, turn) for speed, turn in zip(speeds, turns, strict=True)]
@@ -68,7 +68,7 @@ def walking(components: int = 6, mixtures: int = 2) -> tuple[MotionPrimitive, Fl
 
 
 def mixture_of(latents: Floats, count: int) -> LatentMixture:
-    """Return a mixture of `count` Gaussians, one for each group of latent vectors with similar first numbers."""
+    """Return a mixture of `count` Gaussians, one for each group of latent vectors with similar first components."""
     parts = np.array_split(latents[np.argsort(latents[:, 0], kind="stable")], count)
     floor = 0.05 * np.eye(latents.shape[1])
     return LatentMixture(

@@ -25,10 +25,10 @@ from marey_server.store.fsck import check_store
 
 PORTS = range(20_000, 30_000)
 READY_S = 120.0
-"""A machine that does much else at once takes its time."""
+"""Longest time in seconds until a server is ready; long, because the machine may be busy."""
 
 PATIENT = Retries(tries=400, first_s=0.1, longest_s=1.0, total_s=1.5 * READY_S)
-"""Outlasts a server that takes all its time to start again."""
+"""Retries that last longer than the slowest allowed restart of a server."""
 QUICK_LEASES = {"MAREY_LEASE_TTL_S": "3", "MAREY_HEARTBEAT_S": "0.5", "MAREY_CANCEL_GRACE_S": "2"}
 
 
@@ -148,7 +148,7 @@ class WorkerProcess(MareyProcess):
 
 @contextlib.contextmanager
 def serving(folder: Path, database_url: str | None = None) -> Iterator[ServerProcess]:
-    """Run a server with one worker inside the block; check its exit status at the end."""
+    """Run a server with one worker while the `with` block runs; then check the server's exit status."""
     process = ServerProcess(folder, database_url).start(workers=1)
     try:
         yield process
@@ -161,10 +161,10 @@ _RESERVED: list[socket.socket] = []
 
 
 def reserved_port() -> int:
-    """Return a port for a server that starts on it again and again; no other test gets it while this process runs.
+    """Return a port for a server that is restarted on the same port; no other test gets it while this process runs.
 
-    Systems give none of these ports to sockets that ask for any port. A datagram socket, which disturbs no server,
-    keeps it from the other processes that run tests.
+    The port is in a range from which the system chooses no port for sockets that ask for any free port. A datagram
+    socket that is bound to the port reserves it among the processes that run tests, and does not disturb the server.
     """
     for port in random.SystemRandom().sample(PORTS, 100):
         reserving, probe = socket.socket(type=socket.SOCK_DGRAM), socket.socket()

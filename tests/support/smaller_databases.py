@@ -1,4 +1,4 @@
-"""Databases without some clips or rows, for comparison with results that are computed without removing them."""
+"""Databases without some clips or rows, to check results that predict the effect of removing clips or rows."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 
 
 def without_sources(database: MatchingDatabase, sources: Collection[str]) -> MatchingDatabase:
-    """Return the database without the clips of these sources. Raises `MotionError` if one is unknown or none is
-    left."""
+    """Return the database without the clips of these sources.
+
+    Raises `MotionError` if a source is unknown, or no clip is left.
+    """
     removed = rows_of_sources(database.clips, sources)
     return _gathered(database, [clip for clip in database.clips if not removed[clip.start]], ~removed)
 
@@ -24,8 +26,8 @@ def without_sources(database: MatchingDatabase, sources: Collection[str]) -> Mat
 def without_rows(database: MatchingDatabase, removed: Flags) -> MatchingDatabase:
     """Return the database without these rows (N,); the remaining parts of a clip become clips.
 
-    A part of a clip is named by its uid and its frames, as "walk#120-480". Its last row cannot be chosen, since nothing
-    follows it.
+    The uid of a part of a clip contains the uid of the clip and the frames, such as "walk#120-480". Searches cannot
+    choose the last row of a part, since no row follows.
     """
     selectable = database.selectable.copy()
     pieces = []
@@ -44,7 +46,7 @@ def without_rows(database: MatchingDatabase, removed: Flags) -> MatchingDatabase
 
 
 def _gathered(database: MatchingDatabase, clips: Sequence[DatabaseClip], kept: Flags) -> MatchingDatabase:
-    """Return the rows of `clips`, which are all that are `kept`, in one database."""
+    """Return a database with only `clips`; `kept` (N,) marks the rows of these clips in the given database."""
     if not clips:
         raise MotionError("no clip is left", code="no-clips")
     before = np.concatenate(([0], np.cumsum(kept)))

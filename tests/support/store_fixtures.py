@@ -30,7 +30,7 @@ def skeleton_tree(joints: int = 3, *, bone_m: float = 0.5) -> dict[str, Any]:
 def motion_tree(
     skeleton: Mapping[str, object] | Item, *, frames: int = 5, joints: int = 3, seed: int = 0
 ) -> dict[str, Any]:
-    """Return the document of a random motion of the chain; `skeleton` is an item, or a reference."""
+    """Return the document of a random motion of `skeleton_tree`; `skeleton` is an item, or a reference."""
     ref = {"item": skeleton.id, "revision": skeleton.revision} if isinstance(skeleton, Item) else skeleton
     poses = np.random.default_rng(seed).normal(size=(frames, 3 + 4 * joints)).astype("<f4")
     return {
@@ -52,7 +52,7 @@ WRITE = RequiredRole(Role.CONTRIBUTOR, "write")
 
 
 def requiring(required: RequiredRole, function: Callable[..., Any]) -> Any:
-    """Return a function that runs `function` as an operation that declares the role `required`."""
+    """Return a function that runs `function` as part of an operation that requires the role `required`."""
 
     def run(tx: Transaction, *args: Any, **kwargs: Any) -> Any:
         tx.required_role = required

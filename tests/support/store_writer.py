@@ -37,7 +37,7 @@ def publish(tx: Transaction) -> Any:
 
 
 def purge(database: Database, who: Principal) -> None:
-    """Purge all deleted items of `lab`, each in a transaction of its own."""
+    """Purge all deleted studies of `lab`, each in a transaction of its own."""
     deleted = database.read(who, items.list_items, "lab", Kind.STUDY, items.ItemFilters(deleted=True))
     for one in deleted.items:
         request = PurgeRequest(item=one.id)

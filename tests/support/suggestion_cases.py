@@ -71,7 +71,7 @@ def same_to_the_bit(
 
 
 def places(database: MatchingDatabase, rows: Ints32) -> list[tuple[str, int]]:
-    """Return clip and frame of each row; a row of a part of a clip has the name and the frame of the whole clip."""
+    """Return the uid of the clip and the frame of each row; parts of a clip count as the clip, with its frames."""
     found = []
     for index, row in zip(database.clip_of_row[rows].tolist(), rows.tolist(), strict=True):
         clip = database.clips[index]

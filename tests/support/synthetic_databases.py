@@ -59,7 +59,7 @@ def arc_track(speed_m_s: float, turn_rate_deg_s: float, seconds: float, phase: f
 
 
 def path_track(trial: Trial, **options: Any) -> Track:
-    """Return a root on the trajectory of a trial, and on the second after its end, to which its features look ahead."""
+    """Return a root on the path of a trial and its continuation by one second, to which the last rows look ahead."""
     path = reference(trial)
     return Track(path.positions, path.headings, gait_pose(len(path.headings), trial.speed_m_s), **options)
 
@@ -98,7 +98,7 @@ def synthetic_database(
     *,
     normaliser: Normaliser | None = None,
 ) -> MatchingDatabase:
-    """Return a database of the tracks in the given order; futures stop at the last frame, or continue a loop."""
+    """Return a database of the tracks, in this order; trajectories ahead stop at the last frame, or follow a loop."""
     options = options or DatabaseOptions()
     features: list[Floats] = []
     selectable: list[Flags] = []
@@ -169,9 +169,9 @@ def _features(track: Track, wraps: bool) -> NDArray[np.float64]:
 
 
 def _unwound(track: Track) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return headings and positions of a loop, followed by those of its next rounds.
+    """Return headings and positions of a loop that is played on past its end, as far as features look ahead.
 
-    The step from the last frame to the first one is the mean of its neighbours.
+    The step from the last frame to the first frame is the mean of the last step and the first step.
     """
     heading, position = track.headings, track.positions
 
@@ -213,7 +213,7 @@ def switches(record: TrialRecord) -> int:
 
 
 def on_the_circle(record: TrialRecord) -> tuple[np.ndarray, np.ndarray]:
-    """Return the speeds in m/s and the turn rates in deg/s after the approach."""
+    """Return speeds in m/s and turn rates in deg/s without the first three seconds, the straight approach."""
     speed = np.linalg.norm(np.diff(record.positions, axis=0), axis=1) * 60
     turn_rate = np.degrees(np.diff(record.headings)) * 60
     return speed[180:], turn_rate[180:]

@@ -12,8 +12,9 @@ from typing import Self
 class TcpProxy:
     """Forwards connections to `target_port` on the loopback interface.
 
-    `drop_requests` and `drop_answers` discard the bytes of that direction while they are set. `lose_answers` closes
-    connections when the server begins to answer: the server has done the work, but the client gets no answer.
+    While the event `drop_requests` is set, all bytes to the server are discarded; while `drop_answers` is set, all
+    bytes to the client. `lose_answers` closes connections when the server begins to answer: the server has done the
+    work, but the client gets no answer.
     """
 
     def __init__(self, target_port: int) -> None:

@@ -1,7 +1,7 @@
 """Tiers of tests: which tests `--tier` runs, how many examples property tests draw, and which tests share a process.
 
-`check` is for while you work, `test` for before a change lands, `soak` for before an issue is called resolved. Whatever
-a tier leaves out is counted, with the reason, at the end of the run.
+Run the tier `check` while you work, `test` before you merge a change, and `soak` before you call an issue resolved. At
+the end of a run, the tests that the tier left out are counted by reason.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ import pytest
 from tests.support.database_fixtures import BACKENDS
 
 MOCAP_VARIABLE = "MAREY_TEST_MOCAP"
-"""Names the folder of real motion capture."""
+"""Environment variable with the path of the folder of real motion capture."""
 EXAMPLES, STEPS = 100, 50
 """Number of examples that Hypothesis draws, and of steps that a state machine takes, in the tier `test`."""
 SOAK_EFFORT = 4
-"""Number of times as many examples that the tier `soak` draws, unless `--effort` gives another number."""
+"""Factor by which the tier `soak` draws more examples than the tier `test`, unless `--effort` gives another factor."""
 
 
 LONGEST_STEPS = 2
-"""Greatest multiple of the steps of a state machine; more machines find more than longer ones."""
+"""Greatest factor by which a tier increases `STEPS`; running more state machines finds more than longer runs."""
 
 
 @dataclass(frozen=True)
 class Tier:
-    """A tier of tests: the tests that it leaves out, with reasons, and the effort of generated tests."""
+    """A tier of tests: how many examples its generated tests draw, and which tests it leaves out, by reason."""
 
     effort: float
-    """Number of examples of generated tests, as a multiple of those of the tier `test`."""
+    """Number of examples of generated tests, divided by that of the tier `test`."""
     leaves_out: dict[str, Callable[[pytest.Item], bool]]
 
 
@@ -81,9 +81,10 @@ def _soak_only(item: pytest.Item) -> bool:
 
 
 def _on_other_database(item: pytest.Item) -> bool:
-    """Return whether a fault case or a whole way runs on the other database.
+    """Return whether the tier `test` leaves out a fault case or a workflow because it runs on the other database.
 
-    The name of the fault case, or of the module of the way, decides; so each database gets about half of them.
+    A hash of the name of the fault case, or of the workflow's module, chooses the database; so about half of these
+    tests run on each database.
     """
     backend = backend_of(item)
     if backend is None or item.get_closest_marker("every_database") or not (_fault(item) or _whole_way(item)):
@@ -115,7 +116,7 @@ TIERS = {
 
 
 LEFT_OUT = pytest.StashKey[Counter[str]]()
-"""How many tests the tier left out, by reason."""
+"""Key of the number of tests that the tier left out, by reason."""
 
 
 def examples(count: int) -> int:
@@ -173,9 +174,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect the tests to which a reason applies, count them, and group the others by process.
+    """Deselect and count the tests to which a reason applies, and mark each other test with its group.
 
-    First of all, because pytest-xdist reads the groups in the same hook.
+    This hook must run before that of pytest-xdist, which reads the groups.
     """
     reasons = TIERS[config.getoption("tier")].leaves_out
     if MOCAP_VARIABLE not in os.environ:
@@ -195,16 +196,17 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Stop if pytest-xdist has not read the groups; each process would make all shared data then."""
+    """Stop if pytest-xdist has not read the groups, because each process would then create all shared data."""
     if session.config.getoption("loadgroup", False) and not all("@" in item.nodeid for item in session.items):
         raise pytest.UsageError("pytest-xdist has not seen the groups of tests, see tests/support/tiers.py")
 
 
 def _group(item: pytest.Item) -> str:
-    """Return the group of tests that run in one process: those of a file, or all workflows with one database.
+    """Return the name of a test's group. One process runs all tests of a group.
 
-    Files that share data which take long to create name a group themselves. Fault cases share nothing, take long and
-    wait much, so each may run in any process.
+    The tests of a file are a group, and so are all workflows with one kind of database. Files that share data which
+    takes long to create name their group themselves. Each fault case is a group of its own: fault cases share nothing,
+    and they take long but mostly wait.
     """
     folder = _folder(item)
     if folder.startswith("integration/ways/"):
@@ -213,9 +215,10 @@ def _group(item: pytest.Item) -> str:
 
 
 def _in_order(items: Sequence[pytest.Item]) -> list[pytest.Item]:
-    """Return the tests in the order in which processes start them: large groups first, and fault cases among them.
+    """Return the tests in the order in which processes start them: large groups first, with fault cases in between.
 
-    Fault cases mostly wait, so they should run beside tests that compute; other large groups would end last, alone.
+    Large groups that start late would run alone at the end. Fault cases mostly wait, so they are spread among tests
+    that compute.
     """
     groups: defaultdict[str, list[pytest.Item]] = defaultdict(list)
     for item in items:
@@ -238,7 +241,7 @@ def _group_of(item: pytest.Item) -> str:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Send the counts of a process of pytest-xdist to the process that prints them."""
+    """Send the counts from a worker process of pytest-xdist to the main process, which prints them."""
     output = getattr(session.config, "workeroutput", None)
     if output is not None:
         counts: Counter[str] = session.config.stash[LEFT_OUT]
@@ -255,7 +258,7 @@ def pytest_report_header() -> str:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node: object) -> None:
-    """Take the counts of one process only, because each process has collected all tests."""
+    """Keep the counts of only one worker process, because each process has collected all tests."""
     config: pytest.Config = node.config  # type: ignore[attr-defined]
     config.stash[LEFT_OUT] = Counter(getattr(node, "workeroutput", {}).get("left_out", {}))
 

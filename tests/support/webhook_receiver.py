@@ -36,7 +36,7 @@ IQCXA6VAHlmloaSzEU1Z26+aNoj8t5YTwokj2CZuq88mRQIgO0bgCMX9rHuaRWFT
 KJr2O8GJlqONEqbhOT46ZXvv/OM=
 -----END CERTIFICATE-----
 """
-"""Certificate of 127.0.0.1 that no authority has signed, and its key, which nothing else uses."""
+"""Self-signed certificate of 127.0.0.1, and its private key, which is used only here."""
 
 
 @dataclass

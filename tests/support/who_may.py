@@ -1,7 +1,7 @@
 """Model of the rights of callers: the kinds of callers, and how each operation answers each of them.
 
-It repeats the rules of the server on purpose, in a second form, so that tests can compare the two. The table of
-docs/explanation/threat-model.md is compared with it, too.
+The model repeats the rules of the server on purpose, in a second form, so that tests can compare the two forms. The
+table in docs/explanation/threat-model.md is compared with the model, too.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ SIGN_IN, FORBIDDEN, HIDDEN, OVER = frozenset({401}), frozenset({403}), frozenset
 class Person:
     """Kind of caller of the project `lab`.
 
-    `standing` states the kind of the credential: none, one that the server refuses, one of a user, or one of an attempt
-    in `lab` that is running or has ended.
+    `standing` is the kind of the credential: no credential (`none`), one that the server refuses (`refused`), that of a
+    user (`user`), or that of an attempt in `lab` that is running (`attempt`) or has ended (`ended`).
     """
 
     name: str
@@ -41,12 +41,12 @@ class Person:
         return scope is None or any(held.partition("!")[0] == scope for held in self.scopes)
 
     def reaches(self, project: str) -> bool:
-        """Return whether a scope of the credential applies to the project `lab`."""
+        """Return whether a scope of the credential applies to `project`."""
         return any(held.partition("!project=")[2] in ("", project) for held in self.scopes)
 
     @property
     def rank(self) -> int:
-        """The rank of the caller's role in `lab`, -1 without one."""
+        """The rank of the caller's role in `lab`, -1 without a role."""
         if not self.reaches("lab"):
             return -1
         role = Role.OWNER if self.administrator else self.role
@@ -96,9 +96,9 @@ def _of_guest(operation: Operation, *, public: bool) -> frozenset[int]:
 
 
 def _of_attempt(person: Person, operation: Operation) -> frozenset[int]:
-    """Return the statuses that an operation may answer to the token of an attempt.
+    """Return the statuses with which an operation refuses the token of an attempt, or `LET_THROUGH`.
 
-    A running attempt may use the operations for attempts; one that has ended may only repeat its last request.
+    A running attempt may use the operations for attempts; an attempt that has ended may only repeat its last request.
     """
     if person.standing == "ended":
         return LET_THROUGH if operation.replays else OVER
@@ -128,7 +128,7 @@ def _of_outsider(operation: Operation, *, public: bool) -> frozenset[int]:
 
 
 def table() -> str:
-    """Return the Markdown table of the page on threats: one line per kind of caller, one column per access."""
+    """Return the Markdown table of the threat model page: one row per kind of caller, one column per `Access`."""
     words = {LET_THROUGH: "yes", SIGN_IN: "401", FORBIDDEN: "403", HIDDEN: "404", OVER: "409"}
     columns = [access for access in Access if access is not Access.ANYONE]
     lines = ["| caller | " + " | ".join(access.value for access in columns) + " |", "|---" * (len(columns) + 1) + "|"]
@@ -142,7 +142,7 @@ _SCOPES = {Access.ADMINISTRATOR: "admin", Access.WORKER: "work", Access.ATTEMPT:
 
 
 def _sample(access: Access) -> Operation:
-    """Return an operation of an access that guests of public projects may perform, with the usual scope."""
+    """Return an operation with this `Access` and the usual scope, which guests may perform in public projects."""
     usual = "read" if access in (Access.READER, Access.SIGNED_IN, Access.USER) else "write"
     return Operation(
         "GET", "", "", access, _SCOPES.get(access, usual), None, None, None, 200, paged=False, etag=False,

@@ -1,4 +1,4 @@
-"""Model of invitations: who may create, see and use them, beside the model of all other calls."""
+"""Model of invitations: who may create, see and use them, in addition to the model of all other calls."""
 
 from __future__ import annotations
 

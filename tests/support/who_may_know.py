@@ -1,7 +1,7 @@
 """Model of what callers may know: all contents of projects in memory, and the answers that each caller gets.
 
-Projects, users, items and bytes carry marks in their texts. After every call the answer must have the status of the
-model, contain what the caller asked for, and contain no mark of a project that the caller may not read.
+Projects, users, items and files have marks in their contents. The answer to each call must have the status that the
+model expects, contain what the caller asked for, and contain no mark of a project that the caller may not read.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ DIGESTS = tuple(f"sha256:{hashlib.sha256(data).hexdigest()}" for data in BLOBS)
 
 @dataclass(frozen=True)
 class Caller:
-    """Credential: its user, and the only project to which it is bound, if any."""
+    """Credential of a user; if it is bound to a project, it is valid only there."""
 
     user: str | None
     bound: str | None = None
@@ -121,7 +121,7 @@ class World:
         return any(self.sees_contents(caller, project) and blob in self.items[project].values() for project in PROJECTS)
 
     def may_refer(self, caller: Caller, blob: int) -> bool:
-        """Return whether the caller may read a blob, or refer to it; a bound token counts only in its project."""
+        """Return whether the caller may read a blob and refer to it; a bound token may do so only in its project."""
         places = (caller.bound,) if caller.bound else (None, *PROJECTS)
         held = any((caller.user, place, blob) in self.held for place in places)
         if caller in ATTEMPTS.values():  # whose inputs name no blob
@@ -197,7 +197,7 @@ class Program:
 
     @property
     def kinds(self) -> tuple[Call, ...]:
-        """The kinds of calls; one that is named twice is made twice as often."""
+        """The kinds of calls; a kind that is listed twice is called twice as often."""
         return (
             self.read_project, self.list_projects, self.list_items, self.list_items, self.create_item, self.create_item,
             self.send_blob, self.read_blob, self.read_blob, self.ask_missing, self.put_member, self.remove_member,
@@ -344,7 +344,7 @@ class Program:
             self.world.uploads[answer.json()["id"]] = caller
 
     def read_upload(self, caller: Caller, _project: str) -> None:
-        """Read an upload with the credential that began it, or with one of another user."""
+        """Read an upload with the credential that began the upload, or with a credential of another user."""
         upload = self.chance.choice([*self.world.uploads, "upload_of_nobody"])
         sender = self.world.uploads.get(upload)
         if sender is not None and sender.user == caller.user and sender != caller:
@@ -370,7 +370,7 @@ class Program:
         return 200 if caller.user is None or scope in caller.scopes else 403
 
     def _changed(self, caller: Caller, project: str, status: int) -> int:
-        """Return the status of a change; a caller who may not read its result gets no content."""
+        """Return the status of a successful change: `status`, or 204 if the caller may not read the result."""
         return status if self.world.has(caller, "read", project) else 204
 
     def _user(self, caller: Caller, scope: str) -> int:
@@ -379,7 +379,7 @@ class Program:
         return self.world.refusal(caller) or (0 if scope in caller.scopes else 403)
 
     def _sends(self, caller: Caller) -> int:
-        """Return the status with which bytes are refused, or 0; a bound token sends them to its project."""
+        """Return the status with which uploaded bytes are refused, or 0; a bound token uploads bytes to its project."""
         if caller == ATTEMPTS["running"]:
             return 0
         role = self.world.role(caller, caller.bound) if caller.bound else Role.OWNER
@@ -390,7 +390,7 @@ class Program:
         return owners == [user]
 
     def _call(self, caller: Caller, method: str, path: str, expected: int, **rest: Any) -> httpx.Response:
-        """Send a request and return the answer; record a difference if its status or a mark in it is unexpected."""
+        """Send a request and return the answer; record a difference if the answer has an unexpected status or mark."""
         self.calls += 1
         answer = self.people.client(self.tokens[caller]).request(method, path, **rest)
         if answer.status_code != expected:

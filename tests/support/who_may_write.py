@@ -1,7 +1,7 @@
 """Model of who may write where: folders, items and roles in memory, and random calls whose outcomes it predicts.
 
-It repeats the rules of roles in folders in a second form: a role is looked up from folder to folder at the moment of
-the call, in dictionaries by the ids of folders.
+The model repeats the rules of roles in folders in a second form: at each call, it looks for the nearest role from the
+folder upwards, in a dictionary of each folder.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ROLES = f"{COLLECTIONS}/{{collection}}/roles/{{user}}"
 
 @dataclass
 class Folder:
-    """Folder of the model, with the roles in it by the kind of the member, or `*`."""
+    """Folder of the model, with the roles in this folder, by kind of member or `*` for all members."""
 
     id: str
     name: str
@@ -38,7 +38,7 @@ class Folder:
     roles: dict[str, Role] = field(default_factory=dict)
     deleted: bool = False
     deleted_at: str = ""
-    """Path at the time of the deletion, at which the folder would be restored."""
+    """Path of the folder when it was deleted; a restoration uses this path."""
 
     @property
     def line(self) -> Iterator[Folder]:
@@ -54,7 +54,10 @@ class Folder:
         return "/".join(one.name for one in reversed(list(self.line)) if one.name)
 
     def role(self, who: str) -> Role:
-        """Return the role of a member here: the nearest one of their own or of all members, or else of the project."""
+        """Return the member's role in this folder: the nearest role on the way up, or else the role in the project.
+
+        A role of the member comes before a role of all members in the same folder.
+        """
         if who == "owner":
             return Role.OWNER
         for folder in self.line:
@@ -116,12 +119,12 @@ class WritingProgram:
         return self.chance.choice([self.top, *self._alive()])
 
     def _below(self, folder: Folder) -> list[Folder]:
-        """Return a folder, and the folders below it that are not deleted separately."""
+        """Return a folder, and the folders below it that were not deleted on their own."""
         inside = [one for one in self.folders if folder in one.line]
         return [one for one in inside if one is folder or not any(up.deleted for up in _until(one, folder))]
 
     def _thing(self, *, deleted: bool = False) -> Thing | None:
-        """Return an item in a folder that exists; None if there is none."""
+        """Return a random item in a folder that exists; None if there is no such item."""
         there = {id(one) for one in (self.top, *self._alive())}
         found = [one for one in self.things if one.deleted is deleted and id(one.folder) in there]
         return self.chance.choice(found) if found else None
@@ -176,7 +179,7 @@ class WritingProgram:
     def _on(
         self, who: str, thing: Thing, method: str, path: str, function: Any, *args: Any, allowed: bool | None = None
     ) -> bool:
-        """Call a function for an item; by default, the model expects success for contributors in its folder."""
+        """Call a function for an item; by default, the model expects success for contributors in the item's folder."""
         expected = thing.folder.allows(who, Role.CONTRIBUTOR) if allowed is None else allowed
         state = {"expected_rev": None}
         given = (Kind.SKELETON, thing.id, *args)
@@ -232,7 +235,7 @@ class WritingProgram:
             folder.deleted, folder.above = False, self._made(above)
 
     def _is_free(self, folder: Folder) -> bool:
-        """Return whether a deleted folder can be restored at its path, and no other deleted folder was at this path."""
+        """Return whether a deleted folder can be restored at its path, to which no other folder has a claim."""
         alive = {id(one) for one in self._alive()}
         line = {one.path: one for one in folder.line}
         others = [one for one in self.folders if line.get(one.path, one) is not one]
@@ -249,7 +252,7 @@ class WritingProgram:
         return self.top
 
     def _made(self, path: str) -> Folder:
-        """Return the folder at a path; the restoration of a folder below has created it if it did not exist."""
+        """Return the folder at a path. If the model lacks it, a restoration below has created it, and it is added."""
         found = self._nearest(path)
         if found.path == path:
             return found

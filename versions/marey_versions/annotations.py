@@ -139,12 +139,12 @@ def merge_segments(
     """Combine the segments that two sides have added and removed.
 
     The result has the segments that both sides have kept, and those that one side has added. Two changes exclude each
-    other if both sides have added different segments that overlap, or if both have removed a segment and have not
-    added the same segments in its place.
+    other in two cases: the sides have added different segments that overlap, or both sides have removed a segment and
+    have not added the same segments in its place.
 
     Parameters
     ----------
-    base, ours, theirs : segments in any order; those of one side do not overlap
+    base, ours, theirs : segments in any order; segments of the same side do not overlap
 
     Returns
     -------

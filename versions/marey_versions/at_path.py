@@ -50,7 +50,7 @@ class ChangeAtPath:
 
 @dataclass
 class PathComparer:
-    """Comparison of versions at one path, which counts the entries that it has read."""
+    """Comparer of versions at one path; it counts the entries that it has read."""
 
     reader: ChunkReader
     path: str
@@ -61,7 +61,7 @@ class PathComparer:
     """Number of differing entries that were read."""
 
     def change(self, before: str | None, after: str) -> ChangeAtPath | None:
-        """Return how the tree `after` differs from the tree `before` at the path, or None if it does not.
+        """Return how the tree `after` differs from the tree `before` at the path, or None if they are equal there.
 
         `before` is None if there is no version before `after`.
         """

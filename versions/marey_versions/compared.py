@@ -60,12 +60,12 @@ def compare_entries(changes: Iterable[Changed]) -> list[ComparedEntry]:
     """Return the entries that differ between two versions, sorted by path; moved entries are recognised.
 
     An entry consists of parts, such as `motion` and `info`. A removed and an added entry of the same kind count as one
-    moved entry if all their parts are equal. Entries that remain count as moved if one part is equal. If there are
-    several possible pairs, the order of the paths decides.
+    moved entry if all their parts are equal. Of the entries that remain, a removed and an added entry of the same kind
+    count as moved if one part is equal. If there are several possible pairs, the order of the paths decides.
 
-    An entry of which all parts changed usually counts as changed. But if another differing entry now has all its old
-    parts, or had all its new parts, it is divided into a removed and an added entry, which are paired as above. So two
-    entries that exchanged their names count as moved.
+    An entry whose parts have all changed usually counts as changed. There is one exception: if its old parts are now
+    those of another differing entry, or its new parts were those of another entry before, the entry is divided into a
+    removed and an added entry, which are paired as above. So two entries that exchanged their names count as moved.
     """
     compared = [
         ComparedEntry(*(None if value is None else entry_of(one.key, value) for value in (one.before, one.after)))
@@ -78,7 +78,7 @@ def compare_entries(changes: Iterable[Changed]) -> list[ComparedEntry]:
 
 
 def _split(compared: Iterable[ComparedEntry]) -> Iterator[ComparedEntry]:
-    """Split each entry of which all parts changed into a removed and an added one; yield the others unchanged."""
+    """Split each entry whose parts have all changed into a removed and an added entry; yield others unchanged."""
     for one in compared:
         if one.before and one.after and one.parts.keys() == one.before.parts.keys() | one.after.parts.keys():
             yield ComparedEntry(one.before, None)
@@ -113,7 +113,7 @@ def _of_part(part: str) -> Callable[[DatasetEntry], Hashable]:
 
 
 def _paired(compared: list[ComparedEntry], alike: Callable[[DatasetEntry], Hashable]) -> list[ComparedEntry]:
-    """Pair each removed entry with an added one of the same kind for which `alike` returns the same value."""
+    """Pair each removed entry with an added entry of the same kind for which `alike` returns the same value."""
     removed: dict[tuple[str, Hashable], list[ComparedEntry]] = {}
     for one in compared:
         if one.after is None and one.before is not None and alike(one.before) is not None:

@@ -35,7 +35,7 @@ class MergeConflict(NamedTuple):
 
     @property
     def key(self) -> str:
-        """The key by which a resolution names the conflict: that of the entry in `ours`, else in `base` or `theirs`."""
+        """The key of the conflict in resolutions: the key of the entry in `ours`, else in `base`, else in `theirs`."""
         present = self.ours or self.base or self.theirs
         assert present is not None
         return present.key
@@ -127,7 +127,7 @@ class _Decided(NamedTuple):
 
     @property
     def combined(self) -> CombinedEntry | None:
-        """The merged entry with those of both sides; None if one is missing, or the parts are those of one version."""
+        """The merged entry, with those of both sides; None if one is missing, or if a version has all merged parts."""
         if self.merged is None or self.ours is None or self.theirs is None:
             return None
         known = [one.parts for one in (self.base, self.ours, self.theirs) if one is not None]
@@ -202,9 +202,9 @@ def _apply(
     resolutions: Mapping[str, Side],
     merged: MergedEntries,
 ) -> None:
-    """Add changes of our tree to `merged`; if the new key of an entry already belongs to another, add a conflict.
+    """Add changes of our tree to `merged`; if another entry already has the new key of an entry, add a conflict.
 
-    `occupied` contains the entries that our side has changed, by the keys that they have on our side.
+    `occupied` contains the entries that our side has changed, by their keys on our side.
     """
     for one in decided:
         if one.ours is not None and (one.moves or one.merged is None):
@@ -233,7 +233,8 @@ def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: Datas
     """Return the parts that both sides have changed in different ways.
 
     If a part is computed from another part, the two count as one part: both are returned if one side has changed the
-    first and the other side the second. For example, the sample tree of one side does not fit the model of the other.
+    first part and the other side has changed the second part. For example, the sample tree of one side does not fit the
+    model of the other.
     """
     if ours is None or theirs is None:
         return ("entry",)
@@ -248,7 +249,7 @@ def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: Datas
 
 
 def _made_together(kind: str) -> Iterator[tuple[str, str]]:
-    """Yield pairs of parts: a part, and one that is computed from it."""
+    """Yield pairs of parts: a part, and a part that is computed from it."""
     for name, spec in PARTS[Kind(kind)].items():
         if spec.made_from is not None:
             yield spec.made_from, name

@@ -19,7 +19,7 @@ PATH = "path"
 TAGS = "tags"
 """Name of the origin of an entry's tags."""
 MOST_CHANGES = 100_000
-"""Greatest number of entries that a commit may change; in larger commits, moved entries are not searched for."""
+"""Number of changed entries up to which moved entries are searched for in a commit."""
 
 
 class FoundOrigin(NamedTuple):
@@ -29,7 +29,7 @@ class FoundOrigin(NamedTuple):
     key: str
     """Key that the entry had in this commit; an entry may have been moved since."""
     certain: bool
-    """False if the search ended at this commit, so that an earlier one may be the origin."""
+    """False if the search ended at this commit, so that an earlier commit may be the origin."""
 
 
 @dataclass
@@ -55,7 +55,7 @@ class _OriginSearch:
         return None if value is None else entry_of(key, value)
 
     def before(self, parent: str, commit: str, key: str) -> DatasetEntry | None:
-        """Return the entry that a parent of a commit had, perhaps under another key; None if the commit added it."""
+        """Return the entry in a parent of the commit, perhaps under another key; None if it is not found there."""
         trees = [self.commit_of(one).tree for one in (parent, commit)]
         same, present = self.entry(parent, key), self.entry(commit, key)
         if trees[0] == trees[1] or (same and present and same.parts.items() & present.parts.items()):
@@ -75,14 +75,14 @@ def find_origins(
 ) -> dict[str, FoundOrigin]:
     """Return the origin of each part of an entry, of its path and of its tags, by name.
 
-    A merge is the origin of a part only if the part differs from that of both parents. An entry that was moved is
-    recognised by its content, as in `compare_entries`.
+    A merge is the origin of a part only if the part differs from the same part in both parents. An entry that was moved
+    is recognised by its content, as in `compare_entries`.
 
     Parameters
     ----------
     reader : chunks of the trees of all commits
     commit_of : returns a commit by its digest
-    commit, key : the commit and the entry in it, which exists
+    commit, key : digest of the commit, and key of an entry that exists in this commit
     most : greatest number of commits to look at; origins that are not found within them are marked as not certain
     """
     search = _OriginSearch(reader, commit_of)

@@ -24,7 +24,7 @@ _SEPARATOR = "\t"
 
 
 class RevisionKey(NamedTuple):
-    """Revision of an item that a document refers to."""
+    """Reference in a document to a revision of an item."""
 
     item: str
     revision: int

@@ -78,7 +78,7 @@ class LogUploader:
 
     @property
     def size_bytes(self) -> int:
-        """Return the number of bytes printed so far."""
+        """The number of bytes printed so far."""
         return self.path.stat().st_size
 
     def send(self) -> None:

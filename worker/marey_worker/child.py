@@ -30,7 +30,8 @@ DETAIL_CHARACTERS = 1000
 def main() -> None:
     """Run the jobs that arrive on a pipe until the pipe closes.
 
-    The first argument is the file descriptor of the pipe; the others are kinds of jobs whose modules are loaded first.
+    The first argument is the file descriptor of the pipe; the other arguments are kinds of jobs whose modules are
+    loaded first.
     """
     pipe = connect_to_parent()
     process = os.getpid()

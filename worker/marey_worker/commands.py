@@ -40,8 +40,8 @@ def work(
 ) -> None:
     """Run a worker until SIGTERM or SIGINT, then exit; the exit status is not 0 if a job was running at that time.
 
-    Without `log_form`, the variable MAREY_LOG_FORM sets the form of the log; without both, log lines are text if
-    standard error is a terminal, otherwise JSON. With `attached`, the worker also stops when standard input closes,
+    Without `log_form`, the variable `MAREY_LOG_FORM` sets the form of the log. If neither is given, log lines are text
+    if standard error is a terminal, otherwise JSON. With `attached`, the worker also stops when standard input closes,
     because then the process that started it has ended. Raises `NoCredential` if there is no token.
     """
     if credential.token is None:

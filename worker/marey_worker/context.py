@@ -73,7 +73,8 @@ class Task(NamedTuple):
 class Context:
     """Running job: its inputs, and methods that read documents, report progress and stage results.
 
-    All methods send requests to the supervisor. Parts are read in advance, and results staged, during computation.
+    All methods send requests to the supervisor. While the job computes, parts are read in advance and results are
+    staged.
     """
 
     def __init__(self, run: Run, pipe: Connection) -> None:

@@ -15,9 +15,9 @@ from marey_worker.attempt_api import AttemptApi
 log = logging.getLogger(__name__)
 
 CONFIRM_AFTER = 2 / 3
-"""Greatest age of the last successful heartbeat, as a share of the lease's duration, at the final request.
+"""Greatest age of the last successful heartbeat when a job is completed or failed, as a share of the lease's duration.
 
-If the last success is older, another heartbeat must succeed before the final request.
+If the last success is older, another heartbeat must succeed before the end of the job is reported.
 """
 
 PROGRESS_EVERY_S = 2.0
@@ -66,7 +66,7 @@ class LeaseKeeper:
         self._stopped.set()
 
     def confirm(self, *, patiently: bool) -> None:
-        """Send a heartbeat before the final request, unless a recent heartbeat shows that the lease is still valid.
+        """Send a heartbeat before the end of a job is reported, unless a recent one shows that the lease is valid.
 
         With `patiently`, the heartbeat is retried for up to 10 minutes. Raises `LeaseLost` if the lease is lost, or the
         client's error if the server does not answer.

@@ -129,7 +129,7 @@ class Made:
 
 @dataclass(frozen=True)
 class Done:
-    """Message that the job has computed all its results; the last ones may not be stored yet."""
+    """Message that the job has computed all its results; the last results may not be stored yet."""
 
     result: dict[str, Any]
 

@@ -81,7 +81,7 @@ class Supervisor:
         self._refusal: MareyError | None = None
 
     def stop(self) -> None:
-        """Stop claiming jobs, return the running ones to the queue, and let `run` return."""
+        """Stop claiming jobs, return running jobs to the queue, and let `run` return."""
         self._stopping.set()
 
     def run(self) -> int:
@@ -165,7 +165,7 @@ class Supervisor:
         return claim(opened.transport, wanted)
 
     def _attempt(self, lease: Lease, child: ChildProcess, finisher: Executor) -> Future[None]:
-        """Run a job; return a future that ends when the job's results are stored and its end is reported.
+        """Run a job; return a future that ends when the results are stored and the end of the job is reported.
 
         After a success, this method returns before the future ends, so that the child can run the next job meanwhile.
         """

@@ -19,7 +19,8 @@ def request_contents(
 ) -> dict[str, Any]:
     """Request revisions and documents of a project by content digest, and return the server's answer as a dict.
 
-    Its lists `revisions` and `documents` have the order of the request. With `keep_blocks`, arrays stay compressed.
+    The lists `revisions` and `documents` in the answer have the order of the request. With `keep_blocks`, arrays stay
+    compressed.
     """
     url = f"{project_url}/contents"
     response = transport.send("POST", url, content=as_json(request), headers={"Accept": BLOCKS})
@@ -30,11 +31,11 @@ def request_contents(
 def first_documents(
     transport: Transport, project_url: str, places: Sequence[PartOfContent], *, keep_blocks: bool = False
 ) -> list[Any]:
-    """Request the documents at the given addresses, and return as many of them as fit into one answer, at least one.
+    """Request documents by address, and return those that the server put into one answer: the first ones, at least one.
 
-    The documents are the first ones in the order of `places`.
+    The result has the order of `places`, but may be shorter.
 
-    Raises `UnexpectedAnswer` if the project does not have one of the revisions any more.
+    Raises `UnexpectedAnswer` if one of the revisions is no longer in the project.
     """
     request = ContentsRequest(documents=tuple(places))
     found: list[Any] = request_contents(transport, project_url, request, keep_blocks=keep_blocks)["documents"]
@@ -47,7 +48,7 @@ def first_documents(
 
 
 def read_documents(transport: Transport, project_url: str, places: Sequence[PartOfContent]) -> Iterator[dict[str, Any]]:
-    """Yield the documents at the given addresses, in order, with numpy arrays, keeping one answer in memory."""
+    """Yield the documents at the given addresses, in order, with numpy arrays; memory holds one answer at a time."""
     waiting = list(places)
     while waiting:
         found = first_documents(transport, project_url, waiting[:MOST_CONTENTS])

@@ -135,7 +135,7 @@ class _Import:
     # -- revisions -----------------------------------------------------------------------------------------------------
 
     def _ensure(self, contents: Iterable[str]) -> None:
-        """Send those of the revisions that the project lacks; each is sent after the revisions to which it refers."""
+        """Send the revisions that the project lacks; a revision is sent after the revisions to which it refers."""
         missing = self._missing(sorted(set(contents) - self.held))
         referred = {content: self._references(content) for content in missing}
         if further := set[str]().union(*referred.values()) - self.held - referred.keys():
@@ -146,7 +146,7 @@ class _Import:
                 self._send(together)
 
     def _references(self, content: str) -> set[str]:
-        """Return the revisions to which a revision refers, except in documents that the project has already."""
+        """Return the revisions to which a revision's documents refer; documents that the project has are skipped."""
         documents = [digest for digest in self._revision(content).parts.values() if not self._is_stored(digest)]
         return {one for digest in documents for one in contents_in(self._document(digest))}
 
@@ -174,9 +174,9 @@ class _Import:
     def _is_stored(self, document: str) -> bool:
         """Return whether the project has a document, so that a request can refer to a revision that contains it.
 
-        This is so in two cases: the project has the revision that `homes` names for the document, or the archive lacks
-        the document. In the second case, the document belongs to a version before those in the archive, all of which
-        the dataset has.
+        The project has a document of `homes` in two cases. Either the project has the revision that `homes` names for
+        this document. Or the archive lacks the document, because it belongs to a version before the versions in the
+        archive; the dataset has all of these earlier versions.
         """
         member = ArchiveMember(MemberKind.DOCUMENT, document)
         return document in self.homes and (self.homes[document] in self.held or member not in self.archive.members)
@@ -185,7 +185,7 @@ class _Import:
         return self.archive.tree(MemberKind.DOCUMENT, digest)
 
     def _batches(self, contents: list[str]) -> Iterator[list[str]]:
-        """Divide revisions into batches, one for each request; the number and the size of revisions are limited."""
+        """Divide revisions into batches, one for each request; the number and the total size of a batch are limited."""
         batch: list[str] = []
         size_bytes = 0
         for content in contents:
@@ -217,7 +217,7 @@ class _Import:
     def _part(self, digest: str) -> Any:
         """Return a part of a revision for a request: the document, or a reference to a revision that contains it.
 
-        The reference is used if the project has the document already.
+        It is a reference if the project has the document already.
         """
         if self._is_stored(digest):
             return {"content": self.homes[digest]}

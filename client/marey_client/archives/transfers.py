@@ -19,7 +19,7 @@ MOST_DAYS_KEPT = 7
 
 
 class MissingCommits(NamedTuple):
-    """Commits that another dataset lacks, and their newest ancestors that it has (`bases`)."""
+    """Commits that another dataset lacks; `bases` are their newest ancestors in that other dataset."""
 
     commits: tuple[str, ...]
     bases: tuple[str, ...]
@@ -52,9 +52,9 @@ def fetched_versions(
 ) -> Iterator[Archive]:
     """Write an archive of `head` and its ancestors, without `bases` and their ancestors; yield the opened archive.
 
-    The file is deleted after the `with` block, but kept if the block ends with an error. If the program is interrupted
-    while it writes the file, the next call continues writing. Consents are not checked here: take records are copied
-    with their clips, so that the other server checks them.
+    The archive's file is deleted after the `with` block, but kept if the block ends with an error. If the program is
+    interrupted while it writes the file, the next call continues writing. Consents are not checked here: take records
+    are copied with their clips, so that the other server checks them.
     """
     path = transfers_folder() / f"{short_name([head.digest, *bases])}.tar"
     if not path.exists():

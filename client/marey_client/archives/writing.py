@@ -87,8 +87,9 @@ def write_archive(
     """Write an archive of a version and check it; the versions `since` and all versions before them are left out.
 
     Before the documents of revisions are read, `check` is called with the content digests of these revisions, and may
-    raise an error. An interrupted call leaves a file whose name ends in `.part`; the next call continues this file.
-    Raises `ArchiveInUse` if another process is writing the file, and `NothingToArchive` if no version is left.
+    raise an error. An interrupted call leaves a file whose name ends in `.part`; the next call with the same arguments
+    continues it. Raises `ArchiveInUse` if another process is writing the file, and `NothingToArchive` if no version is
+    left.
     """
     head = dataset.at(version)
     bases = [dataset.at(one) for one in since]
@@ -116,8 +117,8 @@ def write_archive(
 def check_consents(dataset: DatasetReader, reason: str | None, contents: Sequence[str]) -> frozenset[str]:
     """Check that revisions, given by content digest, may be exported.
 
-    Returns the ids of the items whose consent has ended. Raises `Conflict` if there are any, unless a `reason` to
-    export them nevertheless is given, which the server records.
+    Returns the ids of the items whose consent has ended. Raises `Conflict` if there are such items and `reason` is
+    None. A `reason` permits the export of these items; the server records the reason.
     """
     ended: set[str] = set()
     for some in batched(contents, MOST_CHECKED):
@@ -137,7 +138,7 @@ def _lock(file: BinaryIO, path: Path) -> None:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        raise ArchiveInUse(f"another process is writing {path}; wait until it ends") from error
+        raise ArchiveInUse(f"another process is writing {path}; wait until that process has ended") from error
 
 
 @dataclass
@@ -155,7 +156,7 @@ class _Making:
     documents: dict[str, PartOfContent] = field(default_factory=dict)
     """Addresses on the server of the documents of entries, by the digest of the document."""
     earlier: dict[str, PartOfContent] = field(default_factory=dict)
-    """For the digest of each document that replaced an earlier one: the address of that earlier document."""
+    """Address of the earlier document, by the digest of the document that replaced it."""
 
     def run(self, head: Commit, bases: Sequence[Commit]) -> None:
         before: dict[str, Commit] = {}
@@ -276,7 +277,7 @@ class _Making:
             self.writer.add(ArchiveMember(MemberKind.DOCUMENT, digest), data)
 
     def _files(self, digest: str, body: Any) -> set[str]:
-        """Return the digests of the files that a document names and that its earlier version does not name."""
+        """Return the digests of the files that a document names, without the files that its earlier version named."""
         named = _files_in(body)
         if named and digest in self.earlier:
             (before,) = self._fetch([self.earlier[digest]])
@@ -284,7 +285,7 @@ class _Making:
         return named
 
     def _add_revisions(self, contents: Iterable[str]) -> None:
-        """Add revisions to which documents refer, given by content digest, and the documents of these revisions."""
+        """Add revisions, given by content digest, and their documents; other documents refer to these revisions."""
         waiting = sorted(contents)
         self.known.update(waiting)
         self.check(waiting)
@@ -321,7 +322,7 @@ class _EntryPair(NamedTuple):
 
     @property
     def unchanged(self) -> dict[str, str]:
-        """Content digest of the entry's revision before the commit, for each part that the commit did not change."""
+        """For each part that the commit did not change: content digest of the entry's revision before the commit."""
         if self.after is None or self.before is None:
             return {}
         parts = self.after.parts.items() & self.before.parts.items()

@@ -32,14 +32,14 @@ class ColumnStatistics:
 
     @classmethod
     def of(cls, rows: NDArray[np.generic]) -> Self:
-        """Return the statistics of (rows, columns) numbers; an array with one dimension is one column."""
+        """Return the statistics of an array (rows, columns); an array with one dimension counts as one column."""
         values = np.asarray(rows, dtype=np.float64).reshape(len(rows), -1)
         mean = values.mean(axis=0)
         squares = np.square(values - mean).sum(axis=0)
         return cls(len(values), values.min(axis=0), values.max(axis=0), mean, squares)
 
     def merged(self, other: ColumnStatistics) -> ColumnStatistics:
-        """Combine these statistics and `other` into those of all rows, after Chan, Golub and LeVeque (1979)."""
+        """Return the statistics of all rows of this object and `other`, after Chan, Golub and LeVeque (1979)."""
         count = self.count + other.count
         shift = other.mean - self.mean
         return ColumnStatistics(
@@ -52,7 +52,7 @@ class ColumnStatistics:
 
     @property
     def document(self) -> dict[str, list[float] | list[int]]:
-        """The statistics in the form of LeRobot; `std` is the population standard deviation (divisor n)."""
+        """The statistics as LeRobot stores them; `std` is the population standard deviation (divisor n)."""
         return {
             "min": self.low.tolist(),
             "max": self.high.tolist(),

@@ -120,13 +120,13 @@ def prepare_files(
 ) -> MotionFiles:
     """Check whether a version can be exported to files, and read its entries below `path`.
 
-    Raises `CannotExport` unless each file of the format contains motion with its skeleton, so that it can be imported
-    again without other files; also the errors of `require_free` and `version_to_export`.
+    Raises `CannotExport` if files in the format do not contain both motion and skeleton, because such files cannot be
+    imported again without other files. Also raises the errors of `require_free` and `version_to_export`.
     """
     if format not in WHOLE_FORMATS:
         raise CannotExport(
-            f"{format!r} is no format whose files contain motion with its skeleton; the formats are "
-            f"{', '.join(WHOLE_FORMATS)}; marey download writes others"
+            f"{format!r} is not one of the formats whose files contain both motion and skeleton: "
+            f"{', '.join(WHOLE_FORMATS)}; `marey download` writes other formats"
         )
     require_free(target)
     found = version_to_export(dataset, version, path, allow_expired_consent=allow_expired_consent)

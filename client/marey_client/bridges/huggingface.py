@@ -37,7 +37,7 @@ LICENCES = frozenset(
         "osl-3.0", "pddl", "unlicense", "wtfpl", "zlib",
     }
 )  # fmt: skip
-"""Licences of data and software that the metadata of a card can name; any other is `other`."""
+"""Licences of data and software that the metadata of a card can name; any other licence becomes `other`."""
 
 _SIZES = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M")
 
@@ -48,7 +48,7 @@ class _Summary:
 
     licences: Counter[str | None] = field(default_factory=Counter)
     jobs: Counter[tuple[str, tuple[str, ...]] | None] = field(default_factory=Counter)
-    """Number of clips by the kind of the job that made them and the commits of its inputs; None: made by no job."""
+    """Number of clips by the kind and the input commits of the job that made them; the key None: made by no job."""
 
     def add(self, clip: ExportedClip) -> None:
         self.licences[clip.record.licence] += 1
@@ -89,7 +89,7 @@ def dataset_card(
 ) -> str:
     """Return the card of a version: YAML metadata, and a text with the commit, the licences and the lineage.
 
-    `licences` and `jobs` contain the number of clips by licence, and by the job that made them.
+    `licences` is the number of clips by licence. `jobs` is the number of clips by the job that made them.
     """
     clips = sum(licences.values())
     lines = ["---", *_metadata(identity, licences, clips, format), "---", ""]

@@ -1,8 +1,8 @@
 """Export of a version as a LeRobotDataset v3.0: one episode for each clip, many episodes in each file.
 
 A state is the root's position in metres, then the local rotation of each joint as a quaternion w, x, y, z, then the
-position of each joint that has one. The action of a frame is the state of the next frame; that of the last frame is its
-own state.
+position of each joint that has one. The action of a frame is the state of the next frame; the last frame has its own
+state as action.
 """
 
 from __future__ import annotations
@@ -141,18 +141,18 @@ class _Writing:
     episodes: EpisodeTable
     rig: CommonRig | None = None
     first: str = ""
-    """Path of the first clip, with which the others are compared."""
+    """Path of the first clip, with which all other clips are compared."""
     hierarchies: dict[str, str] = field(default_factory=dict)
     """Content digest of the hierarchy of each skeleton, by the content digest of the skeleton's revision."""
     tasks: dict[str, int] = field(default_factory=dict)
     made: Counter[tuple[str, tuple[str, ...]]] = field(default_factory=Counter)
-    """Number of clips by the kind of the job that made them and the commits of its inputs."""
+    """Number of clips, by the kind of the job that made them and the commits of this job's inputs."""
     statistics: dict[str, ColumnStatistics] = field(default_factory=dict)
     frames: int = 0
     done: int = 0
 
     def add_group(self, group: Sequence[DescribedClip], on_progress: OnProgress) -> None:
-        """Add clips as episodes. Raises `CannotExport` with the clips that differ from the first one."""
+        """Add clips as episodes. Raises `CannotExport` with the names of clips that differ from the first clip."""
         differing: list[str] = []
         motions = self.version.documents([one.entry for one in group], "motion")
         for one, motion in zip(group, motions, strict=True):

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 MOST_FILES_PER_CHUNK = 1000
-"""Greatest number of files in a folder `chunk-000`."""
+"""Greatest number of files in a folder such as `chunk-000`."""
 MOST_FILE_MB = 100
 """Greatest size of a file in MiB; a file with one episode can be larger."""
 COMPRESSION = "zstd"

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReturningFolder:
-    """Folder that an export wrote and that is imported again, with its sidecar."""
+    """Folder that an export wrote and that is imported again, with its sidecar, the file `marey.json`."""
 
     folder: Path
     sidecar: ExportedFolder
@@ -93,7 +93,7 @@ class ReturningFolder:
 
 
 def restore_clip(transport: Transport, project: str, item: str, exported: ExportedClip) -> bool:
-    """Add values of an exported take record, and tags, to a clip that lacks them; return whether it was changed."""
+    """Add the exported values of the take record and tags that a clip lacks; return whether the clip was changed."""
     clip = Items(transport, project, Kind.CLIP, ClipHandle).get(item)
     try:
         info = clip.info()

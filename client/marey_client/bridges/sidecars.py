@@ -25,7 +25,7 @@ RECORD_FIELDS = tuple(TakeRecord.model_fields)
 
 
 class SidecarWriter:
-    """Sidecar and table of take records of a folder, both written clip by clip, so that memory stays small."""
+    """Writer of the sidecar and of the table of take records of a folder; it writes clip by clip to save memory."""
 
     def __init__(self, folder: Path, header: dict[str, Any]) -> None:
         self._folder = folder

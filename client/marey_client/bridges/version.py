@@ -39,7 +39,7 @@ class DatasetToExport(DatasetReader, Protocol):
     """Methods of `DatasetHandle` that are needed to export a version."""
 
     def entries(self, version: str, *, path: str = "") -> Iterator[Entry]:
-        """List the entries of a version, all or those below a folder."""
+        """List all entries of a version, or only the entries below a folder."""
 
     def find_ref(self, name: str) -> Ref | None:
         """Return the branch or tag with a name, or None."""
@@ -51,7 +51,7 @@ class ExportOptions(TypedDict, total=False):
     path: str
     """Folder of entries to which the export is limited; default: all entries."""
     allow_expired_consent: str | None
-    """Reason why clips are exported although their consent has ended; None: such clips are refused."""
+    """Reason to export clips whose consent has ended; None: such clips are refused."""
 
 
 class DescribedClip(NamedTuple):
@@ -132,7 +132,7 @@ class VersionToExport:
         return [ClipInfo.model_validate(found.get(id(one.entry), {})) for one in group]
 
     def _job_of(self, clip: _Located) -> ExportedJob | None:
-        """Return the job that made a revision, None if a user did."""
+        """Return the job that made a revision, or None if a user made it."""
         url = f"{self.dataset.project_url}/{clip.entry.kind.plural}/{clip.item}/lineage-graph"
         query: Params = {"revision": clip.revision, "direction": "inputs", "depth": 1}
         graph = self.dataset.transport.get(LineageGraph, url, query)
@@ -158,10 +158,10 @@ class VersionToExport:
 def version_to_export(
     dataset: DatasetToExport, version: str, folder: str = "", *, allow_expired_consent: str | None = None
 ) -> VersionToExport:
-    """Read the entries of a version, all or those below a folder, and check that its clips may be exported.
+    """Read all entries of a version, or only the entries below a folder; check that the clips may be exported.
 
-    Raises `CannotExport` if there is no clip, and `Conflict` if the consent for a clip has ended, unless
-    `allow_expired_consent` gives the reason why the clip is exported nevertheless.
+    Raises `CannotExport` if there is no clip, and `Conflict` if the consent for a clip has ended and
+    `allow_expired_consent` gives no reason to export the clip nevertheless.
     """
     commit, named = dataset.at(version), dataset.find_ref(version)
     folder = folder.strip("/")
@@ -170,7 +170,7 @@ def version_to_export(
     if not clips:
         place = f"below {folder!r}" if folder else "in any folder"
         raise CannotExport(
-            f"the version {version} of {dataset.name} has no clips {place}; marey dataset entries lists what it has"
+            f"the version {version} of {dataset.name} has no clips {place}; `marey dataset entries` lists its entries"
         )
     contents = dict.fromkeys(_located(one).content for one in clips)
     ended = check_consents(dataset, allow_expired_consent, list(contents))

@@ -43,7 +43,7 @@ def login(
             "name and a new password.",
         ),
     ] = False,
-    days: Annotated[int, typer.Option(min=1, max=90, help="Days for which the login is valid.")] = 7,
+    days: Annotated[int, typer.Option(min=1, max=90, help="Number of days for which the login is valid.")] = 7,
 ) -> None:
     """Log in to a server, and store its address and a token for it in a file that only you can read."""
     from marey_client.credentials import logins_path, store_login
@@ -164,11 +164,12 @@ def change_password(
         bool,
         typer.Option(
             "--end-tokens",
-            help="Also revoke all tokens of the user; otherwise, only the sessions of `marey login` end.",
+            help="Revoke all tokens of the user, except the token in use. Without this option, only the tokens that "
+            "`marey login` made are revoked.",
         ),
     ] = False,
 ) -> None:
-    """Set a new password, and end the user's other sessions. To set your own password, also enter the current one."""
+    """Set a new password, and end the user's other logins. For your own password, enter the current password, too."""
     from marey_schemas.access import EndTokens, UserChange
 
     with connect(context) as marey:
@@ -236,7 +237,7 @@ def user_quota(
     defaults: DefaultLimits = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show how many items and bytes count towards a user's quotas, and the limits, which administrators can change."""
+    """Show a user's quotas: the items and bytes that count, and the limits. Administrators can change the limits."""
     change = quota_change(items, stored_bytes, defaults)
     with connect(context) as marey:
         found = marey.users.quotas(name) if change is None else marey.users.change_quotas(name, change)
@@ -248,8 +249,8 @@ def user_quota(
 def _ask_name() -> str:
     if not sys.stdin.isatty():
         raise WrongUsage(
-            "the user name cannot be asked for, because standard input is not a terminal; give "
-            "--name, or use --with-token"
+            "the command cannot ask for the user name, because standard input is not a terminal; give --name, or use "
+            "--with-token"
         )
     return str(typer.prompt("User name", err=True))
 

@@ -43,12 +43,12 @@ class Address:
 
     @property
     def name(self) -> str:
-        """The last name of the path, or an item's id."""
+        """The last part of the path: a name, or the id of an item."""
         return self.path.rpartition("/")[2]
 
     @property
     def has_id(self) -> bool:
-        """Whether the last name of the path is the id of an item."""
+        """Whether the last part of the path is the id of an item."""
         return _ID.fullmatch(self.name) is not None
 
 
@@ -84,7 +84,7 @@ def _missing(marey: Marey, address: Address, what: str) -> WrongUsage:
     The error names the command that lists the folder or the project.
     """
     if address.path and marey.project(address.project).collections.at(address.path) is not None:
-        return WrongUsage(f"{address} is a folder; marey ls {address} lists it")
+        return WrongUsage(f"{address} is a folder; `marey ls {address}` lists it")
     return WrongUsage(f"there is {what} at {address}; `marey ls {address.project}` lists the project")
 
 
@@ -230,7 +230,7 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
     """
     address = Address.parse(text)
     if not address.path:
-        raise WrongUsage(f"{text!r} is a project; give a folder or an item in it, or see marey project --help")
+        raise WrongUsage(f"{text!r} is a project; give a folder or an item in it, or see `marey project --help`")
     wanted = FOLDER if text.endswith("/") else kind
     found = list(_things(marey.project(address.project), address, wanted, deleted=deleted))
     kinds = list(dict.fromkeys(one.kind for one in found))
@@ -248,7 +248,7 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
 def items_selected(
     marey: Marey, places: Sequence[str], query: str, kind: str | None, *, deleted: bool = False
 ) -> list[SingleItem]:
-    """Return the items of a kind, by default clips, that a query selects in projects or folders and their subfolders.
+    """Return the items of one kind that a query selects in projects or folders and below; the default kind is clips.
 
     The items of each place are sorted by path; an item in several places is returned once. With `deleted`, only deleted
     items are selected, including those in deleted folders. If several deleted items have the same path, the one that
@@ -277,7 +277,7 @@ def items_selected(
 
 
 def _is_folder(project: ProjectHandle, path: str, *, deleted: bool) -> bool:
-    """Return whether there is a folder at a path, or, with `deleted`, whether there was one."""
+    """Return whether there is a folder at a path; with `deleted`, whether there is a deleted one."""
     folders = project.collections
     return folders.at(path) is not None or (deleted and folders.at(path, deleted=True) is not None)
 
@@ -299,9 +299,9 @@ def require_apart(things: Sequence[Thing]) -> None:
 
 
 def _things(project: ProjectHandle, address: Address, kind: str | None, *, deleted: bool) -> Iterator[Thing]:
-    """Yield the folders and items at an address, folders first.
+    """Yield the folders at an address, then the items at this address.
 
-    With `deleted`, these are deleted folders and items; in each kind, the item that was deleted last comes first.
+    With `deleted`, yield deleted folders and items; for each kind, the most recently deleted one comes first.
     """
     from marey_schemas.kinds import Kind
 

@@ -120,12 +120,12 @@ def split(
         str | None, typer.Option(help="Label of the second part; default: the label of the first part.")
     ] = None,
 ) -> None:
-    """Cut a segment in two."""
+    """Split a segment into two adjacent segments."""
     _apply(context, place, command="split_segment", at=at, label=label)
 
 
 def merge(context: typer.Context, place: Place, at: At, params: Chosen) -> None:
-    """Merge a segment with a neighbouring segment, including the gap between them."""
+    """Merge a segment with a neighbouring segment; a gap between the two is filled."""
     _apply(context, place, command="merge_segment", at=at, **params)
 
 
@@ -194,14 +194,14 @@ def propose(
     into: Annotated[
         str,
         typer.Option(
-            help="Folder for the annotations, in which the folders of the clips are repeated; default: each annotation "
-            "is stored in the folder of its clip."
+            help="Folder that receives the annotations, in subfolders named like the folders of the clips. By "
+            "default, each annotation is stored in the folder of its clip."
         ),
     ] = "",
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Annotate clips by an algorithm that finds steps (the default), pauses, or contacts of a hand."""
+    """Annotate clips with an algorithm that finds steps (the default), pauses, or contacts of a hand."""
     addresses = addresses_in_one_project(sources)
     proposal = {**DEFAULT_PROPOSAL, **params.pop("proposal", {}), **dict(map(_option, option or ()))}
     with connect(context) as marey:
@@ -217,7 +217,14 @@ def propose(
 def import_annotation(
     context: typer.Context,
     clip: Annotated[str, typer.Argument(help="The clip: project/folder/name, or project/id.")],
-    file: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="A JSON file of Marey's predecessor.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            exists=True,
+            dir_okay=False,
+            help="A JSON file of Marey's predecessor, the older programs that Marey replaces.",
+        ),
+    ],
     layer: Annotated[str, typer.Option(help="Name of the annotation layer, such as steps.")] = "imported",
     name: Annotated[
         str | None,
@@ -226,8 +233,8 @@ def import_annotation(
     end_index: Annotated[
         EndIndex,
         typer.Option(
-            help="inclusive: end_idx in the file is the last frame of a section, as in the predecessor's editor; "
-            "exclusive: end_idx is the frame after the last one."
+            help="Meaning of end_idx in the file. inclusive: the last frame of a section, as in the predecessor's "
+            "editor. exclusive: the frame after the last frame."
         ),
     ] = DEFAULT_END_INDEX,
     label: Annotated[list[str] | None, typer.Option(help="Import only this label; may be repeated.")] = None,
@@ -261,12 +268,12 @@ def export_annotation(
     end_index: Annotated[
         EndIndex,
         typer.Option(
-            help="inclusive: end_idx in the file is the last frame of a section; exclusive: end_idx is the frame after "
-            "the last one."
+            help="Meaning of end_idx in the file. inclusive: the last frame of a section. exclusive: the frame after "
+            "the last frame."
         ),
     ] = DEFAULT_END_INDEX,
 ) -> None:
-    """Write an annotation to a file for Marey's predecessor."""
+    """Write an annotation to a file for Marey's predecessor, the older programs that Marey replaces."""
     with connect(context) as marey:
         found = annotation_at(marey, place)
         typer.echo(found.export(output, format="predecessor", form=form, end_index=end_index))
@@ -305,7 +312,7 @@ def _keyframe(text: str) -> tuple[str, int]:
 
 
 def _option(text: str) -> tuple[str, Any]:
-    """Parse an option of an annotation method, `name=value`, to name and value; a value with commas becomes a list."""
+    """Split the option `name=value` of an annotation method into name and value; a value with commas becomes a list."""
     name, value = assignment(text)
     read = json_or_text(value)
     return name, value.split(",") if read == value and ("," in value or name == "joints") else read

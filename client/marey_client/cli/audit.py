@@ -34,18 +34,23 @@ def add_to(app: typer.Typer) -> None:
 def audit(
     context: typer.Context,
     project: Annotated[
-        str | None, typer.Argument(help="Name of the project; default: all projects and users, for administrators.")
+        str | None,
+        typer.Argument(
+            help="Name of the project. By default, the log of the whole server is shown, which only administrators "
+            "may read."
+        ),
     ] = None,
     kind: Annotated[
         str | None,
-        typer.Option(help="Kind of change, such as member.added; the page on the audit log lists all kinds."),
+        typer.Option(help="Kind of change, such as member.added; an unknown kind prints the list of all kinds."),
     ] = None,
     actor: Annotated[str | None, typer.Option(help="Name of the user who made the change.")] = None,
     subject: Annotated[
         str | None, typer.Option(help="Name or id of the user or of the object that was changed.")
     ] = None,
     since: Annotated[
-        str | None, typer.Option(help="Earliest time, in UTC, as 2026-11-23 or 2026-11-23T15:04:05.")
+        str | None,
+        typer.Option(help="Earliest time of the changes, in UTC, such as 2026-11-23 or 2026-11-23T15:04:05."),
     ] = None,
     until: Annotated[str | None, typer.Option(help="Time before which the changes were made, in UTC.")] = None,
     limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="Greatest number of entries to list.")] = 50,
@@ -53,7 +58,7 @@ def audit(
 ) -> None:
     """Show who changed access, and who deleted or restored something, newest first.
 
-    The log of a project is for its owners, and the log of the server for administrators. Times are in UTC.
+    Only owners of a project may read its log, and only administrators the log of the server. Times are in UTC.
     """
     chosen: dict[str, Any] = {"kind": _kind(kind), "actor": actor, "subject": subject}
     chosen |= {"since": _time("--since", since), "until": _time("--until", until)}

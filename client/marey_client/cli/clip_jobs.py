@@ -79,7 +79,8 @@ def align(
     annotations: Annotated[
         list[str] | None,
         typer.Option(
-            help="Annotations to use, or folders of them; default: all annotations of these clips; may be repeated."
+            help="Annotation to use, or folder of annotations; may be repeated. Default: all annotations of these "
+            "clips."
         ),
     ] = None,
     wait: Wait = True,
@@ -87,7 +88,7 @@ def align(
 ) -> None:
     """Align clips of one action with each other, as a job.
 
-    `--reference` also accepts the address of the clip with which all others are aligned.
+    `--reference` also accepts the address of the clip with which all other clips are aligned.
     """
     from marey_schemas.kinds import Kind
 
@@ -106,14 +107,16 @@ def align(
 
 def cut(
     context: typer.Context,
-    sources: Annotated[list[str], typer.Argument(help="Annotations, or folders of them: project/folder[/name].")],
+    sources: Annotated[
+        list[str], typer.Argument(help="Annotations, or folders of annotations: project/folder[/name].")
+    ],
     into: Into,
     params: Chosen,
     job: Chosen,
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Cut clips along the segments of annotations; each piece keeps the keyframes that are inside it."""
+    """Cut clips along the segments of annotations; each piece keeps the keyframes inside its range of frames."""
     from marey_schemas.kinds import Kind
 
     addresses = addresses_in_one_project(sources)
@@ -126,7 +129,7 @@ def cut(
 
 
 def print_labelled(result: dict[str, Any]) -> None:
-    """Print the number of created clips or annotations, in total and by label, then the inputs that had no results."""
+    """Print the number of created clips or annotations, in total and by label, then the inputs without results."""
     made = counted(result["clips"], "clip") if "clips" in result else counted(result["annotations"], "annotation")
     counts = result.get("segments") or result.get("labels") or {}
     typer.echo(", ".join([made, *(f"{count} {label}" for label, count in counts.items())]))
@@ -135,7 +138,7 @@ def print_labelled(result: dict[str, Any]) -> None:
 
 
 def _print_warnings(result: dict[str, Any]) -> None:
-    """Print to standard error how many clips have each warning."""
+    """Print the number of clips for each warning to standard error."""
     for code, count in result.get("warnings", {}).items():
         print_message(f"warning {code}: {counted(count, 'clip')}; see `marey show --part info` of a clip")
 

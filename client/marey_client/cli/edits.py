@@ -133,7 +133,9 @@ def preview_edit(
     file: From = None,
     saved: With = None,
     frames: Annotated[str, typer.Option(help="Frames of the result to show, such as 100:200.")] = ":",
-    piece: Annotated[int, typer.Option(min=1, help="If the clip is split: the result to show, counted from 1.")] = 1,
+    piece: Annotated[
+        int, typer.Option(min=1, help="Number of the result to show if the commands split the clip, counted from 1.")
+    ] = 1,
     as_json: AsJson = False,
 ) -> None:
     """Show the result of commands on a clip without storing it. With --json, the output also contains its motion."""
@@ -207,7 +209,7 @@ def _given(marey: Marey, project: str, do: list[str] | None, file: str | None) -
 
 
 def _with_ids(marey: Marey, project: str, command: Any) -> Any:
-    """Return a command in which the address of a source clip, if it has one, is replaced by the id of this clip."""
+    """Return a command; if it names a source clip by address, the address is replaced by the clip's id."""
     from marey_schemas.kinds import Kind
 
     source = command.get("source") if isinstance(command, dict) else None
@@ -331,7 +333,7 @@ def _print_preview(shown: EditPreview, piece: int) -> None:
 
 
 def _finding(finding: dict[str, Any]) -> str:
-    """Return what a command reported about a clip as one line of text, with segments as ranges of frames."""
+    """Return one line of text with what a command reported about a clip; segments appear as ranges of frames."""
     figures = []
     for name, value in finding.items():
         if name == "segments":

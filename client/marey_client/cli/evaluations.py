@@ -36,7 +36,7 @@ EVALUATE = OptionsOf(
 )
 
 Loops = Annotated[
-    list[str] | None, typer.Option("--loop", help="A clip that is a loop, or a folder of such clips; may be repeated.")
+    list[str] | None, typer.Option("--loop", help="A clip that is a loop, or a folder of loops; may be repeated.")
 ]
 Trims = Annotated[
     list[str] | None,
@@ -45,7 +45,7 @@ Trims = Annotated[
 Normaliser = Annotated[
     str | None,
     typer.Option(
-        help="Scale features as in this evaluation, so that the results can be compared: project/folder/name."
+        help="Evaluation whose scaling of features is used, so that both results can be compared: project/folder/name."
     ),
 ]
 
@@ -69,13 +69,14 @@ def evaluate(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Measure how good locomotion clips are: accuracy, coverage and use, by simulated motion matching."""
+    """Measure the quality of locomotion clips by simulated motion matching: accuracy, coverage and use of the clips."""
     from marey_schemas.queue.job_params import EvaluateParams
 
     addresses = addresses_in_one_project(sources)
     if out is not None and not wait:
         raise WrongUsage(
-            "--out writes the result of the job, but --no-wait does not wait for it; leave out one of them"
+            "--out writes the result of the job, but --no-wait does not wait for the result; leave out one of "
+            "the two options"
         )
     folder, last = _place_beside(addresses[0].path)
     params.setdefault("name", f"{last}-eval" if last else "evaluation")
@@ -103,9 +104,9 @@ def evaluate(
 
 
 def add_clip_options(marey: Marey, params: Chosen, loop: Sequence[str] | None, trim: Sequence[str] | None) -> None:
-    """Add the clips of --loop and --trim, by their ids, to the parameters of an evaluation.
+    """Add the clips that --loop and --trim name, as ids, to the parameters of an evaluation.
 
-    With --loop, the end policy of the database is `loop`, unless the parameters set another one.
+    With --loop, the end policy of the database is `loop`, unless the parameters set another policy.
     """
     if loop:
         params.setdefault("database", {}).setdefault("end_policy", "loop")
@@ -115,7 +116,7 @@ def add_clip_options(marey: Marey, params: Chosen, loop: Sequence[str] | None, t
 
 
 def _place_beside(path: str) -> tuple[str, str]:
-    """Return the folder beside `path` and a name for results: for `lab/gaits@v1/raw`, `lab` and `gaits-v1-raw`."""
+    """Return a folder and a name for results of `path`: for `lab/gaits@v1/raw`, the folder `lab` and `gaits-v1-raw`."""
     named, at, version = path.partition("@")
     folder, _, last = named.rpartition("/")
     return folder, f"{last}{at}{version}".replace("@", "-").replace("/", "-")
@@ -134,7 +135,7 @@ def report(
         Path | None, typer.Option(help="Write the walk graph of an evaluation to this file: .graphml or .json.")
     ] = None,
     trial: Annotated[
-        str | None, typer.Option(help="The trial of the walk graph; default: all trials together.")
+        str | None, typer.Option(help="Name of the trial whose walk graph is written; default: all trials together.")
     ] = None,
     open_it: Annotated[bool, typer.Option("--open", help="Open the report in a browser.")] = False,
 ) -> None:

@@ -45,7 +45,8 @@ From = Annotated[
     list[str] | None,
     typer.Option(
         "--from",
-        help="Clip or folder of clips that can be added to the set, in the project of the evaluation; may be repeated.",
+        help="Clip, or folder of clips, that could be added to the evaluated clips; may be repeated. It must be "
+        "in the project of the evaluation.",
     ),
 ]
 
@@ -64,8 +65,8 @@ def compare(
     after: Annotated[
         str,
         typer.Argument(
-            help="The evaluation after the change, with the same trials; created by `marey evaluate "
-            "--normaliser BEFORE`."
+            help="The evaluation after the change, with the same trials. Create it with `marey evaluate --normaliser "
+            "BEFORE`."
         ),
     ],
     params: Chosen,
@@ -77,7 +78,8 @@ def compare(
     """Show what changed between two evaluations, trial by trial."""
     if out is not None and not wait:
         raise WrongUsage(
-            "--out writes the result of the job, but --no-wait does not wait for it; leave out one of them"
+            "--out writes the result of the job, but --no-wait does not wait for the result; leave out one of "
+            "the two options"
         )
     with connect(context) as marey:
         first, second = evaluation_at(marey, before), evaluation_at(marey, after)
@@ -102,7 +104,10 @@ def suggest(
     candidates: From = None,
     remove_out: Annotated[
         Path | None,
-        typer.Option(help="File for the paths, one per line, of the clips whose removal has no effect on the trials."),
+        typer.Option(
+            help="Write the paths of the clips whose removal has no effect on the trials to this file, one path per "
+            "line."
+        ),
     ] = None,
     wait: Wait = True,
     as_json: AsJson = False,
@@ -110,8 +115,8 @@ def suggest(
     """Find clips of an evaluated set that can be removed, and other clips that would fill its gaps."""
     if remove_out is not None and not wait:
         raise WrongUsage(
-            "--remove-out writes a part of the result, but --no-wait does not wait for the "
-            "result; leave out one of them"
+            "--remove-out writes a part of the result, but --no-wait does not wait for the result; leave out "
+            "one of the two options"
         )
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
@@ -136,7 +141,7 @@ def optimise(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Find, step by step, which clips to remove from or add to an evaluated set to improve it. No clip is changed."""
+    """Find clips to remove from an evaluated set, or to add to it, so that the results improve. No clip is changed."""
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
         request = handle.optimise_request(_places(marey, handle, candidates), **params)
@@ -152,7 +157,7 @@ def sweep(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Evaluate again with other weights of the features, and rank the features by their effect."""
+    """Repeat an evaluation with other weights of the features, and rank the features by their effect on the result."""
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
         if (found := _found(marey, handle, handle.sweep_request(**params), job, wait, as_json)) is not None:

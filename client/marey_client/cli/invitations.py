@@ -20,10 +20,12 @@ if TYPE_CHECKING:
     from marey_schemas.access import Role
     from marey_schemas.invitations import Invitation, NewInvitation
 
-Days = Annotated[int, typer.Option(min=1, help="Days for which the invitation is valid, at most 30.")]
+Days = Annotated[int, typer.Option(min=1, help="Number of days for which the invitation is valid, at most 30.")]
 Uses = Annotated[int, typer.Option(min=1, help="Number of people who can use the invitation, at most 100.")]
 Note = Annotated[str, typer.Option(help="For whom the invitation is; shown in lists.")]
-Named = Annotated[str, typer.Argument(metavar="PREFIX|ID", help="Prefix or id of the invitation, as in the list.")]
+Named = Annotated[
+    str, typer.Argument(metavar="PREFIX|ID", help="Prefix or id of the invitation, as in the list of invitations.")
+]
 RoleName = Annotated[
     str | None, typer.Option("--role", help="Role in the project: reader, contributor, maintainer or owner.")
 ]
@@ -88,7 +90,7 @@ def accept(context: typer.Context, as_json: AsJson = False) -> None:
 def invite_person(
     context: typer.Context,
     project_name: Annotated[
-        str | None, typer.Option("--project", help="Project of which the new user becomes a member.")
+        str | None, typer.Option("--project", help="Project that the new user joins as a member.")
     ] = None,
     role: RoleName = None,
     days: Days = 7,

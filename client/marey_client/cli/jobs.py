@@ -67,7 +67,7 @@ def submit_job(
     kind: Annotated[
         str,
         typer.Argument(
-            help="Kind of the job; marey job kinds lists all kinds, and marey job kinds KIND lists the inputs and "
+            help="Kind of the job. `marey job kinds` lists all kinds. `marey job kinds KIND` lists the inputs and "
             "parameters of one kind."
         ),
     ],
@@ -76,8 +76,8 @@ def submit_job(
         list[str] | None,
         typer.Option(
             "--input",
-            help="Input as name=folder, name=folder/item[@revision], name=dataset@version[/folder], or name=ID of a "
-            "job whose outputs are used; may be repeated.",
+            help="Input as name=folder, name=folder/item[@revision] or name=dataset@version[/folder]; or name=ID "
+            "with the id of a job whose outputs are the input; may be repeated.",
         ),
     ] = None,
     params: Annotated[
@@ -152,7 +152,10 @@ def list_jobs(
     ] = None,
     author: Annotated[str | None, typer.Option(help="List only jobs that this user submitted.")] = None,
     tasks_of: Annotated[
-        str | None, typer.Option(metavar="JOB", help="List the tasks of this job; default: jobs that are not tasks.")
+        str | None,
+        typer.Option(
+            metavar="JOB", help="List the tasks into which this job was split. By default, tasks are not listed."
+        ),
     ] = None,
     limit: Annotated[int, typer.Option(min=1, help="Greatest number of jobs to list, newest first.")] = 50,
     as_json: AsJson = False,
@@ -219,7 +222,10 @@ def retry_job(
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the job has ended.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Submit a failed or cancelled job again, with unsuccessful jobs that it needs, and jobs that failed due to it."""
+    """Submit a failed or cancelled job again.
+
+    Unsuccessful jobs that the job needs, and jobs that did not run because the job failed, are submitted again, too.
+    """
     with connect(context) as marey:
         ended = follow(marey, marey.jobs.retry(job_id), wait=wait, as_json=as_json)
     if ended is not None:
@@ -231,7 +237,10 @@ def rerun_job(
     context: typer.Context,
     job_id: JobId,
     into: Annotated[
-        str | None, typer.Option(help="Folder for the repeated results; default: reruns/ID, with the id of the job.")
+        str | None,
+        typer.Option(
+            help="Folder for the results of the repetition; default: reruns/ID, where ID is the id of the job."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -274,7 +283,7 @@ def rerun_job(
 
 
 def _difference_of(one: ComparedOutput) -> list[str]:
-    """Return lines that say how an output differs from its repetition; none if it has the same content."""
+    """Return lines that say how an output differs from the repeated output; no lines if both have the same content."""
     from marey_client.cli.difference.words import NO_DIFFERENCE, changes_in_words
 
     if one.difference is not None:

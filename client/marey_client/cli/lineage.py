@@ -68,10 +68,10 @@ _Branch: TypeAlias = "Iterator[str | _Branch]"
 
 
 class _LineageTree:
-    """Lineage graph as indented text: first the inputs of the revision at its start, then the results.
+    """Lineage graph as indented text: first the inputs of the revision where the graph starts, then its results.
 
-    Revisions of one kind that one job created, and that the same jobs used, are listed as one group. The inputs or
-    results of a group are listed only the first time that the group occurs.
+    Revisions of one kind that one job created, and that the same jobs used, are listed as one group. If a group occurs
+    several times, its inputs or results are listed only the first time.
     """
 
     def __init__(self, graph: LineageGraph) -> None:

@@ -40,7 +40,9 @@ def add_to(app: typer.Typer) -> None:
 
 def model(
     context: typer.Context,
-    sources: Annotated[list[str], typer.Argument(help="Aligned clips, or folders of them: project/folder[/name].")],
+    sources: Annotated[
+        list[str], typer.Argument(help="Aligned clips, or folders of aligned clips: project/folder[/name].")
+    ],
     params: Chosen,
     job: Chosen,
     into: Annotated[str | None, typer.Option(help="Folder of the model; default: the folder of the clips.")] = None,
@@ -75,7 +77,7 @@ def sample(
         Path | None, typer.Option("--out", "--output", "-o", help="Folder of the files; default: the current folder.")
     ] = None,
     into: Annotated[
-        str | None, typer.Option(help="Folder of the project in which to create clips; then no files are written.")
+        str | None, typer.Option(help="Create clips in this folder of the model's project, instead of files.")
     ] = None,
     unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
     as_json: AsJson = False,

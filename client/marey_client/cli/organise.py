@@ -170,9 +170,9 @@ def restore(
 
 
 def _last_at_each_path(things: Sequence[Thing]) -> list[Thing]:
-    """Return, for each path, the item or folder that was removed last, and print how many others were left out.
+    """Return, for each path, the item or folder that was removed last; print how many others are left out.
 
-    Of things with the same path, the one that was removed last must come first.
+    In `things`, the one that was removed last must come before all others with the same path.
     """
     chosen: dict[str, Thing] = {}
     for one in things:
@@ -278,7 +278,7 @@ def _with_tags(thing: Thing, added: Sequence[str], removed: Set[str]) -> ItemCha
 def _named_or_selected(
     marey: Marey, places: Sequence[str], kind: str | None, query: str | None, *, deleted: bool = False
 ) -> Sequence[Thing]:
-    """Return the folders and items at addresses or, with `query`, the items that it selects there.
+    """Return the folders and items at addresses. With `query`, return the items in these places that the query selects.
 
     With `deleted`, these are deleted folders and items.
     """
@@ -327,10 +327,10 @@ def _named(things: Sequence[Thing]) -> str:
 def _do_each(
     things: Sequence[AnyThing], do: Callable[[AnyThing], Any], done: str, as_json: bool, *, selected: bool = False
 ) -> None:
-    """Apply a function to each folder or item, and print refusals. Raises `Refused` at the end if there were refusals.
+    """Apply `do` to each folder or item, and print refusals. Raises `Refused` at the end if there was a refusal.
 
-    `done` is the past participle for messages, such as "moved". `selected` says that a query has selected the items:
-    they may be many and do not depend on each other, so several requests are sent at a time, and the number of items
+    `done` is the past participle for messages, such as "moved". `selected` says that a query selected the items. There
+    may be many, and they do not depend on each other, so several requests are sent at a time, and the number of items
     is printed.
     """
     from marey_client.errors import RequestFailed

@@ -1,4 +1,4 @@
-"""Commands `pipeline` and `build-model`: they submit jobs that read each other's outputs, and follow them together."""
+"""Commands `pipeline` and `build-model`: they submit jobs that read each other's outputs, and follow the jobs."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def pipeline(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Submit a graph of jobs, and follow them. Results that were computed before are used again."""
+    """Submit a graph of jobs, and follow the jobs. Results that were computed before are used again."""
     from marey_schemas.queue.pipelines import PipelineCreate
 
     wanted = PipelineCreate.model_validate(read_json(file))
@@ -62,7 +62,7 @@ def build_model(
     context: typer.Context,
     takes: Annotated[
         list[str],
-        typer.Argument(help="Clips or folders of clips, as project/folder[/name]; with --project, local files."),
+        typer.Argument(help="Clips or folders of clips, as project/folder[/name]. With --project: local files."),
     ],
     name: Annotated[str, typer.Option(help="Name of the model.")],
     propose: Chosen,
@@ -71,7 +71,10 @@ def build_model(
     to: Annotated[str | None, typer.Option(help="Skeleton to retarget the takes to: project/folder/name.")] = None,
     into: Annotated[str | None, typer.Option(help="Folder of the results; default: the name of the model.")] = None,
     layer: Annotated[
-        str | None, typer.Option(help="Layer of the annotations to use; with --propose, name of the proposed layer.")
+        str | None,
+        typer.Option(
+            help="Layer of the annotations to use. With --propose: name of the layer for the proposed annotations."
+        ),
     ] = None,
     label: Annotated[list[str] | None, typer.Option(help="Use only segments with this label; may be repeated.")] = None,
     whole: Annotated[
@@ -96,7 +99,7 @@ def build_model(
 ) -> None:
     """Make a model from takes: import, retarget, annotate, cut and align them, train the model, build its search tree.
 
-    Existing results are used again: if a take has changed, only the results that depend on it are computed.
+    Existing results are used again: if a take has changed, only the results that depend on this take are computed.
     """
     plan: dict[str, Any] = _chosen(choices or ())
     if propose:
@@ -156,8 +159,8 @@ def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[st
             raise WrongUsage("the takes must be in one project")
         if options:
             raise WrongUsage(
-                "there are parameters for an import, but the takes are clips of a project; leave these parameters "
-                "out, or give local files, and with --project the project that receives them"
+                "there are parameters for an import, but the takes are clips of a project; leave out these "
+                "parameters, or give local files, and name the project that receives the files with --project"
             )
         return addresses[0].project, {"takes": [clips_at(marey, address) for address in addresses]}
     from marey_client.imports import find_files, left_out_text
@@ -166,8 +169,8 @@ def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[st
     found = find_files(map(Path, takes))
     if found.exported:
         raise WrongUsage(
-            "the takes are a folder that `marey dataset export` wrote; import it with `marey upload`, which also "
-            "imports take records and consents, and give the clips that it creates"
+            "the takes are in a folder that `marey dataset export` wrote; first import the folder with `marey "
+            "upload`, which also imports take records and consents, then give the imported clips as takes"
         )
     if found.left_out:
         print_message(left_out_text(found.left_out))
@@ -198,7 +201,8 @@ def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> 
     except KeyboardInterrupt:
         first = next((job.id for job in run.steps.values() if not job.state.terminal), "JOB")
         print_message(
-            f"the jobs continue on the server; marey job ls {project} shows them, marey job cancel {first} stops them"
+            f"the jobs continue on the server; `marey job ls {project}` shows them, "
+            f"`marey job cancel {first}` stops them"
         )
         raise typer.Exit(INTERRUPTED) from None
     finally:

@@ -1,4 +1,4 @@
-"""Commands `serve`, `worker`, `demo` and `db`, which run locally instead of asking a server."""
+"""Commands `serve`, `worker`, `demo` and `db`, which do their work on this machine."""
 
 from __future__ import annotations
 
@@ -64,7 +64,9 @@ def worker(
     kind: Annotated[list[str] | None, typer.Option(help="Run only jobs of this kind; may be repeated.")] = None,
     label: Annotated[
         list[str] | None,
-        typer.Option(help="Label of the worker, as name=value, that jobs may require; may be repeated."),
+        typer.Option(
+            help="Label of the worker, as name=value; may be repeated. A job can require labels of its worker."
+        ),
     ] = None,
     name: Annotated[
         str | None, typer.Option(help="Name of the worker, shown to people; default: host and process id.")
@@ -77,7 +79,7 @@ def worker(
         LogForm | None, typer.Option(help="Format of the log: text (the default at a terminal) or json.")
     ] = None,
 ) -> None:
-    """Run jobs of a server until the worker is stopped. The token must have the scope `work`."""
+    """Run a worker: it runs jobs of a server until it is stopped. The token must have the scope `work`."""
     from marey_client import embedded
     from marey_client.cli.terminal.invocation import credential_of
     from marey_client.cli.terminal.typed_values import assignment
@@ -142,7 +144,9 @@ def check_database(
     repair: Annotated[
         bool,
         typer.Option(
-            "--repair", help="Correct wrong counters of items and bytes; other writes wait until this is done."
+            "--repair",
+            help="Correct wrong counters of items and bytes. Other writes to the database wait until the correction "
+            "is done.",
         ),
     ] = False,
     data: DataFolder = None,
@@ -174,8 +178,8 @@ def set_clock(
 
     The stored clock never goes back by itself. If a server has run with a clock that was years ahead, its tokens have
     expired and its leases do not end for a long time. --set corrects this: it sets every stored time that is later than
-    now to the present time, ends all leases, and keeps the duration of tokens and time limits that were created with
-    the wrong clock.
+    now to the present time, and ends all leases. Tokens and time limits that were created with the wrong clock keep
+    their durations.
     """
     if set_now and not yes:
         _database("clock", data, None)

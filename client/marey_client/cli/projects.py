@@ -29,7 +29,7 @@ DefaultLimits = Annotated[
     bool,
     typer.Option(
         "--defaults",
-        help="Use the limits in the server's settings, except for those given by `--items` and `--stored-bytes`.",
+        help="Use the limits in the server's settings, except for limits given by `--items` and `--stored-bytes`.",
     ),
 ]
 
@@ -116,7 +116,7 @@ def project_quota(
     defaults: DefaultLimits = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show how many items and bytes a project has, and the limits, which administrators can change."""
+    """Show the quotas of a project: its items and bytes, and the limits. Administrators can change the limits."""
     change = quota_change(items, stored_bytes, defaults)
     with connect(context) as marey:
         found = marey.project(name).quotas() if change is None else marey.project(name).change_quotas(change)
@@ -163,7 +163,10 @@ def list_members(
     project_name: ProjectName,
     folder: Annotated[
         str | None,
-        typer.Option(help="Show only the roles in this folder and the folders below it; / shows those in all folders."),
+        typer.Option(
+            help="Show the roles in this folder and the folders below it, instead of roles in the project. / shows "
+            "the roles in all folders."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from marey_schemas.purges import HeldItem, PurgeAnswer, PurgedItem, PurgeRequest
 
 MOST_SHOWN = 100
-"""Greatest number of refused items that are printed with what still needs them."""
+"""Greatest number of refused items that are printed, each with the objects that still need it."""
 
 
 def add_to(app: typer.Typer) -> None:
@@ -32,14 +32,16 @@ def purge(
     places: Annotated[
         list[str],
         typer.Argument(
-            help="One or more removed items, or folders or projects whose removed items are purged: "
-            "project/folder/name, project/folder/, project/id or project."
+            help="Removed items to purge: project/folder/name or project/id. Or places whose removed items are all "
+            "purged: a folder as project/folder/, or a project."
         ),
     ],
     kind: Annotated[
         str | None,
         typer.Option(
-            "--kind", help="Kind of the items; default: all kinds, or clip with --query. `collection` means a folder."
+            "--kind",
+            help="Kind of the items; default: all kinds. With --query, the default is clip. `collection` means a "
+            "folder.",
         ),
     ] = None,
     query: QueryText = None,
@@ -60,7 +62,7 @@ def purge(
     """Delete removed items for good: content, history, name and tags. Nothing can restore them.
 
     Garbage collection then frees the bytes that nothing else needs. Items that something still needs, such as a version
-    of a dataset, are refused: the command says what holds them, purges the others, and ends with exit status 1. With
+    of a dataset, are refused: the command prints what needs them, purges the other items, and exits with status 1. With
     `--dataset`, a deleted dataset is purged: its versions, branches, tags and proposals, but not its items. Only owners
     of the project may purge.
     """
@@ -147,7 +149,7 @@ def _request(
 
 
 def _is_folder(project: ProjectHandle, address: Address) -> bool:
-    """Return whether an address is that of a folder, existing or removed.
+    """Return whether an address belongs to a folder, existing or removed.
 
     Raises `WrongUsage` if removed items have the same address.
     """
@@ -157,7 +159,7 @@ def _is_folder(project: ProjectHandle, address: Address) -> bool:
     items = project.purge(path=address.path, preview=True)
     if items.purged or items.refused:
         raise WrongUsage(
-            f"{address} is a folder and a removed item; write {address}/ for what was removed from the folder, or the "
+            f"{address} is a folder and a removed item; write {address}/ for all items removed from the folder, or the "
             "id of the item"
         )
     return True

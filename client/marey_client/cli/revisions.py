@@ -23,7 +23,7 @@ _VERSION = re.compile(r"([^/@]+)@([^/@]+)(?:/(.+))?")
 
 
 def require_revision(marey: Marey, address: Address, kinds: Sequence[Kind]) -> tuple[Any, int | None]:
-    """Return the item at an address, and the revision after its `@`, or None if no revision is given.
+    """Return the item at an address, and the revision number after `@`, or None if the address has no revision.
 
     Raises `WrongUsage` if there is no item.
     """
@@ -32,7 +32,7 @@ def require_revision(marey: Marey, address: Address, kinds: Sequence[Kind]) -> t
 
 
 def find_revision(marey: Marey, address: Address, kinds: Sequence[Kind]) -> tuple[ItemHandle, int | None] | None:
-    """Return the item at an address, and the revision after its `@`, if one is given; None if there is no item."""
+    """Return the item at an address, with the revision number after `@` or None; return None if there is no item."""
     found = find_item(marey, address, kinds)
     if found is not None:
         return found, None

@@ -101,15 +101,17 @@ def search(
     ] = None,
     request: Annotated[
         Path | None,
-        typer.Option(help="JSON file with the whole request; needed to search for several consecutive motions."),
+        typer.Option(
+            help="JSON file with the whole search request. Only such a file can request several consecutive motions."
+        ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "--output", "-o", help="File or folder to write the motion to.")
+        Path | None, typer.Option("--out", "--output", "-o", help="File or folder to which the motion is written.")
     ] = None,
     format: Annotated[str, typer.Option(help=f"{one_of(MOTION_FORMATS)}.")] = DEFAULT_FORMAT,  # noqa: A002
     as_json: AsJson = False,
 ) -> None:
-    """Find the motion of a model that best meets constraints.
+    """Find the motion that meets constraints best, among all motions of a model.
 
     WHEN in an option is the label of a keyframe, `start`, `end`, or the number of a canonical frame: a frame of the
     common time to which the examples of the model were aligned.

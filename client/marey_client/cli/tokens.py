@@ -47,15 +47,15 @@ def create_token(
         int | None,
         typer.Option(
             min=0,
-            help="Days for which the token is valid; 0: it does not expire; default: 90, but not "
+            help="Number of days for which the token is valid; 0: the token does not expire. Default: 90, but not "
             "longer than your own token.",
         ),
     ] = None,
     label: Annotated[
         list[str] | None,
         typer.Option(
-            help="Label that a worker with this token may announce, as name=value; repeatable. Allowed only if the "
-            "token has the scope work. Default: the labels of your own token; if it has none, any label."
+            help="Label that a worker with this token may announce, as name=value; may be repeated. Allowed only if "
+            "the token has the scope work. Default: the labels of your own token; if it has none, any label."
         ),
     ] = None,
     output: Annotated[
@@ -162,7 +162,7 @@ def rotate_token(
     ] = 60,
     as_json: AsJson = False,
 ) -> None:
-    """Replace the token in use by a new one with the same rights and expiry, and store the new one in the same file.
+    """Replace the token in use by a new token with the same rights and expiry; store the new token in the same file.
 
     The new token is not shown. If the command is interrupted, run it again: the server returns the same new token.
     """
@@ -180,9 +180,9 @@ def rotate_token(
 def _rotate_stored_token(marey: Marey, credential: Credential, *, grace: timedelta) -> NewToken:
     """Replace the token of `marey` by a successor, on the server and in the file that contains the token.
 
-    The id of the rotation is stored beside this file before the request is sent. So if the program ends before it has
-    stored the successor, a further call gets the same successor. Raises `BadCredentialFile` if no file contains the
-    token.
+    The id of the rotation is stored next to the token's file before the request is sent. If the program ends before it
+    has stored the successor, another call therefore gets the same successor. Raises `BadCredentialFile` if no file
+    contains the token.
     """
     from marey_client.access import Tokens
     from marey_client.credentials import replace_token
@@ -203,7 +203,7 @@ def _rotate_stored_token(marey: Marey, credential: Credential, *, grace: timedel
 
 
 def _rotation_id(begun: Path, token: str) -> str:
-    """Return the id of this token's rotation from the file `begun`; if the file has none, store a new id in it."""
+    """Return the id of this token's rotation from the file `begun`; if the file has no id, store a new one there."""
     from marey_client.credentials import write_private
 
     prefix = token.split("_")[1] if token.count("_") > 1 else ""
@@ -215,11 +215,11 @@ def _rotation_id(begun: Path, token: str) -> str:
     return rotation_id
 
 
-@token.command("rm", help="Revoke a token, at once; the same as `marey token revoke`.")
+@token.command("rm", help="Revoke a token at once; the same as `marey token revoke`.")
 @token.command("revoke")
 def revoke_token(
     context: typer.Context,
-    token_id: Annotated[str | None, typer.Argument(help="Id of the token; marey token ls lists the ids.")] = None,
+    token_id: Annotated[str | None, typer.Argument(help="Id of the token; `marey token ls` lists the ids.")] = None,
     with_created: Annotated[
         bool, typer.Option("--with-created", help="Also revoke the tokens that were created with this token.")
     ] = False,
@@ -232,7 +232,7 @@ def revoke_token(
         ),
     ] = None,
 ) -> None:
-    """Revoke a token, at once. Administrators may revoke the tokens of others."""
+    """Revoke a token at once. Administrators may also revoke tokens of other users."""
     if (token_id is None) == (all_of is None):
         raise WrongUsage("give either the id of a token, or a user with --all-of")
     with connect(context) as marey:

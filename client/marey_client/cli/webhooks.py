@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 webhook = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Notify other programs of events in a project.")
 
-WebhookId = Annotated[str, typer.Argument(metavar="ID", help="Id of the webhook; marey webhook ls lists the ids.")]
+WebhookId = Annotated[str, typer.Argument(metavar="ID", help="Id of the webhook; `marey webhook ls` lists the ids.")]
 Url = Annotated[str, typer.Argument(help="Address to which requests are sent, such as https://ci.example.org/marey.")]
 Kinds = Annotated[
     list[str] | None,
@@ -50,7 +50,7 @@ def create(
 ) -> None:
     """Create a webhook, and print its secret, which is never shown again.
 
-    Without --kind, the webhook reports moved branches, proposals and ends of jobs.
+    Without --kind, the webhook reports moved branches, proposals, and jobs that have ended.
     """
     from marey_schemas.event_kinds import DEFAULT_WEBHOOK_KINDS
 
@@ -116,7 +116,7 @@ def change(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Change, pause or resume a webhook. --kind replaces all kinds of events that it reports."""
+    """Change, pause or resume a webhook. --kind replaces all kinds of events that the webhook reports."""
     from marey_schemas.webhooks import WebhookChange
 
     wanted = WebhookChange(url=url, kinds=_event_kinds(kind) or None, description=description, paused=pause)
@@ -146,7 +146,7 @@ def rotate(
     ] = 24 * 60,
     as_json: AsJson = False,
 ) -> None:
-    """Replace the secret of a webhook, and print the new one, which is never shown again."""
+    """Replace the secret of a webhook, and print the new secret, which is never shown again."""
     with connect(context) as marey:
         made = marey.project(project).webhooks.at(webhook_id).rotate(grace=timedelta(minutes=grace_minutes))
     if as_json:
@@ -165,7 +165,7 @@ def deliveries(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the deliveries that failed or were requested, newest first; dead ones were given up."""
+    """List deliveries that failed or that a user requested, newest first. Dead deliveries are not repeated any more."""
     with connect(context) as marey:
         found = list(marey.project(project).webhooks.at(webhook_id).deliveries(_delivery_state(state)))
     if as_json:
@@ -193,12 +193,17 @@ def redeliver(
     webhook_id: WebhookId,
     delivery: Annotated[
         str | None,
-        typer.Argument(metavar="DELIVERY", help="Id of the delivery; marey webhook deliveries lists the ids."),
+        typer.Argument(metavar="DELIVERY", help="Id of the delivery; `marey webhook deliveries` lists the ids."),
     ] = None,
-    all_dead: Annotated[bool, typer.Option("--all", help="Send again all deliveries that were given up.")] = False,
+    all_dead: Annotated[
+        bool,
+        typer.Option(
+            "--all", help="Send all dead deliveries again: failed deliveries that are not attempted any more."
+        ),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Send a delivery again, or all deliveries that were given up. The exit status is 1 if a delivery fails."""
+    """Send a delivery again, or all dead deliveries. The exit status is 1 if a delivery fails."""
     if (delivery is None) != all_dead:
         raise WrongUsage("give either the id of a delivery, or --all")
     with connect(context) as marey:
@@ -212,7 +217,7 @@ def redeliver(
 
 @webhook.command("test")
 def send_test(context: typer.Context, project: ProjectName, webhook_id: WebhookId, as_json: AsJson = False) -> None:
-    """Send a test event to a webhook, and print the result. The exit status is 1 if it fails."""
+    """Send a test event to a webhook, and print the result. The exit status is 1 if the delivery fails."""
     with connect(context) as marey:
         handle = marey.project(project).webhooks.at(webhook_id)
         found = handle.wait(handle.test().id)

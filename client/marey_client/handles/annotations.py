@@ -24,8 +24,8 @@ class AnnotationHandle(ItemHandle):
         """Apply commands in order, all or none, as one new revision.
 
         A command is a dict, such as `{"command": "split_segment", "at": 120}`. Raises `PreconditionFailed` if the
-        annotation was changed since it was read, and `RequestFailed` if a command cannot be applied; its text names
-        this command.
+        annotation was changed since it was read, and `RequestFailed` if a command cannot be applied; the text of the
+        error names this command.
         """
         change = AnnotationChange.model_validate({"commands": several(commands), "message": message})
         response = self.transport.send(

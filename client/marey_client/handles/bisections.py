@@ -43,7 +43,7 @@ class VersionRange:
 
     @property
     def expected_tests(self) -> int:
-        """The expected number of tests, without the two for the ends: log2 of the number of versions, rounded up."""
+        """The expected number of tests between the two ends: log2 of the number of versions, rounded up."""
         return self.search().expected_tests
 
     @property
@@ -53,7 +53,7 @@ class VersionRange:
         return None if chosen is None else self.commits[chosen]
 
     def search(self) -> BadCommitSearch:
-        """Return a new search for the first bad one of these versions."""
+        """Return a new search for the first bad version in this range."""
         return BadCommitSearch(self.parents, self.bad.digest)
 
 
@@ -77,8 +77,8 @@ class Bisection:
     ----------
     range : the versions among which the first bad one was searched for
     suspects : the first bad version; or, if some versions could not be tested, all versions that can be the first bad
-        one: the last of these was tested and is bad, and the others were not tested
-    tests : all tests in their order; the first two are those of the ends
+        one. The last of these suspects was tested and is bad; the other suspects were not tested
+    tests : all tests in their order; the first two tests are the tests of `good` and `bad`
     """
 
     range: VersionRange

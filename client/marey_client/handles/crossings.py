@@ -1,4 +1,4 @@
-"""Search for the first version of a dataset at which a metric of its evaluation has crossed a value."""
+"""Search for the first version of a dataset whose evaluation has a metric beyond a limit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NAME_DIGITS = 12
 
 @dataclass(frozen=True)
 class Limit:
-    """Value of a metric; versions with a value above it, or below it if `above` is false, are bad."""
+    """Limit of a metric. Versions with a value above the limit are bad, or below the limit if `above` is false."""
 
     value: float
     above: bool = True
@@ -43,8 +43,8 @@ class Limit:
 class Measurement:
     """Value of the metric at a version; None if the version cannot be evaluated, for the given `reason`.
 
-    `output` is the revision of the evaluation, and `reused` is true if it existed before or another version has the
-    same entries.
+    `output` is the revision of the evaluation. `reused` is true if this evaluation existed before, or belongs to
+    another version with the same entries.
     """
 
     commit: Commit
@@ -58,8 +58,8 @@ class Measurement:
 class ParentChange:
     """Change of the metric from a parent of the first bad version to this version.
 
-    `interval` has the bounds of the mean change of a trial at 95 % confidence, by bootstrap over the trials. It is None
-    if the metric is no mean over trials, or if fewer than two trials define it.
+    `interval` has the bounds, at 95 % confidence, of the mean change over all trials, computed by bootstrap. It is None
+    if the metric is not a mean over trials, or if fewer than two trials have a value of the metric.
     """
 
     parent: Measurement
@@ -73,12 +73,12 @@ class ParentChange:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Result of a search for the first version at which a metric has crossed a value.
+    """Result of a search for the first version at which a metric has crossed a limit.
 
     Parameters
     ----------
     search : the tests of versions, and the versions that can be the first bad one according to the tests
-    metric, limit : name of the metric, and the value that it has crossed
+    metric, limit : name of the metric, and the limit that its value has crossed
     measurements : values at the tested versions and at the parents of the first bad one, in the order of measuring
     changes : if there is a single first bad version, the change of the metric from each of its parents
     """
@@ -95,7 +95,7 @@ class Crossing:
         return self.search.first_bad
 
     def value(self, commit: Commit) -> float | None:
-        """Return the value of the metric at a version; None if the version was not or cannot be evaluated."""
+        """Return the value of the metric at a version; None if the version was not evaluated or cannot be evaluated."""
         return next((one.value for one in self.measurements if one.commit.digest == commit.digest), None)
 
 
@@ -114,8 +114,8 @@ class VersionEvaluations:
     params : options of the evaluations; each evaluation is named after the digest of its version
     path : folder of the dataset whose clips are evaluated; empty: all clips
     into : folder that receives the evaluations; None: the name of the dataset with `-bisect` at its end
-    normaliser : evaluation, given as a handle or an id, whose scales of features are used; None: each
-        evaluation computes its own scales
+    normaliser : evaluation whose scales of features are used, as a handle or an id; None: each evaluation computes its
+        own scales
 
     Raises `CannotBisect` if there is no such metric.
     """
@@ -138,7 +138,7 @@ class VersionEvaluations:
             raise CannotBisect(f"evaluations have no metric {self.metric!r}; their metrics are {names}")
 
     def measure(self, commit: Commit) -> Measurement:
-        """Return the value of the metric at a version, from its evaluation or that of a version with the same entries.
+        """Return the value of the metric at a version; versions with the same entries share one evaluation.
 
         An evaluation that is interrupted by Ctrl-C is cancelled.
         """
@@ -186,8 +186,8 @@ class VersionEvaluations:
     def interval(self, before: Measurement, after: Measurement) -> tuple[float, float] | None:
         """Return the bounds, at 95 % confidence, of the mean change of the metric over the trials of two versions.
 
-        Returns None if the metric is no mean over trials, if a version was not evaluated, or if fewer than two trials
-        define the metric.
+        Returns None if the metric is not a mean over trials, if a version was not evaluated, or if fewer than two
+        trials have a value of the metric.
         """
         metric = HEADLINE_METRICS[self.metric].of_trials
         if metric is None or before.output is None or after.output is None:
@@ -243,7 +243,7 @@ def _end(evaluations: VersionEvaluations, commit: Commit, which: str) -> float:
 
 
 def _changes(among: VersionRange, evaluations: VersionEvaluations, first_bad: Commit) -> tuple[ParentChange, ...]:
-    """Return the change of the metric from each parent of the first bad version; evaluate untested parents."""
+    """Return the change of the metric from each parent of the first bad version; evaluate parents if necessary."""
     after = evaluations.measure(first_bad)
     changes = []
     for digest in among.parents[first_bad.digest]:
@@ -266,7 +266,7 @@ def change_interval(
     Returns
     -------
     (2,) float    bounds at 95 % confidence, in the unit of the metric, by bootstrap over trials; None if fewer than two
-        trials define the metric in both
+        trials have a value of the metric in both evaluations
     """
     earlier = {row["trial"]: row.get(metric) for row in before}
     pairs = [

@@ -26,7 +26,7 @@ class ImportedVersion(NamedTuple):
     branch: str
     """The branch that was to move to the version."""
     moved: bool
-    """Whether the branch is at the version now; if not, the branch has other versions, and a merge can combine both."""
+    """Whether the branch is at the version now; if not, the branch has other versions, and a merge can add this one."""
     tag: str | None = None
     """The tag that was copied with the version, or None."""
 
@@ -58,9 +58,9 @@ class Datasets:
     ) -> ImportedVersion:
         """Check an archive, and record its versions in a dataset, which is created if it does not exist.
 
-        The versions keep their digests, and no folder is changed. The branch `into` is created if it does not exist. It
-        moves to the newest imported version if its newest commit is an ancestor of this version. Otherwise it does not
-        move, and the caller can merge the version into it.
+        The versions keep their digests, and no folder is changed. The branch `into` is created if it does not exist. If
+        the newest commit of the branch is an ancestor of the newest imported version, the branch moves to this version.
+        Otherwise, the branch does not move, and the caller can merge the version into the branch.
 
         Raises `marey_versions.archive.members.BadArchive`, which names the member that was changed or is missing, and
         `EarlierVersionsMissing` if the archive builds on a version that the dataset does not have.
@@ -91,10 +91,10 @@ class Datasets:
     ) -> ImportedVersion:
         """Copy a version of another dataset, and all versions before it, into the dataset `name` of this project.
 
-        `source` may be on another server. Only what the dataset `name` lacks is copied; it is created if it does not
-        exist. An interrupted copy is continued by the next call. The branch `into`, by default the branch that
-        `version` names or `main`, moves as in `import_archive`. If `version` is a tag, the tag is created too, unless a
-        branch or tag of this name exists.
+        `source` may be on another server. The dataset `name` is created if it does not exist, and only what it lacks is
+        copied. The next call continues an interrupted copy. The branch `into`, by default the branch that `version`
+        names or `main`, moves as in `import_archive`. If `version` is a tag, the tag is created too, unless a branch or
+        tag of this name exists.
         """
         from marey_client.archives.transfers import fetched_versions, find_missing
 
@@ -126,9 +126,9 @@ class Datasets:
 
 
 def _receive(dataset: DatasetHandle, archive: Archive, into: str, on_progress: OnProgress) -> ImportedVersion:
-    """Record the versions of an archive without checking it, and move the branch `into` to the newest of them.
+    """Record the versions of an archive, which is not checked, and move the branch `into` to the newest version.
 
-    The branch stays where it is if its newest commit is not an ancestor of that version.
+    The branch does not move if its newest commit is not an ancestor of the newest version.
     """
     from marey_client.archives.receiving import send_versions
 
@@ -139,7 +139,7 @@ def _receive(dataset: DatasetHandle, archive: Archive, into: str, on_progress: O
 
 
 def _forward(dataset: DatasetHandle, branch: str, commit: Commit) -> ImportedVersion:
-    """Move a branch to a commit if the newest commit of the branch is an ancestor of that commit.
+    """Move a branch to the given commit if this commit is a descendant of the branch's newest commit.
 
     A branch that does not exist is created. The result says whether the branch is at the commit now.
     """
@@ -154,7 +154,7 @@ def _forward(dataset: DatasetHandle, branch: str, commit: Commit) -> ImportedVer
 
 
 def _fast_forward(dataset: DatasetHandle, branch: str, commit: str) -> bool:
-    """Move a branch to a commit if the newest commit of the branch is an ancestor of that commit.
+    """Move a branch to the given commit if this commit is a descendant of the branch's newest commit.
 
     The branch must have a commit already. Returns whether the branch is at the given commit now.
     """

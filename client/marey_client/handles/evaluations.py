@@ -36,7 +36,7 @@ class EvaluationHandle(ReportedHandle):
         return list(trial_rows(self.document()))
 
     def clips(self) -> list[dict[str, Any]]:
-        """Return one row per clip: name, frames, and its use by the trials."""
+        """Return one row per clip: name, number of frames, and use of the clip by the trials."""
         return list(clip_rows(self.document()))
 
     def records(self) -> dict[str, dict[str, NDArray[Any]]]:
@@ -44,15 +44,16 @@ class EvaluationHandle(ReportedHandle):
         return record_arrays(self.part("records"))
 
     def walk_graph(self, *, trial: str | None = None) -> dict[str, Any]:
-        """Return the frames that the trials displayed, the jumps between them, and the order of each walk, as lists.
+        """Return the frames that the trials displayed, the jumps between frames, and the walk of each trial, as lists.
 
         * `clips`: identifier, name and number of frames of each clip;
-        * `nodes`: the lists `clip`, `frame` and `ticks`, with one element for each displayed frame: the index of its
-          clip, its number, and the number of ticks for which it was displayed;
+        * `nodes`: the lists `clip`, `frame` and `ticks`, with one element for each displayed frame: the index of the
+          clip, the number of the frame in this clip, and the number of ticks for which the frame was displayed;
         * `edges`: the lists `source`, `target` and `count`: the indices of two nodes, and the number of jumps from the
           first to the second;
-        * `walks`: for each name in `trials`, the lists `tick`, `clip`, `frame` and `frames`, with one element for each
-          run of successive frames: its first tick, its clip, its first frame, and its length.
+        * `walks`: for each trial, in the order of the list `trials` of names, the lists `tick`, `clip`, `frame` and
+          `frames`, with one element for each run of successive frames: first tick, clip, first frame, and number of
+          frames.
 
         Without `trial`, the graph is that of all trials together.
         """
@@ -71,7 +72,7 @@ class EvaluationHandle(ReportedHandle):
     # -- jobs on the evaluation: each method submits one and waits for it, or raises `JobUnsuccessful` --
 
     def compare(self, after: EvaluationHandle, *, on_progress: OnProgress | None = None, **options: Any) -> Findings:
-        """Compare this evaluation with a later one, `after`, of the same trials with the same scaling of features.
+        """Compare this evaluation with `after`, a later one with the same trials and the same scaling of features.
 
         `options` are those of `CompareParams`.
         """
@@ -80,7 +81,7 @@ class EvaluationHandle(ReportedHandle):
     def suggest(
         self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
     ) -> Findings:
-        """Find clips that can be removed, and those of `candidates` (clips and folders of clips) that fill gaps.
+        """Find clips that can be removed, and clips among `candidates` (clips and folders of clips) that fill gaps.
 
         `options` are those of `SuggestParams`.
         """
@@ -89,7 +90,7 @@ class EvaluationHandle(ReportedHandle):
     def optimise(
         self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
     ) -> Findings:
-        """Find removals of clips and additions of candidates, step by step, as long as each lowers the objective.
+        """Find removals of clips and additions of candidates, as long as each step lowers the objective function.
 
         `options` are those of `OptimiseParams`.
         """
@@ -146,7 +147,7 @@ def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def clip_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield one row for each clip of an evaluation's document: its number of frames, and how much the trials used it.
+    """Yield one row for each clip of an evaluation's document: number of frames, and how much the trials used the clip.
 
     Frames are counted at the rate of the trials.
     """

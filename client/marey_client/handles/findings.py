@@ -1,4 +1,4 @@
-"""Findings: results of jobs on evaluations, with numbers, a document, and for some kinds a report."""
+"""Findings: results of jobs on evaluations, with numbers and a document; some kinds of jobs also make a report."""
 
 from __future__ import annotations
 

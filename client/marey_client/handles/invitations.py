@@ -36,8 +36,8 @@ class Invitations(_OpenInvitations):
     def create(self, role: Role, *, lifetime: timedelta = WEEK, uses: int = 1, note: str = "") -> NewInvitation:
         """Invite users of the server to the project.
 
-        The code is in the answer and never shown again; send it to the invited people. Raises `Conflict` if there are
-        too many open invitations.
+        Only the answer contains the code; send the code to the invited people. Raises `Conflict` if there are too many
+        open invitations.
         """
         lifetime_s = int(lifetime.total_seconds())
         request = InvitationCreate(role=role, expires_in_s=lifetime_s, uses=uses, note=note)
@@ -56,10 +56,10 @@ class AccountInvitations(_OpenInvitations):
         uses: int = 1,
         note: str = "",
     ) -> NewInvitation:
-        """Invite people to create an account, and to become members of `project` with `role` if these are given.
+        """Invite people to create an account; with `project` and `role`, they also become members of the project.
 
-        The code is in the answer and never shown again; send it to the invited people. Raises `Conflict` if there are
-        too many open invitations.
+        Only the answer contains the code; send the code to the invited people. Raises `Conflict` if there are too many
+        open invitations.
         """
         request = AccountInvitationCreate(
             project=project, role=role, expires_in_s=int(lifetime.total_seconds()), uses=uses, note=note

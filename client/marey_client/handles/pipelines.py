@@ -1,4 +1,4 @@
-"""Pipelines: jobs that read each other's outputs and are submitted and followed together."""
+"""Pipelines: several jobs, submitted and followed together, that read each other's outputs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class PipelineRun:
 
     @property
     def steps(self) -> Mapping[str, Job]:
-        """The jobs by the name of their step, in an order in which each job comes after the jobs that it depends on."""
+        """The jobs by the name of their step; each job comes after the jobs on which it depends."""
         return MappingProxyType(self._steps)
 
     @property
@@ -72,7 +72,7 @@ class PipelineRun:
         return self._jobs.outputs(self._steps[step].id)
 
     def cancel(self) -> Mapping[str, Job]:
-        """Cancel every job that has not ended, the last ones first, so that none fails because its input is missing."""
+        """Cancel every job that has not ended, the last jobs first, so that no job fails because of a missing input."""
         for job in reversed(self.refresh().values()):
             if not job.state.terminal:
                 with suppress(Conflict):  # it has ended since
@@ -82,7 +82,7 @@ class PipelineRun:
     def _look(self, wait_s: float) -> Mapping[str, Job]:
         """Request the state of each unfinished job, and return all jobs by step.
 
-        The request for the first unfinished job waits up to `wait_s` seconds for its end.
+        The request for the first unfinished job waits up to `wait_s` seconds for the end of this job.
         """
         for name, known in self._steps.items():
             if not known.state.terminal:

@@ -1,4 +1,4 @@
-"""Aligned clips: canonical frames, time functions and sources."""
+"""Aligned clips: canonical frames, time functions (the source frame of each canonical frame) and sources."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from marey_schemas.kinds import Kind
 
 
 class ProcessedHandle(ItemHandle):
-    """Handle of an aligned clip: canonical frames of an action, and their mapping to frames of the source clip."""
+    """Handle of an aligned clip: poses at the canonical frames of an action, and the source frame of each of them."""
 
     def motion(
         self, *, frames: slice | None = None, joints: str | Sequence[str] | None = None, revision: int | None = None

@@ -38,7 +38,7 @@ class Proposals:
         return self.at(self.transport.post(Proposal, self.url, request).number)
 
     def list(self, state: ProposalState | None = None) -> Iterator[Proposal]:
-        """List the proposals, newest first; with `state`, only those in this state."""
+        """List the proposals, newest first; with `state`, only proposals in this state."""
         query: Params = {} if state is None else {"state": state.value}
         return pages(self.transport, Proposal, self.url, query)
 
@@ -78,7 +78,7 @@ class ProposalHandle:
         return pages(self.transport, Comment, f"{self.url}/comments")
 
     def review(self, verdict: Verdict, text: str = "", *, commit: str | None = None) -> Review:
-        """Review the newest commit. Raises `Conflict` if `commit` is given and the newest commit is another one."""
+        """Review the newest commit. Raises `Conflict` if `commit` is given and is not the newest commit."""
         request = ReviewCreate(verdict=verdict, text=text, commit=commit)
         return self.transport.post(Review, f"{self.url}/reviews", request)
 
@@ -98,8 +98,8 @@ class ProposalHandle:
     ) -> ProposalCheck:
         """Report the state of a check of the newest commit.
 
-        Raises `Conflict` if `commit` is given and the newest commit is another one, or if `state` is `SUCCEEDED` and
-        `job` has not succeeded.
+        Raises `Conflict` if `commit` is given and is not the newest commit, or if `state` is `SUCCEEDED` and `job` has
+        not succeeded.
         """
         request = CheckReport(name=name, state=state, text=text, job=job, link=link, commit=commit)
         return self.transport.post(ProposalCheck, f"{self.url}/checks", request)
@@ -114,9 +114,9 @@ class ProposalHandle:
     ) -> Proposal:
         """Merge the proposal; with `when_green`, the server merges it as soon as all requirements are met.
 
-        Raises `Conflict` with one of three codes: `proposal-not-green` if something is missing, which `missing` in the
-        error's context lists; `merge-conflicts` if `resolutions` do not decide all conflicts; `proposal-moved` if
-        `commit` is given and the newest commit is another one.
+        Raises `Conflict` with one of three codes. `proposal-not-green`: requirements are not met; `missing` in the
+        context of the error lists them. `merge-conflicts`: `resolutions` do not decide all conflicts. `proposal-moved`:
+        `commit` is given and is not the newest commit.
         """
         request = ProposalMerge(message=message, resolutions=tuple(resolutions), when_green=when_green, commit=commit)
         return self.transport.post(Proposal, f"{self.url}/merge", request)
@@ -126,5 +126,5 @@ class ProposalHandle:
         return read_model(Proposal, self.transport.send("DELETE", f"{self.url}/merge"))
 
     def close(self) -> Proposal:
-        """Close the proposal without merging it; only its author and maintainers may do this."""
+        """Close the proposal without a merge; only the author of the proposal and maintainers may do this."""
         return self.transport.post(Proposal, f"{self.url}/close")

@@ -1,4 +1,4 @@
-"""Purges of deleted items, in as many requests as they need."""
+"""Purges of deleted items; one purge may need several requests."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from marey_schemas.purges import PurgeAnswer, PurgeRequest
 
 
 def purge_step_by_step(transport: Transport, project: str, request: PurgeRequest) -> Iterator[PurgeAnswer]:
-    """Send as many requests as a purge needs, and yield each answer; each request continues after the last one."""
+    """Send all requests of a purge, and yield each answer; each request continues where the previous one ended."""
     wanted = request
     while True:
         answer = transport.post(PurgeAnswer, f"/projects/{project}/purges", wanted)
@@ -25,7 +25,7 @@ def purge_items(transport: Transport, project: str, request: PurgeRequest) -> Pu
 
 
 def combined(answers: Sequence[PurgeAnswer]) -> PurgeAnswer:
-    """Combine one or several answers into one; an item that several previews contain is listed once."""
+    """Combine the answers of a purge into one answer; an item that occurs in several previews is listed once."""
     return PurgeAnswer(
         preview=answers[0].preview,
         purged=tuple({one.item: one for answer in answers for one in answer.purged}.values()),

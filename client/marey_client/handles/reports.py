@@ -20,7 +20,7 @@ class ReportedHandle(ItemHandle):
         return str(self.item.summary["verdict"])
 
     def summary(self) -> dict[str, Any]:
-        """Return the verdict and the headline numbers; the names end in their units."""
+        """Return the verdict and the headline numbers; the name of each number ends in its unit."""
         return dict(self.item.summary)
 
     def figures(self) -> tuple[StoredFigure, ...]:
@@ -39,7 +39,7 @@ class ReportedHandle(ItemHandle):
         trial: str | None = None,
         table: str | None = None,
     ) -> bytes:
-        """Return a figure as png or svg, the data of the figure as json, or one `table` of this data as csv.
+        """Return a figure as png or svg, its data as json, or one `table` of its data as csv.
 
         Figures of single trials need the name of the `trial`.
         """

@@ -27,7 +27,7 @@ class SearchableHandle(ReportedHandle):
     """Handle of an item whose motions can be searched."""
 
     def search(self, constraints: Constraints = (), **options: Any) -> SearchAnswer:
-        """Return the motion that meets constraints best, and the error of each constraint.
+        """Return the motion of the model that meets `constraints` best, and the error of each constraint.
 
         `options` are those of `SearchRequest`. The option `steps` requests a sequence of motions; each step has its own
         constraints and, if it needs another model, the id of that model.

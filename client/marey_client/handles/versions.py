@@ -41,15 +41,15 @@ class PickOptions(TypedDict, total=False):
     into: str
     """Branch that gets the changes; default: main."""
     parent: Literal[1, 2]
-    """For a merge commit: the number of the parent with which it is compared to find its changes."""
+    """For a merge commit: number of a parent; the changes of the commit are the differences from this parent."""
     message: str
     """Message of the commit."""
     resolutions: tuple[Resolution, ...]
-    """Decisions of conflicts."""
+    """Decisions for conflicts."""
     preview: bool
     """Whether the result is only computed, not recorded."""
     expected: str
-    """Commit that must be the newest one of the branch."""
+    """Commit that must be the newest commit of the branch."""
 
 
 @dataclass(frozen=True)
@@ -113,8 +113,8 @@ class DatasetHandle:
     def log(self, version: str = MAIN, *, path: str = "") -> Iterator[ListedCommit]:
         """List a version and the versions before it, newest first; of a merge, only the first parent is followed.
 
-        With `path`, list only the commits that changed the entry or the folder at this path, with the number of entries
-        that each of them added, removed, moved and changed there.
+        With `path`, list only the commits that changed the entry or the folder at this path, each with the number of
+        entries that it added, removed, moved and changed there.
         """
         return pages(self.transport, ListedCommit, f"{self.url}/commits", {"version": version, "path": path})
 
@@ -130,7 +130,7 @@ class DatasetHandle:
             return False
 
     def entries(self, version: str = MAIN, *, path: str = "") -> Iterator[Entry]:
-        """List the entries of a version by path, all or those below a folder."""
+        """List the entries of a version, sorted by path; with `path`, only the entries below this folder."""
         return pages(self.transport, Entry, f"{self.url}/entries", {"version": version, "path": path, "limit": 1000})
 
     def difference(
@@ -190,7 +190,7 @@ class DatasetHandle:
         return self.transport.post(MergeAnswer, f"{self.url}/{resource}", request)
 
     def blame(self, path: str, kind: Kind, version: str = MAIN) -> EntryOrigins:
-        """Return the commits that last changed the parts, the path and the tags of an entry."""
+        """Return, for each part of an entry, for its path and for its tags, the commit that changed it last."""
         query: Params = {"version": version, "entry": path, "kind": kind}
         return self.transport.get(EntryOrigins, f"{self.url}/blame", query)
 
@@ -203,11 +203,11 @@ class DatasetHandle:
         first_parent: bool = False,
         on_step: OnStep | None = None,
     ) -> Bisection:
-        """Find the first bad version among those after `good` that led to `bad`, by halving them again and again.
+        """Find the first bad version after `good` on the way to `bad`, by bisection.
 
-        `is_bad` is called with the commits of versions to test, first with the two ends. It returns whether the version
-        is bad, or None if it cannot be tested. With `first_parent`, only the first parents of merges are followed.
-        `ProjectHandle.bisect` tests a metric of the evaluation of each version.
+        `is_bad` is called with the commit of each version to test, first with `good` and `bad`. It returns whether the
+        version is bad, or None if the version cannot be tested. With `first_parent`, only the first parent of each
+        merge is followed. `ProjectHandle.bisect` tests a metric of the evaluation of each version.
 
         Raises `CannotBisect` if `good` is not among the versions before `bad`, or if the tests of the two ends do not
         show that `good` is good and `bad` is bad.
@@ -233,12 +233,13 @@ class DatasetHandle:
     ) -> Commit:
         """Write a version, all versions before it, and everything that they contain to one file.
 
-        Return the commit of the version. The file exists only when it is complete and checked; the next call continues
-        an interrupted one. The versions `since` and all before them are left out; the archive can then be imported only
-        into datasets that have the versions `since`. Raises `NothingToArchive` if no version is left.
+        Return the commit of the version. The file exists only when it is complete and checked. After an interruption,
+        the next call continues to write. The versions `since` and all versions before them are left out; then the
+        archive can be imported only into datasets that have the versions `since`. Raises `NothingToArchive` if no
+        version is left.
 
-        If the consent for a clip has ended, raises `Conflict`, unless `allow_expired_consent` gives the reason why the
-        clip is exported nevertheless. The server records the reason; the caller must be a maintainer or owner.
+        If the consent for a clip has ended, raises `Conflict`, unless `allow_expired_consent` gives a reason to export
+        the clip nevertheless. The server records the reason; the caller must be a maintainer or owner.
         """
         from marey_client.archives.writing import check_consents, write_archive
 
@@ -254,12 +255,12 @@ class DatasetHandle:
         on_progress: OnProgress = ignore_progress,
         **options: Unpack[FileExportOptions],
     ) -> ExportedVersion:
-        """Write the clips of a version, all or those below the option `path`, to motion files in a new folder.
+        """Write all clips of a version, or the clips below the option `path`, to motion files in a new folder.
 
         The files have the paths of their entries. The sidecar `marey.json` names the version and the origin of each
         clip, so that an upload of the folder restores paths and take records. The folder exists only when it is
-        complete. Raises `FolderNotEmpty` if it exists already, `CannotExport` if the version has no clips or a path
-        cannot be a file name, and `Conflict` if the consent for a clip has ended, as `archive` does.
+        complete. Raises `FolderNotEmpty` if it exists and is not empty, `CannotExport` if the version has no clips or
+        the path of a clip cannot be a file name, and `Conflict` if the consent for a clip has ended, as `archive` does.
         """
         from marey_client.bridges.files import prepare_files, write_files
 
@@ -276,7 +277,8 @@ class DatasetHandle:
     ) -> ExportedVersion:
         """Write the clips of a version to a new folder that can be uploaded to the Hugging Face Hub as a dataset.
 
-        Its card names the commit, the licences and the lineage. Raises the errors of `export_files`.
+        The dataset card, `README.md`, names the commit, the licences and the lineage. Raises the errors of
+        `export_files`.
         """
         from marey_client.bridges.files import prepare_files
         from marey_client.bridges.huggingface import write_huggingface
@@ -294,8 +296,8 @@ class DatasetHandle:
     ) -> ExportedVersion:
         """Write the clips of a version to a new folder as a LeRobotDataset v3.0, with one episode for each clip.
 
-        Raises the errors of `export_files`, also `CannotExport` if the clips do not have the same skeleton and frame
-        rate, and `MissingPackage` if pyarrow is not installed.
+        Raises the errors of `export_files`. Also raises `CannotExport` if the clips do not have the same skeleton and
+        frame rate, and `MissingPackage` if pyarrow is not installed.
         """
         from marey_client.bridges.lerobot import prepare_lerobot, write_lerobot
 

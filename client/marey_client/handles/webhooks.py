@@ -35,8 +35,8 @@ class Webhooks:
     ) -> NewWebhook:
         """Create a webhook that sends events of these kinds to `url`.
 
-        The secret is in the answer and never shown again. Raises `Invalid` if the URL is one that the server does not
-        send to, and `Conflict` if the project has too many webhooks.
+        Only the answer contains the secret. Raises `Invalid` if the server does not send to this URL, and `Conflict` if
+        the project has too many webhooks.
         """
         request = WebhookCreate(url=url, kinds=tuple(kinds), description=description)
         return self.transport.post(NewWebhook, self.url, request, repeatable=False)
@@ -66,7 +66,7 @@ class WebhookHandle:
         return read_model(Webhook, self.transport.send("PATCH", self.url, content=as_json(change)))
 
     def rotate(self, *, grace: timedelta = timedelta(days=1)) -> NewWebhook:
-        """Replace the secret; the new one is in the answer and never shown again.
+        """Replace the secret; only the answer contains the new one.
 
         For the duration `grace`, deliveries are also signed with the old secret.
         """
@@ -78,7 +78,7 @@ class WebhookHandle:
         self.transport.send("DELETE", self.url)
 
     def deliveries(self, state: DeliveryState | None = None) -> Iterator[WebhookDelivery]:
-        """List the deliveries that failed or were requested, newest first; with `state`, only those in this state."""
+        """List deliveries that failed or that a user requested, newest first; with `state`, only in this state."""
         query: Params = {} if state is None else {"state": state}
         return pages(self.transport, WebhookDelivery, f"{self.url}/deliveries", query)
 

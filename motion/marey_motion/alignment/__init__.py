@@ -1,1 +1,1 @@
-"""Alignment of motions in time: the correspondence between the frames of one motion and those of another."""
+"""Alignment of motions in time: which frames of one motion correspond to which frames of another."""

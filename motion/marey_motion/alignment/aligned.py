@@ -23,10 +23,10 @@ class Placement:
     Parameters
     ----------
     heading_rad : float    heading in the first frame, 0 along +z, positive to the left
-    x, z : float    position of `joint` in the first frame, metres
+    x, z : float    ground position of `joint` in the first frame, metres
     y : float    metres subtracted from all heights; 0 by default, which leaves the heights unchanged
-    joint : int    index of the joint that carries the body (`MatchingBody.carrier`): the root, or usually the hips if
-        the root is a static reference on the floor
+    joint : int    index of the joint that carries the body (`MatchingBody.carrier`): the root or, if the root is a
+        static reference on the floor, usually the hips
     """
 
     heading_rad: float
@@ -45,11 +45,11 @@ class AlignedClip:
     uid : str    unique among the clips
     name : str    name shown to people; clips are ordered by name, then uid
     motion : Motion    N frames in canonical coordinates: the body begins at x = z = 0 and faces +z. If the root is
-        static, joints between the root and the joint that carries the body are not translated.
-    time_function : (N,) float64    fractional frame of the source (at the set's rate) at each canonical frame;
-        strictly increasing from 0 to the last frame of the source
-    placement : Placement    start of the source on the ground
-    cost : float    mean cost per cell of the alignment path from which the time function was made, square metres
+        static, the joints between the root and `placement.joint` are not translated.
+    time_function : (N,) float64    time warp: for each canonical frame, the fractional frame of the source, which is
+        sampled at the set's rate; strictly increasing from 0 to the last frame of the source
+    placement : Placement    position and heading of the source's first frame
+    cost : float    mean cost per cell of the alignment path that gave `time_function`, square metres
     source_frames : int    number of frames of the source at the set's rate
     """
 
@@ -93,5 +93,5 @@ class AlignedSet:
 
     @property
     def time_functions(self) -> Floats:
-        """Fractional source frame of each clip at each canonical frame, (clips, N) float64."""
+        """Fractional source frame of each clip for each canonical frame, (clips, N) float64."""
         return np.stack([clip.time_function for clip in self.clips])

@@ -27,8 +27,8 @@ class StoredExample(NamedTuple):
 
     Parameters
     ----------
-    uid : str    uid of the example if its tree contains none
-    clip : Clip    its canonical frames
+    uid : str    uid of the example, used if `info` contains none
+    clip : Clip    canonical frames of the example
     info : mapping    the tree made by `example_to_tree`
     """
 
@@ -43,7 +43,7 @@ def uid_of(item: str, revision: int, *, mirrored: bool = False) -> str:
     Parameters
     ----------
     item : str    id of the clip
-    revision : int    its revision
+    revision : int    revision of the clip
     mirrored : bool    whether the uid is for the clip's mirrored copy
 
     Returns
@@ -134,7 +134,7 @@ def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
 
 
 def restored_clip(clip: Clip, info: Mapping[str, Any]) -> Clip:
-    """Restore the source clip of a stored example at the set's rate, with its original timing and position.
+    """Restore the source clip of a stored example: its timing and position, at the frame rate of the aligned set.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def restored_clip(clip: Clip, info: Mapping[str, Any]) -> Clip:
 
     Returns
     -------
-    Clip    the source at the set's rate
+    Clip    the source at the frame rate of the set
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Alignment of examples of one action in space and time: all get the same canonical coordinates and canonical time."""
+"""Alignment of examples of one action: all get common (canonical) coordinates and a common (canonical) time."""
 
 from __future__ import annotations
 
@@ -55,9 +55,10 @@ class SourceExample:
     Parameters
     ----------
     uid : str    stable name of the example
-    name : str    name shown to people; among equally good references, the first by name, then by uid, is chosen
+    name : str    name shown to people; if several examples are equally good references, the first in the order of name
+        and uid is chosen
     clip : Clip    the motion
-    cuts : tuple of Cut    labelled frames of this clip, in the order of time (`segments.cuts_of`); all examples must
+    cuts : tuple of Cut    labelled frames of the clip, in the order of time (`segments.cuts_of`); all examples must
         have cuts with the same labels
     """
 
@@ -69,7 +70,7 @@ class SourceExample:
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """An example in canonical coordinates, resampled to the set's rate."""
+    """An example in canonical coordinates, resampled to the frame rate of the set."""
 
     example: SourceExample
     motion: Motion
@@ -113,7 +114,7 @@ def align_clips(
     progress: Progress | None = None,
     on_refusal: OnRefusal | None = None,
 ) -> AlignedSet:
-    """Align examples of an action with one of them, the reference, in space and in time.
+    """Align all examples of an action with a reference example, in space and in time.
 
     If the examples have cuts, each section between two cuts is aligned with the same section of the reference. The
     result has the same bytes for any number of threads and any order of the clips.
@@ -125,8 +126,8 @@ def align_clips(
     options : AlignOptions, optional    options; `options.reference` may be the uid of an example
     threads : int    threads to use
     progress : callable, optional    called as progress(done, total, note)
-    on_refusal : callable, optional    called as on_refusal(example, error) for each example that cannot be aligned; the
-        example is left out. The error is raised instead if `on_refusal` is None or the example is the reference.
+    on_refusal : callable, optional    called as on_refusal(example, error) for each example that cannot be aligned and
+        is left out. The error is raised instead if `on_refusal` is None or the example is the reference.
 
     Returns
     -------
@@ -207,7 +208,7 @@ class _Aligning:
     def _kept(self, examples: Sequence[SourceExample], tries: Sequence[Any]) -> list[Any]:
         """Return the results that are not errors, and pass each error to `on_refusal`.
 
-        Raises `MotionError` if there is no such callback, if the reference failed, or if too few results remain.
+        Raises `MotionError` if `on_refusal` is None, if the reference failed, or if too few results remain.
         """
         for example, made in zip(examples, tries, strict=True):
             if isinstance(made, MotionError):
@@ -316,16 +317,16 @@ def joint_weights(body: MatchingBody, given: Mapping[str, float]) -> Floats:
     Parameters
     ----------
     body : MatchingBody    J joints
-    given : mapping of str to float    weights of joints, under their own or their standard names
+    given : mapping of str to float    weights by joint name; a name of the skeleton or a standard name
 
     Returns
     -------
-    (J,) float64    the given weight of each joint; without one, 1 for the joint that carries the body and its
-        descendants, and 0 for all others
+    (J,) float64    weight of each joint. Without a given weight, it is 1 for the carrier (the joint that carries the
+        body) and for the descendants of the carrier, and 0 for all other joints
 
     Raises
     ------
-    MotionError    if no joint has a given name
+    MotionError    if a given name belongs to no joint
     """
     paths = (body.skeleton.path_to_root(joint) for joint in range(body.skeleton.joint_count))
     weights = np.array([float(body.carrier in path) for path in paths])
@@ -338,14 +339,14 @@ def joint_weights(body: MatchingBody, given: Mapping[str, float]) -> Floats:
 
 
 def _with_signs_of(motion: Motion, reference: Motion) -> Motion:
-    """Change the signs of a joint's quaternions, in all frames, if they are on average opposite to the reference's."""
+    """Negate all quaternions of a joint if, on average, they have the opposite sign to those of the reference."""
     return motion._replace(rotations=consistent_signs(motion.rotations[None], reference.rotations)[0])
 
 
 def restore(clip: AlignedClip, skeleton: Skeleton) -> Motion:
     """Undo `align_clips` for one clip.
 
-    The result is exact if the time function is the identity; otherwise the poses are interpolated between canonical
+    The result is exact if `clip.time_function` is the identity; otherwise the poses are interpolated between canonical
     frames.
 
     Parameters
@@ -355,6 +356,6 @@ def restore(clip: AlignedClip, skeleton: Skeleton) -> Motion:
 
     Returns
     -------
-    Motion    the source at the set's rate, at its original place
+    Motion    the source at the frame rate of the set, at its original place
     """
     return placed(warped(clip.motion, inverse(clip.time_function)), clip.placement, skeleton)

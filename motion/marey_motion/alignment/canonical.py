@@ -19,8 +19,8 @@ def to_canonical(motion: Motion, body: MatchingBody, *, keep_height: bool = True
 
     The joint placed at the origin is the one that carries the body: the root, unless it is a static reference on the
     floor. Such a root keeps its rotations and moves with the body; translations of the joints between the root and the
-    carrying joint are merged into the root's. The facing direction is computed from hips and shoulders, in the first
-    frame in which it is defined.
+    carrying joint are merged into the root's translation. The facing direction is computed from hips and shoulders, in
+    the first frame in which it is defined.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def to_canonical(motion: Motion, body: MatchingBody, *, keep_height: bool = True
     Returns
     -------
     motion : Motion    F frames in canonical coordinates
-    placement : Placement    input of `placed`
+    placement : Placement    original position and heading, input of `placed`
 
     Raises
     ------
@@ -76,6 +76,6 @@ def _turn(angle_rad: float) -> Floats:
 
 
 def _carried(motion: Motion, skeleton: Skeleton, carrier: int, turn: Floats, places: AnyFloats) -> Motion:
-    """Move the joint `carrier` to `places` (F, 3) and rotate it by `turn` (4,) in the world; the body moves with it."""
+    """Move a joint to `places` (F, 3) and rotate it by `turn` (4,) in the world; the body moves with this joint."""
     spins = quaternions.multiply(turn, spins_of(motion, skeleton, carrier))
     return carried_at(motion, skeleton, carrier, np.asarray(places, np.float64), np.asarray(spins, np.float64))

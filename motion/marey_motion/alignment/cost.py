@@ -15,13 +15,14 @@ from marey_schemas.options.alignment import CostOptions
 class CostPoints(NamedTuple):
     """The points of one motion of n frames, prepared for comparison with other motions.
 
-    F = n without a window, and n + W - 1 with a window of W frames.
+    F is n without a window, and n + W - 1 if costs are averaged over a window of W frames (`CostOptions.window`).
 
     Parameters
     ----------
     rows : (F, P, 3) float64    positions, multiplied by the square root of each point's share of the total weight
     columns : (P, 3, F) float64    the same, transposed
-    energies : (n,) float64    weighted sum of squared horizontal distances from the centre, over each frame's window
+    energies : (n,) float64    weighted sum of the squared horizontal distances of the points from the centre, over each
+        frame's window
     centres : (n, 2) float64    horizontal weighted centre of each frame's window; zero if there is no window, or if the
         cost is `plain`
     """
@@ -37,14 +38,14 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weight
 
     The cost is the weighted mean of the squared distances between corresponding points. If the option `cost` is
     `turned`, the distances are those after the best rotation about the vertical and the best shift on the ground. If
-    there is a window, the cost is the mean over the frames of the window.
+    the option `window` is above 1, the cost is the mean over a window of frames.
 
     Parameters
     ----------
     a : (n, P, 3) float64    points in metres, Y up
-    b : (m, P, 3) float64    the same points
+    b : (m, P, 3) float64    the same points of the other motion
     options : CostOptions, optional    options
-    weights : (P,), optional    non-negative weights of the points, of any sum; all equal if None
+    weights : (P,), optional    non-negative weights of the points, with any sum; all equal if None
 
     Returns
     -------

@@ -15,8 +15,8 @@ def _products(points, others, real, imaginary, heights):  # type: ignore[no-unty
     """Compare the points of one frame (P, 3) with each of m frames, `others` (P, 3, m).
 
     h = x + i·z is the horizontal position of a point in the one frame, and h' its position in one of the m frames.
-    `real` and `imaginary` (m,) are filled with the real and imaginary parts of the sum of h·h̄' over the points.
-    `heights` (m,) are filled with the sums of the squared differences of height.
+    `real` and `imaginary` (m,) are filled with the real and imaginary parts of the sum over the points of h times the
+    complex conjugate of h'. `heights` (m,) are filled with the sums of the squared differences of height.
     """
     real[:] = 0.0
     imaginary[:] = 0.0

@@ -1,7 +1,7 @@
 """Dynamic time warping: the cheapest path through a matrix of costs from its first cell to its last.
 
-A path has steps of one frame in both motions (1-1), in the first alone (1-0) or in the second alone (0-1), and costs
-the sum of all its cells (Sakoe and Chiba 1978, without weights). All results are exact; there is no band.
+A path has steps of one frame in both motions (1-1), in the first alone (1-0) or in the second alone (0-1). Its cost is
+the sum of the costs of all its cells (Sakoe and Chiba 1978, without weights). All results are exact; there is no band.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Alignment:
 
     Parameters
     ----------
-    path : (L, 2) int32    frame of the first and of the second motion, from (0, 0) to (n - 1, m - 1)
+    path : (L, 2) int32    pairs of a frame of the first motion and a frame of the second, from (0, 0) to (n - 1, m - 1)
     total : float    sum of the costs along the path
     """
 
@@ -158,8 +158,9 @@ def distance_bound(a: NDArray[np.floating], b: NDArray[np.floating], *, frames_p
     """Compute a lower bound of `warped_distance(a, b)` in much less time.
 
     One motion is divided into runs of `frames_per_box` frames, and each run is enclosed in a bounding box per point.
-    Every frame of the other motion is on the path at least once and costs at least its distance from the nearest box.
-    The first and the last cell of the matrix are on every path.
+    Every frame of the other motion is on the warping path at least once and costs at least its distance from the
+    nearest box. The bound is the largest of four numbers: the sum of these distances, the same sum with the motions
+    exchanged, and the costs of the first and the last cell, which are on every path.
 
     Parameters
     ----------

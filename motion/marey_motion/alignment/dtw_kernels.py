@@ -34,7 +34,7 @@ def align(costs, path):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
-    """Find the least of three totals, and the number of its step.
+    """Find the least of three totals, and the number of the step that it belongs to.
 
     Step 0 advances both motions, step 1 the first motion alone, and step 2 the second motion alone. The code has no
     branches, because the processor could not predict them.
@@ -59,7 +59,8 @@ def _cells(costs, before, totals, steps, start, stop):  # type: ignore[no-untype
 def _four_rows(costs, totals, steps):  # type: ignore[no-untyped-def]
     """Fill four rows of `totals` and `steps` at once, as `_cells` does.
 
-    Each row is computed one column behind the row above it, so that one cell of each row is computed in parallel.
+    Each row is computed one column behind the row above it, so that four cells, one of each row, are computed in
+    parallel.
     """
     m = costs.shape[1]
     for row in range(LANES - 1):
@@ -147,11 +148,11 @@ def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first
     """Compute the least totals of paths with limited runs to the cells of row `i`: `not_first` and `not_second` (m,).
 
     `not_first[j]` is the least total of the paths to cell j whose last step does not advance the first motion alone;
-    `not_second[j]` is that of the paths whose last step does not advance the second motion alone. `first_before` and
-    `second_before` are the values of `not_first` and `not_second` in the row before. Row r of `runs` (max_run, m)
-    contains the totals of paths that end with r + 1 steps in the first motion alone; it is updated in place.
-    `scratch` (2, m) is working memory for runs in the second motion alone. Such runs start from `not_second`, which
-    depends only on the row before, so every loop runs over whole vectors.
+    `not_second[j]` is the least total of the paths whose last step does not advance the second motion alone.
+    `first_before` and `second_before` are the values of `not_first` and `not_second` in the row before. Row r of `runs`
+    (max_run, m) contains the totals of paths that end with r + 1 steps in the first motion alone; it is updated in
+    place. `scratch` (2, m) is working memory for runs in the second motion alone. Such runs start from `not_second`,
+    which depends only on the row before, so every loop runs over whole vectors.
     """
     m, max_run = costs.shape[0], runs.shape[0]
     if i == 0:
@@ -187,8 +188,7 @@ def _walk_back_limited(costs, max_run, not_first, not_second, path):  # type: ig
 
     `not_first` and `not_second` (n, m) are the totals of `_limited_row` for all rows.
 
-    Among equally cheap steps, a step in both motions is preferred to a step in the first alone, and that to a step in
-    the second alone.
+    Equally cheap steps are preferred in this order: in both motions, in the first motion alone, in the second alone.
     """
     i, j, length = costs.shape[0] - 1, costs.shape[1] - 1, 0
     barred = BOTH  # what the step that was taken last, in time, forbids: to go on as another run of its own kind

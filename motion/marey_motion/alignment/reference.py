@@ -21,7 +21,7 @@ SAME = 1e-9
 
 
 def nearest_mean_length(frame_counts: Sequence[int]) -> int:
-    """Choose the motion whose number of frames is nearest to the mean.
+    """Choose the motion whose number of frames is nearest to the mean number.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ def nearest_mean_length(frame_counts: Sequence[int]) -> int:
 
     Returns
     -------
-    int    index; of several, the first
+    int    index; the first one if several are equally good
     """
     return int(np.argmin(np.abs(np.array(frame_counts) - np.mean(frame_counts))))
 
@@ -37,7 +37,7 @@ def nearest_mean_length(frame_counts: Sequence[int]) -> int:
 def medoid(totals: Floats) -> int:
     """Choose the motion with the least sum of alignment costs to all motions.
 
-    A motion that can be aligned with more of the others (finite costs) is preferred, whatever the sum.
+    Only the motions that can be aligned with the largest number of other motions (at finite costs) are considered.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def medoid(totals: Floats) -> int:
 
     Returns
     -------
-    int    index; of several, the first
+    int    index; the first one if several are equally good
     """
     impossible = np.isinf(totals).sum(axis=1)
     sums = np.where(np.isinf(totals), 0.0, totals).sum(axis=1)
@@ -64,12 +64,13 @@ def pairwise_totals(
 ) -> Floats:
     """Compute the costs of aligning each pair of motions, section by section.
 
-    Both directions cost the same, so each pair is aligned once.
+    The cost does not depend on the order of a pair, so each pair is aligned once.
 
     Parameters
     ----------
     points : sequence of CostPoints    points of each motion
-    bounds : sequence of sequences of int    bounds of each motion's sections; all motions have equally many
+    bounds : sequence of sequences of int    bounds of each motion's sections; all motions have the same number of
+        bounds
     options : CostOptions    options of the cost
     max_run : int or None    slope limit of `dtw.align`
     threads : int    threads to use

@@ -31,12 +31,12 @@ class Cut(NamedTuple):
 
 
 class Sections(NamedTuple):
-    """The frames between which a motion is aligned: its first and last one, and the cuts in between.
+    """The frames that divide a motion into sections: its first and last frame, and the cuts in between.
 
     Parameters
     ----------
     bounds : tuple of int    increasing frames from 0 to the last frame of the motion. Each section lasts from one bound
-        to the next, both included.
+        to the next, including both bounds.
     labels : tuple of tuples of str    the labels of each bound; empty for a first or last frame without a cut
     """
 
@@ -132,11 +132,11 @@ def common_labels(all_labels: Mapping[str, tuple[tuple[str, ...], ...]]) -> tupl
 
 
 def require_labels(own: tuple[tuple[str, ...], ...], common: tuple[tuple[str, ...], ...]) -> None:
-    """Check that an example has the same cuts in the same order as the others.
+    """Check that an example has the same cuts in the same order as the other examples.
 
     Parameters
     ----------
-    own, common : tuple of tuples of str    labels of the bounds, in this example and in the others
+    own, common : tuple of tuples of str    labels of the bounds, in this example and in the other examples
 
     Raises
     ------
@@ -194,7 +194,8 @@ def align_sections(
     Parameters
     ----------
     costs : (N, M) float64    cost of each pair of a reference frame and a source frame
-    reference, source : sequence of int    equally many bounds of each motion, from 0 to N - 1 and from 0 to M - 1
+    reference, source : sequence of int    bounds of the sections in each motion, from 0 to N - 1 and from 0 to M - 1;
+        the same number in both
     align : callable    finds the path through the costs of one section
 
     Returns

@@ -11,9 +11,9 @@ from marey_motion.arrays import Floats
 def consistent_signs(rotations: Floats, reference: Floats) -> Floats:
     """Choose the signs of quaternions so that the rotations of aligned clips can be averaged.
 
-    The quaternions of each joint are first made continuous in time. Then the signs of all its frames are changed if
-    the mean dot product with the reference is negative. Choosing signs frame by frame would make the quaternions of a
-    joint discontinuous where it turns by more than half a turn.
+    The quaternions of each joint are first made continuous in time. Then the quaternions of the joint are negated in
+    all frames if their mean dot product with the reference is negative. Choosing signs frame by frame would make the
+    quaternions of a joint discontinuous where it turns by more than half a turn.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Time functions, which map each frame of one motion to a time in another.
+"""Time functions (time warps), which map each frame of one motion to a time in another motion.
 
 A time function gives a fractional frame of the source for each canonical frame. It is strictly increasing, begins at 0
 and ends at the source's last frame; between canonical frames it is linear.
@@ -21,12 +21,13 @@ _WHOLE = 1e-9
 
 
 def time_function(path: NDArray[np.integer]) -> Floats:
-    """Compute the time function of an alignment path between a reference and a source.
+    """Compute the time function (time warp) of an alignment path between a reference and a source.
 
-    A canonical frame that is matched with several source frames is mapped to their mean. A source frame that is matched
-    with several canonical frames is assigned to their mean; the frames between are interpolated linearly. The first
-    frames of both motions correspond exactly, and so do the last frames. If a slope is below `LEAST_SLOPE`, the slopes
-    are changed as little as possible, by least squares, so that all of them are at least `LEAST_SLOPE`.
+    A canonical frame (a frame of the reference) that is matched with several source frames is mapped to the mean of
+    these. A source frame that is matched with several canonical frames is assigned to the mean of these; between such
+    points, the function is linear. The first frames of both motions correspond exactly, and so do the last frames. If a
+    slope is below `LEAST_SLOPE`, the slopes are changed as little as possible, by least squares, so that all of them
+    are at least `LEAST_SLOPE`.
 
     Parameters
     ----------
@@ -64,7 +65,7 @@ def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
 
 
 def _with_least_slope(times: Floats) -> Floats:
-    """Change times (N,) as little as possible so that every step from frame to frame is at least `LEAST_SLOPE`.
+    """Change times (N,) as little as possible so that each time exceeds the one before by at least `LEAST_SLOPE`.
 
     The first and the last time stay, and the sum of the squared changes of the steps is minimal. Raises `MotionError`
     if the mean slope is below `LEAST_SLOPE`.
@@ -89,7 +90,7 @@ def _with_least_slope(times: Floats) -> Floats:
 
 
 def inverse(times: Floats) -> Floats:
-    """Invert a time function.
+    """Invert a time function (time warp).
 
     Parameters
     ----------

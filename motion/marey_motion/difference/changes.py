@@ -19,15 +19,15 @@ NOISE_CM = 0.01
 JOINED_S = 0.1
 """Distance, in seconds, below which two ranges of frames are joined into one."""
 POINT_M = 0.01
-"""Extent of a path, in metres, up to which it counts as a point, whose turn cannot be measured."""
+"""Extent in metres. A path of at most this extent counts as a point, whose turn cannot be measured."""
 UNEXPLAINED = 0.1
-"""Share of the mean change of a path. If more remains after a movement of the whole path, no movement is reported."""
+"""A movement of a whole path is reported only if at most this share of the path's mean change remains afterwards."""
 MOST_SPANS = 100
 """Maximum number of ranges in a list; if there are more, the ranges with the smallest gaps are joined, too."""
 
 
 class Course(NamedTuple):
-    """Frames of the new clip that are compared with frames of the old clip, and their rate.
+    """Frames of the new clip that are compared with frames of the old clip, and the rate of the new clip.
 
     Parameters
     ----------
@@ -170,8 +170,8 @@ def whole_move(before: Floats, after: Floats) -> Move | None:
 
     Returns
     -------
-    Move or None    None if the paths are equal, or if more than the share `UNEXPLAINED` of their mean distance remains
-        after the movement
+    Move or None    None if the paths are equal, or if more than the share `UNEXPLAINED` of the mean distance of the
+        paths remains after the movement
     """
     change = np.linalg.norm(after - before, axis=1)
     if not len(change) or CM_PER_M * change.max() <= NOISE_CM:

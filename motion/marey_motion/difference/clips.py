@@ -30,7 +30,7 @@ from marey_schemas.documents.differences import (
 )
 
 STILL_M = 0.001
-"""Largest movement along an axis, in metres, of a joint that counts as not moving."""
+"""A joint that moves along each axis by at most this distance, in metres, counts as not moving."""
 MOST_ROWS = 600
 """Maximum number of rows in the plot of changed rotations."""
 MOST_POINTS = 1000
@@ -49,7 +49,7 @@ def compare_clips(
     Parameters
     ----------
     before, after : Clip    clips of the same or of different skeletons
-    options : DifferenceOptions, optional    thresholds; the frames of larger changes are listed
+    options : DifferenceOptions, optional    thresholds; frames in which a change exceeds its threshold are listed
     plot : bool    whether to compute the data of a plot, too
 
     Returns
@@ -94,7 +94,7 @@ def compare_clips(
 
 
 def _carrier(before: Clip, after: Clip, pairing: JointPairs) -> int:
-    """Return the index, in the lists of `pairing`, of the first joint that moves; 0 if no joint moves.
+    """Return the index in `pairing.before` and `pairing.after` of the first joint that moves; 0 if no joint moves.
 
     The path of this joint counts as the path of the body.
     """
@@ -115,10 +115,10 @@ def _poses(clip: Clip, joints: tuple[int, ...], carrier: int) -> Poses:
 
 
 def _compare_moved(before: Poses, after: Poses, rate_ratio: float) -> tuple[Timing, Move | None]:
-    """Match the frames of two clips. If the whole clip was moved, apply the movement to the old clip, and match again.
+    """Match the frames of two clips. If the whole new clip was moved, move the old clip, too, and match again.
 
     `rate_ratio` is the frame rate of the new clip divided by that of the old clip. Returns the timing, and the movement
-    of the whole clip, or None if there is none.
+    of the whole clip, None if the clip was not moved.
     """
     timing = compare_timing(before, after, rate_ratio)
     move = whole_move(*_paths(timing, after, None))
@@ -134,7 +134,7 @@ def _compare_moved(before: Poses, after: Poses, rate_ratio: float) -> tuple[Timi
 def _paths(timing: Timing, after: Poses, move: Move | None) -> tuple[Floats, Floats]:
     """Return the positions of the body in n matched frames: of the old clip (n, 3), and of the new clip (n, 3).
 
-    If `move` was applied to the old clip, its positions are those before this movement.
+    If `move` was applied to the old clip, the returned positions of the old clip are those before this movement.
     """
     pairs = timing.matching.pairs
     before = timing.before.roots[pairs[:, 0]].astype(np.float64)

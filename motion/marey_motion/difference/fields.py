@@ -36,7 +36,7 @@ def changed_values(before: Any, after: Any, pointer: str = "") -> Iterator[Chang
     """Compare two documents.
 
     Objects are compared field by field, and lists of equal length entry by entry. If two lists have different lengths,
-    an entry that only one of them contains counts as removed or added. Arrays are compared as a whole. Null, an empty
+    an entry that is in only one of the lists counts as removed or added. Arrays are compared as a whole. Null, an empty
     list and an empty object count as absent values.
 
     Parameters
@@ -129,8 +129,8 @@ def compare_models(before: Mapping[str, Any], after: Mapping[str, Any]) -> Model
 
     Returns
     -------
-    ModelDifference    added and removed examples, and the mean log likelihood of both models; None if a model does not
-        store it
+    ModelDifference    added and removed examples, and the mean log likelihood of both models, None for a model that
+        does not store it
     """
     old, new = _examples(before), _examples(after)
     return ModelDifference(

@@ -16,7 +16,7 @@ WINDOWS = 12
 """Number of windows of the old clip that are searched for in the whole new clip."""
 SHORTEST_WINDOW = 8
 SIMILAR = 4.0
-"""Multiple of the squared distance of the best place of a window, up to which the second-best is a candidate, too."""
+"""The second-best place of a window is a candidate if its squared distance is at most this multiple of the best."""
 NEGLIGIBLE = 1e-3
 """Squared distance of two frames that is attributed to noise."""
 GREATEST_PACE = 4.0
@@ -33,9 +33,9 @@ CHANNELS = 8
 def exact_lags(before: Poses, after: Poses) -> tuple[int, ...]:
     """Find the lags at which many frames of two clips are equal, by hashing frames.
 
-    A frame that occurs once in each clip votes for its lag. Of a frame that repeats, as in still motion, the first and
-    the last occurrence vote. Frames are hashed twice, the second time without the root, because a clip may have been
-    moved in space.
+    A frame that occurs once in each clip votes for the lag between its two places. If a frame repeats, as in still
+    motion, its first and its last occurrences vote. Frames are hashed twice, the second time without the root, because
+    a clip may have been moved in space.
 
     Parameters
     ----------
@@ -43,7 +43,8 @@ def exact_lags(before: Poses, after: Poses) -> tuple[int, ...]:
 
     Returns
     -------
-    tuple of int    number of the frame in `after` minus that of the equal frame in `before`, the most frequent first
+    tuple of int    frame number in `after` minus frame number of the equal frame in `before`; the most frequent lag
+        first
     """
     votes: Counter[int] = Counter()
     for hashed in (_hashes, _body_hashes):
@@ -59,7 +60,7 @@ def exact_lags(before: Poses, after: Poses) -> tuple[int, ...]:
 def similar_lags(before: Poses, after: Poses, unmatched: AnyInts) -> tuple[int, ...]:
     """Find the lags at which windows of frames of `before` are most similar to frames of `after`.
 
-    Each window is compared with every place of the other clip at once, by correlation in the frequency domain.
+    Each window is compared with all places of the other clip at once, by correlation in the frequency domain.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ def similar_lags(before: Poses, after: Poses, unmatched: AnyInts) -> tuple[int, 
 
     Returns
     -------
-    tuple of int    number of the frame in `after` minus that of the similar frame in `before`
+    tuple of int    frame number in `after` minus frame number of the similar frame in `before`
     """
     length = min(before.frame_count, after.frame_count, max(SHORTEST_WINDOW, before.frame_count // WINDOWS))
     size = 1 << int(np.ceil(np.log2(after.frame_count + length)))
@@ -122,7 +123,7 @@ def likely_pace(before: Poses, after: Poses) -> float:
 
     Returns
     -------
-    float    number of frames of the new clip per frame of the old clip, with an error of about 3 %
+    float    number of frames of the new clip per frame of the old clip, to within about 3 %
     """
     stride = max(1, max(before.frame_count, after.frame_count) // DECIMATED)
     source, target = (

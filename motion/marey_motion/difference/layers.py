@@ -17,7 +17,7 @@ ALONE = 0.6
 OTHER_LABEL = 0.7
 """Cost of different labels, added to the cost of the ranges: 0 for equal ranges, 1 for ranges that do not overlap."""
 SHIFTED = 0.05
-"""Cost added to a pair of segments if their ranges are compared after the shift that most segments have in common."""
+"""Cost added to a pair of segments if the ranges are compared after the shift that most segments have in common."""
 MOST_PAIRS = 16_000_000
 """Maximum product of the numbers of differing segments in both annotations."""
 
@@ -73,8 +73,8 @@ def _of_keyframes(annotation: Annotation) -> list[Segment]:
 def _match(before: Sequence[Segment], after: Sequence[Segment]) -> list[tuple[int | None, int | None]]:
     """Match the entries of two ordered lists; return the indices of each pair.
 
-    An entry without a match is paired with None. Equal entries at the beginning of both lists, or at the end of both,
-    are left out.
+    An entry without a match is paired with None. Equal entries at the beginning of both lists, or at the end of both
+    lists, are left out.
     """
     shortest = min(len(before), len(after))
     head = next((place for place in range(shortest) if before[place] != after[place]), shortest)

@@ -1,9 +1,9 @@
 """Matching of the frames of two clips, in runs of frames, at the least cost.
 
 A run consists of consecutive frames of both clips, whose frame numbers differ by a constant, the lag. Between runs,
-frames are removed or inserted. Candidates for the lags are found first; the runs are then the cheapest path through
-them. So frames after an insertion remain matched, and motion that stands still or repeats is not split into more runs
-than needed.
+frames are removed or inserted. First, candidates for the lags are found; then, the cheapest path through the pairs of
+frames with these lags gives the runs. In this way, frames after an insertion remain matched, and motion that stands
+still or repeats is not split into more runs than needed.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from marey_motion.difference.poses import Poses, frame_costs
 UNMATCHED = 0.25
 """Cost of a removed or inserted frame. A pair of different frames costs at most twice as much."""
 NEW_RUN = 1.0
-"""Cost of a change of the lag inside the clips."""
+"""Cost of a change of the lag between two matched frames."""
 AT_AN_END = 0.995
-"""Cost of removing or inserting frames at an end; less than `NEW_RUN`, so that an end is preferred to other places."""
+"""Cost of removing or inserting frames at the start or end of the clips: below `NEW_RUN`, to prefer these places."""
 WELL_MATCHED = 0.02
-"""Cost up to which a frame counts as matched well, so that no further lags are tried for it."""
+"""Cost up to which a frame counts as matched well, so that no further lags are tried for the frame."""
 MOST_ROUNDS = 64
 """Maximum number of rounds of the search; the cheapest path with k changes of the lag needs at most k rounds."""
 SHORTEST_REPLACEMENT = 10
@@ -36,7 +36,7 @@ class Matching(NamedTuple):
 
     Parameters
     ----------
-    pairs : (n, 2) int    frames of the old clip and matched frames of the new clip, both increasing
+    pairs : (n, 2) int    frames of the old clip and matched frames of the new clip, both in increasing order
     costs : (n,) float64    cost of each pair, from 0 for equal frames; see `frame_costs`
     total : float    cost of the matching, including removed and inserted frames
     """
@@ -78,7 +78,7 @@ def _poorly_matched(matching: Matching, count: int) -> Ints:
 class _Diagonal(NamedTuple):
     """All pairs of frames with the same lag; the frames of the old clip are [start, stop).
 
-    `costs` (stop - start + 1,) are the cumulative costs of the pairs, from 0 to the sum of all.
+    `costs` (stop - start + 1,) are the cumulative costs of the pairs, from 0 to the sum over all pairs.
     """
 
     lag: int

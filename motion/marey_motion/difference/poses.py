@@ -13,9 +13,9 @@ from marey_motion.motion import Motion
 from marey_motion.resampling import sample_motion
 
 FAR_DEG = 30.0
-"""Smallest angle at which a joint counts as entirely different when frames are matched."""
+"""Smallest angle between two rotations of a joint that count as entirely different when frames are matched."""
 FAR_M = 0.3
-"""Smallest distance at which the root counts as entirely different when frames are matched."""
+"""Smallest distance between two positions of the root that count as entirely different when frames are matched."""
 UNEQUAL = 0.01
 """Least cost of two frames that are not equal, so that equal frames are matched first."""
 BLOCK = 2048

@@ -39,8 +39,8 @@ class JointPairs(NamedTuple):
 def pair_joints(before: Skeleton, after: Skeleton) -> JointPairs:
     """Pair the joints of two skeletons.
 
-    Joints of the same name are paired. Of the other joints, two are paired as renamed if they have the same parent and
-    nearly the same offset, and if neither of them has another possible partner.
+    Joints of the same name are paired. Two of the remaining joints are paired as renamed if they have the same parent
+    and nearly the same offset, and if neither of the two has another possible partner.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from marey_schemas.documents.differences import FrameRun
 
 SAME_PACE = 1e-9
 WELL_EXPLAINED = 0.98
-"""Share of the shorter clip's frames; if more are matched well, no other pace is tried."""
+"""Share of the shorter clip's frames. If this share is matched well, no other pace is tried."""
 MUCH_BETTER = 0.5
 """Another pace is chosen only if its cost is less than this share of the cost at the best pace so far."""
 SIMILAR_ENOUGH = 0.1
@@ -24,9 +24,9 @@ MANY_RUNS = 8
 MOST_REFINEMENTS = 8
 FEWEST_PAIRS = 8
 SLOPES, FRAMES_APART = 20, 64
-"""Distances in matched frames over which `_refined` measures a slope.
+"""Distances over which `_refined` measures a slope, in matched frames.
 
-It alternates between `FRAMES_APART` frames, and 1 / `SLOPES` of all matched frames.
+The distance is alternately `FRAMES_APART` frames and 1 / `SLOPES` of all matched frames.
 """
 FARTHEST_OFFSET = 2.0
 """Maximum offset, in frames, that is estimated from velocities."""
@@ -138,8 +138,8 @@ def _at_pace(before: Poses, after: Poses, pace: Pace, *, search: bool) -> Timing
 def _refined(before: Poses, after: Poses, timing: Timing, *, search: bool) -> Timing:
     """Fit pace and phase to the times of the matched frames, and match again, until the matching stops improving.
 
-    The slope of the fit is measured over a short and over a long distance alternately: over a short distance it is
-    right even if few frames are matched well, over a long distance it is more exact.
+    The slope of the fit is measured over a short and over a long distance alternately: a short distance gives the right
+    slope even if few frames are matched well, a long distance gives a more exact slope.
     """
     failed = False
     for attempt in range(MOST_REFINEMENTS):
@@ -181,7 +181,7 @@ def _robust_line(places: Floats, values: Floats, weights: Floats, apart: int) ->
     """Fit a straight line to values (n,) at places (n,); return its value at place 0, and its slope.
 
     The values may jump where frames were removed; `weights` (n,) are their reliability. The first estimate of the slope
-    is the median over pairs of values whose indices differ by `apart`.
+    is the median slope over pairs of values whose indices differ by `apart`.
     """
     apart = max(1, min(apart, len(places) - 1))
     slope = float(np.median((values[apart:] - values[:-apart]) / (places[apart:] - places[:-apart])))
@@ -216,7 +216,7 @@ def _run_count(timing: Timing) -> int:
 
 
 def _share(timing: Timing, after: Poses) -> float:
-    """Return the cost of a matching, relative to that of entirely different frames: from 0 to 1.
+    """Return the cost of a matching as a share, from 0 to 1, of the cost if all frames differed entirely.
 
     The cost of the frames by which one clip is longer than the other is left out.
     """

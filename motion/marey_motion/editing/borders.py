@@ -10,10 +10,10 @@ from marey_motion.editing.take import Take
 
 
 def range_weights(take: Take, frames: tuple[int, int | None] | None, border_s: float) -> tuple[slice, Floats]:
-    """Compute the weight of each frame of a range.
+    """Compute the weight of each frame of a range: 1 inside, falling smoothly towards 0 at the borders.
 
-    Each transition lies inside the range and is at most half as long as the range. There is no transition at an end of
-    the range that is also an end of the motion.
+    Each of the two transitions lies inside the range and is at most half as long as the range. There is no transition
+    at the start or end of the motion.
 
     Parameters
     ----------

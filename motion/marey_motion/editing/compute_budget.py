@@ -17,9 +17,9 @@ PER_RIG = 10_000_000
 """Work of finding the limbs of a skeleton and the axes they bend about, in nanoseconds."""
 PER_PLANTED_NUMBER = 600
 PER_TAP, MOST_OF_TAPS = 0.35, 200.0
-"""Work of a moving mean for each number of the motion, in nanoseconds: for each frame of the window, and at most."""
+"""Work of a moving mean per number of the motion, in nanoseconds: for each frame of the window, and the maximum."""
 PER_MEETING, PER_MET_NUMBER = 1_000_000, 10
-"""Work of applying a group of constraints, apart from the solver, and work for each number of the rotations.
+"""Work of applying a group of constraints without the solver, and additional work for each number of the rotations.
 
 Both are in nanoseconds.
 """

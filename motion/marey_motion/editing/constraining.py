@@ -47,7 +47,7 @@ class Constraint:
     ----------
     target : the target, with one value for all of these frames or one value per frame
     joints : indices of the joints that may turn to meet the target
-    limb : the limb that ends at the target's joint, if any; it is solved alone before other joints turn
+    limb : the limb that ends at the target's joint, if any; the limb is solved alone before other joints turn
     """
 
     target: Target
@@ -91,8 +91,8 @@ def constrain_motion(
     motion : Motion    F frames
     constraints : sequence of Constraint    C constraints
     blend_frames : int    number of frames that may change before the first and after the last constrained frame
-    freedom : Freedom, optional    limits, stiffness and whether the root moves; the constraints name the joints that
-        may turn
+    freedom : Freedom, optional    limits, stiffness and whether the root moves; the joints that may turn are given by
+        the constraints
     solver : str    "auto", "ccd", "two_bone" or "least_squares"; "auto" uses the two-bone solver for limbs and least
         squares for everything else
     options : SolverOptions, optional    tolerances and iterations
@@ -162,7 +162,7 @@ def _residuals(skeleton: Skeleton, motion: Motion, constraint: Constraint) -> Fl
 def _clusters(
     skeleton: Skeleton, constraints: Sequence[Constraint], together: bool
 ) -> tuple[tuple[Constraint, ...], ...]:
-    """Group the constraints that must be solved together because one of them turns a joint that affects another.
+    """Group the constraints that must be solved together because one constraint turns a joint that affects another one.
 
     If `together` is true, all constraints are in one group.
     """
@@ -195,8 +195,9 @@ class _Cluster:
     def constrained(self, motion: Motion, blend_frames: int) -> Motion:
         """Solve the constraints and blend the motion in and out of the solution.
 
-        Constraints on different ranges are first solved one range after another, each blended in and out, until the
-        remaining errors are small. Solving all of them together then changes little at the borders of a range.
+        Constraints on different ranges are first solved one range after another, and each solution is blended in and
+        out, until the remaining errors are small. Solving all ranges together then changes little at the borders of a
+        range.
         """
         spans: dict[tuple[int, int], list[Constraint]] = {}
         for one in self.constraints:
@@ -224,7 +225,7 @@ class _Cluster:
         return displace(motion, frames, changed, windows_around(frames, blend_frames, motion.frame_count))
 
     def _solve(self, given: Motion, frames: Ints, constraints: Sequence[Constraint]) -> Motion:
-        """Solve some frames of a motion, to all of which the same constraints apply; return only these frames.
+        """Solve frames that all have the same constraints; return only these frames.
 
         `given` is the motion in these frames, and `frames` are their numbers.
         """

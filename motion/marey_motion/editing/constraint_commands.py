@@ -59,7 +59,7 @@ def constrain(take: Take, command: Constrain) -> Take:
     ------
     UnknownJoint    if a joint does not exist; the error names it
     MappingError    if joint limits or a look-at constraint need axes that cannot be determined
-    EditError    naming the constraint that is invalid
+    EditError    if a constraint is invalid; the error names it
     """
     take.budget.spend(PER_RIG)
     rig = _Rig(take)
@@ -113,7 +113,7 @@ def plant_feet(take: Take, command: PlantFeet) -> Take:
 
 
 class _Rig:
-    """Names and axes of a take's joints."""
+    """The joints of a take with their names and axes."""
 
     def __init__(self, take: Take) -> None:
         self.take = take
@@ -127,7 +127,7 @@ class _Rig:
 
     @property
     def axes(self) -> dict[str, JointAxes]:
-        """Axes of the mapped joints by name; those that the rest pose does not define are computed from the motion."""
+        """Axes of the mapped joints by name; axes that the rest pose does not define are computed from the motion."""
         if self._axes is None:
             take = self.take
             clip = take.motion.as_clip(take.skeleton, take.frame_rate_hz)
@@ -197,7 +197,7 @@ def _target(rig: _Rig, joint: int, asked: AnyConstraint, start: int, stop: int) 
 def _looking_axis(rig: _Rig, joint: int) -> NDArray[np.float64]:
     """Choose the axis (3,), in the joint's frame, that a look-at constraint directs at its target.
 
-    It is the forward axis of head and trunk joints, and the direction of the bone for all other joints.
+    This axis is the forward axis for head and trunk joints, and the direction of the bone for all other joints.
     """
     try:
         axes = rig.axes_of(joint)
@@ -251,9 +251,9 @@ def _foot(rig: _Rig, side: str) -> Foot:
 
 
 def _given_contacts(take: Take, feet: Sequence[Foot], command: PlantFeet) -> tuple[FootContacts, ...]:
-    """Return the contacts of each foot that the command lists.
+    """Return, for each foot, the contacts that the command lists.
 
-    In the frames of a contact, the toe is always planted, and the heel only while it is slow.
+    In the frames of a contact, the toe is always planted; the heel is planted only while it is slow.
     """
     positions = take.motion.positions(take.skeleton)
     contacts = []

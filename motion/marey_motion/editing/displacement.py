@@ -1,11 +1,11 @@
 """Displacement maps, which spread changes of a few frames over the surrounding frames with cubic B-splines.
 
 A displacement (Lee and Shin 1999) consists of a shift of the root and a rotation vector d per joint, which replaces the
-local rotation q with q·exp(d). There is one control point per frame. The displacement is the sum of two curves.
-The first is the curve of least bending through the smoothed changes of the given frames. A curve through the changes
+local rotation q with q·exp(d). There is one control point per frame. The displacement is the sum of two curves. The
+first is the curve of least bending through the smoothed changes of the given frames. A curve through the changes
 themselves would continue the slope of the last two frames, which is mostly noise, far into the surroundings. The second
-curve passes through the differences between the changes and the smoothed changes. It has a high tension, so that it
-hardly extends beyond the given frames. Near a smooth end of a window, the control points are zero, so that value, slope
+curve passes through the differences between the changes and the smoothed changes; its high tension keeps it from
+extending far beyond the given frames. Near a smooth end of a window, the control points are zero, so that value, slope
 and curvature are exactly zero there.
 """
 
@@ -48,7 +48,7 @@ class Window(NamedTuple):
 
 
 def windows_around(frames: AnyInts, blend_frames: int, frame_count: int) -> tuple[Window, ...]:
-    """Make windows around given frames, in which their change is blended in and out; overlapping windows are merged.
+    """Make windows in which a change of given frames is blended in and out; overlapping windows are merged.
 
     Parameters
     ----------
@@ -121,25 +121,25 @@ def _check_windows(frames: AnyInts, windows: Sequence[Window]) -> None:
         held = (frames >= start) & (frames < stop)
         if not held.any():
             raise EditError(
-                f"the window {window.start}:{window.stop} contains no changed frame, or only at an end at which it "
-                "is faded out; remove it, or choose a window around a changed frame",
+                f"the window {window.start}:{window.stop} contains no changed frame (frames where the change fades "
+                "out do not count); remove this window, or choose one around a changed frame",
                 where="windows",
             )
         inside |= held
     if not inside.all():
         raise EditError(
-            f"no window contains the changed frame {int(frames[~inside][0])}, or only at an end at which the window "
-            "is faded out; add or extend a window",
+            f"no window contains the changed frame {int(frames[~inside][0])} (frames where the change fades out do not "
+            "count); add or extend a window",
             where="windows",
         )
 
 
 def spread_displacements(frames: AnyInts, values: Floats, window: Window) -> Floats:
-    """Compute a curve of displacements over the frames of a window; at some frames, its values are given.
+    """Compute a curve of displacements over all frames of a window from given values at some of the frames.
 
-    The curve is the sum of two curves. The first passes through the smoothed values, and bends least. The second passes
-    through the differences between the values and the smoothed values. It has a high tension, so that it hardly
-    extends beyond the given frames. So noise in the values is not continued into the rest of the window.
+    The curve is the sum of two curves. The first is the curve of least bending through the smoothed values. The second
+    passes through the differences between the values and the smoothed values; its high tension keeps it from extending
+    far beyond the given frames. In this way, noise in the values is not continued into the rest of the window.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def spread_displacements(frames: AnyInts, values: Floats, window: Window) -> Flo
 def _evened(frames: AnyInts, values: Floats, reach: float) -> Floats:
     """Smooth values (n, c) along runs of consecutive frames (n,), over about `reach` frames.
 
-    Constant values stay constant, and slopes at the ends of runs decrease.
+    Constant values stay constant; at the ends of runs, slopes become smaller.
     """
     from scipy.ndimage import gaussian_filter1d
 
@@ -174,7 +174,7 @@ def _evened(frames: AnyInts, values: Floats, reach: float) -> Floats:
 def _curve(frames: AnyInts, values: Floats, window: Window, swing: float) -> Floats:
     """Compute the curve (stop - start, c) of least bending through `values` (n, c) at `frames` (n,).
 
-    Tension keeps the curve from overshooting the values for more than about `swing` frames.
+    Tension limits the overshoot of the curve beyond the values to about `swing` frames.
     """
     from scipy.linalg import cho_solve_banded, cholesky_banded
 

@@ -14,7 +14,7 @@ from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 
 FAR_M = 0.05
-"""Largest error of a position, in metres, at which the model counts as able to reach the position."""
+"""Error of a position before this step, in metres, above which the model counts as unable to reach the position."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ def finish(
     freedom: Freedom | None = None,
     options: SolverOptions | None = None,
 ) -> FinishedMotion:
-    """Move constrained joints exactly to their targets, blended over a window with a cubic spline.
+    """Move constrained joints exactly to their targets; the change is blended over a window with a cubic spline.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def finish(
 
     Raises
     ------
-    EditError    naming the constraint that is invalid
+    EditError    if a constraint is invalid; the error names it
     """
     made = constrain_motion(skeleton, motion, constraints, blend_frames=window_frames, freedom=freedom, options=options)
     before, after = (

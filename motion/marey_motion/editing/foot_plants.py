@@ -58,8 +58,7 @@ class PlantedMotion:
     ----------
     motion : the whole motion
     contacts : frames in which each foot touches the ground
-    slide_before_m, slide_after_m : distance that a toe slides per contact, mean over contacts; 0 if there are no
-        contacts
+    slide_before_m, slide_after_m : mean distance that a toe slides during a contact; 0 if there are no contacts
     lowered_m : largest distance by which the root is lowered
     """
 
@@ -107,7 +106,7 @@ def plant_feet(
 
     Raises
     ------
-    EditError    if the contacts are not as long as the motion
+    EditError    if the contacts do not have one flag per frame of the motion
     """
     options = options or PlantOptions()
     positions = motion.positions(skeleton)
@@ -134,7 +133,7 @@ def plant_feet(
 def find_contacts(positions: Floats, foot: Foot, frame_rate_hz: float, options: PlantOptions) -> FootContacts:
     """Find the frames in which toe and ankle of a foot are slow.
 
-    Contacts shorter than `SHORTEST_CONTACT_S` count as noise, and so do shorter gaps between the remaining contacts.
+    Contacts shorter than `SHORTEST_CONTACT_S` count as noise; then gaps shorter than this count as noise, too.
 
     Parameters
     ----------
@@ -183,8 +182,8 @@ def _slide(positions: Floats, feet: Sequence[Foot], contacts: Sequence[FootConta
 def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, blend: int) -> _Plan:
     """Compute the targets of a foot: planted toes and heels stay in place, and the ankle follows the toe otherwise.
 
-    `positions` (F, J, 3) and `spins` (F, J, 4) are those of the joints in the world. The targets are blended in and out
-    over `blend` frames.
+    `positions` (F, J, 3) and `spins` (F, J, 4) are the positions and rotations of the joints in the world. The targets
+    are blended in and out over `blend` frames.
     """
     ankle, toe = positions[:, foot.leg.end], positions[:, foot.toe]
     places = toe.copy()
@@ -211,7 +210,7 @@ def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, 
 
 
 def _standing_heels(contacts: FootContacts, blend: int) -> Flags:
-    """Find the frames (F,) in which a heel stays planted; it is released shortly before each new contact of its toe.
+    """Find the frames (F,) in which a heel stays planted: until shortly before each new contact of its toe.
 
     The ankle follows the toe, so each toe contact moves the ankle. A heel that is planted over several toe contacts
     would otherwise jump from one position to the next.
@@ -254,8 +253,8 @@ def _turn_between(before: Floats, after: Floats) -> Floats:
 def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], zone: float, blend: int) -> Floats:
     """Compute how far (F,), in metres, the root must be lowered so that the legs reach the planted feet.
 
-    A knee within `zone` radians of a straight leg is damped (see `solve_two_bone`), so that the leg misses its target
-    slightly. The root is lowered to avoid this, by at most `MOST_LOWERING_M`.
+    The motion of a knee is damped if the leg is within `zone` radians of straight (see `solve_two_bone`), so that the
+    leg misses its target slightly. To avoid this, the root is lowered by at most `MOST_LOWERING_M`.
     """
     from marey_motion.editing.inverse_kinematics import two_bone_kernels
 

@@ -51,7 +51,7 @@ def split(take: Take, command: Split) -> tuple[Take, ...]:
 
     Returns
     -------
-    tuple of Take    one piece more than cuts
+    tuple of Take    the pieces, one more than there are cuts
 
     Raises
     ------
@@ -75,7 +75,8 @@ def split(take: Take, command: Split) -> tuple[Take, ...]:
 def concatenate(take: Take, command: Concatenate) -> Take:
     """Append another clip of the same skeleton, resampled to the frame rate of the take.
 
-    If the root is a static reference and the hips below it are translated, their travel is merged into the root's.
+    If the root is a static reference and the hips below it are translated, the travel of the hips is merged into the
+    travel of the root.
 
     Parameters
     ----------
@@ -84,7 +85,7 @@ def concatenate(take: Take, command: Concatenate) -> Take:
 
     Returns
     -------
-    Take    frames of both
+    Take    frames of both clips
 
     Raises
     ------
@@ -146,7 +147,7 @@ def _joined(first: Motion, second: Motion, overlap: int, count: int, frame_rate_
     """Join two motions.
 
     If `overlap` is not 0, this many frames of both are blended into each other. Otherwise, the difference in pose and
-    velocity decays over the first `count` frames of the second motion; a `count` of 0 makes a hard cut.
+    velocity decays over the first `count` frames of the second motion; if `count` is 0, the result is a hard cut.
     """
     if overlap:
         return _faded_over(first, second, overlap)
@@ -154,7 +155,7 @@ def _joined(first: Motion, second: Motion, overlap: int, count: int, frame_rate_
 
 
 def _inertialised(first: Motion, second: Motion, count: int, frame_rate_hz: float) -> Motion:
-    """Make the second motion start with the pose and velocity in which the first one ends.
+    """Make the second motion start with the pose and velocity that the first motion has at its end.
 
     The change decays over the first `count` frames.
     """
@@ -198,7 +199,7 @@ def resample(take: Take, command: Resample) -> Take:
 
     Returns
     -------
-    Take    the same motion at that rate
+    Take    the same motion at the new rate
 
     Raises
     ------
@@ -216,7 +217,7 @@ def retime(take: Take, command: Retime) -> Take:
     Parameters
     ----------
     take : Take    F frames
-    command : Retime    the factor by which the motion is faster
+    command : Retime    the factor by which the motion becomes faster
 
     Returns
     -------

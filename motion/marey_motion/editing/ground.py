@@ -1,4 +1,4 @@
-"""The height of the ground, and the contacts of the feet with it."""
+"""The height of the ground, and the contacts of the feet with the ground."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from marey_schemas.options.annotations import ContactOptions
 
 FEET = ("left_foot", "right_foot")
 LOWEST_SHARE = 0.05
-"""Quantile of the heights of the lower sole that is used as the ground if the lower foot is never in stance."""
+"""The ground is this quantile of the heights of the lower sole if the lower foot is never in stance."""
 
 
 class Ground(NamedTuple):
@@ -26,8 +26,8 @@ class Ground(NamedTuple):
     Parameters
     ----------
     height_m : height of the ground, metres
-    standing_frames : number of frames in which the lower foot is in stance, from which the height is estimated; if 0,
-        the height is estimated from the frames with the lowest feet
+    standing_frames : number of frames in which the lower foot is in stance; the height is estimated from these frames
+        or, if there are none, from the frames with the lowest feet
     """
 
     height_m: float

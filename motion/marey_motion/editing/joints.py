@@ -1,4 +1,4 @@
-"""Commands that rotate single joints or replace their motion by that of another clip."""
+"""Commands that rotate single joints, or replace the motion of joints with motion from another clip."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ from marey_motion.skeleton import Skeleton
 from marey_schemas.editing.commands import Paste, RotateJoint
 
 SAME_AXES_RAD = 0.02
-"""Largest angle, in radians, between rest rotations that count as equal: they differ a little between subjects."""
+"""Largest angle, in radians, between rest rotations that count as equal: those of two subjects differ a little."""
 
 
 def paste(take: Take, command: Paste) -> Take:
     """Replace the motion of joints with a range of another clip (Herrmann et al. 2019, section 4.1.4).
 
-    The range is resampled with cubic splines to the frames it fills; equal lengths are copied exactly. Within the
-    borders, rotations are blended along the shorter arc, and translations along straight lines.
+    The source range is resampled with cubic splines to the length of the range to fill; if both have equal lengths, it
+    is copied exactly. Within the borders, rotations are blended along the shorter arc, and translations along straight
+    lines.
 
     Parameters
     ----------
@@ -62,7 +63,7 @@ def paste(take: Take, command: Paste) -> Take:
 def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> list[int]:
     """Find the indices in `source` of the target's `joints`, by name.
 
-    Raises `UnknownJoint` if a joint is missing, and `EditError` if its axes differ.
+    Raises `UnknownJoint` if a joint is missing, and `EditError` if the axes of a joint differ.
     """
     origins = [source.index_of(target.joint_names[joint]) for joint in joints]
     apart = quaternions.angle_between(target.rest_rotations[list(joints)], source.rest_rotations[origins])
@@ -78,7 +79,7 @@ def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> l
 
 
 def _stretched(take: Take, clip: Clip, frames: tuple[int, int | None] | None, count: int) -> Motion:
-    """Resample the range `frames` of a clip to `count` frames. Raises `EditError` if the clip lacks the frames."""
+    """Resample the range `frames` of a clip to `count` frames. Raises `EditError` if the clip lacks these frames."""
     try:
         start, stop = take.moved(motion_of(clip)).frames(frames)
     except EditError as error:

@@ -21,14 +21,14 @@ def close_loop(take: Take, command: CloseLoop) -> Take:
     """Make the last frame lead into the first frame, which may be elsewhere on the ground if the clip travels.
 
     The difference in pose and velocity between end and start is distributed: half of it decays from the start onwards,
-    half from the end backwards. If the root is a static reference and the hips below it are translated, their travel is
-    merged into the root's.
+    half from the end backwards. If the root is a static reference and the hips below it are translated, the travel of
+    the hips is merged into the travel of the root.
 
     Parameters
     ----------
     take : Take    F frames
-    command : CloseLoop    whether to first remove the travel and turn of one cycle, evenly over its frames, and the
-        duration of the blend
+    command : CloseLoop    the duration of the blend, and whether to first remove the travel and turn of one cycle,
+        evenly over its frames
 
     Returns
     -------

@@ -1,8 +1,9 @@
 """Offsets between poses that decay over time: blending by inertialisation.
 
-An offset x with velocity v decays to zero over T frames. The decay is the quintic with position x, velocity v and
-acceleration 0 at the start, and with all three 0 at the end: x·(1-s)³·(1+3s+6s²) + v·t·(1-s)³·(1+3s) with s = t/T. This
-follows Bollo (2018), "Inertialization", who also uses the acceleration of the source.
+An offset x with velocity v decays to zero over T frames. The decay is the quintic polynomial whose position, velocity
+and acceleration are x, v and 0 at the start, and all 0 at the end: x·(1-s)³·(1+3s+6s²) + v·t·(1-s)³·(1+3s), where t is
+the time since the start and s = t/T. This follows Bollo (2018), "Inertialization", who also uses the acceleration of
+the source.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from marey_motion.looping import about_vertical
 from marey_motion.motion import Motion
 
 VELOCITY_S = 0.15
-"""Seconds after which a difference of velocities has decayed to zero, so that long blends do not overshoot."""
+"""A difference of velocities decays to zero within these seconds, so that long blends do not overshoot."""
 
 
 class PoseOffset(NamedTuple):
@@ -85,13 +86,13 @@ def offset_to(motion: Motion, frame: int, other: Motion, other_frame: int) -> Po
     Parameters
     ----------
     motion : Motion    the motion
-    frame : int    its frame
+    frame : int    frame of `motion`
     other : Motion    the other motion
-    other_frame : int    its frame
+    other_frame : int    frame of `other`
 
     Returns
     -------
-    PoseOffset    the pose of the other frame minus the pose of the frame
+    PoseOffset    the pose of `other` minus the pose of `motion`, in these frames
     """
     back = quaternions.conjugate(motion.rotations[frame])
     turns = quaternions.as_rotation_vector(quaternions.multiply(other.rotations[other_frame], back))
@@ -129,7 +130,7 @@ def seam_offset(before: Motion, after: Motion) -> tuple[PoseOffset, PoseOffset]:
 
     Returns
     -------
-    offset : PoseOffset    at the first frame of `after`
+    offset : PoseOffset    offset for the first frame of `after`
     velocity : PoseOffset    per frame
     """
     arrival, departure = step_of(before, max(0, before.frame_count - 2)), step_of(after, 0)

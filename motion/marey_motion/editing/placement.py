@@ -99,9 +99,9 @@ def move_to_origin(take: Take, command: MoveToOrigin) -> Take:
 
 
 def scale(take: Take, command: Scale) -> Take:
-    """Scale the positions of the body's path about the origin, including heights.
+    """Scale the path of the body about the origin, including heights.
 
-    The skeleton does not change, so a scaled path can fit the strides of a larger or smaller body.
+    The skeleton does not change, so a path can be scaled to fit the strides of a larger or smaller body.
 
     Parameters
     ----------
@@ -280,9 +280,10 @@ def mirror(take: Take, _command: Mirror) -> Take:
 
 
 def fix_drift(take: Take, command: FixDrift) -> Take:
-    """Spread a shift and a turn about the vertical over a range: none in its first frame, all in its last frame.
+    """Spread a shift and a turn about the vertical over a range: nothing in the first frame, everything in the last.
 
-    Within the range, each frame turns about its own pelvis. The frames after the range move rigidly with its last one.
+    Within the range, each frame turns about its own pelvis. The frames after the range move rigidly with the last frame
+    of the range.
 
     Parameters
     ----------

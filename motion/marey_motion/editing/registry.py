@@ -56,7 +56,7 @@ COMMANDS: Mapping[str, Callable[..., Take | tuple[Take, ...]]] = {
         plant_feet,
     )
 }
-"""Functions by the names of their commands. A new command needs an entry here and a model in `marey_schemas.editing`.
+"""Functions by command name. A new command needs an entry here and a model in `marey_schemas.editing`.
 """
 
 
@@ -87,7 +87,7 @@ def edit_clip(
 ) -> tuple[EditedClip, ...]:
     """Apply commands to a clip.
 
-    The computation is in double precision and rounded to single precision once, at the end.
+    The computation is in double precision; the result is rounded to single precision once, at the end.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def edit_clip(
 
     Raises
     ------
-    MotionError    if a command cannot be applied; `where` names the command and the parameter
+    MotionError    if a command cannot be applied; `where` of the error is the command and the parameter
     """
     body = body or EditedBody(clip.skeleton)
     first = Take(
@@ -179,7 +179,7 @@ def apply_command(take: Take, command: AnyCommand) -> tuple[Take, ...]:
 
 
 def _size_for(take: Take, command: AnyCommand) -> int:
-    """Count the values that a command processes: the values of the take and of the clip that the command names."""
+    """Count the values that a command processes: the values of the take and of the source clip, if any."""
     other = take.sources.get(command.source) if isinstance(command, Concatenate | Paste) else None
     return take.size + (0 if other is None else other.poses.size)
 

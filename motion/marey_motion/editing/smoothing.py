@@ -29,10 +29,10 @@ LEAST_LENGTH = 0.1
 
 
 def smooth(take: Take, command: Smooth) -> Take:
-    """Replace the joints' rotations and translations and the root's path with weighted averages over time.
+    """Replace the path of the root, and rotations and translations of joints, with weighted averages over time.
 
-    No frame is lost: beyond each end, the motion is continued by its point reflection through the end pose. Therefore
-    the first and the last frame, and straight paths, do not change. Rotations are averaged as quaternions of continuous
+    No frame is lost: beyond each end, the motion is continued by its own reflection through the end pose. Therefore the
+    first and the last frame, and straight paths, do not change. Rotations are averaged as quaternions of continuous
     sign and then normalised.
 
     Parameters
@@ -123,7 +123,8 @@ def _smooth_rotations(take: Take, rotations: Floats, weights: Floats, joints: Se
 def _reflected(end: Floats, rotations: Floats) -> Floats:
     """Reflect rotations (n, J, 4) through the rotations `end` (J, 4) of an end frame.
 
-    A reflected rotation differs from that of the end frame by the same angle in the opposite direction.
+    A reflected rotation differs from the rotation of the end frame by the same angle as before, but in the opposite
+    direction.
     """
     back = quaternions.multiply(end, quaternions.multiply(quaternions.conjugate(rotations), end))
     return np.asarray(back, dtype=np.float64)

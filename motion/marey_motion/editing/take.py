@@ -66,7 +66,7 @@ class EditedBody:
 
     @cached_property
     def matching(self) -> MatchingBody:
-        """Joints of hips, shoulders, feet and toes. Raises `MappingError` naming the missing standard joints."""
+        """Joints of hips, shoulders, feet and toes. Raises a `MappingError` that names the missing standard joints."""
         return MatchingBody.from_mapping(self.skeleton, self.mapping)
 
 
@@ -134,7 +134,7 @@ class Take:
 
         Returns
         -------
-        Take    with that motion
+        Take    the take with the new motion
         """
         return replace(self, motion=motion)
 
@@ -147,7 +147,7 @@ class Take:
 
         Returns
         -------
-        Take    with one finding more
+        Take    the take with one more finding
         """
         return replace(self, findings=(*self.findings, finding))
 
@@ -164,7 +164,7 @@ class Take:
 
         Raises
         ------
-        EditError    if there is none
+        EditError    if there is no such clip
         """
         if name not in self.sources:
             known = ", ".join(sorted(self.sources)) or "none"
@@ -209,11 +209,11 @@ class Take:
 
         Returns
         -------
-        int    its index
+        int    index of the joint
 
         Raises
         ------
-        UnknownJoint    with the nearest names
+        UnknownJoint    if there is no such joint; the error suggests similar names
         """
         return self.skeleton.index_of(name)
 
@@ -252,7 +252,7 @@ class Take:
 
 
 def motion_of(clip: Clip) -> Motion:
-    """Convert a clip to double precision; a frame that no command changes is bit-identical after converting it back.
+    """Convert a clip to double precision; frames that no command changes are bit-identical after converting back.
 
     Parameters
     ----------
@@ -312,7 +312,7 @@ def require_finite(numbers: Floats) -> None:
 
     Raises
     ------
-    EditError    naming the first frame with a number that is not finite
+    EditError    if a number is not finite; the error names the first such frame
     """
     if not np.isfinite(numbers).all():
         frame = int(np.argmin(np.isfinite(numbers.reshape(len(numbers), -1)).all(axis=1)))

@@ -17,7 +17,7 @@ from marey_schemas.documents.evaluations import CONFIDENCE, RESAMPLES
 
 BOOTSTRAP_SEED = 0
 SAME_CHANGE = 1e-12
-"""Relative difference up to which two changes count as equal, because rounding can cause such a difference."""
+"""Relative difference up to which two changes count as equal, because rounding can cause a difference of this size."""
 
 LESS_IS_BETTER = (
     "abs_se_v",
@@ -32,7 +32,7 @@ LESS_IS_BETTER = (
     "pose_cost_p95",
     "response_s",
 )
-"""Metrics of which a lower value is better; for all other metrics, only the change is reported."""
+"""Metrics for which a lower value is better; for all other metrics, only the change is reported."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class MetricChange:
 
     Parameters
     ----------
-    before, after : means over the trials in which both evaluations define the metric, in the metric's own unit
+    before, after : means over the trials in which the metric is defined in both evaluations, in the unit of the metric
     change : mean of after - before over these trials
     low, high : bounds of the mean change at `CONFIDENCE`, by bootstrap over trials (bias corrected and accelerated)
     trials : number of these trials; with a single trial, `low` and `high` equal `change`
@@ -59,8 +59,8 @@ class MetricChange:
     def verdict(self) -> str:
         """Verdict: same, better, worse, changed or unclear.
 
-        "changed" is for metrics of which neither direction is better; "unclear" means that the interval contains 0 or
-        that there is only one trial.
+        "changed" is for metrics of which neither a lower nor a higher value is better; "unclear" means that the
+        interval contains 0, or that there is only one trial.
         """
         if self.low == self.high == 0.0:
             return "same"
@@ -73,7 +73,7 @@ class MetricChange:
 
 @dataclass(frozen=True)
 class TrialChange:
-    """Trial whose two records differ, with the first tick that differs and the mean offset in both evaluations.
+    """A trial whose records in two evaluations differ, with the first tick that differs and the mean offset in both.
 
     `same_motion` is true if only the names of displayed clips differ and all numbers are equal.
     """
@@ -91,10 +91,10 @@ class Comparison:
 
     Parameters
     ----------
-    metrics : changes of the metrics that both evaluations have, in alphabetical order
+    metrics : changes of the metrics that exist in both evaluations, in alphabetical order
     changed : the trials whose records differ, in the suite's order
-    removed, added : uids of the clips that only the first, or only the second, data set has
-    newly_unused : uids of the clips of both data sets that only the first evaluation used
+    removed, added : uids of the clips that are only in the first data set, or only in the second
+    newly_unused : uids of clips that are in both data sets, but were used only in the first evaluation
     coverage_change_s : (V, O) float64    seconds of data gained per cell of the coverage map
     """
 

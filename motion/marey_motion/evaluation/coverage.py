@@ -1,7 +1,7 @@
 """Coverage of a set of clips: windows of one second, counted over cells of speed and turn rate.
 
 A window never spans two clips. The cells are centred on the points of the trial grid, with edges half-way between
-neighbours, so each trial has its own cell. Windows beyond the outermost cells are listed, but not counted in the map.
+neighbours, so each trial has its own cell. Windows beyond the outermost cells are listed, but not counted in the cells.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ EDGE_DECIMALS = 9
 
 
 class Windows(NamedTuple):
-    """Mean speed, turn rate and velocities in windows of one second, one per starting frame; arrays of shape (W,)."""
+    """Mean speed, turn rate and velocities in W windows of one second, which start one frame apart; arrays (W,)."""
 
     speed_m_s: Floats
     turn_rate_rad_s: Floats
@@ -36,7 +36,7 @@ class Windows(NamedTuple):
 
 
 def sliding_windows(positions: Floats, headings: Floats, rate_hz: float) -> Windows:
-    """Compute speed, turn rate and signed velocities of a root over every second of one clip.
+    """Compute speed, turn rate and signed velocities of a root, in windows of one second that begin at each frame.
 
     Parameters
     ----------
@@ -68,15 +68,15 @@ def sliding_windows(positions: Floats, headings: Floats, rate_hz: float) -> Wind
 def measure_coverage(
     database: MatchingDatabase, options: EvaluationOptions, *, with_in_place: bool = False
 ) -> Coverage:
-    """Measure the windows of all clips, and the seconds they cover in each cell of the trial grid.
+    """Measure the windows of all clips, and the seconds of data in each cell of the trial grid.
 
-    Clips that walk in place, as on a treadmill, would count as standing still; they are left out by default.
+    Clips of walking in place, as on a treadmill, would count as standing still; these clips are left out by default.
 
     Parameters
     ----------
     database : MatchingDatabase    the clips
     options : EvaluationOptions    grid and minimum seconds per cell
-    with_in_place : bool    include clips that walk in place
+    with_in_place : bool    whether to include clips of walking in place
 
     Returns
     -------
@@ -144,7 +144,7 @@ def coverage_of(
 
 
 def cell_deficits(seconds: Floats, least_s: float, window_s: float) -> Floats:
-    """Compute the seconds that cells lack.
+    """Compute the missing seconds of data in each cell.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def cell_counts(speeds: Floats, speed_edges: Floats, turn_rates: Floats, turn_ed
 
     Parameters
     ----------
-    speeds, turn_rates : (W,) float64    of the windows
+    speeds, turn_rates : (W,) float64    speed and turn rate of each window
     speed_edges, turn_edges : (V + 1,), (O + 1,) float64    edges of the cells, in the same units
 
     Returns

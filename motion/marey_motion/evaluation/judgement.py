@@ -1,14 +1,14 @@
 """Verdict on a data set by simple rules.
 
-A trial counts as followed if the character meets three limits, on average over the trial:
+A trial counts as followed if the character keeps within three limits, on average over the trial:
 
 * its distance from the desired position is at most the distance that it travels in half a second at the desired speed,
 * its speed differs from the desired speed by at most 15 %,
 * its turn rate differs from the desired turn rate by at most 10 degrees a second.
 
 The share of followed trials gives the grade: from 90 % very good, from 70 % good, from 40 % usable in part, below that
-poor. With clips generated for every cell of the default grid, 95 % of the trials are followed, so the best grade can be
-reached.
+poor. The best grade can be reached: with clips generated for every cell of the default grid, 95 % of the trials are
+followed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TOLERANCE = 1e-12
 
 
 class Strain(NamedTuple):
-    """Ratios of a trial's errors of position, speed and turn rate to their limits; infinite for undefined errors."""
+    """Errors of a trial in position, speed and turn rate, each divided by its limit; infinite for undefined errors."""
 
     place: float
     speed: float
@@ -41,7 +41,7 @@ class Strain(NamedTuple):
 
 @dataclass(frozen=True)
 class Judgement:
-    """Grade of a data set, and the numbers that it is based on.
+    """Grade of a data set, and the numbers on which the grade is based.
 
     Parameters
     ----------

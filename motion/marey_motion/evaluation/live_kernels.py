@@ -78,7 +78,7 @@ def _smooth(take, filters, frame, shortest_mean):  # type: ignore[no-untyped-def
 
 @compiled
 def newest_window(take, duration_s, window):  # type: ignore[no-untyped-def]
-    """Write the speed, turn rate, forward and strafe velocity of the newest frames of `take` to `window`.
+    """Write to `window` the speed, turn rate, forward and strafe velocity of the newest `duration_s` seconds of `take`.
 
     Returns whether the take is long enough.
     """
@@ -96,8 +96,8 @@ def newest_window(take, duration_s, window):  # type: ignore[no-untyped-def]
 def receive(take, filters, frames, duration_s, shortest_mean, windows):  # type: ignore[no-untyped-def]
     """Process raw frames (n, 4), with columns as in `LiveTake.raw`.
 
-    The windows that the frames complete are written to `windows`; their number is returned. `duration_s` is the
-    duration of a window, and `shortest_mean` as in `_smooth`.
+    The windows that the frames complete are written to `windows`; the number of these windows is returned. `duration_s`
+    is the duration of a window, and `shortest_mean` as in `_smooth`.
     """
     width = take.raw.shape[0]
     written = 0
@@ -117,7 +117,7 @@ def receive(take, filters, frames, duration_s, shortest_mean, windows):  # type:
 
 @compiled
 def finish(take, filters, duration_s, shortest_mean, windows):  # type: ignore[no-untyped-def]
-    """Smooth the last frames of a take; write the windows that they complete and return their number.
+    """Smooth the last frames of a take; write the windows that these frames complete, and return the number of windows.
 
     The parameters are as in `receive`.
     """

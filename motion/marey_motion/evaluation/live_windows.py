@@ -29,12 +29,13 @@ from marey_schemas.options.evaluation import LEAST_FRAME_RATE_HZ, MOST_FRAME_RAT
 
 
 class LiveTake(NamedTuple):
-    """State of the current take: ring buffers in which frame f of the take is at f modulo their length.
+    """State of the current take: ring buffers, in which frame f of the take is at f modulo the buffer's length.
 
     Parameters
     ----------
     raw : (D, 4)    ground position (x, z) in metres and unit facing (x, z) of the newest frames, not smoothed
-    steps : (S, 3)    length, forward and leftward part of the newest steps of the smoothed root, metres
+    steps : (S, 3)    newest steps of the smoothed root from frame to frame: length, forward part and leftward part,
+        metres
     headings : (S + 1,)    newest headings of the smoothed root, radians, continuous
     sums : (3,)    sums of the columns of `steps`
     root : (3,)    ground position (x, z) and heading of the smoothed root, in the newest smoothed frame
@@ -57,7 +58,7 @@ class Filters(NamedTuple):
 
 
 class LiveWindows:
-    """Windows of one second of a performance at `rate_hz`, computed for one take after another."""
+    """Computation of windows of one second for a performance at `rate_hz`, one take after another."""
 
     def __init__(self, rate_hz: float) -> None:
         if not LEAST_FRAME_RATE_HZ <= rate_hz <= MOST_FRAME_RATE_HZ:
@@ -176,9 +177,9 @@ class LiveWindows:
 def smoother(window: int) -> Floats:
     """Make the matrix of a Savitzky-Golay filter: row i estimates frame i of a window from all its frames.
 
-    The middle row is the filter. The rows before it are for the beginning of a take and the rows after it for its end,
-    where the polynomial of the outermost window is evaluated up to the edge. If the window is too short for the
-    polynomial, the result is the identity.
+    The middle row is the filter. The rows before it are for the beginning of a take, and the rows after it for the end
+    of a take: there, the polynomial of the outermost window is evaluated up to the edge. If the window is too short for
+    the polynomial, the result is the identity of shape (1, 1), which leaves values unchanged.
 
     Parameters
     ----------

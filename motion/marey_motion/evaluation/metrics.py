@@ -1,9 +1,9 @@
 """Metrics of a trial: accuracy, responsiveness and costs, over the whole trial and per regime.
 
-Everything is measured on steps: step k leads from tick k - 1 to tick k. Its speed is the distance between its two
-positions divided by its duration, its error is the recorded minus the reference value, and its offset is the distance
-between recorded and reference position at tick k. A regime is all time with the same desired motion: the approach, the
-trial's base speed ("base"), or the speed it switches to ("switched").
+Everything is measured on steps: step k leads from tick k - 1 to tick k. The speed of a step is the distance between its
+two positions, divided by its duration. An error is a recorded value minus the reference value. The offset is the
+distance between the recorded and the reference position at tick k. A regime is all time with the same desired motion:
+the approach, the trial's base speed ("base"), or the speed it switches to ("switched").
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from marey_schemas.options.evaluation import EvaluationOptions, Grid
 
 REGIMES = ("approach", "base", "switched")
 RESPONSE_SHARE = 0.1
-"""Share of the desired speed below which the error of the speed must fall for the speed to count as reached."""
+"""A desired speed counts as reached if the error of the speed is below this share of it for `RESPONSE_HOLD_S`."""
 RESPONSE_HOLD_S = 0.5
 """Seconds for which the error must stay below `RESPONSE_SHARE` for the speed to count as reached."""
 LEAST_TRAVEL_M_S = 0.05
@@ -43,8 +43,8 @@ class TrialSeries:
     wanted_speeds_m_s, wanted_turn_rates_rad_s : speed and turn rate of the reference
     offsets_m : distance from the reference at the same tick
     cross_track_m, along_track_m : components of this offset in the reference's frame, positive to the left and ahead
-    regimes : index into `REGIMES`
-    pieces : index of the period of constant speed, -1 for the approach
+    regimes : index of the step's regime in `REGIMES`
+    pieces : index of the step's period of constant desired speed, -1 for the approach
     """
 
     rate_hz: float
@@ -62,12 +62,12 @@ class TrialSeries:
 
 
 def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> TrialSeries:
-    """Compute the speeds, turn rates and offsets of each step, recorded and of the reference.
+    """Compute the recorded and the desired speed and turn rate of each step, and the offset from the reference.
 
     Parameters
     ----------
     trial : Trial    the trial
-    reference : Reference    its trajectory
+    reference : Reference    trajectory of the trial
     record : TrialRecord    T ticks
 
     Returns
@@ -107,12 +107,12 @@ def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> Tri
 
 
 def measure_trial(trial: Trial, reference: Reference, record: TrialRecord, options: EvaluationOptions) -> TrialResult:
-    """Compute every metric of one trial (docs/explanation/evaluation.md), and of each regime if it has several.
+    """Compute every metric of one trial (docs/explanation/evaluation.md), and of each regime if there are several.
 
     Parameters
     ----------
     trial : Trial    the trial
-    reference : Reference    its trajectory
+    reference : Reference    trajectory of the trial
     record : TrialRecord    T ticks
     options : EvaluationOptions    options of the evaluation
 
@@ -213,7 +213,7 @@ def _offset_metrics(series: TrialSeries, window: Flags) -> dict[str, float | Non
 
 
 def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None]:
-    """Compute the mean response time to speed switches, or None, and count the switches without response."""
+    """Compute the mean response time to speed switches (None without any), and count switches without response."""
     times = [
         _response_s(series, first, stop)
         for first, stop in _stretches(series.pieces)
@@ -227,7 +227,7 @@ def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | N
 
 
 def _stretches(pieces: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """Find the half-open ranges of consecutive equal values."""
+    """Find the ranges [start, stop) of consecutive equal values."""
     bounds = [0, *(np.flatnonzero(np.diff(pieces)) + 1).tolist(), len(pieces)]
     return list(pairwise(bounds))
 
@@ -249,7 +249,7 @@ def _response_s(series: TrialSeries, first: int, stop: int) -> float | None:
 
 
 def _switch_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]:
-    """Count the transitions that searches chose, and separately the ends of clips and restarts of loops.
+    """Count the transitions that searches chose; count separately the ends of clips, including restarts of loops.
 
     `window` marks the steps that count.
     """
@@ -309,7 +309,7 @@ def _literal_metrics(series: TrialSeries, window: Flags, grid: Grid) -> Metrics:
 
 
 def _of(measure: Callable[[Floats], np.float64 | float], values: Floats) -> float | None:
-    """Apply the measure to the values; return None if there are no values."""
+    """Apply a measure to values; return None if there are no values."""
     return float(measure(values)) if len(values) else None
 
 
@@ -328,9 +328,9 @@ SUMMED = ("transitions", "clip_ends", "response_missed")
 def pooled_metrics(results: Sequence[TrialResult]) -> dict[str, float | None]:
     """Pool the metrics of several trials; metrics of a regime get the prefix `<regime>.`.
 
-    Maxima are pooled to the largest value of all trials, root mean squares to the root mean square of the trials'
-    values, and counts to their sum. Every other metric is pooled to the mean over the trials in which it is defined.
-    `dse_…_pooled` is the root mean square of the trials' spreads.
+    The pooled value of a maximum is the largest value of all trials; that of a root mean square is the root mean square
+    of the trials' values; that of a count is the sum. For every other metric, it is the mean over the trials in which
+    the metric is defined. `dse_…_pooled` is the root mean square of the standard deviations of the trials.
 
     Parameters
     ----------

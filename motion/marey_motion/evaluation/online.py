@@ -1,4 +1,4 @@
-"""Coverage during a recording: the data recorded so far, the missing data, and paths to walk in order to record it.
+"""Coverage during a recording: the data recorded so far, the missing data, and paths to walk to record missing data.
 
 A performance arrives as frames, in groups of any size. For a whole clip, the counted windows are the same as those of
 `coverage.measure_coverage` at the same frame rate.
@@ -38,7 +38,7 @@ PATH_RATE_HZ = 5.0
 AWAY_DECIMALS = 1
 """Decimals to which distances between cells are compared.
 
-Of equally distant targets, the one that lacks more seconds comes first.
+Of two equally distant cells, the cell that lacks more seconds comes first.
 """
 
 
@@ -46,8 +46,8 @@ Of equally distant targets, the one that lacks more seconds comes first.
 class PerformerState:
     """Position of the performer in the newest frame, and mean motion in the newest window.
 
-    The motion is None until a window exists. Ground position in metres, heading in radians, strafe positive to the
-    left.
+    `window` is None until a window exists. The position is on the ground, in metres; the heading is in radians; strafe
+    is positive to the left.
     """
 
     x_m: float
@@ -58,7 +58,7 @@ class PerformerState:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A cell that lacks data, and a path that fills it.
+    """A cell that lacks data, and a path to walk that fills the cell.
 
     `path` is in metres in the performer's frame: it starts at (0, 0) with heading 0, x to the left and z ahead.
     """
@@ -213,9 +213,9 @@ class OnlineCoverage:
         return PerformerState(x, z, float(np.arctan2(facing_x, facing_z)), self._live.newest_window)
 
     def targets(self, count: int, *, path_s: float = TARGET_PATH_S) -> tuple[Target, ...]:
-        """List the cells that lack data, the nearest to the performer's current speed and turn rate first.
+        """List cells that lack data, the cell nearest to the performer's current speed and turn rate first.
 
-        Distances are counted in cells. Without a performer, they are measured from standing still.
+        Distances are counted in cells. Outside a take, distances are measured from standing still.
 
         Parameters
         ----------
@@ -224,7 +224,7 @@ class OnlineCoverage:
 
         Returns
         -------
-        tuple of Target    each target with a path at its speed and turn rate
+        tuple of Target    the cells, each with a path at the speed and turn rate of the cell
         """
         seconds, deficits = self.seconds, self.deficit_s
         speeds, turn_rates = np.unique(self.grid.speeds_m_s), np.unique(self.grid.turn_rates_deg_s)

@@ -1,4 +1,4 @@
-"""Digests of the content and conditions of an evaluation, which show whether two evaluations are comparable."""
+"""Digests of the content and of the conditions of an evaluation; they show whether two evaluations are comparable."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def require_comparable(before: Provenance, after: Provenance) -> None:
 
     Raises
     ------
-    MotionError    if they differ; the error names all differences
+    MotionError    if any of these differ; the error names all differences
     """
     different = {
         name: f"their {plural} differ ({_short(first)} and {_short(second)}): {remedy}"
@@ -99,7 +99,7 @@ def _digest(value: Any) -> str:
 
 
 def _canonical(value: Any) -> Any:
-    """Convert to plain values in which equal numbers are written equally: 3 as 3.0, and -0.0 as 0.0."""
+    """Convert a value to plain values in which equal numbers are written in the same way: 3 as 3.0, and -0.0 as 0.0."""
     if isinstance(value, Options):
         return _canonical(value.model_dump())
     if is_dataclass(value) and not isinstance(value, type):

@@ -1,4 +1,4 @@
-"""Relevance of clips and frames: their use, popularity and the jumps between them."""
+"""Relevance of clips and frames: their use and popularity, and the jumps from frame to frame."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import Status, TrialRecord
 
 TREADING_S = 1 / 3
-"""Duration, in seconds. A jump within a clip over at most this duration makes the character tread on the spot."""
+"""A jump within a clip over at most this duration, in seconds, makes the character tread on the spot."""
 
 
 class Jumps(NamedTuple):
-    """Jumps of a character from a row to another row that does not follow it.
+    """Jumps of a character from one row to another row that is not the next row.
 
     Parameters
     ----------
     ticks : (J,) int64    the first tick after each jump
-    left, entered : (J,) int64    rows displayed before and after
+    left, entered : (J,) int64    rows displayed before and after each jump
     forced : (J,) bool    whether the jump was forced because the clip had ended; all other jumps were chosen
     """
 
@@ -96,7 +96,7 @@ def measure_usage(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord])
 
     Returns
     -------
-    tuple of ClipUsage    one per clip, in their order
+    tuple of ClipUsage    one per clip, in the order of the clips
     """
     starts = clip_starts(clips)
     popularity = np.zeros(starts[-1], dtype=np.int64)
@@ -166,7 +166,7 @@ def sum_by_source(clips: Sequence[DatabaseClip], usage: Sequence[ClipUsage]) -> 
 
     Returns
     -------
-    tuple of SourceUsage    in the order of their uids
+    tuple of SourceUsage    in the order of the uids
     """
     families: dict[str, list[int]] = {}
     for index, clip in enumerate(clips):

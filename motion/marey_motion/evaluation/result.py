@@ -14,8 +14,8 @@ from marey_motion.matching.record import TrialRecord
 from marey_schemas.options.evaluation import EvaluationOptions
 
 Metrics = Mapping[str, float | None]
-"""Value of each metric by name, in the unit in which the name ends. None if the metric is undefined: for example, a
-response time without a response.
+"""Value of each metric by name; docs/explanation/evaluation.md lists the units. None if a metric is undefined: for
+example, the response time if there was no response.
 """
 
 
@@ -30,14 +30,14 @@ class TrialResult:
 
 @dataclass(frozen=True, eq=False)
 class ClipUsage:
-    """Use of one clip in the suite; indices are into `EvaluationResult.clips`.
+    """Use of one clip in the suite; `clip` is an index of `EvaluationResult.clips`.
 
     Parameters
     ----------
-    ticks : number of ticks that displayed the clip
+    ticks : number of ticks in which the clip was displayed
     share : share of all ticks of the suite, 0 to 1
     entries : number of jumps to the clip, chosen or forced by the end of a clip
-    trials : number of trials that displayed the clip
+    trials : number of trials in which the clip was displayed
     popularity : (frames,) int64    number of ticks in which each frame was displayed
     """
 
@@ -58,11 +58,12 @@ class Coverage:
     clip : (W,) int32    index of the clip of each window
     speed_m_s, turn_rate_rad_s, forward_m_s, strafe_m_s : (W,) float64    means of each window; strafe is positive to
         the left
-    speed_edges_m_s, turn_rate_edges_deg_s : (V + 1,), (O + 1,)    cells centred on the trial grid
+    speed_edges_m_s, turn_rate_edges_deg_s : (V + 1,), (O + 1,)    edges of the cells, which are centred on the trial
+        grid
     seconds : (V, O) float64    seconds of data in each cell
     deficit_s : (V, O) float64    seconds that each cell lacks
     index : share of the cells with enough data, 0 to 1
-    symmetry : 1 if turning left and right are covered equally, 0 if only one of them is covered
+    symmetry : 1 if left and right turns are covered equally, 0 if only one side is covered
     too_short : indices of the clips that have no window, because they last one second or less
     """
 

@@ -1,7 +1,7 @@
 """Similarity of the poses in each cell of the coverage map, across clips.
 
-A cell may have enough data and yet be useless for motion matching, if poses of its clips are never close enough to
-blend. A frame belongs to the cell of the one-second window that begins with it.
+A cell may have enough data, and yet be useless for motion matching because the poses of different clips are never close
+enough to blend. A frame belongs to the cell of the one-second window that begins with it.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from marey_motion.matching.record import Status, TrialRecord
 ProgressCallback = Callable[[int, int, str], None]
 
 MOST_FRAMES = 2_000
-"""Maximum number of frames of a cell that are measured; if there are more, every k-th frame is measured. The nearest
-frame is searched among all frames of the cell.
+"""Maximum number of frames of a cell that are measured; if the cell has more frames, every k-th frame is measured. The
+nearest frame is searched for among all frames of the cell.
 """
 
 
@@ -37,7 +37,8 @@ class PoseSimilarity:
     threshold_m : largest distance at which frames can be blended: sum over the pose joints, metres
     frames, sources : (V, O) int64    numbers of frames and of sources in the cell; a clip and its mirrored copy are one
         source
-    measured : (V, O) int64    number of frames compared; evenly chosen if there are more than `MOST_FRAMES`
+    measured : (V, O) int64    number of frames compared; if a cell has more than `MOST_FRAMES`, evenly spaced frames
+        are chosen
     distance_m : (V, O) median distance; NaN with fewer than two sources
     blendable_share : (V, O) share of the measured frames within the threshold; 0 if the cell has one source, NaN if it
         has no frames
@@ -85,7 +86,7 @@ def measure_similarity(
     Parameters
     ----------
     database : MatchingDatabase    the clips
-    coverage : Coverage    their coverage
+    coverage : Coverage    coverage of the clips
     threshold_m : float    distance up to which a frame can be blended, usually `accepted_distance`; metres
     most_frames : int    frames compared per cell
     progress : callable, optional    called as progress(done, total, name)
@@ -179,7 +180,7 @@ def window_cells(coverage: Coverage) -> NDArray[np.int64]:
 
 
 def source_of_rows(database: MatchingDatabase) -> NDArray[np.int64]:
-    """Find the source of each row, as a number.
+    """Number the sources, and find the number of each row's source.
 
     Parameters
     ----------
@@ -187,7 +188,7 @@ def source_of_rows(database: MatchingDatabase) -> NDArray[np.int64]:
 
     Returns
     -------
-    (N,) int64    number of the source, which a clip shares with its mirrored copy
+    (N,) int64    number of the source; a clip and its mirrored copy have the same source
     """
     of_clip = np.empty(len(database.clips), dtype=np.int64)
     for number, own in enumerate(clips_by_source(database.clips).values()):

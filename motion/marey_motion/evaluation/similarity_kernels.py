@@ -12,8 +12,8 @@ def nearest_of_others(queries, query_groups, points, groups, found):  # type: ig
     """Fill `found` (Q,) with the distance of each query (Q, P, 3) from the nearest of N poses (N, P, 3).
 
     The distance of two poses is the sum over their P points. A query is compared only with poses whose `groups` (N,)
-    differ from its own, `query_groups` (Q,); the result is infinite if there are none. The pose that was nearest to the
-    previous query is tried first, so that most other poses are ruled out early.
+    differ from its own, `query_groups` (Q,); the result is infinite if there are no such poses. The pose that was
+    nearest to the previous query is tried first, so that most other poses are ruled out early.
     """
     before = 0
     for q in range(queries.shape[0]):

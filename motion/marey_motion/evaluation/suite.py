@@ -69,8 +69,8 @@ def run_suite(
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
     trials : sequence of Trial, optional    the trials to run; all of the suite if None
-    done : mapping of str to TrialRecord, optional    existing records, by the name of their trial; these trials are
-        not run again
+    done : mapping of str to TrialRecord, optional    existing records, by the name of the trial; trials with a record
+        are not run again
     index : SearchIndex, optional    index of the database's normalised features, built if None
     threads : int, optional    number of trials at a time; one per processor if None
     progress : callable, optional    called as progress(trials done, total, name of the last trial)
@@ -114,7 +114,7 @@ def _runner(
 
 
 def guide_for(trial: Trial, database: MatchingDatabase) -> Reference:
-    """Compute a trial's trajectory, extended beyond its end by the look-ahead of the database.
+    """Compute a trial's trajectory, extended beyond the end of the trial by the look-ahead of the database.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def evaluate(
     ----------
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
-    threads : int, optional    trials at once, one per processor if None
+    threads : int, optional    number of trials at a time; one per processor if None
     with_baseline : bool    whether to also evaluate generated clips
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
@@ -265,7 +265,7 @@ def evaluate_baseline(
     Parameters
     ----------
     options : EvaluationOptions    options of the evaluation
-    threads : int, optional    trials at once, one per processor if None
+    threads : int, optional    number of trials at a time; one per processor if None
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
 
@@ -297,7 +297,7 @@ def baseline_clips(options: EvaluationOptions) -> tuple[list[SourceClip], list[s
     Returns
     -------
     clips : list of SourceClip    the gaits
-    notes : list of str    pairs of speed and turn rate at which no gait can be generated
+    notes : list of str    pairs of speed and turn rate for which no gait can be generated
     """
     speeds = set(options.speeds_m_s)
     if "switching" in options.families:
@@ -328,7 +328,7 @@ def baseline_database(options: EvaluationOptions) -> tuple[MatchingDatabase, lis
     Returns
     -------
     database : MatchingDatabase    the gaits
-    notes : list of str    pairs of speed and turn rate at which no gait can be generated
+    notes : list of str    pairs of speed and turn rate for which no gait can be generated
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Directed graph of the frames that characters display and of the jumps between them.
 
-The terms follow Kovar et al. (2002): clips that lead to each other and back form a strongly connected component; a dead
-end is a component that is entered and never left.
+The terms follow Kovar et al. (2002): clips from which jumps lead to each other and back form a strongly connected
+component; a dead end is a component that is entered, but never left.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ class WalkGraph:
     rows : (N,) int64    the nodes: displayed database rows, ascending
     ticks : (N,) int64    number of ticks in which each row was displayed
     edges : (E, 3) int64    row left, row entered and count; ordered by the first two
-    walks : for each record (R, 3) int64    first tick, first row and number of frames of each run without a jump
+    walks : for each record, an array (R, 3) int64 of its R runs without a jump: first tick, first row and number of
+        frames
     """
 
     clips: tuple[DatabaseClip, ...]
@@ -172,8 +173,10 @@ class ClipGraph:
 
     Parameters
     ----------
-    counts : number of jumps by (clip left, clip entered), in ascending order; both may be the same clip
-    components : strongly connected components of the clips that were displayed, largest first, then by lowest index
+    counts : number of jumps for each pair (clip left, clip entered), in ascending order of the pairs; both may be the
+        same clip
+    components : strongly connected components of the displayed clips; the largest comes first, then the one with the
+        lowest index
     dead_ends : components that were entered and never left
     """
 

@@ -44,16 +44,16 @@ def read_motion(
     companion_name: str = "the companion",
     options: ImportOptions | None = None,
 ) -> ImportedMotion:
-    """Read a motion or skeleton file of any known format into Marey's convention.
+    """Read a motion or skeleton file of any known format, and convert it to metres and Y up.
 
     Parameters
     ----------
     data : bytes    the content of the file
-    name : str    its name, which helps to detect the format and appears in messages
+    name : str    name of the file, which helps to detect the format and appears in messages
     companion : bytes, optional    content of the file with the skeleton, for formats that need one: the ASF of an AMC,
         or the skeleton document of a clip in the format of `formats.predecessor`
-    companion_name : str    name of that file, for messages
-    options : ImportOptions, optional    facts about the file, such as its unit, that have precedence over its content
+    companion_name : str    name of the companion file, for messages
+    options : ImportOptions, optional    facts about the file, such as its unit; they have precedence over the content
 
     Returns
     -------
@@ -94,10 +94,10 @@ def read_source(
     Parameters
     ----------
     data : bytes    the content of the file
-    name : str    its name
+    name : str    name of the file
     companion : bytes or None    content of the companion file, such as the ASF of an AMC
     companion_name : str    name of the companion file
-    options : ImportOptions    facts about the file, such as its unit, that have precedence over its content
+    options : ImportOptions    facts about the file, such as its unit; they have precedence over the content
 
     Returns
     -------
@@ -137,7 +137,7 @@ def write_motion(clip: Clip, file_format: str, **options: Any) -> bytes:
 
     Raises
     ------
-    UnknownFormat    if the format is not one of these
+    UnknownFormat    if the format is not in `MOTION_FORMATS`
     FormatError    if the format cannot hold the clip
 
     Examples
@@ -155,7 +155,7 @@ def write_motion(clip: Clip, file_format: str, **options: Any) -> bytes:
 
 
 def reader_of(row: FileFormat) -> Callable[..., SourceMotion | SourceDocument]:
-    """Find the function that reads files of a format; the format must be one that can be imported.
+    """Find the function that reads files of a format, which must be a format that can be imported.
 
     Parameters
     ----------

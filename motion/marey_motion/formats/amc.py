@@ -1,6 +1,6 @@
 """AMC (Acclaim motion capture): reading a motion together with its ASF skeleton.
 
-Angles are extrinsic rotations about fixed axes, in the order of the skeleton's `dof`: `dof rx ry rz` is Rz · Ry · Rx.
+Angles are rotations about fixed axes (extrinsic), in the order of `dof` in the ASF: `dof rx ry rz` is Rz · Ry · Rx.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ def read_amc(
     Parameters
     ----------
     data : bytes    content of the AMC file
-    file : str    its name, for messages
+    file : str    name of the file, for messages
     companion : bytes, optional    content of the ASF file
-    companion_name : str    its name, for messages
-    frame_rate_hz : float, optional    frames per second; if neither this nor the file gives a rate, 120 is assumed with
-        a warning
+    companion_name : str    name of the ASF file, for messages
+    frame_rate_hz : float, optional    frames per second, replaces the rate in the file; if both are missing, 120 is
+        assumed with a warning
 
     Returns
     -------
@@ -46,7 +46,7 @@ def read_amc(
 
     Raises
     ------
-    FormatError    naming the line, and the bone if there is one
+    FormatError    if the file is invalid; the error names the line, and the bone if there is one
     """
     if companion is None:
         message = "an AMC file contains angles but no skeleton; import it together with its ASF file"
@@ -76,8 +76,8 @@ def read_amc(
 def _read_amc_header(lines: TextLines, degrees: bool) -> tuple[bool, float | None]:
     """Read the header, up to the first frame.
 
-    Returns whether angles are in degrees, and the frame rate or None. `degrees` says whether the ASF uses degrees; the
-    same unit is assumed if the AMC gives none.
+    Returns whether angles are in degrees, and the frame rate or None. `degrees` says whether the ASF uses degrees; an
+    AMC that does not state the unit is assumed to use the same unit.
     """
     rate_hz = None
     while True:

@@ -63,12 +63,13 @@ def scan_frames(lines: TextLines, skeleton: AsfSkeleton) -> tuple[NDArray[np.flo
 
     Returns
     -------
-    values : (F, C) float64    the bones' channels side by side, degrees or radians and the file's unit of length
-    gaps : int    number of gaps in the frames' numbers
+    values : (F, C) float64    channels of all bones side by side, in degrees or radians and in the file's unit of
+        length
+    gaps : int    number of gaps in the numbering of the frames
 
     Raises
     ------
-    FormatError    naming line and bone
+    FormatError    if the file is invalid; the error names the line and the bone
     """
     text = ending_in_a_line(np.frombuffer(lines.data, np.uint8))
     table = BoneTable.of(skeleton.bones)
@@ -188,7 +189,7 @@ def _bone_called(text, start, stop, names, name_ends, expected):  # type: ignore
 def _read_bone(text, i, first_columns, values, long_tokens, state):  # type: ignore[no-untyped-def]
     """Read the numbers of a bone, from position `i` to the end of the line, into `values`.
 
-    Returns the position after them, or -1 if a number is malformed.
+    Returns the position after the numbers, or -1 if a number is malformed.
     """
     bone, frame = state[_BONE], state[_FRAME]
     state[_FOUND] = 0
@@ -234,7 +235,7 @@ def _read_long_tokens(
 def _fail(
     stopped: int, lines: TextLines, skeleton: AsfSkeleton, seen: NDArray[np.int64], state: NDArray[np.int64]
 ) -> NoReturn:
-    """Raise the error that stopped the scanner, with the line where it stopped."""
+    """Raise the error that stopped the scanner, with the line where the scanner stopped."""
     bone = skeleton.bones[state[_BONE]]
     word = lines.data[state[_POSITION] : state[_POSITION] + 64].split(maxsplit=1)[:1] or [b""]
     if stopped == _BAD_NUMBER:

@@ -3,8 +3,8 @@
 In an ASF, a bone has a direction and a length in world axes at rest, and an `axis`: the frame in which its angles are
 measured. With C the rotation of that frame and M the rotation by the angles, the bone turns by C · M · C⁻¹ relative to
 its parent. The joints made from the bones have world-aligned frames at rest (identity rest rotations, as in BVH). Each
-joint is at the start of its bone, so its offset is its parent's bone vector; the end of a bone without children becomes
-an end site.
+joint is at the start of its bone, so the offset of a joint is the bone vector of the parent; the end of a bone without
+children becomes an end site.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ _CHANNELS = {kind + axis for kind in "rt" for axis in _AXES}
 class Bone:
     """A bone in the units and conventions of the file.
 
-    `vector` is the direction times the length, in the file's unit and world axes. `frame` is the quaternion of its
-    `axis`. `channels` are its degrees of freedom in order ("rx", "tz"). `line` is its line in the file.
+    `vector` is the direction times the length, in the file's unit and world axes. `frame` is the quaternion of the
+    bone's `axis`. `channels` are the degrees of freedom in order ("rx", "tz"). `line` is the number of the bone's line
+    in the file.
     """
 
     name: str
@@ -97,7 +98,7 @@ def read_asf(data: bytes, file: str) -> SourceMotion:
     Parameters
     ----------
     data : bytes    content of the file
-    file : str    its name, for messages
+    file : str    name of the file, for messages
 
     Returns
     -------
@@ -105,7 +106,7 @@ def read_asf(data: bytes, file: str) -> SourceMotion:
 
     Raises
     ------
-    FormatError    with the line, and the bone if there is one
+    FormatError    if the file is invalid; the error names the line, and the bone if there is one
     """
     return skeleton_source(parse_asf(data, file))
 
@@ -143,7 +144,7 @@ def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
 
 _LONGEST_KEPT = 1 << 18
 _KNOWN: LruCache[bytes, AsfSkeleton] = LruCache(max_entries=32)
-"""Cache of the skeletons parsed last, by digest of their file, since many AMC files share one ASF.
+"""Cache of the skeletons parsed last, by the digest of the ASF file, since many AMC files share one ASF.
 
 The cached skeletons must not be changed.
 """
@@ -155,7 +156,7 @@ def parse_asf(data: bytes, file: str) -> AsfSkeleton:
     Parameters
     ----------
     data : bytes    content of the file
-    file : str    its name, for messages
+    file : str    name of the file, for messages
 
     Returns
     -------
@@ -163,7 +164,7 @@ def parse_asf(data: bytes, file: str) -> AsfSkeleton:
 
     Raises
     ------
-    FormatError    with the line, and the bone if there is one
+    FormatError    if the file is invalid; the error names the line, and the bone if there is one
     """
     if len(data) > _LONGEST_KEPT:
         return _AsfReader(TextLines(data, file)).read()
@@ -297,7 +298,7 @@ class _AsfReader:
         return order
 
     def _frame(self, angles: list[float], order: str) -> NDArray[np.float64]:
-        """Make the quaternion of three turns about fixed axes, applied in the order of their names."""
+        """Make the quaternion of three turns about fixed axes, applied in the order of the axis names in `order`."""
         radians = np.radians(angles) if self.degrees else np.array(angles)
         frame = np.array([1.0, 0.0, 0.0, 0.0])
         for axis, angle in zip(order, radians, strict=True):

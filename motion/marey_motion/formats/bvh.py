@@ -35,7 +35,7 @@ class ChannelColumns:
     """Column of each channel in the table of numbers.
 
     `turns` and `axes` (J, 3) are the column and the axis of each joint's rotations; `positions` (J, 3) are the columns
-    of x, y and z. `NO_COLUMN` marks a channel that the joint lacks. `labels` are names of the columns for messages.
+    of x, y and z. `NO_COLUMN` marks a channel that the joint lacks. `labels` are names of the columns, for messages.
     """
 
     turns: NDArray[np.int64]
@@ -50,7 +50,7 @@ def read_bvh(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
     Parameters
     ----------
     data : bytes    content of the file
-    file : str    its name, for messages
+    file : str    name of the file, for messages
     frame_rate_hz : float, optional    replaces the rate computed from the file's Frame Time
 
     Returns
@@ -59,7 +59,7 @@ def read_bvh(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
 
     Raises
     ------
-    FormatError    with the line, and the joint if there is one
+    FormatError    if the file is invalid; the error names the line, and the joint if there is one
     """
     lines = TextLines(data, file)
     header = read_header(lines)
@@ -209,10 +209,10 @@ def _take_bones_from_positions(source: SourceMotion, translations: NDArray[np.fl
 
 
 def _resolve_displacements(source: SourceMotion, translations: NDArray[np.float64]) -> None:
-    """Add offsets to position channels below the root that contain displacements from the offsets.
+    """Add the offsets to the values of position channels below the root that contain displacements from the offsets.
 
-    Some exporters write such channels. They are detected by their size: for most joints, the values stay within a tenth
-    of the bone's length from zero. If they were positions, every bone would have nearly no length.
+    Some exporters write displacements. They are detected by their size: for most joints, the values stay within a tenth
+    of the bone's length from zero. If such values were positions, every bone would have nearly no length.
     """
     offsets = source.offsets[list(source.translated_joints)]
     lengths = np.linalg.norm(offsets, axis=1)
@@ -233,7 +233,7 @@ def _resolve_displacements(source: SourceMotion, translations: NDArray[np.float6
 
 
 def _drop_redundant_translations(source: SourceMotion, translations: NDArray[np.float64]) -> None:
-    """Keep only translations of joints whose positions differ from their OFFSET by more than the rounding of files."""
+    """Keep only the translations of joints whose positions differ from OFFSET by more than a rounding error."""
     offsets = source.offsets[list(source.translated_joints)]
     size = np.abs(source.offsets).max()
     farthest = np.maximum(translations.max(axis=0) - offsets, offsets - translations.min(axis=0))

@@ -32,8 +32,8 @@ _LONGEST_KEPT = 1 << 18
 class BvhHeader:
     """Everything in a BVH file before its numbers.
 
-    `offsets[joint]`, `channels[joint]` follow the order of the joints in the file; `data_start` is the byte and
-    `data_line` the line where the numbers begin; `frame_time_s` is None if the file does not contain it.
+    `offsets` and `channels` are in the order of the joints in the file; the numbers begin at the byte `data_start` and
+    the line `data_line`; `frame_time_s` is None if the file does not contain it.
     """
 
     names: list[str] = field(default_factory=list)
@@ -49,9 +49,9 @@ class BvhHeader:
 
 @dataclass(frozen=True)
 class _KeptHierarchy:
-    """Parsed HIERARCHY in the cache. Files with equal text share it, so its lists must not be changed.
+    """Parsed HIERARCHY in the cache. Files with equal text share one hierarchy, so its lists must not be changed.
 
-    `position` is the offset of the first byte after its text, `number` the number of the last line of its text.
+    `position` is the offset of the first byte after the text of the hierarchy; `number` is the number of its last line.
     """
 
     header: BvhHeader
@@ -76,7 +76,7 @@ def read_header(lines: TextLines) -> BvhHeader:
 
     Raises
     ------
-    FormatError    naming the invalid line
+    FormatError    if the file is invalid; the error names the line
     """
     header = _read_hierarchy(lines)
     _read_motion_header(lines, header)

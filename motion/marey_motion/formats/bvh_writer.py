@@ -36,9 +36,9 @@ def write_bvh(
     ----------
     clip : Clip    F frames
     unit : str or float    unit of length by name ("cm", "m", "inch", …) or in metres
-    rotation_order : str    order of the rotations, outermost first, for joints without an order in `source`
-    source : SourceInfo, optional    record of the file the clip was imported from; its joints keep their rotation
-        orders
+    rotation_order : str    order of the rotations, outermost first; used for joints that have no order in `source`
+    source : SourceInfo, optional    record of the file from which the clip was imported; joints of this file keep their
+        rotation orders
 
     Returns
     -------
@@ -70,7 +70,7 @@ def _axes_of(skeleton: Skeleton, joint: int, rotation_order: str, source: Source
 
 
 def _depth_first(skeleton: Skeleton) -> list[int]:
-    """List the indices of the joints in depth-first order, the children of a joint in the order of the skeleton."""
+    """List the indices of the joints in depth-first order; the children of a joint keep their order."""
     order, waiting = [], [0]
     while waiting:
         joint = waiting.pop()

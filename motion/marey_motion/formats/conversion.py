@@ -41,12 +41,12 @@ _CONVERTED: LruCache[tuple[Anatomy, tuple[tuple[int, bytes], ...], bytes, float]
 
 
 def convert(source: SourceMotion, file: str, options: ImportOptions) -> ImportedMotion:
-    """Convert a motion in its file's unit and axes to a clip, with the record of the import.
+    """Convert a motion from the unit and axes of its file to a clip, and record the import.
 
     Parameters
     ----------
     source : SourceMotion    the file in its own unit and axes
-    file : str    its name, for messages
+    file : str    name of the file, for messages
     options : ImportOptions    facts given by the user
 
     Returns
@@ -98,7 +98,7 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
 
 
 def _check_range(source: SourceMotion, file: str) -> None:
-    """Refuse lengths whose squares or float32 values would overflow. No body or path is that long in any unit."""
+    """Refuse lengths so large that their squares or float32 values would overflow. No body or path is that long."""
     tips = np.array([offset for _, offset in source.end_sites])
     for values in (source.offsets, tips, source.root_positions, source.translations):
         if values is not None and np.abs(values).max(initial=0.0) > _LARGEST_LENGTH:
@@ -135,7 +135,7 @@ def _converted_clip(source: SourceMotion, skeleton: Skeleton, axes: NDArray[np.f
 
 
 def _moved(vectors: NDArray[np.float64], axes: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
-    """Convert vectors (..., 3) to metres, by the factor `scale`, and to Marey's axes; exact if nothing changes.
+    """Convert vectors (..., 3) to metres, by the factor `scale`, and to Marey's axes; exact if unit and axes stay.
 
     The rows of `axes` (3, 3) are Marey's axes in the axes of the file.
     """

@@ -27,12 +27,12 @@ _ZIP = b"PK\x03\x04"
 
 
 def detect_format(data: bytes, name: str) -> FileFormat:
-    """Find the format of a file; its content has precedence over its name.
+    """Find the format of a file; the content of the file has precedence over the name.
 
     Parameters
     ----------
     data : bytes    content of the file
-    name : str    its name
+    name : str    name of the file
 
     Returns
     -------

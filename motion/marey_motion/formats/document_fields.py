@@ -1,4 +1,4 @@
-"""Reading of fields of unvalidated documents; a missing or invalid value raises an error that names the field."""
+"""Functions that read fields of unvalidated documents; if a value is missing or invalid, an error names the field."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def field_of(document: Any, name: str, kind: type[T] | tuple[type[T], ...], file
 
     Raises
     ------
-    FormatError    naming the field
+    FormatError    if the field is missing or invalid; the error names it
     """
     value = document.get(name) if isinstance(document, dict) else None
     if not isinstance(value, kind):
@@ -52,7 +52,7 @@ def text_list(document: Any, name: str, file: str) -> list[str]:
 
     Raises
     ------
-    FormatError    naming the field
+    FormatError    if the field is missing or invalid; the error names it
     """
     values = field_of(document, name, list, file)
     if not all(isinstance(value, str) and value for value in values):
@@ -77,7 +77,7 @@ def number_list(document: Any, name: str, count: int, file: str, joint: str | No
 
     Raises
     ------
-    FormatError    naming the field
+    FormatError    if the field is missing or invalid; the error names it
     """
     values = field_of(document, name, list, file)
     numbers = number_array(values, file, name, joint)
@@ -106,7 +106,7 @@ def number_array(values: Any, file: str, name: str, joint: str | None = None) ->
 
     Raises
     ------
-    FormatError    naming the field
+    FormatError    if a value is not a finite number; the error names the field
     """
     try:
         array = np.array(values)

@@ -88,8 +88,9 @@ def rotations_from_euler(values, columns, axes, rotations):  # type: ignore[no-u
 def euler_from_rotations(rotations, axes, angles_deg):  # type: ignore[no-untyped-def]
     """Fill Euler angles from quaternions, through rotation matrices; the inverse of `rotations_from_euler`.
 
-    Of the two solutions, the one nearer to the frame before is used, and whole turns are added so that angles do not
-    jump. In gimbal lock (middle angle ±90°), the third angle stays as in the frame before and the first is computed.
+    Of the two solutions, the one nearer to the angles of the previous frame is used, and whole turns are added so that
+    angles do not jump. In gimbal lock (middle angle ±90°), the third angle stays as in the previous frame, and the
+    first angle is computed.
 
     Parameters
     ----------

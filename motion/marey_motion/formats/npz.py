@@ -1,4 +1,4 @@
-"""npz: a clip or skeleton as plain numpy arrays, exact, for scripts.
+"""npz: a clip or skeleton as plain numpy arrays without rounding, for scripts.
 
 A zip archive of .npy members, never pickled; the same clip always gives the same bytes. Members:
 
@@ -101,8 +101,8 @@ def read_npz(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
     Parameters
     ----------
     data : bytes    content of the file
-    file : str    its name, for messages
-    frame_rate_hz : float, optional    replaces the file's rate
+    file : str    name of the file, for messages
+    frame_rate_hz : float, optional    replaces the frame rate in the file
 
     Returns
     -------
@@ -110,7 +110,8 @@ def read_npz(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
 
     Raises
     ------
-    FormatError    naming the missing or invalid member; also if the content is larger than `MOST_UNPACKED_BYTES`
+    FormatError    if a member is missing or invalid (the error names it), or if the content is larger than
+        `MOST_UNPACKED_BYTES`
     """
     arrays = _read_members(data, file)
     if "format" not in arrays or str(arrays["format"]) != MARK:

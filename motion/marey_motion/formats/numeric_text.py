@@ -32,8 +32,8 @@ class NumberTable:
     """Numbers of a text block, row after row.
 
     `values` is flat; `rows` is the number of lines with numbers. `ragged_line` is the first line, counted from 1, that
-    does not have the expected number of values, and `ragged_count` is its number of values; `ragged_line` is 0 if there
-    is no such line. `last_line` is the last line read.
+    does not have the expected number of values, 0 if there is no such line; `ragged_count` is the number of values in
+    this line. `last_line` is the last line read.
     """
 
     values: NDArray[np.float64]
@@ -44,7 +44,7 @@ class NumberTable:
 
 
 class BadNumber(ValueError):
-    """A token that is not a finite decimal number: its text, its line, and the index of its value in the block."""
+    """A token that is not a finite decimal number, with its text, its line, and the index of the value in the block."""
 
     def __init__(self, token: str, line: int, index: int, in_line: int) -> None:
         super().__init__(f"{token!r} in line {line} is not a finite decimal number")
@@ -56,7 +56,7 @@ class BadNumber(ValueError):
 
 @compiled
 def parse_number(text, start):  # type: ignore[no-untyped-def]
-    """Read one decimal number at `text[start:]`. The text must end in a line feed, since its end is not checked.
+    """Read one decimal number at `text[start:]`. The text must end in a line feed, since its length is not checked.
 
     Positions are unsigned, because signed positions would need a test for negative indices at every byte.
 
@@ -69,7 +69,7 @@ def parse_number(text, start):  # type: ignore[no-untyped-def]
     -------
     kind : int    `EXACT`, `LONG` or `MALFORMED`
     value : float    valid only when `kind` is `EXACT`
-    stop : int    one past the token
+    stop : int    position after the token
     """
     i = np.uint64(start)
     negative = text[i] == 45
@@ -187,8 +187,8 @@ def scan_numbers(text: NDArray[np.uint8], width: int, first_line: int) -> Number
     Parameters
     ----------
     text : (bytes,) uint8    the text
-    width : int    expected number of values in a line; a line with more or fewer values raises no error, but the first
-        such line is returned
+    width : int    expected number of values in a line; lines with more or fewer values raise no error, but the first
+        such line is reported
     first_line : int    number of the first line of `text`, from 1
 
     Returns

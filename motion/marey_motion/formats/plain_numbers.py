@@ -54,14 +54,14 @@ def _word(text, i):  # type: ignore[no-untyped-def]
 
 @compiled
 def _bytes_before(marks):  # type: ignore[no-untyped-def]
-    """Count the bytes of an integer of 8 bytes before the first byte whose highest bit is set; 7 if no byte has it."""
+    """Count the bytes of an 8-byte integer before the first byte whose highest bit is set; 7 if there is none."""
     first = marks & (~marks + _ONE)
     return ((((first - _ONE) & _ONES) * _ONES) >> _SEVEN_BYTES) - _ONE
 
 
 @compiled
 def _length(first, second):  # type: ignore[no-untyped-def]
-    """Count the bytes before the first white space in two integers of 8 bytes each; 15 if there is none."""
+    """Count the bytes before the first white space in two integers of 8 bytes each; 15 if there is no white space."""
     # A borrow can mark only bytes after a white space, which do not matter.
     in_first = (first - _PRINTED) & ~first & _HIGH_BITS
     in_second = (second - _PRINTED) & ~second & _HIGH_BITS
@@ -89,7 +89,7 @@ def _digits(word):  # type: ignore[no-untyped-def]
 def read_plain_numbers(text, values, i, count):  # type: ignore[no-untyped-def]
     """Read plain numbers separated by spaces, up to the first other byte.
 
-    Reading also stops before a number whose bytes are too close to the end of the text to be read all at once.
+    Reading also stops before a number that is too close to the end of the text, because bytes are read eight at a time.
 
     A plain number has at most 15 digits, with at most 8 before and 8 after the point, and fits in 15 bytes. It can have
     a minus sign before it and a negative power of ten after it.

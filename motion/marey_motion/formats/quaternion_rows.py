@@ -32,7 +32,7 @@ def as_rotations(
 
     Raises
     ------
-    FormatError    with the joint whose quaternion is zero or not finite, and its frame
+    FormatError    naming the joint and the frame of a quaternion that is zero or not finite
     """
     values = np.asarray(values, np.float64)
     with np.errstate(over="ignore"):  # a length beyond all numbers is refused below

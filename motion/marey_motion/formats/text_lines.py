@@ -69,7 +69,7 @@ class TextLines:
         return FormatError(message, code=code, file=self.file, line=max(self.number, 1), joint=joint)
 
     def numbers(self, words: list[bytes], count: int, what: str, joint: str | None = None) -> list[float]:
-        """Parse an exact number of finite decimal numbers.
+        """Parse words as finite decimal numbers, and check that there are exactly `count` of them.
 
         Parameters
         ----------
@@ -122,7 +122,7 @@ def read_number(word: bytes) -> float | None:
 
     Returns
     -------
-    float or None    None for anything else
+    float or None    the number; None if the word is anything else
     """
     if not word or not _NUMBER.fullmatch(word):
         return None

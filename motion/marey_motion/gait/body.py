@@ -30,7 +30,7 @@ SIDES = {"Left": 1, "Right": -1}
 
 @dataclass(frozen=True)
 class GaitMoments:
-    """Inputs of the pose at n evenly spaced moments.
+    """Inputs of `pose_body` at n evenly spaced points in time.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class GaitMoments:
 
     @property
     def frame_rate_hz(self) -> float:
-        """Moments per second."""
+        """Number of points in time per second."""
         return (len(self.times_s) - 1) / float(self.times_s[-1] - self.times_s[0])
 
     def settled(self, values: AnyFloats, window_s: float = BLENDING_S) -> AnyFloats:
@@ -67,9 +67,9 @@ class GaitMoments:
     def settled_below(self, limits: AnyFloats, window_s: float = SETTLING_S) -> AnyFloats:
         """Compute a smooth curve that is nowhere above given limits.
 
-        Each limit is first replaced by the least limit in a window around its moment. The result is then smoothed with
-        a Hann window of the same width. All values that enter an average are minima of windows that contain the moment
-        of the average, so that the curve does not exceed the limit at this moment.
+        Each limit is first replaced by the least limit in a window around it. The result is then smoothed with a Hann
+        window of the same width. The curve at a point in time is thus an average of minima over windows that all
+        contain this point, so it does not exceed the limit there.
 
         Parameters
         ----------
@@ -89,15 +89,15 @@ def _reach(window_s: float, frame_rate_hz: float) -> int:
 
 
 def padding_frames(frame_rate_hz: float) -> int:
-    """Count the moments to add before and after the requested ones, so that averages at the ends are complete.
+    """Compute how many frames to add before and after the requested ones, so that averages at the ends are complete.
 
     Parameters
     ----------
-    frame_rate_hz : float    moments per second
+    frame_rate_hz : float    frames per second
 
     Returns
     -------
-    int    number of moments
+    int    number of frames
     """
     return 2 * _reach(BLENDING_S, frame_rate_hz) + 1
 
@@ -111,7 +111,7 @@ def pose_body(
     ----------
     skeleton : Skeleton    the studio skeleton, J joints
     style : GaitStyle    style of the walker
-    moments : GaitMoments    n moments
+    moments : GaitMoments    inputs at n points in time
     feet : mapping of str to FootMotion    motion of the "Left" and "Right" foot
 
     Returns
@@ -213,7 +213,8 @@ def _bend_leg(
     """Solve a leg by two-bone inverse kinematics; the knee bends towards the heading `facing` (n,), in radians.
 
     The heading `facing` lies between the headings of pelvis and foot. An ankle that is out of reach is moved towards
-    the hip until the leg reaches it. Where `freedom` (n,) is greater, this begins earlier and more gradually.
+    the hip until the leg reaches it. The greater `freedom` (n,) is, the earlier and the more gradually this movement
+    begins.
     """
     thigh, shank = _thigh_m(skeleton), _shank_m(skeleton)
     reach = ankle - hip

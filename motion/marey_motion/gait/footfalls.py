@@ -112,7 +112,7 @@ class Cadence:
 
 @dataclass(frozen=True)
 class FootMotion:
-    """Motion of one foot at n moments.
+    """Motion of one foot at n points in time.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ class FootMotion:
 
 
 class _Foot(NamedTuple):
-    """Pose of one foot at n moments, in stance or in swing.
+    """Pose of one foot at n points in time, in stance or in swing.
 
     Parameters
     ----------
@@ -151,14 +151,14 @@ class _Foot(NamedTuple):
 
 @dataclass(frozen=True)
 class Footfalls:
-    """The stances of one foot over a stretch of time.
+    """The stances (phases of ground contact) of one foot over a stretch of time.
 
     Parameters
     ----------
     cadence : Cadence    strides over time, along a path
     shape : FootShape    lengths of the foot
     side : int    1 for the left foot, -1 for the right
-    span_s : (float, float)    first and last requested moment, seconds
+    span_s : (float, float)    first and last requested time, seconds
     """
 
     cadence: Cadence
@@ -247,7 +247,7 @@ class Footfalls:
 
     @cached_property
     def _leaving_pitch_rates(self) -> AnyFloats:
-        """Pitch rate of each foot at the end of its push-off, radians per second."""
+        """Pitch rate at the end of the push-off of each stance, radians per second."""
         return np.asarray(self._leaving_pitches / ((1.0 - PUSH_OFF_START) * (self.leaves_s - self.strikes_s)))
 
     def _standing(self, times_s: AnyFloats, stance: NDArray[np.intp]) -> _Foot:
@@ -306,7 +306,7 @@ class Footfalls:
     def _swing_ground(
         self, times_s: AnyFloats, stance: NDArray[np.intp], following: NDArray[np.intp], share: AnyFloats
     ) -> Complexes:
-        """Compute the path of the ball over the floor: a cubic in the root's frame that joins both stances smoothly."""
+        """Compute the path of the ball over the floor: a cubic in the root's frame from one stance to the next."""
         path = self.cadence.path
         leaving, landing = path.at(self.leaves_s[stance]), path.at(self.strikes_s[following])
         pitches, rates = self._leaving_pitches[stance], self._leaving_pitch_rates[stance]

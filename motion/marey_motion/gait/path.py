@@ -23,9 +23,9 @@ class PathSegment:
     Parameters
     ----------
     duration_s : seconds, positive
-    speed_m_s : speed at its start, metres per second, not negative
+    speed_m_s : speed at the start, metres per second, not negative
     turn_rate_rad_s : change of heading, radians per second; positive turns left
-    end_speed_m_s : speed at its end; `speed_m_s` if None
+    end_speed_m_s : speed at the end; `speed_m_s` if None
     travel_angle_rad : direction of travel relative to the heading: 0 forward, π/2 to the left, π backward
     """
 
@@ -66,7 +66,7 @@ class PathSegment:
 
 @dataclass(frozen=True)
 class RootState:
-    """Position and motion of the root at n moments.
+    """Position and motion of the root at n points in time.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ class RootPath:
 
     @cached_property
     def starts_s(self) -> AnyFloats:
-        """Start of each of `pieces`, in seconds; 0 for the first piece, which has no start and ends at time 0."""
+        """Start of each of `pieces`, in seconds; 0 for the first piece, which has an end (time 0) but no start."""
         ends = np.cumsum([segment.duration_s for segment in self.segments])
         return np.concatenate(([0.0, 0.0], ends))
 
@@ -236,7 +236,7 @@ def start_and_stop(
     ----------
     speed_m_s : float    full speed, metres per second
     wait_s, ramp_s, cruise_s : float    seconds of waiting, of each change of speed, and of travel at full speed
-    turn_rate_rad_s : float    radians per second while it travels at full speed
+    turn_rate_rad_s : float    radians per second during the travel at full speed
 
     Returns
     -------

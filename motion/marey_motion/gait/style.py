@@ -26,9 +26,9 @@ class GaitStyle:
     Parameters
     ----------
     stride : length of strides at a given speed
-    step_width : distance between the lines on which the feet walk
+    step_width : distance between the lines along which the two feet walk
     lift : height of the swinging feet
-    bounce : rise and fall of the pelvis and its sideways tilt
+    bounce : rise, fall and sideways tilt of the pelvis
     lean : forward lean of the trunk and banking into turns
     sway : counter-rotation of the shoulders against the legs
     arm_swing : amplitude of the arms

@@ -139,7 +139,7 @@ def foot_motions(
 
 
 def _at_studio_size(path: RootPath, times_s: AnyFloats, size: float) -> tuple[RootPath, AnyFloats]:
-    """Scale the path and times of a walker, whose stature is `size` times the studio stature, to the studio stature.
+    """Scale the path and times of a walker who is `size` times as tall as the studio skeleton to the studio skeleton.
 
     Bodies of all sizes move alike if times scale with the square root of lengths (equal Froude numbers, Alexander and
     Jayes 1983).

@@ -1,4 +1,4 @@
-"""Anatomy of a skeleton: its standard joints, landmarks, axes and documents.
+"""Anatomy of a skeleton: standard joints, landmarks and axes, and the documents that contain them.
 
 An anatomy is computed once for all files with equal skeletons.
 """
@@ -34,7 +34,7 @@ class Anatomy:
 
     @cached_property
     def landmarks(self) -> Landmarks:
-        """The joints that give the upward direction, the stature and the ground."""
+        """The joints from which the upward direction, the stature and the ground are determined."""
         return find_landmarks(self.skeleton, self.mapping)
 
     @cached_property

@@ -181,7 +181,7 @@ def _rest_poses(clip: Clip, tracks: Tracks) -> list[CheckWarning]:
 
 
 def _rest_pose_frames(clip: Clip, tracks: Tracks) -> tuple[int, int]:
-    """Count the frames of a rest pose at the start of a clip, and those at its end.
+    """Count the frames of a rest pose at the start of a clip and at the end of the clip.
 
     In a rest pose, nearly every joint has the rotation of the skeleton's rest pose, or the arms are held out in a T.
     """
@@ -201,7 +201,7 @@ def _rest_pose_frames(clip: Clip, tracks: Tracks) -> tuple[int, int]:
 
 
 def _leading(blocks: Iterable[NDArray[np.bool_]]) -> int:
-    """Count the true values before the first false value in consecutive arrays; later arrays are not computed."""
+    """Count the true values before the first false value in a series of arrays; later arrays are not computed."""
     total = 0
     for block in blocks:
         if not block.all():

@@ -1,4 +1,4 @@
-"""Conversion of imported graphs of models: each node is linked to the model of the project that has the node's name.
+"""Conversion of imported graphs of models: each node is linked to the project's model with the same name.
 
 Such graphs come from files of the predecessor, the system that Marey replaces (`formats.predecessor`). They name the
 models of one or several actions, and the possible transitions between these models.

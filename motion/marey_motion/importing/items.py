@@ -41,8 +41,8 @@ class FileToImport:
 
     Parameters
     ----------
-    planned : its plan
-    data, digest : its bytes and their digest, recorded as the origin of a clip
+    planned : plan for the file
+    data, digest : bytes of the file and their digest, which is recorded as the origin of a clip
     companion, companion_digest : bytes and digest of the companion file that the plan names
     options : import options given by the user
     skeleton : stored skeleton that the clips must use
@@ -96,8 +96,8 @@ class ImportedFile:
 
     Parameters
     ----------
-    items : a skeleton followed by a clip or model that uses it, or one of these alone. The skeleton has no document
-        `mapping` yet: see `mapping_part`
+    items : a skeleton, a clip or a model, or else a skeleton followed by a clip or model that uses it. The skeleton has
+        no document `mapping` yet: see `mapping_part`
     checks : findings about the motion, as documents
     frames : number of frames of the clip
     graph : content of a file that holds a graph instead of items
@@ -126,7 +126,7 @@ def given_skeleton(given: GivenSkeleton) -> Skeleton:
 
 
 def skeleton_item(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
-    """Make the item of a file's own skeleton, marked to be stored only if the project has no equal skeleton.
+    """Make the item of a file's own skeleton, which is to be stored only if the project has no equal skeleton.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def skeleton_item(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
 
     Returns
     -------
-    ImportedItem    an item with its hierarchy
+    ImportedItem    item with the document `hierarchy`
     """
     anatomy = anatomy_of(skeleton)
     parts = {"hierarchy": anatomy.hierarchy}
@@ -152,7 +152,7 @@ def main_item(file: FileToImport, kind: Kind, item_name: str, parts: Mapping[str
     file : FileToImport    the file
     kind : Kind    kind of the item
     item_name : str    name of the item
-    parts : mapping of str to tree    its documents
+    parts : mapping of str to tree    documents of the item, by part
 
     Returns
     -------

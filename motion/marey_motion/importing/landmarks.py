@@ -1,4 +1,4 @@
-"""Landmarks of a body: the joints that give the upward direction, the stature and the ground."""
+"""Landmarks of a body: the joints from which the upward direction, the stature and the ground are determined."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ KEPT_SKELETONS = 256
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Indices of joints, None if none was found.
+    """Joint indices of the landmarks of a body; None for a landmark that was not found.
 
     `hips` is the lowest joint from which both feet descend. The pairs are (left, right); `feet` are the ankles and
-    `hands` the wrists. `by_names` is false if the joints were found by the skeleton's build alone; this also finds
-    joints of animals.
+    `hands` the wrists. `by_names` is true if the joints were recognised by their names; otherwise, the skeleton may be
+    that of an animal.
     """
 
     hips: int | None = None

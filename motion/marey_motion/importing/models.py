@@ -36,7 +36,7 @@ from marey_schemas.options.modelling import TreeOptions
 
 
 def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
-    """Import a model with its tree, or a graph.
+    """Import a model and, if the file has one as a companion, its cluster tree; or import a graph.
 
     Parameters
     ----------

@@ -1,6 +1,7 @@
 """Plan of the import of a batch of files, made from their names alone.
 
-The plan contains, for each file, its companion, the collection and the name of its item, or the reason of a refusal.
+The plan contains, for each file, its companion, the collection and the name of its item, or the reason why it is
+refused.
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ class PlannedFile:
     Parameters
     ----------
     name : name of the file, as given
-    role : a `motion` or `skeleton` to import, a `companion` that is read with another file, or `refused`
+    role : `motion` or `skeleton` for a file to import, `companion` for a file that is read with another file, or
+        `refused`
     companion : name of the companion file that this file needs; None if it needs none
     folder, item_name : path below the collection that receives the import, and name of the clip
-    reason : reason of the refusal; empty for other roles
+    reason : reason why the file is refused; empty for other roles
     """
 
     name: str

@@ -20,7 +20,7 @@ Subject = Literal["model", "tree", "graph"]
 
 @dataclass(eq=False)
 class SourceMotion:
-    """A motion in its file's unit of length and axes, with rotations already as quaternions.
+    """A motion in the unit of length and the axes of its file, with rotations already as quaternions.
 
     Parameters
     ----------

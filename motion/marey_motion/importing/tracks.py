@@ -20,7 +20,7 @@ _FRAMES_PER_BLOCK = 4096
 
 @dataclass(frozen=True)
 class BodyPoints:
-    """Points of a skeleton that the checks use, and lengths between them.
+    """Points of a skeleton that the checks use, and lengths of its limbs.
 
     `points` lists the points: joints by their index, then end sites, which are numbered from J on. The place of a point
     in this list is its column; `column` maps points to columns. `soles` has, for each foot, the columns of its joints

@@ -1,8 +1,8 @@
 """The unit of length and the upward axis of a file, inferred from the body, with the evidence.
 
-Files rarely state either. Both can be inferred from the body: an adult's leg is about 0.9 m long, the head is above the
-feet, and feet on the ground stay at one height. Every finding is stored as a sentence with its numbers; if the findings
-are not conclusive, an error asks the user.
+Files rarely state the unit or the axis. Both can be inferred from the body: an adult's leg is about 0.9 m long, the
+head is above the feet, and feet on the ground stay at one height. Every finding is stored as a sentence with its
+numbers; if the findings are not conclusive, an error asks the user.
 """
 
 from __future__ import annotations
@@ -77,10 +77,10 @@ class Conversion:
 
 @dataclass
 class _Measurements:
-    """Measures of the file's body, in its own unit and axes.
+    """Measures of the body in a file, in the unit and axes of the file.
 
-    `positions` (J, F, 3) are those of the joints in sampled frames, `rest` (J, 3) those in the rest pose. `leg` is None
-    if there are not two feet.
+    `positions` (J, F, 3) are joint positions in sampled frames, `rest` (J, 3) joint positions in the rest pose. `leg`
+    is None if there are not two feet.
     """
 
     file: str
@@ -175,7 +175,7 @@ def _choose_up_axis(source: SourceMotion, body: _Measurements, options: ImportOp
 
 
 def _settle_up_axis(body: _Measurements, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
-    """Choose the upward axis if the body is not upright along y: it may lie or climb, or another axis may point up.
+    """Choose the upward axis if the body is not upright along y; it may lie or climb, or another axis may point up.
 
     `axis` is the axis nearest to the direction from feet to head, and `cosine` is the cosine of the angle between this
     axis and the direction. `flat` is the result of `_flat_axis`.

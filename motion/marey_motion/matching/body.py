@@ -14,7 +14,7 @@ from marey_motion.rigs.mapping import symmetric_joints
 from marey_motion.skeleton import Skeleton
 
 POSE_JOINTS = ("pelvis", "spine_2", "head", "left_wrist", "right_wrist", "left_ankle", "right_ankle")
-"""Standard joints whose distances make up the pose cost of a transition: hips, spine, head, hands, feet."""
+"""Standard joints over which the pose cost of a transition is summed: hips, spine, head, hands, feet."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ def build_database(
     normaliser: Normaliser | None = None,
     progress: Progress | None = None,
 ) -> MatchingDatabase:
-    """Build a matching database from clips of one skeleton; the result does not depend on their order.
+    """Build a matching database from clips of one skeleton; the result does not depend on the order of the clips.
 
     Parameters
     ----------
@@ -54,8 +54,8 @@ def build_database(
 
     Raises
     ------
-    MotionError    if a clip has another skeleton, no facing direction or too few frames (the error names it), if uids
-        repeat, if options are invalid, or if the normaliser has other dimensions
+    MotionError    if a clip has another skeleton, no facing direction or too few frames (the error names the clip);
+        also if uids repeat, if options are invalid, or if the normaliser has other dimensions
     """
     layout = feature_layout(options, body)
     if normaliser is not None:
@@ -107,7 +107,7 @@ def with_normaliser(database: MatchingDatabase, normaliser: Normaliser) -> Match
 
 
 def union_normaliser(databases: Sequence[MatchingDatabase]) -> Normaliser:
-    """Fit one normaliser to the rows of several databases together, so that their costs can be compared.
+    """Fit one normaliser to the rows of several databases, so that costs in different databases can be compared.
 
     Parameters
     ----------
@@ -256,8 +256,8 @@ def _joined_translations(
 ) -> tuple[NDArray[np.float32] | None, tuple[int, ...]]:
     """Collect the translations (N, k, 3) of the k joints that any clip translates, and the indices of these joints.
 
-    In a clip that does not translate a joint, they equal the joint's offset. Returns None and no joints if no clip
-    translates any.
+    For a clip that does not translate one of these joints, the joint's offset is used. Returns None and no joints if no
+    clip translates a joint.
     """
     joints = np.array(sorted({joint for row in built for joint in row[1].translated_joints}), dtype=np.int64)
     if not len(joints):

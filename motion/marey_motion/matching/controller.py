@@ -19,7 +19,7 @@ from marey_schemas.options.matching import ControllerOptions
 
 
 class Trajectory(Protocol):
-    """Interface of a trajectory to follow, sampled at every tick.
+    """Interface of a trajectory that a character is to follow, sampled at every tick.
 
     For example, `marey_motion.evaluation.scenario.Reference` implements it.
     """
@@ -67,16 +67,18 @@ class ControllerConstants(NamedTuple):
 
     Parameters
     ----------
-    follow : constant of `controller_kernels`: the desired path is followed by time, by position or in open loop
-    by_distance : whether poses are compared by the distances of their joints instead of their features
+    follow : constant of `controller_kernels`, which says whether the path is followed by time, by position or in open
+        loop
+    by_distance : whether poses are compared by the distances between their joints instead of by their features
     period : number of ticks from one search to the next
     window : number of rows on each side of the displayed row that a search may not choose
-    bias, margin : numbers that are added to, and subtracted from, the cost of continuing the displayed clip, before the
-        costs of other rows are compared with it
+    bias, margin : `bias` is added to the cost of continuing the displayed clip, and `margin` is subtracted from it; the
+        costs of other rows are compared with the result
     blends_root : whether the velocity of the root is blended at a switch
-    decay : (2, 2) matrix that advances the offset of the velocity, and its change per second, by one tick
+    decay : (2, 2) matrix that advances an offset of the root's velocity, and the offset's change per second, by one
+        tick
     holds : whether the root is pulled to the desired path
-    pull, clamp_m : share of the distance from the path that is removed in each tick, and largest distance that remains
+    pull, clamp_m : share of the distance from the path that each tick removes, and largest distance that may remain
     tick_s : duration of a tick
     """
 
@@ -95,7 +97,7 @@ class ControllerConstants(NamedTuple):
 
 
 class DatabaseArrays(NamedTuple):
-    """Arrays of a database that a controller needs besides the index.
+    """Arrays of a database that a controller needs in addition to the search index.
 
     Parameters
     ----------

@@ -4,7 +4,7 @@ Ground positions are (x, z) in metres; headings are in radians and increase in a
 name have the same meaning in all functions:
 
 * `index` is a `search.SearchIndex`.
-* `wish` is the desired path, a `controller.TrajectoryArrays`; `when` is a moment of this path, in ticks.
+* `wish` is the desired path, a `controller.TrajectoryArrays`; `when` is a time on this path, in ticks.
 * `rules` is a `controller.ControllerConstants`, and `playback` a `controller.DatabaseArrays`.
 * `record` is a tuple of the arrays of a `TrialRecord`, which are filled.
 """
@@ -73,9 +73,9 @@ def _wished(wish, when):  # type: ignore[no-untyped-def]
 
 @compiled
 def _progress(wish, when, x, z):  # type: ignore[no-untyped-def]
-    """Find the moment, in ticks, at which the desired path is nearest to (x, z).
+    """Find the time, in ticks, at which the desired path is nearest to (x, z).
 
-    Only moments near `when`, the result at the previous tick, are searched.
+    Only times near `when`, the result at the previous tick, are searched.
     """
     window = int(PATH_WINDOW_S / wish.tick_s)
     best, best_square = 0, np.inf
@@ -96,17 +96,17 @@ def _progress(wish, when, x, z):  # type: ignore[no-untyped-def]
 
 @compiled
 def _moment(rules, wish, when, tick, x, z):  # type: ignore[no-untyped-def]
-    """Compute the moment of the desired path, in ticks, that corresponds to `tick`.
+    """Compute the time on the desired path, in ticks, that corresponds to `tick`.
 
-    If the path is followed by position, it is the moment at which the path is nearest to (x, z), near the moment `when`
-    of the previous tick; otherwise, it is `tick` itself.
+    If the path is followed by position, the result is the time at which the path is nearest to (x, z); only times near
+    `when`, the result at the previous tick, are searched. Otherwise, the result is `tick` itself.
     """
     return _progress(wish, when, x, z) if rules.follow == BY_PATH else float(tick)
 
 
 @compiled
 def moments_along(rules, wish, positions, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (T,) with the moment of the desired path, in ticks, that corresponds to each tick of a trial.
+    """Fill `out` (T,) with the time on the desired path, in ticks, that corresponds to each tick of a trial.
 
     `positions` (T, 2) are the positions of the root at the ticks.
     """
@@ -122,7 +122,7 @@ def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):  
     """Fill `query` (D,) with normalised features: the pose of the database's row `row`, then the desired trajectory.
 
     The trajectory starts at tick `when`, and is seen from the root at `x`, `z` in metres with `heading` in radians. In
-    open loop, it is the arc of the desired speed and turn rate.
+    open loop, the trajectory is the arc with the desired speed and turn rate.
     """
     horizons = playback.horizons_s.shape[0]
     first = query.shape[0] - 4 * horizons
@@ -147,11 +147,11 @@ def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):  
 
 @compiled
 def _distance_cost(index, points, row, other, query, first, limit):  # type: ignore[no-untyped-def]
-    """Compute the cost of row `other` as successor of row `row`.
+    """Compute the cost of row `other` as the successor of row `row`.
 
-    It is the squared difference of the trajectory features (from dimension `first` on) from those of the query, plus
-    the distances, in metres, between the pose joints of both rows. If the cost exceeds `limit`, any value above `limit`
-    is returned.
+    The cost is the squared difference between the row's and the query's trajectory features (from dimension `first`
+    on), plus the distances, in metres, between the pose joints of the two rows. If the cost exceeds `limit`, any value
+    above `limit` is returned.
     """
     cost = 0.0
     for d in range(first, query.shape[0]):
@@ -212,7 +212,7 @@ def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
 
 @compiled
 def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-untyped-def]
-    """Find the row with which a trial starts, and its cost; only trajectories are compared, not poses.
+    """Find the row with which a trial starts, and the cost of this row; only trajectories are compared, not poses.
 
     `root` is x, z and heading; `query` (D,) is overwritten.
     """
@@ -224,7 +224,7 @@ def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-un
 
 @compiled
 def _jumped(wish, before, when):  # type: ignore[no-untyped-def]
-    """Return whether the desired velocity or direction jumped between the moments `before` and `when`, in ticks."""
+    """Return whether the desired velocity or direction jumped between the times `before` and `when`, in ticks."""
     last = wish.speeds.shape[0] - 1
     a, b = min(int(before), last), min(int(when), last)
     x = wish.speeds[b] * np.sin(wish.headings[b]) - wish.speeds[a] * np.sin(wish.headings[a])
@@ -255,7 +255,7 @@ def _advance(playback, rules, row, offsets, root):  # type: ignore[no-untyped-de
 def _hold(rules, wish, when, root):  # type: ignore[no-untyped-def]
     """Pull `root` (x, z, heading) towards a place on the desired path, and limit its distance from this place.
 
-    The place is the one that the path reaches after `when` ticks; the limit is `rules.clamp_m`, in metres.
+    The path reaches this place after `when` ticks. The limit is `rules.clamp_m`, in metres.
     """
     x, z, heading = _wished(wish, when)
     turn = heading - root[2]

@@ -32,9 +32,10 @@ class RootMotion(NamedTuple):
 
     Parameters
     ----------
-    successors : (N,) int64    the row that follows; -1 after the last row of a clip that does not wrap
+    successors : (N,) int64    the row that follows; -1 for the last row of a clip that does not wrap (continue at its
+        start)
     steps : (N, 3) float64    metres to the left and forward, in the frame of the row's root, and radians to the left.
-        The last row of a clip that does not wrap has the step that led to it, so that its velocity is known, too.
+        The last row of a clip that does not wrap repeats the step before, so that every row has a velocity.
     """
 
     successors: NDArray[np.int64]
@@ -46,14 +47,14 @@ def root_motion(
 ) -> RootMotion:
     """Compute the steps of a root from row to row.
 
-    The step that closes a clip marked in `wraps` is the mean of its neighbours: the last step and the first.
+    For a clip marked in `wraps`, the step from the last row to the first is the mean of the steps before and after it.
 
     Parameters
     ----------
     positions : (N, 2) float64    (x, z) in metres
     headings : (N,) float64    radians
     starts : (C + 1,) int64    first row of each clip, and N
-    wraps : (C,) bool    clips whose last row leads to their first one
+    wraps : (C,) bool    True for clips whose last row is followed by their first row
 
     Returns
     -------
@@ -83,9 +84,9 @@ class SourceClip:
     ----------
     uid : permanent identifier of the clip, for example "clip_01J…@3"; if rows of several clips have equal costs, the
         row of the clip with the lowest uid is chosen
-    name : name for people
+    name : name to show to users
     content : digest of its motion document, or "" when unknown
-    loop : whether the last frame leads into the first one
+    loop : whether the last frame leads into the first frame
     frames : the half-open range of frames to use; all frames if None
     """
 
@@ -138,19 +139,20 @@ class DatabaseNote:
 
 @dataclass(frozen=True, eq=False)
 class MatchingDatabase:
-    """A database of N rows, D feature dimensions, P pose joints and C clips, which are in ascending order of uid.
+    """A database of N rows, D feature dimensions, P pose joints and C clips; the clips are in ascending order of uid.
 
     The pose of a row is relative to its root. If the root is placed at position p with heading theta, and R(theta) is
     the rotation about +Y, joint 0 is at R(theta)·poses[:3] + (p.x, 0, p.z) with the rotation R(theta)·poses[3:7]. All
-    other joints follow by their local rotations, offsets and translations. If p and theta are those of the clip's own
-    root, the result is the clip's pose of `MatchingBody.carrier` and of every joint below it. Joints above the carrier,
-    which in clips may stay at an origin while the body moves away, are in their rest pose relative to the root instead.
+    other joints follow by their local rotations, offsets and translations. If p and theta are the position and heading
+    of the root in the clip, the joint `MatchingBody.carrier` and all joints below it have the same pose as in the clip.
+    Joints above the carrier have their rest pose relative to the root instead, because in some clips they stay in one
+    place while the body moves away.
 
     Parameters
     ----------
     features : (N, D) float64    before normalisation, in metres and metres per second, in the frame of the row's root
     normaliser : see `Normaliser`; costs are computed from `normaliser.apply(features)`
-    selectable : (N,) bool    rows a search may choose
+    selectable : (N,) bool    True for rows that a search may choose
     root_positions : (N, 2) float64    the simulation root on the ground, metres, in the clip's own world
     root_headings : (N,) float64    radians, continuous within a clip
     pose_points : (N, P, 3) float32    positions of the body's pose joints in the frame of the row's root, metres
@@ -198,6 +200,6 @@ class MatchingDatabase:
 
     @cached_property
     def root_motion(self) -> RootMotion:
-        """Successor of each row, and the step of the root to it."""
+        """Successor of each row, and the step of the root from the row to its successor."""
         wraps = np.array([clip.loop and self.options.end_policy == "loop" for clip in self.clips], dtype=np.bool_)
         return root_motion(self.root_positions, self.root_headings, self.starts, wraps)

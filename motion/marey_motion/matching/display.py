@@ -50,9 +50,9 @@ def displayed_clip(database: MatchingDatabase, record: TrialRecord, options: Con
 def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: ControllerOptions) -> Floats:
     """Compute the distances between the displayed pose and the next one.
 
-    Both are in the frame of the root. The displayed pose includes the remaining offsets of earlier switches. The next
-    pose belongs to the row chosen for the next tick, or, at the last tick, to the row that would follow; it has no
-    offsets.
+    Both poses are in the frame of the root. The displayed pose includes the remaining offsets of earlier switches; the
+    next pose has no offsets. The next pose is the pose of the row chosen for the next tick or, at the last tick, of the
+    row that would follow.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def switched_rows(database: MatchingDatabase, rows: NDArray[np.int32]) -> NDArra
 def _inertialised(
     database: MatchingDatabase, rows: NDArray[np.int32], joints: NDArray[np.int64], half_life_s: float
 ) -> tuple[Floats, Floats]:
-    """Compute displayed poses (T, 3 + 4·K) of K joints, and the local translations (T, M, 3) of M of them.
+    """Compute displayed poses (T, 3 + 4·K) of K joints, and local translations (T, M, 3) of M of these joints.
 
     `rows` (T,) are the displayed rows of the database. The poses are in the frame of the simulation root.
     """

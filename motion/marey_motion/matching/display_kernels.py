@@ -54,7 +54,7 @@ def _turn_to(pose, column, w, x, y, z):  # type: ignore[no-untyped-def]
 def _add_velocity(poses, places, successors, joints, moved, row, rate, velocities):  # type: ignore[no-untyped-def]
     """Add `rate` times the difference between a row and the next row of its clip to `velocities` (1 + M + K, 3).
 
-    The parts of `velocities` are those of the root's position, of M translations and of K rotations.
+    `velocities` contains the velocity of the root's position, then of M translations, then of K rotations.
     """
     if successors[row] < 0:  # a clip's end goes on as it came
         if row == 0 or successors[row - 1] != row:
@@ -76,10 +76,10 @@ def _add_velocity(poses, places, successors, joints, moved, row, rate, velocitie
 
 @compiled
 def _show(pose, place, joints, moved, offsets, shown, shown_places):  # type: ignore[no-untyped-def]
-    """Fill `shown` (3 + 4·K) and `shown_places` (M, 3) with K joints of a row's pose and M of its translations.
+    """Fill `shown` (3 + 4·K) and `shown_places` (M, 3) with K joints of a row's pose and M of the row's translations.
 
-    `pose` and `place` are the pose and all translations of the row. The `offsets` (1 + M + K, 3) of the root's
-    position, the translations and the rotations are added to them.
+    `pose` and `place` are the pose and all translations of the row. `offsets` (1 + M + K, 3) of the root's position, of
+    the translations and of the rotations are added.
     """
     for c in range(3):
         shown[c] = pose[c] + offsets[0, c]
@@ -105,7 +105,7 @@ def _show_row(pose, place, joints, moved, shown, shown_places):  # type: ignore[
 def _take_offsets(shown, shown_places, pose, place, joints, moved, offsets):  # type: ignore[no-untyped-def]
     """Fill `offsets` (1 + M + K, 3) with the difference of the displayed pose from the pose of a row.
 
-    `shown` and `shown_places` are the displayed pose and translations; `pose` and `place` are those of the row.
+    `shown` and `shown_places` are the displayed pose and translations; `pose` and `place` are the row's own.
     """
     for c in range(3):
         offsets[0, c] = shown[c] - pose[c]
@@ -134,7 +134,7 @@ def _decay(decay, offsets, velocities):  # type: ignore[no-untyped-def]
 def inertialised(  # type: ignore[no-untyped-def]
     poses, places, successors, joints, moved, rows, cuts, decay, rate_hz, out, out_places
 ):
-    """Fill `out` (T, 3 + 4·K) and `out_places` (T, M, 3) with displayed poses of K joints, M of them translated.
+    """Fill `out` (T, 3 + 4·K) and `out_places` (T, M, 3) with displayed poses of K joints and translations of M joints.
 
     When the display switches from one row of the database to another, an offset is added to the next poses, so that the
     displayed motion continues smoothly; the offset decays.
@@ -142,12 +142,12 @@ def inertialised(  # type: ignore[no-untyped-def]
     Parameters
     ----------
     poses, places : (N, 3 + 4·J), (N, L, 3) poses and local translations of the N rows of the database
-    successors : (N,) the row that continues each row's clip, or -1
-    joints, moved : (K,), (M,) indices of the wanted joints; indices of their translations among the L translations of
-        the database
+    successors : (N,) the row that follows each row in its clip, or -1
+    joints, moved : (K,) indices of the wanted joints; (M,) indices of the wanted translations among the L translations
+        of the database
     rows : (T,) the row that is displayed at each tick, that is, each frame of the display
-    cuts : (T,) the row that a search chose at each tick instead of the displayed one, so that its successor is
-        displayed next; -1 if the displayed clip continues
+    cuts : (T,) the row that a search chose at each tick instead of the displayed row (the successor of the chosen row
+        is displayed next); -1 if the displayed clip continues
     decay : (2, 2) matrix that advances an offset and its velocity by one tick
     rate_hz : ticks per second
     """

@@ -59,7 +59,7 @@ class Explanation:
     sentence : the reason with its numbers, for a person
     going_on : `shown` as a candidate; None at the start of a trial and at the end of a clip
     candidates : the cheapest rows that could be chosen, cheapest first
-    others : the further rows that the caller requested, in that order
+    others : the further rows that the caller requested, in the requested order
     """
 
     tick: int
@@ -91,7 +91,7 @@ def explain_choice(
     Parameters
     ----------
     database : MatchingDatabase    the database that the trial used
-    index : SearchIndex    its index
+    index : SearchIndex    search index of the database
     guide : trajectory    the trajectory of the trial
     options : ControllerOptions    options of the trial
     record : TrialRecord    result of `run_trial` for these arguments
@@ -170,7 +170,7 @@ def _chosen(
     record: TrialRecord,
     tick: int,
 ) -> tuple[int, float, Reason]:
-    """Find the row that was chosen at a tick, its cost, and the reason for the choice; `query` is the tick's query."""
+    """Find the row that was chosen at a tick, the row's cost, and the reason; `query` is the query of the tick."""
     from marey_motion.matching import controller_kernels as kernels
 
     shown = int(record.rows[tick])

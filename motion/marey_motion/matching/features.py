@@ -18,7 +18,7 @@ from marey_schemas.options.matching import DatabaseOptions
 
 
 class FeatureGroup(NamedTuple):
-    """Dimensions [start, stop) that share a scale; `joint` is the joint they describe, None for the trajectory."""
+    """Feature dimensions [start, stop) that share a scale; `joint` is the joint described, None for the trajectory."""
 
     name: str
     start: int
@@ -144,14 +144,14 @@ def turned_to_root(vectors: Floats, root: SimulationRoot) -> Floats:
 
 
 def look_ahead(root: SimulationRoot, ticks: NDArray[np.int64], *, wraps: bool) -> SimulationRoot:
-    """Look up the root some frames ahead of each frame.
+    """Look up where the root is some frames after each frame.
 
-    After its last frame, a clip stays at that frame, and a loop that wraps continues with its next rounds.
+    After the last frame, the root stays in place; the root of a loop that wraps continues with the next rounds.
 
     Parameters
     ----------
     root : SimulationRoot    F frames
-    ticks : (H,) int64    frames to look ahead
+    ticks : (H,) int64    numbers of frames to look ahead
     wraps : bool    whether the root belongs to a loop that wraps
 
     Returns
@@ -179,7 +179,7 @@ def extract_features(
     layout : FeatureLayout    D dimensions with H horizons
     positions, velocities : (F, J, 3) float64    in the world, metres and metres per second
     root : SimulationRoot    root of the frames
-    future : SimulationRoot    the root at each horizon, positions (F, H, 2) and headings (F, H)
+    future : SimulationRoot    the root at each horizon: positions (F, H, 2) and headings (F, H)
 
     Returns
     -------

@@ -1,8 +1,8 @@
 """Inertialisation: blending that adds the decaying difference between the old and the new motion to the new motion.
 
-The difference x decays like a critically damped spring with half-life h. Its value is computed in closed form, so that
-it does not depend on the length of the ticks: x(t) = e^(-y·t)·(x0 + (v0 + y·x0)·t) with y = 2·ln 2 / h, where x0 and v0
-are the difference and its change per second at the start.
+The difference x decays like a critically damped spring with half-life h. It is computed in closed form, so that the
+result does not depend on the length of the ticks: x(t) = e^(-y·t)·(x0 + (v0 + y·x0)·t) with y = 2·ln 2 / h, where x0
+and v0 are the difference and its change per second at the start.
 """
 
 from __future__ import annotations

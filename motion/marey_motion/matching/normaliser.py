@@ -16,7 +16,7 @@ from marey_motion.errors import MotionError
 from marey_motion.matching.features import FeatureLayout
 
 LEAST_SCALE = 1e-3
-"""Least scale of a feature; smaller scales are raised to it, so that a feature without variation does not dominate."""
+"""Least scale of a feature: smaller scales are raised, so that a feature without variation does not dominate."""
 UNMATCHED_SCALE = 1e30
 """Scale of groups with weight 0."""
 
@@ -28,7 +28,7 @@ class Normaliser:
     Parameters
     ----------
     offset, scale : (D,) float64    `apply` gives (features - offset) / scale; weights are part of the scale
-    fitted_on : str    digest of the data it was fitted on
+    fitted_on : str    digest of the data to which the normaliser was fitted
     names : tuple of str    names of the D dimensions; empty when they are not known
     floored : tuple of str    groups whose scale was raised to `LEAST_SCALE`
     """

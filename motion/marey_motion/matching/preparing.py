@@ -37,7 +37,7 @@ class PreparedClip:
 
     Parameters
     ----------
-    seam : transition from the end of a loop to its start, if rows look ahead across it; None if the clip does not wrap
+    seam : transition from the end of a loop to its start, across which rows look ahead; None if the clip does not wrap
     notes : remarks on data that were left out or look doubtful
     mirrored : whether left and right are exchanged
     first_s : time of the first frame in the recording, seconds
@@ -171,7 +171,7 @@ def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], warn: _W
 
 
 def _closed(motion: Motion, warn: _Warn) -> Motion:
-    """Drop the last frame of a loop where it repeats the first one."""
+    """Drop the last frame of a loop if it repeats the first frame."""
     if motion.frame_count < 3 or motion.rotations.shape[1] < 2:
         return motion
     inner = motion.rotations[:, 1:]

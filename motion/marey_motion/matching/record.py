@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 
 class Status(IntEnum):
-    """Status of the displayed clip at a tick."""
+    """Relation of the displayed row at a tick to the rows before and after it."""
 
     KEPT = 0
-    """The next frame of the clip follows."""
+    """The displayed row continues the clip that was displayed at the previous tick."""
     REPLACING = 1
     """A search chose another frame: the displayed row is the first after a switch."""
     REPLACED = 2
@@ -39,7 +39,7 @@ class TrialRecord:
         without a search and at the end of the clip
     pose_cost : (T,) float64    distance in metres, summed over the pose joints, from the displayed pose to the pose of
         the row that follows at the next tick. The displayed pose includes the remaining offsets of earlier switches;
-        the other pose has no offsets
+        the pose of the following row has no offsets
     """
 
     rate_hz: float

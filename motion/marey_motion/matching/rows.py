@@ -24,7 +24,7 @@ from marey_motion.motion import Motion
 from marey_schemas.options.matching import DatabaseOptions
 
 CLAMPED_S = 1 / 3
-"""Seconds before the end of a clip in which searches may not choose rows, because the look-ahead is cut off there."""
+"""Duration, in seconds, of the end of a clip where searches may not choose rows, because the look-ahead is cut off."""
 
 
 class ClipRows(NamedTuple):
@@ -112,8 +112,8 @@ def _poses(motion: Motion, carrier: Floats, root: SimulationRoot, body: Matching
 def _hang(poses: Floats, rotations: Floats, facing: Floats, motion: Motion, body: MatchingBody) -> None:
     """Set the joints above the carrier to their rest pose relative to the root, without moving the carrier.
 
-    `poses` and their part `rotations` (F, J, 4) are changed; `facing` (F, 4) are the rotations from the world to the
-    root's frame.
+    `rotations` (F, J, 4) is a view of the rotations in `poses`; both are changed in place. `facing` (F, 4) are the
+    rotations from the world to the root's frame.
     """
     skeleton = body.skeleton
     above = skeleton.path_to_root(body.carrier)[1:]

@@ -28,15 +28,15 @@ _SCAN_ABOVE = 0.35
 class SearchIndex(NamedTuple):
     """A database prepared for search, as a tuple of arrays that can be passed to compiled code.
 
-    B blocks of up to 16 selectable rows of one clip, G groups of up to 16 blocks of one clip; D' is D rounded up to an
-    even number. A block or group of fewer than sixteen elements is padded with copies of its last element.
+    There are B blocks of up to 16 selectable rows of one clip, and G groups of up to 16 blocks of one clip. D' is D
+    rounded up to an even number. A block or group of fewer than 16 elements is padded with copies of its last element.
 
     Parameters
     ----------
     rows : (N, D) float64    normalised features
-    selectable : (N,) bool    rows a search may choose
-    blocks : (B, D', 16) float32    the blocks' rows, one dimension after the other
-    block_rows : (B, 16) int32    numbers of these rows
+    selectable : (N,) bool    True for rows that a search may choose
+    blocks : (B, D', 16) float32    the features of the rows of each block, one dimension after the other
+    block_rows : (B, 16) int32    numbers of the rows of each block
     block_of_row : (N,) int32    index of each row's block; a row that is not selectable has the block of the last
         selectable row before it, or of the first selectable row
     boxes : (G, D', 2, 16) float32    low and high sides of the boxes about a group's blocks
@@ -71,7 +71,7 @@ def build_index(
     ----------
     normalised : (N, D) float64    normalised features, from `Normaliser.apply`
     starts : (C + 1,) int64    first row of each clip, and N
-    selectable : (N,) bool    rows a search may choose
+    selectable : (N,) bool    True for rows that a search may choose
     method : str    "boxes", "scan" or "auto". "auto" makes a few searches, with mixtures of rows as queries, and
         chooses by the share of the database that they visit. The choice depends only on the data, and affects only the
         time of a search, not its result
@@ -82,7 +82,7 @@ def build_index(
 
     Raises
     ------
-    MotionError    if no row is selectable or a value is not finite or larger than `LARGEST`
+    MotionError    if no row is selectable, or if a value is not finite or exceeds `LARGEST`
     """
     rows = np.ascontiguousarray(normalised, dtype=np.float64)
     mask = np.ascontiguousarray(selectable, dtype=np.bool_)
@@ -214,12 +214,12 @@ def find_nearest(
 
     Returns
     -------
-    rows : (Q,) int64    -1 where all rows are skipped
-    costs : (Q,) float64    infinite where all rows are skipped
+    rows : (Q,) int64    numbers of the rows; -1 where all rows are skipped
+    costs : (Q,) float64    squared distances; infinite where all rows are skipped
 
     Raises
     ------
-    MotionError    if the queries or weights have another number of dimensions than the index, or invalid values
+    MotionError    if the queries or weights have invalid values or a different number of dimensions from the index
     """
     from marey_motion.matching import search_kernels as kernels
 

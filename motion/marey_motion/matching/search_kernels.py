@@ -13,11 +13,11 @@ vectors' cost:
     c32 ≤ (1 + u)^(D + 8) (√c + reach)²
 
 If a row's cost is at most `best`, its c32 is at most the right side with c = best. `_limit` returns this value, with
-four times the margin of each term. So a row above the limit is farther away than the best one and can be skipped; the
-costs of all others are computed again in float64, in the order of the dimensions. A box's float32 bound obeys the same
-inequality, because in exact arithmetic it is at most the cost of every rounded row in the box. This is proven for all
-magnitudes; a fixed slack of 1e-5 relative and 1e-6 absolute is enough only while the norms of row and query add up to
-less than about 40.
+four times the margin of each term. So a row above the limit is farther away than the best row and can be skipped; the
+costs of all other rows are computed again in float64, in the order of the dimensions. A box's float32 bound obeys the
+same inequality, because in exact arithmetic it is at most the cost of every rounded row in the box. This is proven for
+all magnitudes; a fixed slack of 1e-5 relative and 1e-6 absolute is enough only while the norms of row and query add up
+to less than about 40.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ class _Query(NamedTuple):
     Parameters
     ----------
     exact, exact_weights : (D,) float64 the query, and the weights of the squared differences
-    rounded, weights : the same in float32, padded with zeros to the dimensions of the index
+    rounded, weights : `exact` and `exact_weights` in float32, padded with zeros to the dimensions of the index
     skip_start, skip_stop : the rows [skip_start, skip_stop) are not considered
     reach, margin, least : terms of the bound that `_limit` computes
-    sums, bounds : (16,) float32 arrays for the float32 costs of the rows of a block, and for those of 16 boxes
+    sums, bounds : (16,) float32 arrays for the costs of the rows of a block, and for the lower bounds of 16 boxes
     """
 
     exact: Any
@@ -230,7 +230,8 @@ def nearest(index, query, warm_row, skip_start, skip_stop):  # type: ignore[no-u
 
     Returns the row and its cost, or (-1, inf) if there is none.
 
-    The lowest row wins a tie. `warm_row` is a row likely to be near, or -1: it changes the time taken, not the answer.
+    Of several nearest rows, the lowest is returned. `warm_row` is a row likely to be near, or -1: it changes the time
+    taken, not the answer.
     """
     return _nearest(index, query, np.ones(query.shape[0]), warm_row, skip_start, skip_stop)
 
@@ -243,7 +244,7 @@ def nearest_weighted(index, query, weights, skip_start, skip_stop):  # type: ign
 
 @compiled
 def nearest_of_each(index, queries, weights, warm_rows, skips, rows, costs):  # type: ignore[no-untyped-def]
-    """Fill `rows` and `costs` (Q,) with the nearest row of each query (Q, D), and its cost.
+    """Fill `rows` and `costs` (Q,) with the nearest row of each query (Q, D), and the cost of this row.
 
     `weights` (D,) multiply the squared differences. `warm_rows` (Q,) are rows likely to be near, or -1; `skips` (Q, 2)
     are the ranges [start, stop) of rows that are not considered.

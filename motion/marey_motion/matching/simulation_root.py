@@ -53,8 +53,8 @@ def simulation_root(positions: Floats, body: MatchingBody, rate_hz: float) -> Si
     Notes
     -----
     Savitzky-Golay filters of third order over 0.5 s and 1 s are used, as is usual for motion matching; for short clips,
-    they are shorter. A loop is filtered across its seam if it has been extended by frames of the rounds before and
-    after it (`looping.continue_motion`).
+    the filters are shorter. A loop is filtered across its seam if it has been extended by frames of the rounds before
+    and after it (`looping.continue_motion`).
     """
     raw = raw_root(positions, body)
     facing = np.stack((np.sin(raw.headings), np.cos(raw.headings)), axis=-1)
@@ -87,7 +87,7 @@ def raw_root(positions: Floats, body: MatchingBody) -> SimulationRoot:
 def bone_root(motion: Motion, body: MatchingBody) -> SimulationRoot:
     """Compute the motion of the root joint on the ground, for data whose root joint is meant to steer the character.
 
-    Its heading is the heading of the rest pose plus the root's rotation about the vertical.
+    The heading is the heading of the rest pose plus the rotation of the root joint about the vertical.
 
     Parameters
     ----------

@@ -14,22 +14,22 @@ from marey_motion.modelling.splines import SplineBasis
 from marey_schemas.options.modelling import DEFAULT_INNER_PRODUCT, InnerProduct
 
 SMALLEST_RELATIVE_DEVIATION = 2e-7
-"""Ratio to the largest singular value below which a singular value is treated as a rounding error.
+"""A singular value whose ratio to the largest one is below this number is treated as a rounding error.
 
-The ratio is much larger than the precision of float64, because singular values are computed as square roots of the
+The number is much larger than the precision of float64, because singular values are computed as square roots of the
 eigenvalues of the Gram matrix.
 """
 
 SMALLEST_RELATIVE_SPREAD = 1e-11
-"""Ratio to the norm of all examples below which a singular value is treated as a rounding error.
+"""A singular value whose ratio to the norm of all examples is below this number is treated as a rounding error.
 
-Examples that vary less than this are copies of one example.
+Examples that vary so little are copies of one example.
 """
 
 
 @dataclass(frozen=True)
 class Keep:
-    """Number of components to keep: the fewest that hold `share` of the variance, at most `most`; or exactly `count`.
+    """Number of components to keep: `count`, or else the fewest that hold `share` of the variance, at most `most`.
 
     If `count` exceeds the rank of the examples, all components are kept.
     """

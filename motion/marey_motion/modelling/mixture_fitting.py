@@ -35,7 +35,7 @@ class MixtureCandidate:
     ----------
     components : int    number of components
     bic, aic : float    Bayesian and Akaike information criterion
-    log_likelihood : float    of all examples, natural logarithm
+    log_likelihood : float    natural logarithm of the likelihood of all examples
     smallest_weight : float    the least weight of a component
     converged : bool    whether the fit converged
     refusal : str    reason why the mixture is excluded, regardless of its criteria; empty if it is not excluded.
@@ -54,16 +54,16 @@ class MixtureCandidate:
 
 @dataclass(frozen=True, eq=False)
 class FittedMixture:
-    """A mixture, its method, and the candidates compared.
+    """A mixture, the method by which it was fitted, and the candidates compared.
 
     Parameters
     ----------
     mixture : LatentMixture    the mixture
     method : str    "em": expectation maximisation; "shrunk": one component of shrunk covariance, for few examples;
-        "point": examples that do not vary
+        "point": a single point, for examples that do not vary
     candidates : tuple of MixtureCandidate    by number of components; empty unless the method is "em"
-    held_out : (n,) float64, optional    ln p of each example under a mixture with the same number of components that
-        was fitted without the example's fold
+    held_out : (n,) float64, optional    ln p of each example under a mixture that has the same number of components,
+        but was fitted without the fold (part of the data) that contains the example
     """
 
     mixture: LatentMixture
@@ -167,9 +167,9 @@ class _Fitting:
     def _best(self, candidates: dict[int, MixtureCandidate]) -> tuple[int, Floats | None]:
         """Choose the number of components with the best criterion among the candidates that are not refused.
 
-        `candidates` maps a number of components to its candidate. A candidate that is refused here is replaced by one
-        with the reason. Returns the chosen number, and the held-out log-likelihoods (n,) of the examples with this
-        number, or None.
+        `candidates` maps a number of components to its candidate. A candidate that is refused here is replaced by a
+        copy that contains the reason. Returns the chosen number, and the held-out log-likelihoods (n,) of the examples
+        for this number, or None.
         """
         single = self._held_out(1)
         falling = sorted(candidates.values(), key=lambda one: getattr(one, self.options.criterion))
@@ -186,7 +186,7 @@ class _Fitting:
         raise ModelError("no mixture can be chosen, because a mixture with 1 component was not tried")
 
     def _held_out(self, count: int) -> Floats | None:
-        """Compute ln p of each example under a mixture of `count` components fitted without the example's fold; (n,).
+        """Compute ln p (n,) of each example under a mixture of `count` components fitted without the example's fold.
 
         Returns None if the examples cannot be divided into folds.
         """
@@ -233,7 +233,7 @@ def _fitted(latents: Floats, count: int, options: MixtureOptions, seed: int) -> 
 def _normal(latents: Floats, regularisation: float, *, shrink: bool) -> LatentMixture:
     """Fit one component to latent vectors (n, d) by maximum likelihood.
 
-    With `shrink`, its covariance is shrunk towards a sphere. `regularisation` is added to the diagonal.
+    With `shrink`, the covariance is shrunk towards a sphere. `regularisation` is added to the diagonal.
     """
     if shrink:
         from sklearn.covariance import ledoit_wolf

@@ -43,7 +43,7 @@ class FunctionalComponents:
     projections : (k, n, D) functions whose inner products with coefficients are scores; their inner products with the
         directions are the identity matrix
     variances : (k,) variances of the training examples' scores
-    energy : (k,) cumulative share of the total variance in the first 1, 2, ... components
+    energy : (k,) share of the total variance in the first 1, 2, ... components together
     """
 
     basis: SplineBasis
@@ -221,7 +221,7 @@ class MotionPrimitive:
         return np.asarray(poses, dtype=np.float64)
 
     def time_functions(self, latents: Floats) -> Floats:
-        """Compute the frames of real time that have passed at each canonical frame.
+        """Compute how many frames of real time have passed at each canonical frame.
 
         A motion whose duration is outside `duration_range_s` is played faster or slower as a whole.
 
@@ -295,8 +295,8 @@ class MotionPrimitive:
     def latents_of(self, poses: Floats, time_functions: Floats) -> Floats:
         """Compute the latent vectors of aligned examples.
 
-        The signs of quaternions must be those of the training examples: the dot product of a quaternion with the same
-        quaternion of the mean motion must not be negative.
+        Quaternions must have the same signs as in the training examples: the dot product of a quaternion with the
+        corresponding quaternion of the mean motion must not be negative.
 
         Parameters
         ----------

@@ -25,12 +25,12 @@ Tree = dict[str, Any]
 
 
 def primitive_to_tree(primitive: MotionPrimitive, skeleton: Mapping[str, Any]) -> Tree:
-    """Convert a primitive to the document of its part `model`.
+    """Convert a primitive to the document that is stored as the part `model`.
 
     Parameters
     ----------
     primitive : MotionPrimitive    the model
-    skeleton : mapping    reference to the revision of its skeleton
+    skeleton : mapping    reference to the revision of the primitive's skeleton
 
     Returns
     -------
@@ -57,12 +57,12 @@ def primitive_to_tree(primitive: MotionPrimitive, skeleton: Mapping[str, Any]) -
 
 
 def trained_to_tree(trained: TrainedPrimitive, skeleton: Mapping[str, Any], provenance: Mapping[str, Any]) -> Tree:
-    """Convert a trained primitive, its training and its report to the document of its part `model`.
+    """Convert a trained primitive, its training and its report to the document that is stored as the part `model`.
 
     Parameters
     ----------
     trained : TrainedPrimitive    the model with its report
-    skeleton : mapping    reference to the revision of its skeleton
+    skeleton : mapping    reference to the revision of the primitive's skeleton
     provenance : mapping    origin of the examples
 
     Returns
@@ -84,12 +84,12 @@ def trained_to_tree(trained: TrainedPrimitive, skeleton: Mapping[str, Any], prov
 
 
 def primitive_from_tree(tree: Mapping[str, Any], skeleton: Skeleton) -> MotionPrimitive:
-    """Read the primitive of a part `model`; its joints must be the joints of the skeleton, in any order.
+    """Read the primitive of a part `model`; the primitive's joints must be those of the skeleton, in any order.
 
     Parameters
     ----------
     tree : mapping    plain values and arrays
-    skeleton : Skeleton    its skeleton
+    skeleton : Skeleton    skeleton of the primitive
 
     Returns
     -------
@@ -128,7 +128,7 @@ def _components_to_tree(components: FunctionalComponents) -> Tree:
 
 
 def _components_from_tree(tree: Mapping[str, Any], columns: NDArray[np.int64] | None) -> FunctionalComponents:
-    """Read components from a document. `columns` selects and orders its channels; None keeps all in their order."""
+    """Read components from a document. `columns` selects and orders the channels; None keeps all in the same order."""
     arrays = {name: np.asarray(tree[name]) for name in _COMPONENTS}
     if columns is not None:
         for name in ("mean", "directions", "projections"):
@@ -137,7 +137,7 @@ def _components_from_tree(tree: Mapping[str, Any], columns: NDArray[np.int64] | 
 
 
 def _columns(joints: list[str], skeleton: Skeleton) -> NDArray[np.int64] | None:
-    """Return, for each channel of the skeleton, its index in a document; None if the document has the same order."""
+    """Return the index in a document of each channel of the skeleton; None if the document has the same order."""
     if tuple(joints) == skeleton.joint_names:
         return None
     if sorted(joints) != sorted(skeleton.joint_names) or joints[0] != skeleton.joint_names[0]:

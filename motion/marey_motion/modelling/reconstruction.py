@@ -1,6 +1,4 @@
-"""Errors of joint positions when motions are reconstructed from a few components, for training examples and for
-left-out examples.
-"""
+"""Errors of joint positions in motions that are reconstructed from a few components: training and left-out examples."""
 
 from __future__ import annotations
 
@@ -112,7 +110,7 @@ def comparison_frames(basis: SplineBasis) -> NDArray[np.int64]:
 
 
 def _left_out(scores: Floats, example: int, count: int) -> Floats:
-    """Compute the scores (count, r) of an example's reconstruction by 0, 1, ... components of the other examples."""
+    """Compute the scores (count, r) of reconstructions of an example by 0, 1, ... components of the other examples."""
     examples = len(scores)
     own = scores[example]
     if examples < 2:

@@ -9,7 +9,7 @@ from marey_motion.kernels import compiled, inverse, product, put_rotation, rotat
 
 @compiled
 def _load_rotations(pose, rotations, lengths):  # type: ignore[no-untyped-def]
-    """Fill `rotations` (J, 4) with a pose's quaternions, scaled to unit length; `lengths` (J,) with their lengths."""
+    """Fill `rotations` (J, 4) with the unit quaternions of a pose, and `lengths` (J,) with the original lengths."""
     for joint in range(len(rotations)):
         column = 3 + 4 * joint
         w, x, y, z = pose[column], pose[column + 1], pose[column + 2], pose[column + 3]
@@ -63,11 +63,10 @@ def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-un
 
 @compiled
 def squared_error_gradient(poses, parents, offsets, targets, gradient):  # type: ignore[no-untyped-def]
-    """Compute the sum of squared distances of joints from targets (F, J, 3), and its gradient (F, D) by the poses.
+    """Compute the sum of squared distances of joints from targets (F, J, 3), and its gradient (F, D) in the poses.
 
-    Quaternions need not be of unit length: the error, and so the gradient, is that of the rotations they represent.
-    From the leaves to the root, the gradients of all joints below a joint are added up to a force and a torque on this
-    joint.
+    Quaternions need not have unit length: the sum is computed for the rotations that they represent. From the leaves to
+    the root, the gradients of all joints below a joint are added up to a force and a torque on this joint.
     """
     joints = len(parents)
     local, world = np.empty((joints, 4)), np.empty((joints, 4))

@@ -52,7 +52,7 @@ def foot_speeds(toes: Floats, time_functions: Floats, frame_rate_hz: float) -> F
 def standing_steps(toes: Floats, time_functions: Floats, frame_rate_hz: float) -> NDArray[np.bool_]:
     """Find the steps in which most examples have a foot on the ground.
 
-    A foot is on the ground while its speed in three dimensions is below the limit for contacts.
+    A foot counts as on the ground while its speed in three dimensions is below the limit for contacts.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ TOLERANCE = 1e-5
 """Change of the error, as a share of the first error, below which the optimisation stops."""
 
 MOST_POSES = 6000
-"""Maximum number of poses in which joints are compared; the more examples there are, the fewer frames of each."""
+"""Maximum number of poses in which joints are compared; if there are many examples, fewer frames of each are used."""
 
 
 def optimised_weights(
@@ -44,7 +44,7 @@ def optimised_weights(
     skeleton : Skeleton    J joints
     basis : SplineBasis    splines with n coefficients
     coefficients : (m, n, D) float64    coefficients of examples with consistent signs
-    starts : sequence of (D,) float64    weights to start from; the best of them is improved
+    starts : sequence of (D,) float64    candidates for the starting weights; the best candidate is improved
     keep : Keep    number of components
     inner_product : str    "coefficients" or "l2"
 
@@ -55,10 +55,10 @@ def optimised_weights(
 
     Notes
     -----
-    Reconstructing examples from their leading components projects their matrix of coefficients from the left, on the
-    leading eigenvectors of the Gram matrix K = Σ wᵍ² Kᵍ over the channels g. So the weights matter only through an (m,
-    m) matrix, and the derivative of its eigenprojector gives the gradient. Value and gradient together cost one pass of
-    forward kinematics.
+    When examples are reconstructed from leading components, the matrix of their coefficients is projected, from the
+    left, on the leading eigenvectors of the Gram matrix K = Σ wᵍ² Kᵍ over the channels g. So the weights matter only
+    through K, which has the shape (m, m), and the derivative of its eigenprojector gives the gradient. Value and
+    gradient together cost one pass of forward kinematics.
     """
     from scipy.optimize import minimize
 

@@ -9,7 +9,7 @@ from marey_motion.arrays import Floats
 from marey_motion.skeleton import Skeleton
 
 LEAST_ROOT_EXTENT_M = 1e-3
-"""Extent of a root axis, in metres, below which the axis is not scaled up to the size of the others."""
+"""Extent of a root axis, in metres, below which the axis is not scaled up to the size of the other axes."""
 
 LEAST_WEIGHT_M = 0.01
 """Least weight of a joint, so that the rotation of a joint without children, such as a hand, counts a little."""
@@ -41,8 +41,8 @@ def jacobian_weights(skeleton: Skeleton, poses: Floats) -> Floats:
     """Compute weights that scale each channel by the distance that a unit step of the channel moves the body.
 
     A unit step of a joint's quaternion rotates the joints below it by 2 radians. The joint's weight is the root mean
-    square, over all joints of the body, of their displacement: twice their lever arms, and 0 for joints that are not
-    below it. (The mean over the joints below alone would give a finger the weight of a spine.)
+    square of the displacements of all joints of the body: twice the lever arm for each joint below, and 0 for the other
+    joints. (The mean over only the joints below would give a finger the weight of a spine.)
 
     Parameters
     ----------

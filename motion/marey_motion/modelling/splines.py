@@ -1,4 +1,4 @@
-"""Cubic B-splines over canonical time: the functional form of motions and of time functions.
+"""Cubic B-splines over canonical time, by which motions and time functions (time warps) are represented.
 
 Canonical time of N frames runs from 0 to N - 1. Knots are clamped, so that a spline begins and ends at its first and
 last coefficient.
@@ -96,7 +96,7 @@ class SplineBasis:
 
         Returns
         -------
-        (m, n) float64    values of the basis functions; derivatives per frame to the power of the order
+        (m, n) float64    values of the basis functions, or their derivatives per frame to the power of `derivative`
         """
         from scipy.interpolate import BSpline
 

@@ -1,6 +1,4 @@
-"""Time functions of motions, represented by the logarithms of their slopes, so that time increases in every sample of a
-model.
-"""
+"""Time functions (time warps) of motions, stored as logarithms of slopes, so that time increases in every sample."""
 
 from __future__ import annotations
 
@@ -15,8 +13,8 @@ def fit_log_slopes(basis: SplineBasis, time_functions: Floats) -> Floats:
     """Fit splines to the logarithms of the slopes of time functions.
 
     The logarithms are fitted by least squares. Then each function is shifted as a whole, so that the motion keeps its
-    exact duration. (Smoothing of logarithms would otherwise shorten it: the logarithm of a mean is above the mean of
-    logarithms.)
+    exact duration. (Smoothing of logarithms would otherwise shorten the motion: the logarithm of a mean is above the
+    mean of logarithms.)
 
     Parameters
     ----------

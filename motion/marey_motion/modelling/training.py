@@ -194,7 +194,7 @@ def channel_weights(
     aligned : AlignedSet    the examples
     basis : SplineBasis    splines with n coefficients
     poses : (m, N, D) float64    poses with consistent signs
-    coefficients : (m, n, D) float64    their coefficients
+    coefficients : (m, n, D) float64    coefficients of the poses
     keep : Keep    number of components
     options : ModelOptions    options
 
@@ -244,8 +244,9 @@ def _sampled_range(aligned: AlignedSet) -> tuple[float, float]:
 def _log_slope_range(aligned: AlignedSet, temporal: PrincipalExamples) -> tuple[float, float]:
     """Compute the range to which the logarithms of time steps are clipped in motions of the model.
 
-    It covers the time steps of the examples, and of the examples rebuilt from the kept components, and is extended by
-    `LOG_SLOPE_MARGIN` at both ends. So clipping changes no rebuilt example. The range never exceeds ±`MOST_LOG_SLOPE`.
+    The range covers the time steps of the examples and of the examples rebuilt from the kept components, and is
+    extended by `LOG_SLOPE_MARGIN` at both ends. Clipping therefore changes no rebuilt example. The range never exceeds
+    ±`MOST_LOG_SLOPE`.
     """
     functions = temporal.functions
     rebuilt = functions.basis.at_frames @ functions.coefficients(_kept_scores(temporal))[..., 0].T

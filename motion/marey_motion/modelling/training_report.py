@@ -33,11 +33,12 @@ class ExampleReport:
 
     Parameters
     ----------
-    log_likelihood : natural logarithm of its density
-    held_out_log_likelihood : its log-likelihood under a mixture fitted without it; None if it was not requested
-    left_out_error_cm : mean distance of its joints from their reconstruction by the components of the other examples,
-        with as many components as the model has
-    outlier : whether its likelihood is much lower than those of the others
+    log_likelihood : natural logarithm of the density of the example
+    held_out_log_likelihood : log-likelihood of the example under a mixture fitted without the example's fold (a part of
+        the examples); None if it was not computed
+    left_out_error_cm : mean distance of the joints from their reconstruction by components of the other examples; the
+        number of components is that of the model
+    outlier : whether the likelihood of the example is much lower than that of the other examples
     """
 
     uid: str
@@ -74,7 +75,7 @@ class TrainingReport:
     mixture_method : see `FittedMixture`
     candidates : mixtures compared, with their criteria
     log_likelihood : mean log-likelihood of the examples
-    held_out_log_likelihood : mean log-likelihood of the examples, each under a mixture fitted without that example
+    held_out_log_likelihood : mean of the examples' `held_out_log_likelihood`; None if it was not computed
     examples : reports of the examples, in the order of the aligned set
     time_error_frames : root mean square difference between the examples' time functions and those rebuilt by the model
     """

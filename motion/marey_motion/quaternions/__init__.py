@@ -2,8 +2,8 @@
 
 Components are on the last axis; any leading axes broadcast. Arithmetic is done in float64 and the result has the
 floating type of the arguments (float32 in, float32 out). Angles are radians. A rotation acts on column vectors, so
-`multiply(a, b)` applies `b` first. The functions `from_x` convert another form to quaternions, and `as_x` convert
-quaternions to that form.
+`multiply(a, b)` applies `b` first. Functions named `from_…` convert another form of rotations to quaternions; functions
+named `as_…` convert quaternions to another form.
 """
 
 from __future__ import annotations

@@ -145,7 +145,7 @@ def between_vectors(start: ArrayLike, end: ArrayLike, *, half_turn_axis: ArrayLi
 
     Opposite directions have no unique shortest rotation. For them, the result is half a turn about the component of
     `half_turn_axis` that is perpendicular to `start`. If `half_turn_axis` is None or parallel to `start`, the
-    coordinate axis with the largest angle to `start` is used in its place.
+    coordinate axis with the largest angle to `start` is used instead.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def perpendicular(vector: ArrayLike, direction: ArrayLike) -> AnyFloats:
 
     Raises
     ------
-    RotationError    if the two are parallel
+    RotationError    if `vector` and `direction` are parallel
     """
     (vector, direction), dtype = widened((vector, 3), (direction, 3))
     direction = unit(direction, "direction")
@@ -197,7 +197,7 @@ def twist_swing(q: ArrayLike, axis: ArrayLike) -> tuple[AnyFloats, AnyFloats]:
     """Split rotations into a twist about an axis and a swing: q = swing · twist.
 
     The swing's axis is perpendicular to `axis`. If the swing is half a turn, the twist is not determined, and the
-    identity is returned for it.
+    identity is returned as the twist.
 
     Parameters
     ----------
@@ -221,8 +221,8 @@ def twist_swing(q: ArrayLike, axis: ArrayLike) -> tuple[AnyFloats, AnyFloats]:
 def unroll(q: ArrayLike, axis: int = 0) -> AnyFloats:
     """Choose the signs of quaternions so that neighbours in time are close.
 
-    q and -q are one rotation; the first frame keeps its sign, and each later frame takes the sign nearer to the frame
-    before it.
+    q and -q are the same rotation. The first frame keeps its sign, and each later frame gets the sign with which it is
+    nearer to the frame before.
 
     Parameters
     ----------
@@ -261,7 +261,7 @@ def angular_velocity(q: ArrayLike, frame_rate_hz: float) -> AnyFloats:
 
 
 def rate_from_steps(steps: Floats, frame_count: int) -> Floats:
-    """Compute rates at frames from rates between frames: means inside, linear extrapolation at the ends.
+    """Compute rates at frames from rates between frames: means of adjacent rates, and linear extrapolation at the ends.
 
     Parameters
     ----------

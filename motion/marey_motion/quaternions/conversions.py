@@ -101,7 +101,7 @@ def from_axis_angle(axis: ArrayLike, angle_rad: ArrayLike) -> AnyFloats:
 
 
 def from_rotation_vector(vector: ArrayLike) -> AnyFloats:
-    """Make rotations about vectors, by angles equal to their lengths (the exponential map).
+    """Make rotations about vectors, by angles equal to the lengths of the vectors (the exponential map).
 
     Parameters
     ----------
@@ -185,8 +185,8 @@ def as_euler(q: ArrayLike, order: str, *, intrinsic: bool = True) -> AnyFloats:
 
     Notes
     -----
-    Method of Bernardes and Viollet (2022): one arctangent gives half the sum of the first and last angles, another one
-    half their difference.
+    Method of Bernardes and Viollet (2022): one arctangent gives half the sum of the first and last angles, another
+    arctangent gives half the difference.
     """
     axes = _euler_axes(order)
     if len(axes) != 3:

@@ -1,9 +1,9 @@
 """Anatomical axes of joints, each in the joint's own frame, by which rotations of different rigs can be compared.
 
-`twist` points along the bone: from the joint towards the next one. `swing` is perpendicular to it and points to the
-body's left when the limb hangs down or the trunk is upright: it is the axis about which knees and elbows hinge. The
-swing axis of an arm turns with the arm when the arm is raised sideways: in a T-pose with palms down, the swing axis of
-the left arm points up, and that of the right arm points down.
+`twist` points along the bone: from the joint towards the next one. `swing` is perpendicular to `twist` and points to
+the body's left when the limb hangs down or the trunk is upright: `swing` is the axis about which knees and elbows
+hinge. The swing axis of an arm turns with the arm when the arm is raised sideways: in a T-pose with palms down, the
+swing axis of the left arm points up, and that of the right arm points down.
 
 The twist can usually be computed from offsets alone. The swing of a limb can be computed from the rest pose only if the
 rest pose is that of a standing body. In many files all bones are on one line at rest; the swing is then determined from
@@ -73,7 +73,7 @@ class JointAxes:
     Parameters
     ----------
     twist : (float, float, float)    direction along the bone
-    swing : (float, float, float)    direction perpendicular to it, about which knees and elbows hinge
+    swing : (float, float, float)    direction perpendicular to `twist`, about which knees and elbows hinge
 
     Examples
     --------
@@ -202,14 +202,14 @@ class _PosedBody:
     def way(self, start: str, end: str) -> Floats | None:
         """Compute unit directions (K, 3) from one standard joint to another.
 
-        Returns None if one of them is not mapped. The direction is zero in frames in which both coincide.
+        Returns None if one of the joints is not mapped. The direction is zero in frames where the two joints coincide.
         """
         if start not in self.joints or end not in self.joints:
             return None
         return _unit(self.positions[:, self.joints[end]] - self.positions[:, self.joints[start]])
 
     def coinciding(self, start: str, end: str) -> MappingError:
-        """Make the error for a direction between joints at the same position."""
+        """Make the error for two joints at the same position, between which there is no direction."""
         names = [self.skeleton.joint_names[self.joints[standard]] for standard in (start, end)]
         return MappingError(
             f"{names[0]} ({start}) and {names[1]} ({end}) are at the same position, so the bone between them "
@@ -341,7 +341,7 @@ def _tip(skeleton: Skeleton, joint: int) -> Floats | None:
 def _swing(standard: str, body: _PosedBody) -> Floats:
     """Compute the swing axis of a joint in each of K frames, as directions (K, 3) in the world.
 
-    Their mean in the frame of the joint is its swing axis.
+    The mean of these directions in the frame of the joint is the joint's swing axis.
     """
     side, _, joint = standard.partition("_")
     if side not in SIDES:
@@ -364,7 +364,7 @@ def _swing(standard: str, body: _PosedBody) -> Floats:
 
 
 def _leg_hinge(side: str, body: _PosedBody) -> Floats:
-    """Find the axes (K, 3) about which a knee bends backwards; the body's left if the knee never bends."""
+    """Find the axes (K, 3) about which a knee bends backwards; if it never bends, the direction of the body's left."""
     thigh, shank = body.way(f"{side}_hip", f"{side}_knee"), body.way(f"{side}_knee", f"{side}_ankle")
     if len(body.positions) > 1 and thigh is not None and shank is not None:
         bend = np.cross(thigh, shank)
@@ -376,7 +376,8 @@ def _leg_hinge(side: str, body: _PosedBody) -> Floats:
 def _arm_hinge(side: str, joint: str, body: _PosedBody) -> Floats:
     """Find the axes (K, 3) about which an elbow extends.
 
-    If the elbow never bends, return the body's left, rotated as the arm is rotated from hanging down to its pose.
+    If the elbow never bends, return the direction of the body's left, rotated like the arm from hanging down to its
+    pose.
     """
     upper, fore = body.way(f"{side}_shoulder", f"{side}_elbow"), body.way(f"{side}_elbow", f"{side}_wrist")
     if len(body.positions) > 1 and upper is not None and fore is not None:

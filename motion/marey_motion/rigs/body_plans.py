@@ -1,8 +1,8 @@
 """Recognition of the legs and arms of a person, and of the joints at which they bend, by proportions.
 
 A skeleton can have other pairs of chains, such as a cape, wings or the bones of a skirt, and twist bones between the
-joints that bend. Every interpretation of the chains has a score: the sum of the logarithms of how frequent each of its
-proportions is among people.
+joints that bend. Every interpretation of the chains has a score: the sum, over its proportions, of the logarithm of how
+frequent the proportion is among people.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SHORTER = -1.5
 class Build:
     """Usual proportions of an arm or a leg of a person.
 
-    `ratio` and `end` are pairs of a usual value and the spread of its logarithm; `before` is an upper limit.
+    `ratio` and `end` each consist of a usual value and the spread of its logarithm; `before` is an upper limit.
     """
 
     ratio: tuple[float, float]  # upper by lower long bone
@@ -63,7 +63,7 @@ ARM_BY_LEG_LIMITS = (0.3, 1.2)
 class LimbReading:
     """Interpretation of a pair of chains as arms or legs, with a score.
 
-    `places` are the positions in each chain of hip, knee and ankle, or of shoulder, elbow and wrist.
+    `places` are three indices into each chain: of hip, knee and ankle, or of shoulder, elbow and wrist.
     """
 
     pair: LimbPair
@@ -73,7 +73,7 @@ class LimbReading:
 
     @property
     def triple(self) -> tuple[int, int, int]:
-        """Indices of hip, knee and ankle, or shoulder, elbow and wrist, of the first of the two limbs."""
+        """Joint indices of hip, knee and ankle (or of shoulder, elbow and wrist) of the first of the two limbs."""
         a, b, c = (self.pair.limbs[0].chain[place] for place in self.places)
         return a, b, c
 
@@ -98,7 +98,7 @@ class LimbReading:
 
 @dataclass(frozen=True)
 class BodyPlan:
-    """Legs and arms, and a score of how common their proportions are: at least 0 for most people, else negative."""
+    """Legs and arms, and a score of how common their proportions are; for most people, it is at least 0."""
 
     legs: LimbReading
     arms: LimbReading
@@ -142,7 +142,7 @@ def _readings(tree: BoneTree, pair: LimbPair, build: Build) -> list[LimbReading]
 
 
 def _likeliest_first(reading: LimbReading) -> tuple[float, int, int, int]:
-    """Make the key that sorts interpretations of limbs by falling score, and those of equal score by their joints.
+    """Make a sort key: interpretations of limbs by falling score, and interpretations of equal score by their joints.
 
     Of several joints at the same position, the one farthest down the chain is preferred as hip, knee, shoulder or
     elbow, and the one nearest to the root as ankle or wrist.
@@ -219,11 +219,11 @@ def commonness(value: float, usual: tuple[float, float]) -> float:
     Parameters
     ----------
     value : float    the proportion
-    usual : (float, float)    its usual value and the spread of its logarithm
+    usual : (float, float)    usual value of the proportion, and the spread of the value's logarithm
 
     Returns
     -------
-    float    0 for the usual value, less for others, at least `LEAST_WORTH`
+    float    0 for the usual value, negative for other values, at least `LEAST_WORTH`
     """
     expected, spread = usual
     if value <= 0.0:

@@ -114,7 +114,7 @@ def _doubts(skeleton: Skeleton, plan: BodyPlan, rivals: list[BodyPlan]) -> tuple
 def _neck(tree: BoneTree, plan: BodyPlan) -> tuple[float, list[int]]:
     """Find the chain of joints from neck to head, which starts where the arms branch off.
 
-    Returns a score of how common its proportions are, and the chain; the chain is empty if there is none.
+    Returns a score of how common the proportions of the chain are, then the chain, which is empty if none is found.
     """
     skeleton, arms, legs = tree.skeleton, plan.arms.pair, plan.legs.pair
     limbs = {limb.chain[0] for limb in arms.limbs} | set(skeleton.path_to_root(legs.parent))
@@ -165,9 +165,10 @@ def _branches(tree: BoneTree, joint: int) -> list[int]:
 
 
 def _left_direction(skeleton: Skeleton, legs: LimbReading, joints: dict[str, int]) -> Floats | None:
-    """Compute the direction (3,) to the body's left in the rest pose: up, crossed with the direction of the feet.
+    """Compute the direction (3,) to the body's left in the rest pose: the cross product of up and forward.
 
-    Returns None if these do not determine it.
+    Up points from the pelvis to the head, and forward from the ankles to the toes or the tips of the feet. Returns None
+    if up or forward is zero, or if they are nearly parallel.
     """
     positions = skeleton.rest_global_positions
     up = positions[joints.get("head", joints["pelvis"])] - positions[joints["pelvis"]]
@@ -192,7 +193,7 @@ def _foot(skeleton: Skeleton, ankle: int | None, toe: int | None) -> Floats:
 
 
 def _left_and_right(skeleton: Skeleton, reading: LimbReading, left: Floats) -> tuple[tuple[int, int], bool]:
-    """Sort a pair of limbs, the left limb first; also return whether their names show the sides."""
+    """Sort a pair of limbs, the left limb first; also return whether the joint names show the sides."""
     first, second = reading.pair.limbs
     sides = [
         {parse_name(skeleton.display_names[joint]).side for joint in limb.chain} - {""} for limb in (first, second)

@@ -22,7 +22,7 @@ class NameMatch:
 
     Parameters
     ----------
-    rig : str, optional    name of the rig; None if the names are everyday words of no particular tool
+    rig : str, optional    name of the rig; None if the names are everyday words that belong to no particular tool
     joints : dict of str to int    index by standard name
     signature_share : float    share of the rig's distinctive names (`KnownRig.signature`) that were found, 0 to 1
     """
@@ -50,12 +50,12 @@ class NameMatch:
 def best_match(skeleton: Skeleton) -> NameMatch | None:
     """Find the known rig whose names fit best.
 
-    Of rigs that match equally many essential joints, the rig of a tool is preferred to everyday words. Of rigs that
-    match equally in everything, the one listed first is taken.
+    If several rigs match equally many essential joints, the rig of a tool is preferred to everyday words. If rigs match
+    equally well in every respect, the rig listed first is taken.
 
     Parameters
     ----------
-    skeleton : Skeleton    its display names are compared
+    skeleton : Skeleton    skeleton whose display names are compared
 
     Returns
     -------
@@ -102,7 +102,7 @@ def _parsed_names(rig: KnownRig) -> tuple[tuple[str, tuple[JointName, ...]], ...
 def _prefixes(pelvis: tuple[JointName, ...], joints: dict[JointName, int]) -> list[str]:
     """List prefixes that all joint names may share, the shortest first.
 
-    They come from joint names that end with the rig's name of the pelvis: the text before this name may be a prefix.
+    If a joint name ends with the rig's name for the pelvis, the text before this ending may be a prefix.
     """
     prefixes = {
         joint.base[: len(joint.base) - len(name.base)]

@@ -1,7 +1,8 @@
 """Rigs that are in common use, with the names of their joints.
 
-Names are compared by side and base (see `names`), so one template covers all styles of writing a name. Prefixes that
-all joints of a file share are not part of a template. "{}" marks the position of the side.
+Names are given as templates, in which "{}" marks the position of the side. Names are compared by side and base (see the
+module `names`), so one template covers all styles of writing a name. Prefixes that all joints of a file share are not
+part of a template.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Chains of bones that may be limbs: pairs of chains that branch from one joint and have nearly equal bone lengths."""
+"""Chains of bones that may be limbs: pairs that branch from one joint and have nearly equal bone lengths."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class BoneTree:
         return float(self.lengths[joint] + self.reach[joint])
 
     def limb(self, start: int) -> Limb:
-        """Follow the farthest-reaching chain from a joint.
+        """Follow the chain that leads from a joint to the farthest tip.
 
         End sites are not bones: exporters write arbitrary lengths there.
 

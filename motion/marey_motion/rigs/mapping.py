@@ -35,7 +35,7 @@ class JointMapping:
     rig : str, optional    the known rig whose names were recognised
     joints : mapping of str to str    standard name to joint name; one joint can have several standard names, such as
         hips that are both root and pelvis
-    confidence : float    0 to 1; below 0.5 a person should check it before use
+    confidence : float    0 to 1; if below 0.5, a person should check the mapping before use
     method : str    "names", "geometry" or "manual"
     notes : tuple of str    assumptions and missing joints, in sentences for people
 
@@ -80,7 +80,7 @@ class JointMapping:
 
 
 def map_joints(skeleton: Skeleton) -> JointMapping:
-    """Find the standard joints of a skeleton: by the names of a known rig or, failing those, by its build.
+    """Find the standard joints of a skeleton: by the names of a known rig or, failing those, by geometry.
 
     Never fails: joints that cannot be found are left out and named in the notes, and the confidence is lower.
 
@@ -132,8 +132,8 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
 def require_trust(mapping: JointMapping) -> JointMapping:
     """Refuse a mapping in which hardly any joint was recognised.
 
-    The skeleton may be that of an animal, or the few recognised joints may be wrong. So a person must check the mapping
-    before it is used.
+    The skeleton may be that of an animal, or the few recognised joints may be wrong. Therefore, a person must check
+    such a mapping before it is used.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def require_trust(mapping: JointMapping) -> JointMapping:
 
     Raises
     ------
-    MappingError    if its confidence is below `LEAST_CONFIDENCE`
+    MappingError    if the confidence of the mapping is below `LEAST_CONFIDENCE`
     """
     if mapping.confidence < LEAST_CONFIDENCE:
         found = f"its joints were recognised with a confidence of {mapping.confidence:.2f} only"
@@ -190,8 +190,8 @@ def symmetric_joints(skeleton: Skeleton, mapping: JointMapping) -> NDArray[np.in
 def _spine(skeleton: Skeleton, joints: Mapping[str, int]) -> dict[str, int]:
     """Find the joints between pelvis and arms: the lowest, the middle and the one to which the arms are attached.
 
-    Rigs have one to six of them under all kinds of names; a single one is the chest, because the arms are attached to
-    it.
+    Rigs have one to six such joints, under all kinds of names. A single joint is the chest, because the arms are
+    attached to it.
     """
     tops = [joints.get(f"{side}_clavicle", joints.get(f"{side}_shoulder")) for side in SIDES]
     if None in tops or "pelvis" not in joints:
@@ -214,7 +214,7 @@ def _spine(skeleton: Skeleton, joints: Mapping[str, int]) -> dict[str, int]:
 
 
 def _animal_signs(skeleton: Skeleton, joints: Mapping[str, int]) -> str:
-    """Describe the evidence for four legs, in words; empty for a human."""
+    """Describe in words the evidence that the skeleton has four legs; empty for a human."""
     for index, name in enumerate(skeleton.display_names):
         base = parse_name(name).base
         is_animal = any(word in base for word in _ANIMAL_WORDS)

@@ -26,7 +26,7 @@ def parse_name(name: str) -> JointName:
     """Parse the side and base of a joint name of any style.
 
     "mixamorig:LeftUpLeg", "L_UpLeg", "upLeg.l" and "UpLeg_L" have the same side and differ at most by a prefix of the
-    base. A namespace, up to the last ":" or "|", is dropped.
+    base. The namespace, which is the text up to the last ":" or "|", is dropped.
 
     Parameters
     ----------

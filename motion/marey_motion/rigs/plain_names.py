@@ -1,4 +1,4 @@
-"""Joint names without prefixes and suffixes that an exporter added to all of them.
+"""Joint names without the prefixes and suffixes that an exporter added to all names.
 
 Duplicating an armature, joining scenes and converting files leave marks on every joint: "Hips.001", "hero_Hips",
 "Hips_jnt", "Hips_07". These marks contain no information about the body, but with them the names do not match the names
@@ -47,7 +47,7 @@ def readings(names: Sequence[str]) -> tuple[Names, ...]:
 
 
 def _marked(names: Names) -> Names:
-    """List the names that must share a prefix or suffix for it to be removed: those of all joints except the root.
+    """List the names that must all have a mark before the mark is removed: the names of all joints except the root.
 
     Exporters often add a root with a name of its own.
     """

@@ -1,7 +1,7 @@
 """The standard joints: one name for the same anatomical joint of every rig.
 
-A joint is named for the articulation at its origin: `left_hip` is where the left thigh turns, `left_shoulder` where the
-upper arm does (rigs often call that joint "arm" and the clavicle "shoulder").
+A joint is named for the articulation at its origin: `left_hip` is where the left thigh turns, and `left_shoulder` is
+where the left upper arm turns (rigs often call this joint "arm", and the clavicle "shoulder").
 """
 
 from __future__ import annotations

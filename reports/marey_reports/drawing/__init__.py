@@ -1,1 +1,1 @@
-"""Shared drawing code: style of figures, bodies as lines, figures with their numbers, pages and tables."""
+"""Shared drawing code: style of figures, bodies drawn as lines, figures with their data, pages and tables."""

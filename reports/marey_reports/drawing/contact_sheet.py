@@ -56,7 +56,7 @@ class TakePair(NamedTuple):
 def contact_sheet(
     takes: Sequence[TakePair], *, heading: str = "Retargeting", moments: int = 6, total: int | None = None
 ) -> bytes:
-    """Draw a PNG with one row per take: at each moment, the figure of the source beside the figure of the result.
+    """Draw a PNG with one row per take: at each of several times, the source and the result side by side.
 
     The result has a tinted background. The figures of a take have the same scale and the same view: from the front left
     of the source in its first frame. Each figure is drawn over its own patch of the floor y = 0, with an arrow in its
@@ -66,7 +66,7 @@ def contact_sheet(
     ----------
     takes : takes to draw, at most `MAX_TAKES`
     heading : title of the page
-    moments : number of evenly spaced moments of each take, at most `MAX_MOMENTS` and one per frame
+    moments : number of evenly spaced times at which a take is drawn, at most `MAX_MOMENTS` and one per frame
     total : number of takes from which the drawn takes were chosen; None if all takes are drawn
 
     Raises
@@ -132,10 +132,10 @@ class _SheetCell:
 
     Parameters
     ----------
-    left, bottom, width : place and size of its background, inches
+    left, bottom, width : place and size of the background, inches
     centre : position of the floor under the pelvis, inches
     scale : inches per metre
-    ground : colour of its background
+    ground : colour of the background
     """
 
     left: float
@@ -170,7 +170,7 @@ def _draw_header(axes: Axes, top: float, heading: str, takes: str) -> None:
 
 
 def _draw_row(axes: Axes, row: _SheetRow, top: float, cell: float) -> None:
-    """Draw a title, then one cell per moment with the figures of source and result. `top` is in inches."""
+    """Draw a title, then one cell with the figures of source and result for each time. `top` is in inches."""
     _draw_titles(axes, row, top)
     low, high = row.extent_m
     scale = 0.80 * STAGE / max(high - low, 1e-6)
@@ -214,7 +214,7 @@ def _draw_floor(axes: Axes, stage: _SheetCell, camera: Camera, facing: AnyFloats
 
 
 def _draw_body(axes: Axes, stage: _SheetCell, body: StickFigure, seen: AnyFloats, head_m: float) -> None:
-    """Draw bones from back to front, each with an edge in the background's colour that separates it from others."""
+    """Draw bones from back to front, each with an edge in the background's colour, which separates bones that cross."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Circle
 
@@ -240,5 +240,5 @@ def _draw_body(axes: Axes, stage: _SheetCell, body: StickFigure, seen: AnyFloats
 
 
 def _write(axes: Axes, place: tuple[float, float], text: str, size: float, colour: str = INK, **options: Any) -> None:
-    """Write text literally, without the mathematical notation that matplotlib reads between dollar signs."""
+    """Write text literally: matplotlib would read text between dollar signs as mathematical notation."""
     axes.text(*place, text, fontsize=size, color=colour, parse_math=False, **options)

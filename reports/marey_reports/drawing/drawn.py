@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Column = Any
-"""A sequence or an array of numbers, texts or None."""
+"""Sequence or array whose elements are numbers, texts or None."""
 Tables = Mapping[str, Mapping[str, Column]]
-"""Tables by name. A table has columns of equal length by name; the name of a column ends with its unit."""
+"""Tables by name. A table maps the names of columns to columns of equal length; a name ends with the column's unit."""
 
 
 class Sketch(NamedTuple):
@@ -39,8 +39,8 @@ class DrawnFigure:
     Parameters
     ----------
     sketch : the page, the numbers that it shows, and its caption
-    name : name by which it is requested
-    number : number in the paper, or "" for figures that the paper does not have
+    name : name by which callers request the figure
+    number : number that the figure has in its paper, or "" if no paper contains the figure
     """
 
     sketch: Sketch

@@ -41,7 +41,7 @@ class Section(NamedTuple):
 
 
 def page(title: str, lead: Content, sections: Sequence[Section], ending: Content) -> str:
-    """Return a whole HTML document with these sections."""
+    """Return a whole HTML document with the given sections."""
     links = [element("li", element("a", section.heading, href=f"#{section.anchor}")) for section in sections]
     head = element(
         "head",
@@ -83,7 +83,7 @@ def _shown(figure: DrawnFigure, prefix: str) -> Html:
 
 
 def _inline(figure: DrawnFigure, prefix: str) -> Html:
-    """Return a figure's SVG for use in a page: with the colours and font of the page, and ids that are unique there."""
+    """Return a figure's SVG for use in a page: with the page's colours and font, and ids unique in the page."""
     svg = _NEEDLESS.sub("", figure.svg)
     svg = _BLANKS.sub(" ", _STANDING.sub("", _FONTS.sub("", svg))).replace("xlink:href", "href")
     for colour, themed in _THEMED.items():

@@ -64,7 +64,7 @@ class Place(NamedTuple):
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty page of this size in inches."""
+    """Return an empty page with the given size in inches."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), dpi=DPI, facecolor=PAPER)
@@ -91,7 +91,7 @@ def add_panel(figure: Figure, place: Place, *, title: str = "", x: str = "", y: 
 def add_colour_bar(
     figure: Figure, mappable: ScalarMappable, place: Place, label: str, ticks: NDArray[np.float64] | None = None
 ) -> Axes:
-    """Draw a colour bar at a place, upright if the place is higher than wide, else horizontal; return its axes."""
+    """Draw a colour bar, vertical if its place is higher than wide, otherwise horizontal; return the bar's axes."""
     width, height = figure.get_size_inches()
     left, bottom, across, up = place
     axes = figure.add_axes((left / width, bottom / height, across / width, up / height))
@@ -106,7 +106,7 @@ def add_colour_bar(
 
 
 def write(axes: Axes, place: tuple[float, float], text: str, **options: Any) -> None:
-    """Write text literally, without the mathematical notation that matplotlib reads between dollar signs."""
+    """Write text literally: matplotlib would read text between dollar signs as mathematical notation."""
     look: dict[str, Any] = {"fontsize": SMALL, "color": INK, "parse_math": False, "va": "center", **options}
     axes.text(*place, plain(text), **look)
 
@@ -120,7 +120,7 @@ def add_keys(axes: Axes, **options: Any) -> None:
 
 
 def name_ticks(axes: Axes, places: Sequence[float], names: Sequence[str], others: Sequence[str] = ()) -> None:
-    """Write the names of clips along the vertical axis, and after them `others`: names of rows that are not clips."""
+    """Write the names of clips along the vertical axis, then `others`, the names of further rows that are not clips."""
     labels = [plain(label) for label in (*labels_of(names), *others)]
     axes.set_yticks(list(places), labels, parse_math=False)
     axes.tick_params(axis="y", length=0, labelcolor=INK)
@@ -160,8 +160,9 @@ def differing_parts(names: Sequence[str]) -> list[str]:
 def labels_of(names: Sequence[str], longest: int = LONGEST_NAME) -> list[str]:
     """Shorten names of clips to `longest` characters so that different names stay different.
 
-    Folders are left out if the names without them are still unique; the beginning that all names share is left out if
-    one name is too long. If cutting the middle would make several names equal, their shared beginning is cut instead.
+    Folders are left out if the names are unique without folders. If one name is too long, the beginning that all names
+    share is left out. Names that are still too long lose their middle; if this would make several names equal, their
+    shared beginning is cut instead.
     """
     takes = [name.rpartition("/")[2] for name in names]
     apart = takes if len(set(takes)) == len(set(names)) else without_shared_folder(names)
@@ -188,7 +189,7 @@ def shortened(name: str, longest: int = LONGEST_NAME) -> str:
 
 
 def reach(values: NDArray[np.floating[Any]], wanted: float) -> float:
-    """Choose the end of an axis between `wanted` and twice `wanted`; the most extreme values may lie beyond it."""
+    """Choose the end of an axis, from `wanted` to twice `wanted`; the most extreme values may lie beyond this end."""
     if not len(values):
         return wanted
     most = float(np.quantile(values, 0.98))

@@ -23,7 +23,8 @@ HEADING_PAIRS = ("hip", "shoulder")
 class Camera:
     """Camera with parallel projection.
 
-    `direction_rad` is its direction about +Y (0: it looks from +Z); `tilt_rad` is its angle above the horizontal.
+    `direction_rad` is the direction of the camera about +Y (0: it looks from +Z). `tilt_rad` is its angle above the
+    horizontal.
     """
 
     direction_rad: float
@@ -48,10 +49,10 @@ class StickFigure:
         all end sites
     sides : (n,) LEFT, CENTRE or RIGHT for each bone
     pelvis : index of the joint that is at the centre of a drawn figure
-    head : index of the bone of the head, and the position of the centre of the head along it, from 0 (inner end) to 1
-        (outer end); None if no head is known
-    facing : indices of joints of the left side, and of the same joints of the right side, from which the facing
-        direction is computed
+    head : index of the bone of the head, and the position of the centre of the head along this bone, from 0 (inner end)
+        to 1 (outer end); None if no head is known
+    facing : indices of joints on the left side, and of the matching joints on the right side; the facing direction is
+        computed from them
     """
 
     bones: Indices
@@ -63,7 +64,7 @@ class StickFigure:
 
 @dataclass(frozen=True)
 class Stances:
-    """Points of a body at K moments.
+    """Points of a body in K frames of a clip.
 
     Parameters
     ----------

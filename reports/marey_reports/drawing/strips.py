@@ -1,4 +1,4 @@
-"""Strips of small figures: motions at the same moments, one motion or one set of motions per row.
+"""Strips of small figures: poses of motions in the same frames, one motion or one set of motions per row.
 
 All cells of a column show the same patch of the floor, so that differences between rows are visible in place. The lines
 of a body are joined to one shape per side, which keeps the file of a drawing of a hundred bodies small.
@@ -43,9 +43,9 @@ class StripRow:
     Parameters
     ----------
     label, note : texts to the left of the row; the note is below the label, in small letters
-    bodies : (m, T, P, 3) points of m motions at T moments, metres, drawn on top of each other
+    bodies : (m, T, P, 3) points of m motions in T frames, metres, drawn on top of each other
     ways : (m, N, 3) paths of the root, drawn on the floor; N may be 0
-    ghost : (T, P, 3) points of a motion to compare with, drawn in grey behind
+    ghost : (T, P, 3) points of a motion for comparison, drawn in grey behind the bodies
     """
 
     label: str
@@ -56,7 +56,7 @@ class StripRow:
 
 
 class StripMoments(NamedTuple):
-    """Columns of a strip: for each column, x and z (T, 2) of the point at its centre in metres, title and label."""
+    """Columns of a strip: for each of T columns, its centre (T, 2) as x and z in metres, its title and its label."""
 
     middles: Floats
     names: Sequence[str]
@@ -123,7 +123,7 @@ class _StripCell:
 def _scale(
     body: StickFigure, rows: Sequence[StripRow], moments: StripMoments, camera: Camera, cell_in: tuple[float, float]
 ) -> float:
-    """Compute the scale in inches per metre at which the highest point fits, and most figures fit from side to side."""
+    """Compute the scale in inches per metre at which the highest point fits, and most figures fit in width."""
     middles = np.stack((moments.middles[:, 0], np.zeros(len(moments.middles)), moments.middles[:, 1]), axis=1)
     drawn = np.unique(np.append(body.bones, body.pelvis))
     seen = np.concatenate([camera.seen(row.bodies[:, :, drawn] - middles[:, None]).reshape(-1, 3) for row in rows])

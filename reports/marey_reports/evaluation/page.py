@@ -78,7 +78,7 @@ def render_comparison(
 
     Parameters
     ----------
-    comparison : comparison of both; adds confidence intervals, and marks the trials that differ in any tick
+    comparison : comparison of `before` and `after`; adds confidence intervals, and marks trials that differ in any tick
     labels : names of both evaluations in figures and tables
     figures : figures by name, as returned by `draw_figures` for two results; if None, they are drawn
     """

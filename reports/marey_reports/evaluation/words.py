@@ -28,12 +28,12 @@ class CoverageGap(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Words for the range, such as "left turns of 75 to 100 degrees a second at 2 to 3 m/s"."""
+        """Description of the range, such as "left turns of 75 to 100 degrees a second at 2 to 3 m/s"."""
         return f"{turning(*self.turn_rates_deg_s)} at {span(*self.speeds_m_s)} m/s"
 
 
 def find_holes(coverage: Coverage) -> list[CoverageGap]:
-    """Combine the cells without enough data into few rectangles, the largest deficit first.
+    """Combine the cells without enough data into few rectangles, the rectangle that lacks most data first.
 
     First, neighbouring cells of equal speed are joined to runs; a run contains only left turns, only right turns or
     only straight motion. Then, runs over the same turn rates at neighbouring speeds are joined to rectangles.

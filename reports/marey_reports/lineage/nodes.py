@@ -32,7 +32,7 @@ class Box(NamedTuple):
 
 
 class Arrow(NamedTuple):
-    """An arrow between two boxes, which are identified by their indices, with its label."""
+    """Arrow with a label between two boxes; the boxes are given by index."""
 
     source: int
     target: int

@@ -71,7 +71,7 @@ def warning_chapter(trained: TrainedPrimitive) -> Section:
 
 
 def motion_chapter(subject: ModelSubject, figures: Figures) -> Section:
-    """Write the chapter on the samples of the model and the space that they reach."""
+    """Write the chapter on the samples of the model, and on the space that these samples reach."""
     text = element(
         "p",
         "Left and right are the sides of the body: the left side is blue, the right side orange. All motions begin "

@@ -16,7 +16,7 @@ MOST_CHANGES = 10_000
 """Greatest number of explicit changes in one commit."""
 
 TIME_OF_COMMIT = "%Y-%m-%dT%H:%M:%S.%fZ"
-"""Format of the time of a commit, which is in UTC."""
+"""Format of the time of a commit; the time is in UTC."""
 
 EntryPath = Annotated[
     str,
@@ -95,7 +95,9 @@ class Commit(Answer):
     message: str
     at: datetime
     entries: int = Field(description="Number of entries.")
-    job: str | None = Field(None, description="Job that made the commit of its outputs; null: a user or a program.")
+    job: str | None = Field(
+        None, description="Job that made this commit of its outputs; null: a user or a program made the commit."
+    )
 
 
 class Entry(Answer):

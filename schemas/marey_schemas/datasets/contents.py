@@ -17,7 +17,7 @@ from marey_schemas.names import Digest, Message, Tag
 MOST_CONTENTS = 256
 """Greatest number of revisions, and of documents, in one request."""
 MOST_CHECKED = 500
-"""Greatest number of revisions in one request that checks whether they may be exported."""
+"""Greatest number of revisions in one request to check whether revisions may be exported."""
 MOST_RECEIVED_CHANGES = 200_000
 """Greatest number of entries that a commit from an archive or another server may change."""
 
@@ -69,7 +69,8 @@ class ReceivedRevision(Request):
     )
     kind: Kind
     path: EntryPath | None = Field(
-        description="Path of an entry that has the revision; null: no entry has it, but another revision refers to it."
+        description="Path of an entry that has the revision; null: no entry has the revision, but another revision "
+        "refers to it."
     )
     parts: dict[PartName, Any] = Field(
         min_length=1,
@@ -80,13 +81,13 @@ class ReceivedRevision(Request):
 
 
 class ReceivedRevisions(Request):
-    """Revisions from an archive or another server; the project must have the revisions to which they refer."""
+    """Revisions from an archive or another server. The project must already have all revisions to which these refer."""
 
     revisions: tuple[ReceivedRevision, ...] = Field(min_length=1, max_length=MOST_CONTENTS)
 
 
 class StoredRevisions(Answer):
-    """Number of revisions that a request has added; the project had the others already."""
+    """Number of revisions that a request has added; revisions that the project already had do not count."""
 
     added: int
 

@@ -15,19 +15,24 @@ ChangeKind = Literal["added", "removed", "moved", "changed"]
 
 
 class ListedCommit(Commit):
-    """Commit in a list of commits; if the list is limited to a path, with the changes of the entries at this path."""
+    """Commit in a list of commits. If the list is limited to a path, the commit's changes at the path are counted."""
 
     changes: dict[ChangeKind, int] | None = Field(
         None,
-        description="Number of entries at the path of the list or below it that the commit added, removed, moved or "
-        "changed, compared with its first parent; null: the list has no path. At most 100,000 entries are counted; if "
-        "the commit changes more entries than that in all folders, moved entries count as added or removed.",
+        description="Number of entries that the commit added, removed, moved or changed, compared with its first "
+        "parent. Only entries at the path of the list or below it count; null: the list has no path. At most 100,000 "
+        "entries are counted. If the commit changes more than 100,000 entries of the dataset, moved entries count as "
+        "added or removed.",
     )
     moved_from: str | None = Field(
-        None, description="If the commit moved a single entry to the path of the list: the path before."
+        None,
+        description="If the commit moved a single entry to the path of the list: the path of the entry before the "
+        "move.",
     )
     moved_to: str | None = Field(
-        None, description="If the commit moved a single entry away from the path of the list: the path after."
+        None,
+        description="If the commit moved a single entry away from the path of the list: the path of the entry after "
+        "the move.",
     )
 
 

@@ -30,7 +30,7 @@ class ExportedSource(Answer):
 
 
 class ExportedInput(Answer):
-    """Revision that was an input of the job that made a clip; its ids are those of the server of the export."""
+    """Revision that was an input of the job that made a clip; all ids are those of the server that made the export."""
 
     role: str = Field(description="Name of the job input for which the revision was used.")
     kind: str
@@ -68,7 +68,9 @@ class ExportedIdentity(Answer):
 
     dataset: str
     commit: str
-    tag: str | None = Field(None, description="Tag by which the version was named.")
+    tag: str | None = Field(
+        None, description="Tag that the request for the export gave as the version; null: the request gave no tag."
+    )
     folder: str = Field("", description="Folder of the version to which the export was limited.")
     author: str
     at: str

@@ -95,8 +95,8 @@ class EntryConflict(Answer):
     path: str
     kind: Kind
     parts: tuple[str, ...] = Field(
-        description="Parts that both sides have changed; `path` if both have moved the entry or want the same path, "
-        "`entry` if one side has removed it."
+        description="Parts that both sides have changed. `path`: both sides have moved the entry, or have different "
+        "entries at the same path. `entry`: one side has removed the entry."
     )
     base: Entry | None
     ours: Entry | None
@@ -138,7 +138,7 @@ class CheckoutRequest(Request):
 class CheckoutAnswer(Answer):
     """Result of a checkout, with the numbers of entries that it changed in the folder of a dataset."""
 
-    commit: str = Field(description="Digest of the commit that the folder has now.")
+    commit: str = Field(description="Digest of the commit whose content the folder has now.")
     added: int
     removed: int
     moved: int

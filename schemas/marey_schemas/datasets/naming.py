@@ -22,7 +22,7 @@ RefName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9](?:[A-Za-z0-9._
 Version = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}(?:~[0-9]{1,4})?$")]
 """Name of a version: a branch, a tag, or the digest of a commit (the first 8 digits are enough).
 
-With `~n` at the end, it names the version n commits earlier.
+With `~n` at the end, the name stands for the version n commits earlier.
 """
 
 
@@ -60,13 +60,13 @@ class RefCreate(Request):
 
     name: RefName
     kind: RefKind
-    at: Version = Field(MAIN, description="Version that the new branch or tag names.")
+    at: Version = Field(MAIN, description="Version to which the new branch or tag points.")
 
 
 class RefMove(Request):
     """Request to move a branch to another version."""
 
-    at: Version = Field(description="Version that the branch names from now on.")
+    at: Version = Field(description="Version to which the branch points from now on.")
 
 
 class Ref(Answer):

@@ -71,7 +71,7 @@ class ReviewCreate(Request):
     verdict: Verdict
     text: str = Field("", max_length=MOST_TEXT)
     commit: Version | None = Field(
-        None, description="Commit that was reviewed; null: the newest one. Another commit than the newest is refused."
+        None, description="Commit that was reviewed; null: the newest one. Any commit other than the newest is refused."
     )
 
 
@@ -81,7 +81,7 @@ class CheckReport(Request):
     name: CheckName
     state: CheckState
     commit: Version | None = Field(
-        None, description="Commit that was checked; null: the newest one. Another commit than the newest is refused."
+        None, description="Commit that was checked; null: the newest one. Any commit other than the newest is refused."
     )
     job: ItemId | None = Field(
         None,
@@ -100,7 +100,7 @@ class ProposalMerge(Request):
     message: Message = Field("", description="Message of the commit; empty: the number and title of the proposal.")
     resolutions: tuple[Resolution, ...] = Field((), max_length=10_000)
     commit: Version | None = Field(
-        None, description="Commit to merge; null: the newest one. Another commit than the newest is refused."
+        None, description="Commit to merge; null: the newest one. Any commit other than the newest is refused."
     )
     when_green: bool = Field(
         False,
@@ -136,7 +136,9 @@ class Proposal(Answer):
         description="Digest of the newest commit of the target; in a proposal that has ended, the one that was the "
         "newest just before that time."
     )
-    merged: str | None = Field(description="Digest of the commit that the merge made; null if it is not merged.")
+    merged: str | None = Field(
+        description="Digest of the commit that the merge made; null if the proposal is not merged."
+    )
     when_green: str | None = Field(
         description="User on whose behalf the proposal is merged as soon as no requirement is missing; null: nobody "
         "has requested this."

@@ -53,6 +53,6 @@ class ProtectionRule(Request):
 
 
 class Protection(ProtectionRule):
-    """Rule of a protected branch, as included in answers about the branch."""
+    """Rule of a protected branch, in answers about the branch."""
 
     model_config = ConfigDict(extra="ignore")

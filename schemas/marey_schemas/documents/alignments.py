@@ -46,7 +46,10 @@ class AlignmentInfo(Request):
     schema_: Literal["marey/alignment@1"] = Field("marey/alignment@1", alias="schema")
     name: str = Field("", max_length=300, description="Name of the example, shown to people.")
     clip: ExampleRef | None = Field(None, description="The source clip; absent if it is not stored.")
-    reference: ExampleRef | None = Field(None, description="The example whose time is the canonical time.")
+    reference: ExampleRef | None = Field(
+        None,
+        description="The reference example: the time of all other examples is mapped to its time, the canonical time.",
+    )
     set: Digest | None = Field(None, description="Digest of all clips that were aligned together and of the options.")
     frame_rate_hz: float = Field(
         gt=0, allow_inf_nan=False, description="Rate of the canonical frames and of `source_frames`, in hertz."

@@ -47,7 +47,8 @@ def members_of(tree: Any) -> list[tuple[str, Any]]:
 
 
 def references_of(schema: str, body: Any) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """Return two dictionaries by JSON Pointer: a stored document's references to arrays, and its digests of files.
+    """Return the references to arrays and the digests of files in a stored document, each as a dictionary by JSON
+    Pointer.
 
     The digest of a file is the value of a member called `blob`, or of a field that `_FILE_POINTERS` lists for the
     schema.

@@ -1,6 +1,6 @@
 """Clips: their motions, and descriptions of their origin.
 
-Lengths are metres, times seconds, quaternions w,x,y,z; axes are right-handed with Y up
+Lengths are in metres, times in seconds. Quaternions are w,x,y,z. Axes are right-handed with Y up
 (docs/explanation/conventions.md).
 """
 
@@ -135,10 +135,10 @@ class RecordingFacts(TakeRecord):
 
 
 def with_earlier_facts(info: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the part `info` of a clip; facts about the recording that it lacks are taken from an earlier revision.
+    """Return the part `info` of a clip, in which absent facts about the recording are taken from an earlier revision.
 
-    If both revisions state the last day of the consent, the earlier day counts. If both state its purposes, those that
-    both contain count.
+    If both revisions state the last day of the consent, the earlier day counts. If both revisions state the purposes of
+    the consent, only the purposes that occur in both revisions count.
     """
     names = [name for name in RecordingFacts.model_fields if info.get(name) is None and earlier.get(name) is not None]
     kept = {**info, **{name: earlier[name] for name in names}}
@@ -160,8 +160,9 @@ class ClipInfo(RecordingFacts):
     def with_consent_of(self, others: Iterable[ClipInfo]) -> Self:
         """Return this description with a consent that is at least as strict as its own and those of `others`.
 
-        `others` describe clips whose motion this clip also contains. The last day of the consent is the earliest one
-        of all clips. Its purposes are those that all clips have in common; clips without recorded purposes are ignored.
+        `others` describe clips whose motion this clip also contains. The last day of the consent is the earliest of the
+        last days of all clips. The purposes of the consent are those that all clips have in common; clips without
+        recorded purposes are ignored.
         """
         infos: tuple[ClipInfo, ...] = (self, *others)
         days = [one.consent_until for one in infos if one.consent_until is not None]

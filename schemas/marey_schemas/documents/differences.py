@@ -30,13 +30,13 @@ class DifferenceOptions(Options):
         1.0,
         ge=0.01,
         le=180,
-        description="Threshold in degrees: the times at which a joint's rotation changed by more are listed.",
+        description="Threshold in degrees: the times at which a joint's rotation changed by more than this are listed.",
     )
     threshold_cm: float = Field(
         1.0,
         ge=0.001,
         le=1e6,
-        description="Threshold in centimetres: the times at which a position changed by more are listed.",
+        description="Threshold in centimetres: the times at which a position changed by more than this are listed.",
     )
 
 
@@ -82,7 +82,8 @@ class Exceeding(Answer):
     spans: tuple[Range, ...] = Field(
         (),
         description="Ranges of frames of the revision `after` in which the change exceeds the threshold; at most 100. "
-        "Ranges less than 0.1 s apart are joined, and wider gaps too if there would be more than 100.",
+        "Ranges less than 0.1 s apart are joined. Ranges farther apart are also joined if there would otherwise be "
+        "more than 100.",
     )
 
 
@@ -235,7 +236,7 @@ class DifferencePlot(Answer):
     joints: tuple[str, ...] = Field(description="Joints in the order of the columns of `rotation_deg`.")
     frame_rate_hz: float = Field(description="Frame rate of the revision `after`.")
     frames: tuple[int, ...] = Field(
-        description="First frame of each row of `rotation_deg`, then the frame after those of the last row."
+        description="First frame of each row of `rotation_deg`, then the frame after the last frame of the last row."
     )
     rotation_deg: MatchedFloats = Field(
         description="[rows, joints]: largest change of rotation within the row's frames, in degrees; -1: no frame is "

@@ -17,7 +17,7 @@ CONFIDENCE = 0.95
 """Confidence level of the intervals that are computed for changes between two evaluations."""
 
 RESAMPLES = 9_999
-"""Number of bootstrap samples of the trials from which each of the confidence intervals is computed."""
+"""Number of bootstrap samples from which each confidence interval is computed; the trials are resampled."""
 
 
 class HeadlineMetric(NamedTuple):
@@ -25,7 +25,7 @@ class HeadlineMetric(NamedTuple):
 
     meaning: str
     of_trials: str | None = None
-    """Metric of single trials whose mean over the trials is this metric; None if this metric is not such a mean.
+    """Metric of a single trial. Its mean over the trials is this metric; None if this metric is not a mean over trials.
 
     Trials in which the metric is not defined are left out of the mean.
     """
@@ -58,14 +58,14 @@ USAGE_FACETS: Mapping[str, str] = MappingProxyType(
         "counted.",
     }
 )
-"""Facets that an evaluation publishes about its clips, by name."""
+"""Facets (published numbers) of the clips of an evaluation, by name of the facet."""
 REMOVAL_FACETS: Mapping[str, str] = MappingProxyType(
     {
         "removal_harm": "Harm of removing the clip from the evaluated set, in metres, by the newest suggestions that "
         "assessed the clip; 0 if no trial needs the clip, negative if the removal helps."
     }
 )
-"""Facets that jobs of the kind `suggest` publish about the clips whose removal they tried, by name."""
+"""Facets (published numbers) of the clips of an evaluated set from jobs of the kind `suggest`, by name of the facet."""
 
 
 class EvaluationDocument(Request):

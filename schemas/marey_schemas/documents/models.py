@@ -28,7 +28,7 @@ Stack = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=3)]
 
 
 class FunctionalComponentsDocument(Request):
-    """Functions of canonical time with D channels: a mean and k principal components in n B-spline coefficients."""
+    """Functions of canonical time with D channels: a mean and k principal components, as n B-spline coefficients."""
 
     degree: int = Field(3, ge=0, le=9)
     knots: Vector = Field(description="[n + degree + 1] knots of the splines, in canonical frames.")

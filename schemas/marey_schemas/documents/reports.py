@@ -30,7 +30,9 @@ class StoredFigure(Request):
     title: str
     caption: str
     trial: TrialName | None = Field(
-        None, description="The trial that the figure was requested for; null for figures of the worst trial or of all."
+        None,
+        description="The trial that the figure was requested for; null for figures of the worst trial or of all "
+        "trials.",
     )
     png: StoredFile
     svg: StoredFile

@@ -1,6 +1,6 @@
 """Skeletons: the hierarchy of joints, and their mapping to standard joints.
 
-Lengths are metres, quaternions w,x,y,z; axes are right-handed with Y up (docs/explanation/conventions.md).
+Lengths are in metres. Quaternions are w,x,y,z. Axes are right-handed with Y up (docs/explanation/conventions.md).
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class JointAxesDocument(Request):
 
 
 class SkeletonMapping(Request):
-    """Part `mapping` of a skeleton: the joint for each standard joint, and the axes of joints. Editable."""
+    """Part `mapping` of a skeleton, which users can edit: the joint for each standard joint, and the axes of joints."""
 
     schema_: Literal["marey/skeleton-mapping@1"] = Field("marey/skeleton-mapping@1", alias="schema")
     rig: str | None = Field(None, description="The known rig whose joint names were recognised.")

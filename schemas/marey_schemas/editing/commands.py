@@ -1,7 +1,8 @@
 """The commands of an edit: one model each, discriminated by `command`.
 
-Frames count from 0 and ranges are half-open; a stop of null is the end. Lengths are metres, times seconds, angles
-degrees where a name ends in `_deg`. Directions and positions are those of the world: right-handed, Y up.
+Frames count from 0 and ranges are half-open; a stop of null is the end. Lengths are in metres and times in seconds.
+Angles are in degrees if the name of the field ends in `_deg`. Directions and positions are those of the world:
+right-handed, Y up.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def _show_examples(schema: dict[str, Any], model: type[NamedCommand]) -> None:
 
 
 class NamedCommand(Tagged):
-    """Base of the commands of an edit. `examples` are parameters with which the command is documented and tested."""
+    """Base of the commands of an edit. `examples` are parameters that are used to document and test the command."""
 
     model_config = ConfigDict(json_schema_extra=_show_examples)
     tag: ClassVar[str] = "command"

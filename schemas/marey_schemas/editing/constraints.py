@@ -1,7 +1,7 @@
 """Commands of an edit that use inverse kinematics.
 
-Joints are given by their own names or by standard ones, such as `left_wrist`. Positions are metres in the world,
-rotations unit quaternions (w, x, y, z) in the world; offsets and axes are in the joint's own frame.
+Joints are given by their own names or by standard ones, such as `left_wrist`. Positions (in metres) and rotations (unit
+quaternions w, x, y, z) are in the world; offsets and axes are in the joint's own frame.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class _Constraint(Tagged):
     top: JointName | None = Field(
         None,
         description="The highest joint of the chain that may turn; absent: the upper joint of the limb for a "
-        "wrist or an ankle, the joint below the root for others.",
+        "wrist or an ankle, the joint below the root for other joints.",
     )
     weight: float = Field(
         1.0,
@@ -143,7 +143,7 @@ AnyLimit = Annotated[HingeLimit | ConeLimit, Field(discriminator="kind")]
 
 
 class Constrain(NamedCommand):
-    """Meet constraints in ranges of frames by inverse kinematics, blended in and out with B-splines."""
+    """Meet constraints in ranges of frames by inverse kinematics; changes are blended in and out with B-splines."""
 
     examples: ClassVar[Examples] = (
         {"constraints": [{"kind": "position", "joint": "LeftHand", "frames": [40, 50], "shift_m": [0.0, 0.05, 0.02]}]},
@@ -173,7 +173,7 @@ class FootContact(Request):
 
 
 class PlantOptions(Options):
-    """Options for the detection of contacts of the feet, and for the blending before and after them."""
+    """Options for the detection of contacts of the feet, and for the blending before and after each contact."""
 
     speed_m_s: float = Field(
         TOE_SPEED_M_S,
@@ -184,8 +184,9 @@ class PlantOptions(Options):
     )
     blend_s: Seconds = Field(
         0.15,
-        description="Seconds before and after a contact in which the foot is blended. If a leg is too short, the body "
-        "is also lowered a little, from at most three times as long before the contact to as long after it.",
+        description="Seconds before and after a contact in which the motion of the foot is blended. If a leg is too "
+        "short, the body is also lowered a little; this begins and ends at most three times as many seconds before and "
+        "after the contact.",
     )
     knee_damping_deg: float = Field(
         10.0,

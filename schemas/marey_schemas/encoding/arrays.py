@@ -41,7 +41,7 @@ _ELEMENT_TYPES: dict[str, set[type]] = {"f": {int, float}, "i": {int}, "u": {int
 
 @dataclass(frozen=True, slots=True)
 class EncodedArray:
-    """Block-encoded array that is passed on without decoding it."""
+    """Block-encoded array that can be passed on without being decoded."""
 
     dtype: str
     shape: tuple[int, ...]

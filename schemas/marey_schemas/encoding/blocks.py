@@ -31,7 +31,7 @@ class BlockError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """Division of an array into tiles: blocks of frames, and each block into groups of columns."""
+    """Division of an array into tiles: an array is cut into blocks of frames, and each block into groups of columns."""
 
     spec: ArraySpec
     block_frames: int
@@ -92,8 +92,8 @@ def encode(array: NDArray[Any], *, predict: bool = True) -> bytes:
 def is_well_packed(data: bytes) -> bool:
     """Return whether valid bytes may be stored instead of the bytes that `encode` would produce for the same array.
 
-    This is so if they have the same layout as the bytes from `encode`, if every tile has a form with prediction, and if
-    they are not larger than the plain array.
+    They may be stored if they have the same layout as the bytes from `encode`, if every tile has a form with
+    prediction, and if they are not larger than the plain array.
     """
     layout, starts = _read_head(data)
     return (
@@ -156,7 +156,7 @@ def decode(
     columns: NDArray[np.intp] | None = None,
     max_bytes: int = MAX_ARRAY_BYTES,
 ) -> NDArray[Any]:
-    """Decode an array, or some frames and columns of it, reading only the tiles that contain them.
+    """Decode an array, or some of its frames and columns; only the tiles that contain the wanted values are read.
 
     `columns` are indices into all axes after the first, flattened: the result is then two-dimensional and equals
     `array.reshape(len(array), -1)[frames][:, columns]`. The result is writable and at most `max_bytes` large. Raises
@@ -265,7 +265,7 @@ def _columns_by_group(
 
 
 def _column_indices(columns: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Return `columns` with negative indices, which count from the end, made positive. Raises `IndexError`."""
+    """Return `columns` after replacing each negative index, which counts from the end. Raises `IndexError`."""
     picked = np.asarray(columns)
     if picked.ndim != 1 or (picked.size and picked.dtype.kind not in "iu"):
         raise IndexError("columns must be a one-dimensional list of integers")

@@ -29,14 +29,14 @@ MAX_LIST = 1 << 20
 MAX_VALUES = 1 << 21
 """Greatest number of values in a document that is decoded; the elements of arrays do not count."""
 FREE_LISTS = 1 << 17
-"""Number of objects and lists that a document of any size may contain; larger documents may contain more."""
+"""Number of objects and lists that every document may contain; a large document may contain more of them."""
 BYTES_PER_LIST = 6
-"""Least size in bytes of a document for each of its objects and lists, if it has more than `FREE_LISTS` of them.
+"""Least number of bytes per object or list in a document with more than `FREE_LISTS` objects and lists.
 
 Each object or list takes 70 bytes of memory.
 """
 BSON_COPIES = 8
-"""Greatest number of bytes copied per byte of a BSON document; reading it copies nested objects once for each level."""
+"""Greatest number of bytes copied per byte of a BSON document. The reader copies a nested object once per level."""
 
 ArrayForm = Literal["plain", "blocks"]
 
@@ -103,9 +103,9 @@ def decode_tree(
 
     With `keep_blocks`, arrays in the block encoding become `EncodedArray` if their bytes can be stored unchanged; they
     are decoded nevertheless, as a check. `max_bytes` limits the size of the input. `max_array_bytes` limits the total
-    size of all arrays; it is never more than `max_bytes`, which is the default. `take_bytes` is called with the size of
-    each array before the array is decoded, and may raise an error of its own. The number of values is limited, too.
-    Raises `CodecError`.
+    size of all arrays; its default and its upper bound are `max_bytes`. `take_bytes` is called with the size of each
+    array before the array is decoded, and may raise an error of its own. The number of values is limited, too. Raises
+    `CodecError`.
     """
     _require_media_type(media_type)
     if len(data) > max_bytes:

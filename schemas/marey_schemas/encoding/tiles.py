@@ -51,7 +51,8 @@ def pack_raw(tile: NDArray[Any], level: int = FASTEST) -> bytes:
 def unpack(data: bytes | memoryview, dtype: np.dtype[Any], frames: int, columns: int) -> NDArray[Any]:
     """Return the (frames, columns) array of a tile.
 
-    Raises `TileError` for bytes that are not such a tile, before it allocates more memory than the tile needs.
+    Raises `TileError` for bytes that are not a tile of this dtype and size. The function never allocates more memory
+    than the tile needs.
     """
     try:
         size = zstandard.frame_content_size(data)
@@ -125,7 +126,7 @@ class _Sections:
 
 
 def _to_integers(channels: NDArray[Any]) -> Integers:
-    """Return the values as unsigned integers; the integers of floats, read as signed ones, sort like the floats."""
+    """Return the values as unsigned integers; the integers of floats, read as signed integers, sort like the floats."""
     bits = channels.view(f"<u{channels.dtype.itemsize}")
     return _order(bits) if channels.dtype.kind == "f" else bits
 

@@ -13,7 +13,7 @@ CostMethod = Literal["turned", "plain"]
 
 MEDOID = "medoid"
 NEAREST_MEAN_LENGTH = "nearest_mean_length"
-"""Method that chooses as reference the clip whose length is nearest to the mean; `MEDOID` is the other method."""
+"""Choice of the reference: the clip whose length is nearest to the mean length; `MEDOID` is the other choice."""
 
 _Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 

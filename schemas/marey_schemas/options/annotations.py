@@ -49,7 +49,10 @@ class _Proposal(Tagged):
 
 
 class StepsProposal(_Proposal):
-    """Steps of a walk or run, from the contact of one foot to that of the other, named after the foot that swings."""
+    """Steps of a walk or run: each lasts from the contact of one foot to the contact of the other foot.
+
+    A step is named after the foot that swings.
+    """
 
     method: Literal["steps"] = Field("steps", description="Name of the method that proposes segments and keyframes.")
     contact_speed_m_s: float = Field(

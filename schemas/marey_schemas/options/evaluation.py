@@ -59,7 +59,11 @@ class EvaluationOptions(Grid):
         description="Kinds of trials. circle: a circle at constant speed; switching: the speed changes on the circle.",
     )
     approach_s: float = Field(
-        3.0, ge=0, le=60, allow_inf_nan=False, description="Seconds straight ahead before the circle."
+        3.0,
+        ge=0,
+        le=60,
+        allow_inf_nan=False,
+        description="Duration of the approach in seconds: the straight path before the circle.",
     )
     duration_s: float = Field(
         30.0, ge=1, le=600, allow_inf_nan=False, description="Duration of the circle in seconds, after the approach."

@@ -41,7 +41,7 @@ class SuggestionOptions(ObjectiveChoice):
         10,
         ge=0,
         le=1000,
-        description="Number of clips whose removal is planned, in addition to that of the unused clips; 0: none.",
+        description="Number of clips whose removal is planned, in addition to the unused clips; 0: none.",
     )
     consider: int | None = Field(
         50,
@@ -103,6 +103,6 @@ class SweepOptions(ObjectiveChoice):
         (0.5, 2.0),
         min_length=1,
         max_length=20,
-        description="Factors; the weight of each group of features is multiplied by each of them, with all "
-        "other weights unchanged.",
+        description="Factors to try. Each setting multiplies the weight of one group of features by one factor and "
+        "leaves all other weights unchanged.",
     )

@@ -23,7 +23,7 @@ _OF_GROUP = "Weight of the {} in the cost of a match; 0 leaves it out."
 
 
 class FeatureWeights(Options):
-    """Weight of each group of features in the cost of a match, in the order of the features."""
+    """Weights of the groups of features in the cost of a match; the fields have the order of the features."""
 
     left_foot_position: _Weight = Field(0.75, description=_OF_GROUP.format("position of the left foot"))
     right_foot_position: _Weight = Field(0.75, description=_OF_GROUP.format("position of the right foot"))
@@ -41,7 +41,7 @@ class DatabaseOptions(Options):
     """Options of the conversion of clips to a database for motion matching."""
 
     mirroring: Mirroring = Field(
-        "none", description="add: a mirrored copy of every clip beside it; only: the mirrored copies alone."
+        "none", description="add: every clip and its mirrored copy; only: the mirrored copies alone."
     )
     end_policy: EndPolicy = Field(
         "clamp",
@@ -59,13 +59,13 @@ class DatabaseOptions(Options):
         (1 / 3, 2 / 3, 1.0),
         min_length=1,
         max_length=8,
-        description="Times ahead at which trajectories are compared, in seconds, increasing.",
+        description="Times after the current frame at which trajectories are compared, in seconds, increasing.",
     )
     extra_joints: tuple[Annotated[str, StringConstraints(min_length=1, max_length=64)], ...] = Field(
         (),
         max_length=16,
-        description="Standard joints to match in addition to feet and hips; with many of them the trajectory "
-        "has too little weight.",
+        description="Standard joints to match in addition to feet and hips; with many joints the trajectory has too "
+        "little weight.",
     )
     rate_hz: float = Field(
         TICK_RATE_HZ,
@@ -108,8 +108,8 @@ class ControllerOptions(Options):
 
     follow: Follow = Field(
         "time",
-        description="Desired trajectory of the character. time: the reference at the same time; path: the "
-        "reference from its nearest point on; open_loop: only its speed and turn rate.",
+        description="Desired trajectory of the character. time: the reference at the same time; path: the reference, "
+        "beginning at the point nearest to the character; open_loop: only the speed and turn rate of the reference.",
     )
     search_every_s: float = Field(0.1, gt=0, le=2, allow_inf_nan=False, description="Seconds between two searches.")
     continuing_bias: float = Field(
@@ -117,10 +117,14 @@ class ControllerOptions(Options):
         ge=-1000,
         le=1000,
         allow_inf_nan=False,
-        description="Value added to the cost of continuing the current clip; negative values favour it.",
+        description="Value added to the cost of continuing the current clip; negative values favour continuing.",
     )
     switch_margin: float = Field(
-        1e-4, ge=0, le=1000, allow_inf_nan=False, description="Least gain in cost for which the controller switches."
+        1e-4,
+        ge=0,
+        le=1000,
+        allow_inf_nan=False,
+        description="Least reduction of the cost that makes the controller switch.",
     )
     reselect_window_s: float = Field(
         0.0,
@@ -149,8 +153,8 @@ class ControllerOptions(Options):
         ge=0,
         le=1,
         allow_inf_nan=False,
-        description="Share of the distance to the reference per second by which the character is pulled to "
-        "it; this hides tracking errors.",
+        description="Rate, per second, at which the character is pulled to the reference: within a second, the "
+        "distance shrinks by the factor exp(-rate). This hides tracking errors.",
     )
     root_clamp_m: float | None = Field(
         None,

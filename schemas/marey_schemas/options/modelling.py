@@ -74,7 +74,7 @@ class ModelOptions(MixtureOptions):
     temporal_share: _Share = Field(0.99, description="Share of the variance that the temporal components explain.")
     most_temporal_components: int = Field(3, ge=0, le=1000, description="Greatest number of temporal components.")
     temporal_coefficients: int = Field(
-        8, ge=4, le=1000, description="Number of coefficients of the time function's spline."
+        8, ge=4, le=1000, description="Number of coefficients of the spline of the temporal function (the time warp)."
     )
     temporal_weight: float | None = Field(
         None,

@@ -39,16 +39,16 @@ class TransitionOptions(Options):
     joints: tuple[JointName, ...] = Field(
         ("left_wrist", "right_wrist", "left_ankle", "right_ankle"),
         max_length=256,
-        description="Standard names of the joints that should not jump between motions; joints that a skeleton of any "
-        "motion lacks are ignored.",
+        description="Standard names of the joints that should not jump between motions; joints that the skeleton of "
+        "one of the motions lacks are ignored.",
     )
     tolerance_m: float = Field(
         TRANSITION_TOLERANCE_M,
         ge=1e-5,
         le=1e4,
         allow_inf_nan=False,
-        description="Distance, in metres, by which joints and the height of the pelvis may jump between two motions; "
-        "it counts as an error of 1.",
+        description="Size of a jump between two motions that counts as an error of 1, in metres; jumps of joints and "
+        "of the height of the pelvis are measured.",
     )
     weight: float = Field(
         1.0,

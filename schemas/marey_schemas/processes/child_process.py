@@ -28,14 +28,14 @@ READY_S = 300.0
 """Longest wait in seconds for `READY`; after an installation, the child may have to compile its modules first."""
 TERMINATE_S = 10.0
 WAIT_EVERY_S = 0.005
-"""Time in seconds between two checks whether a process has ended, while this process waits for its end."""
+"""Seconds between two checks whether the child process has ended, while the parent waits for its end."""
 MOST_MESSAGE_BYTES = 1 << 30
 ONE_DESCRIPTOR = b"\x01"
-"""Number of descriptors in a message, as `multiprocessing.reduction.recv_handle` expects it."""
+"""Message that says that one descriptor is passed, in the form that `multiprocessing.reduction.recv_handle` expects."""
 
 
 class ChildBroken(Exception):
-    """Child process that ended before it was ready; `status` is its exit status, a negative number for a signal."""
+    """A child process ended before it was ready; `status` is its exit status, a negative number for a signal."""
 
     def __init__(self, status: int) -> None:
         super().__init__(f"a child process ended with status {status} before it was ready; its log says why")
@@ -47,7 +47,7 @@ class BadMessage(Exception):
 
 
 class ConnectedChild(ABC):
-    """Process in its own session, with which this process exchanges messages through a socket.
+    """Child process in a session of its own; parent and child exchange messages through a socket.
 
     Only one thread may receive messages, kill the process and close it; other threads may send messages and abort it.
     """
@@ -103,7 +103,7 @@ class ConnectedChild(ABC):
     def send_socket(self, message: bytes, passed: socket.socket) -> None:
         """Send a message and then a socket, which the child receives by `recv_handle`.
 
-        If that fails, the child is killed, because it would wait for the socket; the next `receive` reports its end.
+        If sending fails, the child is killed, because it would wait for the socket; the next `receive` reports its end.
         """
         with self._sending:
             try:
@@ -136,7 +136,8 @@ class ConnectedChild(ABC):
     def _close(self) -> None:
         """Close the pipe and the socket, once no other thread is sending a message.
 
-        Otherwise, the system could give the descriptor of the pipe to a new file while that thread still writes to it.
+        Otherwise, the system could give the descriptor of the pipe to a new file while another thread still writes to
+        the descriptor.
         """
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)  # ends a `send` that waits for room

@@ -5,8 +5,8 @@ child is ready in milliseconds and shares this memory. The fork server has only 
 threads hold would stay locked in its children for ever. It never reads the messages from the parent to a child.
 
 The parent sends `FORK`, followed by a socket for the new child. The fork server answers with the process id of the
-child and `STARTED`. When the child has ended, the fork server sends the process id with the exit status. The parent
-sends the process id back when it will not signal the child any more; until then, no other process gets this id.
+child and `STARTED`. When the child has ended, the fork server sends the process id with the exit status. When the
+parent will not signal the child any more, it sends the process id back; until then, no other process gets this id.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class ForkServer:
     def wait_until_ready(self) -> None:
         """Start the fork server, and wait until it has loaded its modules.
 
-        Raises `ChildBroken` if the fork server ends before, and `OSError` if the system cannot start it.
+        Raises `ChildBroken` if the fork server ends before that, and `OSError` if the system cannot start it.
         """
         self._watching.start()
         if (error := self._launched.get()) is not None:
@@ -139,7 +139,7 @@ class ForkServer:
             self._watching.join()
 
     def _watch(self) -> None:
-        """Start the fork server, receive process ids and exit statuses of children, and reap the server at its end."""
+        """Start the fork server, receive process ids and exit statuses of children, and finally reap the server."""
         module, arguments = self._command
         try:
             process = self._process = ChildProcess(module, arguments, threads=1, at_most=True)

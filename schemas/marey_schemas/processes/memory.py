@@ -11,7 +11,7 @@ import ctypes
 KEPT_BLOCK_BYTES = 20 * 2**20
 """Size in bytes above which freed blocks are returned to the system at once; writing a clip as JSON takes 17 MB."""
 KEPT_BYTES = 32 * 2**20
-"""Number of free bytes at the end of a heap above which glibc returns them; each thread has its own heap."""
+"""Number of free bytes at the end of a heap above which glibc returns them to the system; each thread has a heap."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
 
 

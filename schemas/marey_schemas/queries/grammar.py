@@ -1,7 +1,7 @@
 """Queries that select clips and other items, such as `subject = 02 and frames > 120 and not warning = foot-slide`.
 
 `parse` turns the text of a query into conditions over the fields in `FIELDS`. Every condition is either true or false
-for an item: one about a value that the item does not have is false, and its negation is true.
+for an item. A condition about a value that the item does not have is false, and the negation of this condition is true.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class QueryError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """Comparison of a field with values, of which one must match; `has` has no values.
+    """Comparison of a field with values, at least one of which must match; the operator `has` takes no values.
 
     Values are numbers for fields of the type `number`, and texts for the type `text`. For the type `date`, they are
     dates, or times with a time zone.

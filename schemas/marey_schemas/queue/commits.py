@@ -1,4 +1,4 @@
-"""Commits of job outputs to datasets: the fields of a submission that request one, and the result in a job."""
+"""Commits of job outputs to datasets: the request in the submission of a job, and the result in the job."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from marey_schemas.datasets.naming import MAIN, DatasetName, RefName
 from marey_schemas.names import CollectionPath, Message
 
 MOST_COMMITTED = 200_000
-"""Greatest number of entries that the commit of one job adds, changes or removes. It limits the memory needed."""
+"""Greatest number of entries that the commit of one job adds, changes or removes; this bounds the memory needed."""
 MOST_COMMITTED_AT_ONCE = 10_000
 """Greatest number of outputs whose commit is computed in the transaction that publishes them.
 
@@ -31,19 +31,20 @@ class OutputsCommit(Request):
     branch: RefName = MAIN
     folder: CollectionPath | None = Field(
         None,
-        description="Folder of the dataset that receives the outputs, with their paths relative to `into`; null: the "
-        "outputs get the paths that they have in the project, relative to the dataset's folder if they are in it.",
+        description="Folder of the dataset that receives the outputs; the paths of the outputs below this folder are "
+        "their paths below `into`. Null: the outputs get the paths that they have in the project; for outputs in the "
+        "dataset's folder, the paths relative to that folder.",
     )
     message: Message = Field("", description="Message of the commit; empty: the kind and the id of the job.")
     replace: bool = Field(
         False,
-        description="Also remove the entries that the folder has from earlier and that this job does not make again, "
-        "if they are of the kinds that the job makes.",
+        description="Also remove earlier entries of the folder that this job does not make again; only entries of the "
+        "kinds that the job makes are removed.",
     )
 
     @classmethod
     def at(cls, place: str, **fields: Any) -> OutputsCommit:
-        """Return the commit to a place that is written `dataset[@branch][/folder]`. Raises `ValueError`."""
+        """Return the commit to a place that is given as `dataset[@branch][/folder]`. Raises `ValueError`."""
         match = _PLACE.fullmatch(place.strip())
         if match is None:
             raise ValueError(f"{place!r} names no branch of a dataset; write dataset[@branch][/folder]")
@@ -83,7 +84,9 @@ class CommitConflict(Answer):
 
     code: Literal["paths-changed", "too-many-changes", "path-too-long", "too-many-refs"]
     detail: str
-    branch: str | None = Field(None, description="Branch that has the outputs instead; null: they are in no commit.")
+    branch: str | None = Field(
+        None, description="Branch that has the outputs instead; null: the outputs are in no commit."
+    )
     paths: tuple[str, ...] = Field((), description=f"Paths in conflict, at most {MOST_LISTED}.")
     count: int = Field(0, description="Number of paths in conflict.")
 
@@ -97,8 +100,8 @@ class JobCommit(Answer):
     message: str
     replace: bool
     base: str | None = Field(
-        description="Newest commit of the branch when the inputs of the job were fixed: what others change later is "
-        "not overwritten."
+        description="Newest commit of the branch when the inputs of the job were fixed; changes that others make later "
+        "are not overwritten."
     )
     digest: str | None = Field(
         None, description="Commit that has the outputs; null before the end of the job, and if no entry changed."

@@ -33,7 +33,7 @@ class ItemFacets(Request):
 
 
 def require_facet_names(kind: str, names: Collection[str]) -> None:
-    """Raise `ValueError` if the job kind `kind` declares too many facets, or one whose name queries cannot contain."""
+    """Raise `ValueError` if the job kind `kind` declares too many facets, or a name that a query cannot contain."""
     if len(names) > MOST_FACETS or not all(re.fullmatch(_NAME_PATTERN, name) for name in names):
         raise ValueError(
             f"job kind {kind}: declare at most {MOST_FACETS} facets, with names of at most 64 lower-case letters, "

@@ -52,8 +52,9 @@ class KindDeclaration:
     Some jobs never reuse results. A kind declares them with these fields:
 
     * `never_cached_for`: function of the parameters, which returns whether the job looks up names while it runs.
-    * `never_cached_without`: inputs. If a job lacks one of them, it looks up names while it runs.
-    * `in_place`: parameter. If it is true, results replace their sources, if these are still the newest revisions.
+    * `never_cached_without`: inputs. If one of these inputs is not given, the job looks up names while it runs.
+    * `in_place`: parameter. If it is true, each result replaces its source, provided that the source is still the
+      newest revision.
 
     `facets` contains the meaning of each facet, a number that the job publishes about its inputs, by name.
 
@@ -61,10 +62,10 @@ class KindDeclaration:
     `suffix` is appended to the names. `unclear_place` is a function of the parameters and a collection; it returns why
     these do not determine the place of the results, or None if they do.
 
-    `exports` is the input whose clips the job writes to files. Its parameters then extend `ConsentOverride`. The job
-    must refuse the clips of this input that have `consent_ended`, unless `allow_expired_consent` is true, and list the
-    ids of all of them as `consent_ended` in its result. The results of an identical job are reused only if the consent
-    has ended for the same clips.
+    `exports` is the input whose clips the job writes to files. Its parameters then extend `ConsentOverride`. Unless
+    `allow_expired_consent` is true, the job must refuse the clips of this input that have `consent_ended`. In any case,
+    it must list the ids of these clips as `consent_ended` in its result. The results of an identical job are reused
+    only if the consent has ended for the same clips.
     """
 
     name: str
@@ -349,7 +350,8 @@ CUT = KindDeclaration(
             kind=Kind.CLIP,
             many=True,
             required=False,
-            description="The annotated clips at those revisions; the history of the pieces then lists them.",
+            description="The annotated clips, at the revisions to which the annotations refer. If they are given, the "
+            "history of the pieces lists them.",
         ),
     },
     outputs={"clips": Kind.CLIP, "annotations": Kind.ANNOTATION},
@@ -401,7 +403,7 @@ TREE = KindDeclaration(
     version=1,
     inputs={
         "model": InputSpec(
-            kind=Kind.MODEL, parts=("model",), description="The model that the tree is added to, as a part."
+            kind=Kind.MODEL, parts=("model",), description="The model to which the tree is added as a part."
         )
     },
     outputs={"model": Kind.MODEL},

@@ -44,7 +44,7 @@ class SuffixedResults(TaggedResults):
 
 
 MOST_EXAMPLES = 2000
-"""Greatest number of examples that are all compared with each other, including mirrored ones."""
+"""Greatest number of examples that are all compared with each other; mirrored copies count."""
 
 
 class AlignParams(AlignOptions, SuffixedResults):
@@ -130,7 +130,7 @@ class CutParams(TaggedResults):
 
 MOST_TRIALS = 2000
 MOST_SIMULATED_S = 100_000.0
-"""Greatest total duration of all trials, in seconds; the default suite has 5,346 s."""
+"""Greatest total duration of all trials, in seconds; with default options it is 5,346 s."""
 TRIALS_PER_TASK = 8
 MOST_EVALUATION_TASKS = 64
 

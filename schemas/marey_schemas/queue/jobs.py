@@ -33,7 +33,7 @@ class JobState(StrEnum):
 
 
 class FailureReason(StrEnum):
-    """Reason why a job has finally failed."""
+    """Reason why a job has failed and is not tried again."""
 
     ERROR = "error"
     TIMEOUT = "timeout"
@@ -187,7 +187,9 @@ class JobOutput(Answer):
     kind: Kind
     revision: int
     created: bool = Field(description="False if the item had the same content before.")
-    purged: bool = Field(False, description="Whether the item was deleted for good since then; its name is then empty.")
+    purged: bool = Field(
+        False, description="Whether the item has been deleted for good since the job made it; if so, `name` is empty."
+    )
     entry: str | None = Field(
         None, description="Path at which the job commits the output to a dataset; null if the job makes no commit."
     )
@@ -213,10 +215,10 @@ class Job(Answer):
     state: JobState
     params: dict[str, Any]
     inputs: dict[str, Any] = Field(
-        description="Inputs by name: items with their revisions, and the commits that they were taken from. Outputs of "
-        "a job that has not ended are given as `{job}`. If the items of an input were distributed over tasks, only "
-        "their number and their commits are given. An item that was purged since then has no name here, and the member "
-        "`purged`."
+        description="Inputs by name: items with their revisions, and the commits from which the items were taken. "
+        "Outputs of a job that has not ended are given as `{job}`. If the items of an input were distributed over "
+        "tasks, only the number of items and their commits are given. An item that has been purged since the "
+        "submission has the member `purged` and no name."
     )
     after: tuple[str, ...] = Field((), description="Jobs that must succeed before this one starts.")
     into: str

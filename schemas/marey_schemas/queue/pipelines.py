@@ -37,7 +37,7 @@ class PipelineStep(Request):
     after: tuple[StepName, ...] = Field(
         (),
         max_length=MOST_STEPS,
-        description="Steps that must succeed first, in addition to those that make its inputs.",
+        description="Steps that must succeed first, in addition to the steps that make the inputs of this step.",
     )
 
     into: CollectionPath | None = None
@@ -116,7 +116,7 @@ def order_steps(pipeline: PipelineCreate) -> tuple[str, ...]:
 
 
 def job_of_step(pipeline: PipelineCreate, name: str, ids: Mapping[str, str]) -> JobCreate:
-    """Return the job request of a step; `ids` maps each step that it depends on to the id of that step's job."""
+    """Return the job request of a step; `ids` contains the job ids of the steps on which it depends, by step name."""
     step = pipeline.steps[name]
 
     def resolved(choice: StepInput) -> JobInput:

@@ -14,7 +14,7 @@ from marey_schemas.queue.facets import MOST_MEASURED, ItemFacets
 from marey_schemas.queue.jobs import ItemInput, JobOutput, JobState, Progress, Resources
 
 FAULT_VARIABLE = "MAREY_FAULT"
-"""Environment variable by which tests make a server or worker fail at a named place."""
+"""Environment variable with which tests make a server or worker fail at a named point."""
 
 PROTOCOL_VERSION = 1
 """Version of the worker protocol; sent with every claim."""
@@ -64,8 +64,8 @@ class PinnedInput(Answer):
     def folder(self) -> str:
         """The path of the folder below the job's `into` in which results of this input are stored.
 
-        It is the path of the input's folder in the project, or, if the input was given as an output of another job, the
-        path below the `into` of that job.
+        This is the path of the input's folder in the project. If the input was given as an output of another job, it is
+        the folder's path below the `into` of that job.
         """
         return self.collection if self.below is None else self.below
 
@@ -80,7 +80,7 @@ class PinnedInput(Answer):
         return RevisionRef(item=self.item, revision=self.revision)
 
     def as_input(self) -> ItemInput:
-        """Return the input in the form in which the record of a result's origin lists it."""
+        """Return the input in the form that is used in the record of the origin of a result."""
         return ItemInput(item=self.item, revision=self.revision)
 
 
@@ -159,7 +159,7 @@ class StageRequest(Request):
         (),
         max_length=MOST_MEASURED,
         description="Numbers about inputs of the job, and about clips of evaluations among the inputs. They replace "
-        "those of an earlier request.",
+        "the numbers of an earlier request.",
     )
 
     @model_validator(mode="after")

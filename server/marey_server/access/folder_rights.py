@@ -1,8 +1,8 @@
 """Rights of one user in the folders of a project: the user's role in the project, and the overrides of folders.
 
 An override gives a member, or all members, another role in a folder and everything below it. The nearest folder with an
-override counts; there, an override for the member takes precedence over one for all members. Overrides limit or extend
-who may write, not who may read: every member may read the whole project.
+override counts; in one folder, an override for the member takes precedence over an override for all members. Overrides
+limit or extend who may write, not who may read: every member may read the whole project.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ class FolderRoleProblem(ForbiddenProblem):
 class FolderRights:
     """Role of a user in a project, and in the folders that have overrides for this user.
 
-    `overrides` has a mapping under the key None, for folders that are not deleted, and one for each time at which
-    folders were deleted. Each mapping contains the role of the user in a folder, by the path of the folder. It is empty
-    for users without overrides, such as owners.
+    `overrides` has the key None for folders that are not deleted, and one key for each time at which folders were
+    deleted. Each value maps the path of a folder to the user's role in the folder. `overrides` is empty for users
+    without overrides, such as owners.
     """
 
     project: str
@@ -38,11 +38,11 @@ class FolderRights:
     overrides: Mapping[FolderState, Mapping[str, Role]] = field(default_factory=dict)
 
     def role_in(self, path: str, deleted_us: FolderState = None) -> Role:
-        """Return the role in the folder `path`; `deleted_us` is the time at which a deleted folder was deleted.
+        """Return the role in the folder `path`; `deleted_us` is the time at which the folder was deleted, if it was.
 
         The folders above a deleted folder may have been deleted later, and new folders may have been created at their
-        paths. So two roles are looked up, with the overrides of deleted folders only and with those of all folders at
-        these paths, and the lower one counts.
+        paths. So two roles are computed: one from the overrides of deleted folders only, and one from the overrides of
+        all folders at these paths. The lower role is returned.
         """
         existing = self.overrides.get(None, {})
         if deleted_us is None:
@@ -58,7 +58,7 @@ class FolderRights:
             raise self._refusal(path, needed, held)
 
     def require_below(self, path: str, needed: Role) -> None:
-        """Raise `FolderRoleProblem` unless the role is at least `needed` in a folder and all folders below it."""
+        """Raise `FolderRoleProblem` unless the role in `path` and in every folder below `path` is at least `needed`."""
         self.require(path, needed)
         below = f"{path}/" if path else ""
         for folder, held in sorted(self.overrides.get(None, {}).items()):
@@ -68,17 +68,18 @@ class FolderRights:
     def require_entry(self, path: str, needed: Role) -> None:
         """Raise `FolderRoleProblem` unless the folder at `path` may be moved or deleted.
 
-        The role must be at least `needed` in this folder, in all folders below it, and in the folder above it.
-        Otherwise a user with a role in one folder only could move this folder to another place.
+        The role must be at least `needed` in this folder, in all folders below it, and in its parent folder. Without
+        the check of the parent folder, a user with a role in this folder only could move the folder to another place.
         """
         self.require(path.rpartition("/")[0], needed)
         self.require_below(path, needed)
 
     def require_restoration(self, path: str, deleted_us: FolderState) -> None:
-        """Raise `FolderRoleProblem` unless an item of the folder `path`, deleted at `deleted_us`, may be restored.
+        """Raise `FolderRoleProblem` unless an item of the folder `path` may be restored.
 
-        If the folder is deleted, the item is restored into another folder at this path, to which the overrides of the
-        deleted folder do not apply. So the role must suffice in both folders.
+        `deleted_us` is the time at which the folder was deleted, or None. If the folder is deleted, the item is
+        restored into another folder at this path, to which the overrides of the deleted folder do not apply. So the
+        role must suffice in both folders.
         """
         for state in (deleted_us, None):
             self.require(path, Role.MAINTAINER, state)
@@ -99,7 +100,7 @@ class FolderRights:
 
 
 def _nearest(path: str, overrides: Sequence[Mapping[str, Role]]) -> Role | None:
-    """Return the lowest override of the folder `path`, or else of the nearest folder above; None if there is none."""
+    """Return the lowest override of the folder `path`, or of the nearest folder above it with an override, or None."""
     for folder in with_ancestors(path):
         found = [roles[folder] for roles in overrides if folder in roles]
         if found:

@@ -1,4 +1,4 @@
-"""Labels of jobs and workers, stored as one indexed text."""
+"""Labels of jobs and workers: all labels of a job are stored as one indexed text."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def labels_key(labels: Mapping[str, str]) -> str:
 
 
 def keys_within(labels: Mapping[str, str]) -> list[str]:
-    """Return the key of every set of labels that a worker with `labels` satisfies, the empty one first."""
+    """Return the key of every set of labels that a worker with `labels` satisfies, beginning with the empty set."""
     pairs = _checked_pairs(labels)
     return [",".join(subset) for size in range(len(pairs) + 1) for subset in combinations(pairs, size)]
 
 
 def first_outside(labels: Mapping[str, str], allowed: Mapping[str, str] | None) -> str | None:
-    """Return the first label, as `name=value`, that is not among those allowed; None if there is none.
+    """Return the first label that is not allowed, as `name=value`, or None if all are allowed.
 
     `allowed` is None if every label is allowed.
     """

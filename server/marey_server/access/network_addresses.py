@@ -1,7 +1,7 @@
 """Network addresses that the server may connect to for a user: public ones, and those that the operator allows.
 
 Users give URLs to the server, so the server could be used to reach machines behind a firewall. Therefore addresses of
-private networks are refused, also if they are written in another form or embedded in an IPv6 address.
+private networks are refused, even if they are written in an unusual form or embedded in an IPv6 address.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ def hash_password(password: str) -> str:
 
 
 def password_matches(password: str, stored: str | None) -> bool:
-    """Return whether `password` matches the hash `stored`; if `stored` is None, return False after the same time."""
+    """Return whether `password` matches the hash `stored`; if `stored` is None, take as long and return False."""
     parsed = _parse(stored or _nobody())
     key = _derive(password, parsed.salt, parsed.log2_n, parsed.block, parsed.parallel, len(parsed.key))
     return hmac.compare_digest(key, parsed.key) and stored is not None
@@ -60,7 +60,7 @@ def _parse(stored: str) -> _Parsed:
 
 
 def _nobody() -> str:
-    """Return a hash that no password matches, so that a check for an unknown user takes as long as any other."""
+    """Return a hash that no password matches, so that checking an unknown user takes as long as a known one."""
     return "$".join(("scrypt", str(LOG2_N), str(_BLOCK), str(_PARALLEL), _text(bytes(16)), _text(bytes(_KEY_BYTES))))
 
 

@@ -30,7 +30,7 @@ class Principal:
     fence: int | None = None
     project_id: str | None = None
     token_key: bytes = field(default=b"", repr=False)
-    """Secret from which tokens of attempts and the successor of a user's token are derived; empty if there is none."""
+    """Key from which attempt tokens and the successor of the user's token are derived; empty without a user's token."""
     ended: bool = False
     labels: Mapping[str, str] | None = field(default=None, hash=False)
     """Labels that a worker with this token may announce; None if it may announce any."""

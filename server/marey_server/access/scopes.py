@@ -26,8 +26,8 @@ def exceeding(wanted: Iterable[str], held: Iterable[str]) -> list[str]:
 
 
 def projects_of(scopes: Iterable[str], *needs: str) -> set[str]:
-    """Return the names of the projects to which the scopes named in `needs` are limited.
+    """Return the names of the projects for which `scopes` include at least one of `needs`.
 
-    The set also contains an empty name if one of these scopes is for all projects.
+    A scope for all projects adds the empty name.
     """
     return {name for need, _, name in (scope.partition("!project=") for scope in scopes) if need in needs}

@@ -1,8 +1,8 @@
 """Bearer tokens as text: functions that create them, split them, and hash their secrets.
 
-`marey_<prefix>_<secret>` belongs to a user; the prefix identifies its row. `mareyjob_<secret>` belongs to an attempt of
-a job. `mareyinvite_<prefix>_<secret>` is the code of an invitation. The database stores the SHA-256 of the secret. A
-secret has 256 random bits, so a slow hash is not needed.
+`marey_<prefix>_<secret>` belongs to a user; the prefix identifies the token's row in the database. `mareyjob_<secret>`
+belongs to an attempt of a job. `mareyinvite_<prefix>_<secret>` is the code of an invitation. The database stores the
+SHA-256 of the secret. A secret has 256 random bits, so a slow hash is not needed.
 """
 
 from __future__ import annotations
@@ -90,12 +90,12 @@ def secret_matches(secret: str, secret_hash: str) -> bool:
 
 
 def split_user_token(text: str) -> tuple[str, str] | None:
-    """Return prefix and secret of a user's token, or None if `text` is not one."""
+    """Return prefix and secret of a user's token, or None if `text` is no such token."""
     return _split(text, _USER)
 
 
 def split_invitation(text: str) -> tuple[str, str] | None:
-    """Return prefix and secret of the code of an invitation, or None if `text` is not one."""
+    """Return prefix and secret of the code of an invitation, or None if `text` is no such code."""
     return _split(text, CODE_PREFIX)
 
 
@@ -107,5 +107,5 @@ def _split(text: str, start: str) -> tuple[str, str] | None:
 
 
 def attempt_secret(text: str) -> str | None:
-    """Return the secret of an attempt's token, or None if `text` is not one."""
+    """Return the secret of an attempt's token, or None if `text` is no such token."""
     return text[len(_ATTEMPT) :] or None if text.startswith(_ATTEMPT) else None

@@ -98,8 +98,8 @@ class PasswordResource(Resource):
     async def check_password(self, name: str, password: str) -> tuple[SignInTry, str | None]:
         """Count a try to sign in and check its password.
 
-        Return the try and the stored hash; None replaces the hash if the password does not match. The check takes the
-        same time for a user who does not exist. Raises `TooManyRequestsProblem` or `UnavailableProblem`.
+        Return the try and the stored hash, or the try and None if the password does not match. The check takes the same
+        time for a user who does not exist. Raises `TooManyRequestsProblem` or `UnavailableProblem`.
         """
         services = self.services
         address = limited_address(self.client_address)
@@ -217,7 +217,7 @@ class TokenResource(Resource):
 
     @writes(access=Access.USER, query=RevokeQuery)
     async def delete(self, token: str, query: RevokeQuery) -> Rendered:
-        """Revoke a token, which stops working at once; administrators may revoke the tokens of all users."""
+        """Revoke a token; it stops working at once. Administrators may revoke the tokens of all users."""
         return await self.answer(tokens.revoke_token, token, with_created=query.with_created)
 
 
@@ -231,7 +231,7 @@ class RotatedToken(Resource):
     async def post(self, token: str, body: TokenRotation) -> Rendered:
         """Replace the token of this request by a successor with the same rights and the same expiry.
 
-        The replaced token remains valid for `grace_s`. A repeated request gets the same successor.
+        The replaced token remains valid for `grace_s` seconds. A repeated request gets the same successor.
         """
         return await self.answer_with(lambda made: Reply(made, headers=WITH_SECRET), rotation.rotate_token, token, body)
 
@@ -274,7 +274,7 @@ class UserResource(PasswordResource):
 
     @reads(access=Access.USER, answer=User, etag=True)
     async def get(self, user: str) -> Rendered:
-        """Return a user. Only administrators may read other users than themselves."""
+        """Return a user. Only administrators may read users other than themselves."""
         return await self.answer(users.find_user, user)
 
     @writes(access=Access.USER, body=UserChange, answer=User, precondition="required", etag=True)
@@ -311,7 +311,7 @@ class UserResource(PasswordResource):
 
     @writes(access=Access.ADMINISTRATOR, scope="admin", precondition="required")
     async def delete(self, user: str) -> Rendered:
-        """Disable a user: the name remains on the user's work; tokens and password no longer work."""
+        """Disable a user: tokens and password become invalid; the user is still shown as author."""
         return await self.answer(users.delete_user, user, expected_rev=self.precondition.expected_rev)
 
 
@@ -323,7 +323,7 @@ class UserQuotas(Resource):
 
     @reads(access=Access.USER, answer=QuotasInUse)
     async def get(self, user: str) -> Rendered:
-        """Return the numbers of items and bytes of a user, with the limits.
+        """Return how many items and bytes a user has stored, and the limits.
 
         Only administrators may read the quotas of other users.
         """

@@ -14,7 +14,7 @@ from marey_server.motions.annotating import apply_commands, prepare_annotation
 from marey_server.store import items
 
 MOST_TRIES = 5
-"""Greatest number of attempts to apply commands sent with `If-Match: *` while other requests change the annotation."""
+"""Greatest number of times that commands with `If-Match: *` are applied while other requests change the annotation."""
 
 
 class AnnotationCommands(Resource):

@@ -50,7 +50,8 @@ class Blob(BlobSender):
     async def put(self, digest: str) -> Rendered:
         """Store bytes under their digest.
 
-        Other users can read them once a document refers to them; bytes without a reference are deleted after a day.
+        Other users can read the bytes once a document refers to them; bytes to which nothing refers are deleted after a
+        day.
         """
         with await self.receiver.finish() as spool:
             if spool.digest == digest:

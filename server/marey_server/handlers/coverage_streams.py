@@ -1,4 +1,4 @@
-"""Resources that measure coverage during a recording: they receive frames and return motions to record next.
+"""Resources that measure coverage during a recording: they receive frames, and return which motions to record next.
 
 Coverage is the number of seconds of recorded motion at each speed and turn rate. A stream is stored in a row of the
 database, which is updated before each answer. So no acknowledged frame is lost if the server crashes.
@@ -52,8 +52,8 @@ class ProjectCoverageStreams(Resource):
     async def post(self, project: str, body: CoverageStreamCreate) -> Rendered:
         """Create a stream, which measures the coverage of a recording.
 
-        The coverage is empty at first, or starts with the coverage of an evaluation. A stream that receives no frames
-        for a day is deleted; the number of streams of a project is limited.
+        The stream starts with no coverage, or with the coverage of an evaluation. A stream that receives no frames for
+        a day is deleted; the number of streams of a project is limited.
         """
         given = await self.look_up(coverage.read_given, project, body)
         order = partial(coverage.begin_order, body, given)

@@ -23,7 +23,7 @@ class EditPreviewResource(Resource):
         """Apply commands to a clip, and return some frames of the result; nothing is stored.
 
         The path parameter `kind` must be `clips`. The whole edit is computed, so the frames equal those that a job of
-        the kind `edit` would store. Edits that would take longer than some seconds are refused with 413.
+        the kind `edit` would store. Edits that would take more than a few seconds are refused with 413.
         """
         source = await self.look_up(previewing.read_preview, project, kind_of(kind), item, body)
         order = partial(previewing.preview_order, source, body, self.media.encoding)

@@ -20,7 +20,7 @@ from marey_server.store.wakeups import Listener, events_topic, wakeups
 
 KEEP_ALIVE_S = 15.0
 LOOK_AGAIN_EVERY = 4
-"""Number of keep-alive comments after which a connection reads the feed, in case a notification of events is lost."""
+"""Number of keep-alive comments after which the feed is read even without a notification, because one may be lost."""
 
 
 class EventsQuery(Request):
@@ -47,10 +47,10 @@ class Events(Resource):
         headers=("Last-Event-ID",),
     )
     async def get(self, project: str, query: EventsQuery) -> Reply | None:
-        """Return events in the order of their commits; as text/event-stream, also events that occur later.
+        """Return events in the order of their commits; as text/event-stream, also send events that occur later.
 
-        If events after `after` were deleted because they are old, the answer is 410 (`events-deleted`), and `context`
-        contains the number after which the remaining events begin.
+        If events that follow the event `after` were deleted because of their age, the answer is 410 (`events-deleted`),
+        and `context` contains the number after which the remaining events begin.
         """
         after = self._last_received(query)
         await self.services.number_events()

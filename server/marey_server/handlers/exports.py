@@ -50,13 +50,14 @@ class ExportQuery(ConsentOverride):
     )
     part: Literal["model", "tree", "alignment"] | None = Field(
         None,
-        description="Part to export. For models: `tree`. For aligned clips in the predecessor's format: the "
-        "time function and the sections. Absent: the model or the clip itself.",
+        description="Part to export. For models: `tree`. For aligned clips in the predecessor's format: `alignment`, "
+        "which contains the source frame at each canonical frame, and the sections. Absent: the model or the clip "
+        "itself.",
     )
     layout: Literal["2", "3"] | None = Field(
         None,
-        description="For models in the predecessor's format: version of the layout; absent: the layout of the file "
-        "from which an unchanged model was imported; otherwise 3.",
+        description="For models in the predecessor's format: version of the layout. Absent: the imported file, if the "
+        "model was not changed since; otherwise layout 3.",
     )
     time: ExportTime = Field(
         "canonical",
@@ -83,12 +84,12 @@ class Export(BlobSender):
         """Return an item as a file; if it was imported from a file, the original can be returned.
 
         Clips and aligned clips can be returned as bvh, npz, predecessor and json. Annotations, models with their trees,
-        and graphs can be returned as predecessor and json; items of other kinds only as json. The formats called
-        predecessor are those of Marey's predecessor: an unchanged item that was imported from such a file is returned
-        as that file.
+        and graphs can be returned as predecessor and json; items of other kinds only as json. The format `predecessor`
+        stands for the file formats of Marey's predecessor. A model, tree or graph that was imported from such a file
+        and not changed since is returned as this file, unless `layout` is given.
 
-        If the consent for a clip has ended, the export is refused (409, `consent-expired`). The last day of the
-        consent is in the take record of the clip's newest revision; for an aligned clip, in that of its source clip.
+        If the consent for a clip has ended, the export is refused (409, `consent-expired`). The last day of the consent
+        is in the take record of the clip's newest revision; an aligned clip has the consent of its source clip.
         Maintainers can allow the export with `allow_expired_consent` and a reason.
         """
         place = (project, kind_of(kind), item, query.revision)

@@ -20,7 +20,7 @@ class FolderRolesQuery(PageQuery):
     user: str | None = Field(
         None,
         max_length=64,
-        description="List only the roles of this member; `*` lists only those of all members together.",
+        description="List only the roles of this member; `*`: only the roles that are given to all members together.",
     )
 
 
@@ -32,7 +32,7 @@ class ProjectFolderRoles(Resource):
 
     @reads(access=Access.READER, query=FolderRolesQuery, answer=FolderRole, paged=True, public=False)
     async def get(self, project: str, query: FolderRolesQuery) -> Rendered:
-        """List the roles that members have in single folders instead of their role in the project."""
+        """List the roles in folders, which replace the members' roles in the project."""
         return await self.answer(
             managing.list_folder_roles,
             project,
@@ -58,9 +58,10 @@ class FolderRoleResource(Resource):
     async def put(self, project: str, collection: str, user: str, body: FolderRoleChange) -> Rendered:
         """Set the role of a member in a folder and everything below it.
 
-        The role may be higher or lower than that in the project. It concerns changes only: every member may read the
-        whole project. The role in the nearest folder that has one applies; in the same folder, a role for the member
-        takes precedence over the role for all members (user `*`). Owners have all rights in all folders.
+        The role in the folder may be higher or lower than the role in the project. The role in the folder concerns
+        changes only: every member may read the whole project. If several folders on a path have roles, the role of the
+        lowest of these folders applies. In one folder, a role for the member takes precedence over the role for all
+        members (user `*`). Owners have all rights in all folders.
         """
         believed = self.precondition
         return await self.answer(
@@ -75,7 +76,7 @@ class FolderRoleResource(Resource):
 
     @writes(access=Access.OWNER, precondition="required")
     async def delete(self, project: str, collection: str, user: str) -> Rendered:
-        """Remove the role of a member in a folder; the roles in the folders above it, or in the project, then apply."""
+        """Remove the role of a member in a folder; then the role in a folder above, or else in the project, applies."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(managing.remove_folder_role, project, collection, user, expected_rev=expected_rev)
 

@@ -44,7 +44,8 @@ class Readyz(Resource):
         """Return whether the server is ready for requests.
 
         It is ready if the database is reachable and has the current schema, there is space for blobs, and the server is
-        not stopping. If it is not ready, the log gives the reason, and so does the answer to an administrator.
+        not stopping. If the server is not ready, the log gives the reason; the answer gives the reason only to
+        administrators.
         """
         if self.services.draining.is_set():
             raise UnavailableProblem(

@@ -92,7 +92,7 @@ class ProjectImports(Resource):
             self._field = None
 
     async def _take_file(self, name: str, receiver: Receiver) -> None:
-        """Keep a received file in memory; files beyond the limit of a request are stored as blobs for an import job."""
+        """Keep a received file in memory, or store it as a blob if the request is too large for an immediate import."""
         spool = await receiver.finish()
         file = SourceFile(name, spool.digest, spool.size_bytes, spool)
         if self._is_large([*self.files, file]):
@@ -119,7 +119,7 @@ class ProjectImports(Resource):
         in_folders=True,
     )
     async def post(self, project: str) -> Reply:
-        """Import motion files; the answer has one entry for each file, and a faulty file does not affect others.
+        """Import motion files; the answer has one entry for each file. A faulty file does not affect the others.
 
         Send files as multipart/form-data, with the options as form fields, or name files by digest. If the project
         already has the content of a file, importing the file changes nothing. Many files, or many bytes, are imported
@@ -154,7 +154,7 @@ class ProjectImports(Resource):
         return Reply(job, status=202, location=f"/jobs/{job.id}", headers={"Retry-After": "1"})
 
     async def _import_now(self, project: str, options: ImportOptions) -> list[ImportEntry]:
-        """Read files in child processes while earlier ones are stored; return one entry for each file, in order."""
+        """Read files in child processes while earlier files are stored; return one entry for each file, in order."""
         skeleton = None
         if options.skeleton is not None:
             skeleton = await self.look_up(importing.read_skeleton, project, options.skeleton)
@@ -247,7 +247,7 @@ def _keep(tx: Transaction, project: str, spool: blobs.Spool) -> None:
 
 
 def _form_options(form: dict[str, bytearray]) -> ImportOptions:
-    """Return the options in form fields. Raises `InvalidProblem`, which names the first invalid field."""
+    """Return the options that the form fields contain. Raises `InvalidProblem`, which names the first invalid field."""
     try:
         values: dict[str, Any] = {name: value.decode() for name, value in form.items()}
     except UnicodeDecodeError:

@@ -1,6 +1,7 @@
 """Resources of invitations: of a project, of the server, and their acceptance.
 
-A code is a secret, so it is only in bodies of requests and in the answer to the request that created it.
+The code of an invitation is a secret, so only bodies of requests contain it, and the answer to the request that creates
+the invitation.
 """
 
 from __future__ import annotations

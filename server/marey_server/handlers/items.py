@@ -25,7 +25,7 @@ MAX_DOCUMENT_BYTES = 128 * MIB
 
 
 class ItemsQuery(CountedPageQuery):
-    """Query parameters of a list of items: filters, order, and the members of each item to return."""
+    """Query parameters of a list of items: filters, order, and which members of each item to return."""
 
     collection: str | None = Field(None, max_length=1024, description="Return items in this folder or below it.")
     directly_in: str | None = Field(
@@ -93,7 +93,7 @@ def kind_of(plural: str) -> Kind:
 def reply_with(found: Item) -> Reply:
     """Return the answer that shows an item.
 
-    Its ETag depends on `rev` and on the facets, because jobs publish facets without a new `rev`.
+    The ETag depends on `rev` and on the facets, because jobs can change the facets without a new `rev`.
     """
     if not found.facets:
         return Reply(found, rev=found.rev)

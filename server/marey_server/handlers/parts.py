@@ -32,7 +32,7 @@ class PartQuery(Request):
     joints: CommaSeparated | None = Field(None, description="Names of the joints to return, in the desired order.")
 
     def frame_slice(self) -> slice | None:
-        """Return the frames that the query names as a slice, or None if it names none."""
+        """Return the query's range of frames as a slice, or None if the query has no range."""
         if self.frames is None:
             return None
         start, _, stop = self.frames.partition(":")

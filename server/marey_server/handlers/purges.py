@@ -19,10 +19,10 @@ class ProjectPurges(Resource):
     async def post(self, project: str, body: PurgeRequest) -> Rendered:
         """Purge deleted items: delete their revisions, documents and names for good, or preview this.
 
-        An item that something still needs is not purged, and the answer says what holds it: versions of datasets,
-        documents of other items, jobs that have not ended. If the request names one item, the answer is then 409, with
-        the holders in `context`. Garbage collection frees the bytes later. One request examines a limited number of
-        items; send `next` of the answer as `after` to continue.
+        An item is not purged if a version of a dataset, a document of another item, or an unfinished job still needs
+        it; the answer lists these holders. If the request names only this item, the answer is 409, with the holders in
+        `context`. Garbage collection frees the bytes later. One request examines a limited number of items; send `next`
+        of the answer as `after` to continue.
         """
         if body.preview:
             return await self.render_document(Reply(await self.look_up(purging.preview_purge, project, body)))
@@ -42,7 +42,7 @@ class DatasetPurges(Resource):
 
         A version is still needed by items that a job made from it, and by unfinished jobs that read it. If there are
         such items or jobs, the answer is 409 (`still-held`), and `context` lists them. The purge does not delete the
-        items in the versions; those of them that are deleted already can be purged afterwards.
+        items in the versions; afterwards, deleted items among them can be purged.
         """
         if body.preview:
             return await self.render_document(Reply(await self.look_up(purging.preview_dataset_purge, project, body)))

@@ -58,7 +58,7 @@ class StoredFileSender(BlobSender):
     """Base of resources that answer with a file to which a document refers."""
 
     async def send_file(self, file: StoredFile, query: ReportQuery, media_type: str, sandbox: str) -> Rendered | None:
-        """Answer with the file, which a browser displays under a content security policy that contains `sandbox`."""
+        """Answer with the file; a content security policy with `sandbox` restricts browsers that display the file."""
         return await self.send_blob(
             file.blob,
             disposition="inline",
@@ -119,7 +119,7 @@ def _scripts(report: ReportDocument) -> str:
 
 
 def read_report(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ReportDocument:
-    """Return the report of an item, such as an evaluation or a model. Raises `NotFoundProblem` if it has no report."""
+    """Return the report of an evaluation or a model. Raises `NotFoundProblem` if the item has no report."""
     part: dict[str, Any] = items.read_part(tx, project, kind, item_id, "report", revision=revision, arrays="none").tree
     return _REPORT_OF[part["schema"]].model_validate(part)
 
@@ -142,7 +142,7 @@ def find_figure(report: ReportDocument, name: str, trial: str | None) -> StoredF
 
 
 def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:
-    """Return a figure's file in the requested format. Raises `NotFoundProblem` if it lacks the requested CSV table."""
+    """Return a figure's file in the requested format. Raises `NotFoundProblem` if there is no such CSV table."""
     if query.format != "csv":
         return {"png": figure.png, "svg": figure.svg, "json": figure.json_}[query.format]
     if not figure.csv:

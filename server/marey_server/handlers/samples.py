@@ -27,7 +27,7 @@ class SampleQuery(Request):
         1,
         ge=1,
         le=MOST_SAMPLES,
-        description="Number of samples; a larger number keeps the first samples of a smaller one.",
+        description="Number of samples; with a larger number, the first samples stay the same.",
     )
     seed: int = Field(
         0, ge=0, le=MOST_SEED, description="Seed of the random numbers; the same seed gives the same samples."
@@ -36,7 +36,7 @@ class SampleQuery(Request):
 
 
 class SampleFileQuery(SampleQuery):
-    """Query parameters of samples that are sent as files: those of `SampleQuery`, the file format and the unit."""
+    """Query parameters of samples that are sent as files: as in `SampleQuery`, and the file format and unit."""
 
     format: MotionFormat = Field(
         DEFAULT_FORMAT, description="File format; several files are returned in one ZIP archive."
@@ -93,7 +93,7 @@ class SampleFiles(ModelUser):
         answer_types=(*MOTION_MEDIA_TYPES, "application/zip"),
     )
     async def get(self, project: str, kind: str, item: str, query: SampleFileQuery) -> Reply:
-        """Return motions drawn from a model (kind `models`): one as a file, several as a ZIP archive of files."""
+        """Return motions drawn from a model (kind `models`): one motion as a file, several as a ZIP archive."""
         found, model = await self.found_model(project, kind, item, query.revision)
         order = SampleFileOrder(
             found=found, model=model, count=query.n, seed=query.seed, format=query.format, unit=query.unit

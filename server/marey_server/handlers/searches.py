@@ -31,7 +31,7 @@ class Searcher(ModelUser):
     """Base of resources that search models."""
 
     async def searched_models(self, project: str, kind: str, item: str, request: SearchRequest) -> SearchedModels:
-        """Return the model of each step of a search, with the documents as bytes for a child process."""
+        """Return the model of each step of a search; the models' documents are bytes for a child process."""
         found = await self.look_up(searching.find_searchables, project, kind_of(kind), item, request)
         packed: dict[str, bytes] = {}
         for one in found:
@@ -74,7 +74,7 @@ class SearchFile(Searcher):
         answer_types=MOTION_MEDIA_TYPES,
     )
     async def post(self, project: str, kind: str, item: str, query: FoundFileQuery, body: SearchRequest) -> Reply:
-        """Return the motion found by a search as one file; if the search has several steps, it contains all of them."""
+        """Return the motion found by a search as one file; the motions of several steps are joined in this file."""
         models, limits = await self.searched_models(project, kind, item, body), search_answers.search_limits()
         order = SearchFileOrder(request=body, models=models, limits=limits, format=query.format, unit=query.unit)
         file = await self.compute_apart(search_answers.WRITE_SEARCH, order.pack, ComputedFile.unpack)

@@ -1,4 +1,4 @@
-"""Resumable uploads: creation, receipt of pieces, state, and storage as blobs.
+"""Resumable uploads: how they are created, receive pieces, show their state, and are stored as blobs.
 
 Long bodies of other requests are also stored piece by piece, because one transaction for all bytes of a body would
 delay the writes of other requests.
@@ -25,7 +25,7 @@ PIECE_BYTES = MIB
 LONGEST_PAUSE_S = 0.2
 """Longest time in seconds that a piece waits for the database to process earlier writes.
 
-The wait keeps uploads from delaying other writes.
+Without this wait, uploads would delay other writes.
 """
 PAUSE_STEP_S = 0.01
 LONG_BODY_BYTES = 4 * MIB
@@ -152,7 +152,7 @@ class UploadResource(Resource):
     async def patch(self, upload: str) -> Reply:
         """Send the next piece. After the last piece, the upload becomes a blob, whose digest is returned.
 
-        If the offset is wrong, the answer is 409 with the right offset in the header Upload-Offset and in the context.
+        If the offset is wrong, the answer is 409 with the right offset in the header Upload-Offset and in `context`.
         """
         if self.piece:
             await self._append()

@@ -1,6 +1,6 @@
-"""Connections of clients: their number is limited, in total and for each address, and a connection is closed if its
-client does not read the answer. When the limit is reached, idle connections are closed in favour of new ones. If no
-file descriptor is free, new connections wait.
+"""Connections of clients: the number of connections is limited, in total and for each address. A connection is closed
+if its client does not read the answer. When a limit is reached, idle connections are closed in favour of new
+connections. If no file descriptor is free, new connections wait.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from marey_schemas.sizes import KIB
 log = logging.getLogger(__name__)
 
 RESERVED_DESCRIPTORS = 256
-"""File descriptors that are kept for the database, files and child processes."""
+"""Number of file descriptors that are kept for the database, files and child processes."""
 MOST_CONNECTIONS = 10_000
 ADDRESS_SHARE = 0.75
 """Largest share of all connections that one address may have; trusted proxies may have more."""
@@ -39,12 +39,12 @@ PAUSE_S = 0.5
 LOG_EVERY_S = 60.0
 CHECKS_PER_TIMEOUT = 4
 LEAST_TAKEN_BYTES = 64 * KIB
-"""Least number of bytes that a client must receive within each write timeout while more wait to be sent."""
+"""Number of bytes that a client with waiting answers must receive within each write timeout, to stay connected."""
 _EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
 def raise_descriptor_limit() -> None:
-    """Raise this process's limit on open files to the greatest value that it may have."""
+    """Increase this process's limit on open files to the greatest allowed value."""
     if sys.platform == "win32":
         return
     import resource
@@ -68,7 +68,7 @@ def default_connections() -> int:
 
 
 class _Connection(IOStream):
-    """Connection that counts the bytes that its client has received since a given time."""
+    """Connection that counts the bytes received by its client since the last call of `start_count`."""
 
     def __init__(
         self, accepted: socket.socket, address: str, forget: Callable[[_Connection], None], server: HTTPServer
@@ -84,7 +84,7 @@ class _Connection(IOStream):
         self._forget(self)
 
     def write(self, data: bytes | memoryview) -> asyncio.Future[None]:
-        """Write bytes, and begin to check that the client receives some of them within the time limit.
+        """Write bytes, and start a time limit within which the client must receive some of them.
 
         Returns a future that ends when all bytes are written.
         """
@@ -112,7 +112,7 @@ class Connections:
     most : greatest number of connections
     most_each : greatest number of connections of one address
     write_timeout_s : time in seconds in which a client must receive `LEAST_TAKEN_BYTES`, or all bytes that wait for it
-    busy : returns the streams on which a request is being answered; others are idle
+    busy : returns the streams on which a request is being answered; all other streams are idle
     count_closed : counts a refused or closed connection by its reason
     """
 
@@ -156,7 +156,7 @@ class Connections:
             one.close()
 
     def close(self) -> None:
-        """Stop the regular check of the connections."""
+        """Stop the regular checks for slow clients."""
         if self._check is not None:
             self._check.cancel()
 
@@ -193,7 +193,7 @@ class Connections:
         self._server.handle_stream(stream, address)
 
     def _evict(self, host: str | None) -> None:
-        """Close the oldest idle connections of the address `host`, or, if None, of the address with most idle ones."""
+        """Close the oldest idle connections of `host`, or, if None, of the address with the most idle connections."""
         busy = self._busy()
         idle = [one for one in self._open if one not in busy and not one.writing()]
         if host is None and idle:

@@ -1,4 +1,4 @@
-"""Base class of handlers that call the store, and compute in threads and child processes, on behalf of a caller."""
+"""Base class of handlers: calls the store, and computes in threads and child processes, on behalf of a caller."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CLIENT_GONE = "The client closed the connection before this was computed."
 
 
 class CallingExchange(Exchange):
-    """Exchange with a caller, whose share of threads, child processes and memory it uses."""
+    """Exchange that uses threads, child processes and memory from its caller's share."""
 
     operation: Operation
     caller: Caller
@@ -123,7 +123,7 @@ class CallingExchange(Exchange):
 
     @property
     def _child_user(self) -> str:
-        """User whose share of child processes this request uses; callers without a user have one share together."""
+        """User whose share of child processes this request uses; all callers without a user have one common share."""
         user = self.principal.user_id if self.principal is not None else None
         return user or UNKNOWN_CLIENTS
 

@@ -40,7 +40,7 @@ class Caller:
     principal: Principal | None = None
 
     def identify(self, tx: Transaction) -> None:
-        """Find the principal of the credential, check its access to the operation, and give it to the transaction.
+        """Find the credential's principal, check whether it may perform the operation, and set `tx.principal`.
 
         The store enforces the role that the operation declares. Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
         """
@@ -60,7 +60,7 @@ class Caller:
 
 @dataclass(frozen=True, slots=True)
 class BodyTarget:
-    """Target of a request with a body: a project (its name), or an attempt (the id of the job, and the fence).
+    """Target of a request with a body: the name of a project, or an attempt, given by the job's id and the fence.
 
     The caller needs a role in this project, or the token of this attempt.
     """
@@ -170,8 +170,8 @@ def run_call(call: Call, tx: Transaction) -> Rendered | Reply:
 def admit(tx: Transaction, target: BodyTarget) -> None:
     """Refuse a caller who lacks the role that the operation declares for the project.
 
-    If the operation belongs to an attempt of a job, every token but that of the attempt is refused, too. The credential
-    has been checked before by `run_plain`.
+    If the operation belongs to an attempt of a job, only the token of this attempt is admitted. `run_plain` has checked
+    the credential before.
     """
     if target.project is not None:
         projects.require(tx, target.project)
@@ -199,7 +199,7 @@ def idempotency_key(headers: HTTPHeaders) -> str | None:
 
 
 def fingerprint_of(request: HTTPServerRequest, body: bytes | bytearray) -> str:
-    """Return a digest of a request; two requests with the same idempotency key must have the same digest."""
+    """Return a digest of a request, to refuse a different request with the same idempotency key."""
     digest = hashlib.sha256(f"{request.method} {request.uri}\n".encode())
     digest.update(request.headers.get("Content-Type", "").encode() + b"\n")
     digest.update(body)

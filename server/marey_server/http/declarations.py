@@ -1,7 +1,7 @@
 """Declarations of handler methods by the decorators `@reads` and `@writes`.
 
-They attach an `Operation` to a method. The checks before the method runs, the OpenAPI document, the documentation page
-and the access test are all derived from it.
+The decorators attach an `Operation` to a method. The checks before the method runs, the OpenAPI document, the
+documentation page and the access test are all derived from this `Operation`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Access(StrEnum):
 
 
 class Document:
-    """Marker of a body or an answer that is a document: a tree with arrays that names its schema."""
+    """Marker of a body or an answer that is a document: a tree with arrays, which contains the name of its schema."""
 
 
 class Bytes:
@@ -68,8 +68,8 @@ class RequestBody:
     """Body of a request: a model, a document, bytes or files.
 
     `streamed` bodies are passed to the resource piece by piece while they are received. If `results` is true, the body
-    contains results of a job. Their arrays may have up to `max_bytes` when decoded, and are stored in the encoding in
-    which they are sent, if possible.
+    contains results of a job. The arrays in these results may have up to `max_bytes` when decoded, and are stored as
+    they are sent, without decoding, if possible.
     """
 
     content: Content | type[Files]
@@ -120,7 +120,7 @@ class Operation:
 
     @property
     def stores(self) -> bool:
-        """Whether the operation stores a request body, which may need much disk space. False if it is `reserved`."""
+        """Whether the operation stores a request body and may need much disk space; false for `reserved` operations."""
         changes = self.access is Access.ATTEMPT or self.scope in ("write", "jobs")
         return changes and self.body is not None and not self.reserved
 
@@ -164,7 +164,7 @@ def reads(
     public : whether guests of a public project may use the method
     headers : request headers that the method reads
     stream : whether the answer is also available as server-sent events
-    reserved : whether the method runs in threads that no other requests occupy
+    reserved : whether the method runs in threads that are kept free for such methods
     attempts : whether running attempts of jobs may use the method
     """
     return _declare(
@@ -196,9 +196,9 @@ def writes(
 
     Parameters
     ----------
-    access : minimum access; `Access.READER` is refused, because readers may not change a project
+    access : minimum access, but not `Access.READER`, because readers may not change a project
     precondition : `required` demands If-Match; `create` demands If-Match or `If-None-Match: *`; `optional` accepts both
-    idempotency : `key` accepts Idempotency-Key; `nature` means that repeating the request has no further effect
+    idempotency : `key` accepts Idempotency-Key; `nature` means that a repeated request has no further effect
     answer, also, headers, reserved, attempts : as for `reads`
     replays : whether an ended attempt may repeat the request
     in_folders : whether members who have the role only in some folders may use the method in these folders; the

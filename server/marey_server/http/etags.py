@@ -1,9 +1,9 @@
 """Entity tags and preconditions (RFC 9110, section 13).
 
-A tag is `"<state>.<form>"`: the state of a resource and the form it was sent in. The state of a resource that can be
-changed begins with its `rev`. After a dot, it can contain the caller's role, if the answer depends on it, or a digest
-of members that change without a new `rev`. Preconditions of writes compare only the `rev`, so that a resource read as
-MessagePack can be changed with JSON.
+A tag is `"<state>.<form>"`: the state of a resource, and the form (media type) in which it was sent. If the resource
+can be changed, the state begins with the `rev` of the resource. After a dot, the state can contain the caller's role,
+if the answer depends on the role, or a digest of members that change without a new `rev`. Preconditions of writes
+compare only the `rev`, so that a resource read as MessagePack can be changed with JSON.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _REV = re.compile("[0-9]{1,9}")
 
 @dataclass(frozen=True, slots=True)
 class Precondition:
-    """Precondition of a write: one or several states, any state (`*`), or no existing resource."""
+    """Precondition of a write: the resource is in one of some states, in any state (`*`), or does not exist."""
 
     expected_rev: ExpectedRev = None
     """The `rev` that the UPDATE requires, or None."""
@@ -31,7 +31,7 @@ class Precondition:
 
 
 ANY_STATE = Precondition()
-"""Precondition that every state meets: that of `If-Match: *`, or of a request without preconditions."""
+"""Precondition that every state meets, for `If-Match: *` and for requests without preconditions."""
 
 ABSENT = Precondition(absent=True)
 """Precondition of the header `If-None-Match: *`, which allows only creation."""
@@ -75,8 +75,8 @@ def matches(if_none_match: str | None, tag: str) -> bool:
 def write_precondition(if_match: str | None, if_none_match: str | None, *, may_create: bool = False) -> Precondition:
     """Return the precondition of a write.
 
-    Raises `PreconditionRequiredProblem` if the request has none, `PreconditionFailedProblem` if no tag has the form of
-    the tags of resources, which begin with a number, and `BadRequestProblem` if the tags are malformed or too many.
+    Raises `PreconditionRequiredProblem` if the request has no precondition, `PreconditionFailedProblem` if no tag
+    begins with a number, as the tags of resources do, and `BadRequestProblem` if the tags are malformed or too many.
     """
     if if_none_match is not None and may_create:
         if if_none_match.strip() != "*":

@@ -27,9 +27,9 @@ from marey_server.process.services import Services
 LINGER_BYTES = 64 * 2**20
 """Number of bytes of a refused body that are read and discarded, so that its sender receives the answer."""
 JOINED_BYTES = 64 * KIB
-"""Size of a body above which it is sent in pieces, each after the client has received the one before."""
+"""Size above which a body is sent in pieces, each after the client has received the previous piece."""
 PIECE_BYTES = MIB
-"""Size of a piece of a body: the most that waits in a connection for its client."""
+"""Size of a piece of a body, so that at most this number of bytes waits in a connection for the client."""
 _LENGTH = re.compile("[0-9]{1,4300}")
 """Pattern of a Content-Length; the number of digits is limited because `int` refuses very long ones."""
 _SECURITY_HEADERS = {
@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 class Departure:
     """Function without arguments that returns whether the client of a request has closed the connection.
 
-    The request has a reference to this object. The object has none to the request, because only the garbage collector
+    The request refers to this object. The object does not refer to the request, because only the garbage collector
     would free such a reference cycle.
     """
 
@@ -83,7 +83,7 @@ class Exchange(RequestHandler):
 
     @property
     def client_address(self) -> str:
-        """The address of the client; behind a trusted proxy, the one that the proxy names."""
+        """The address of the client; behind a trusted proxy, the address that the proxy gives in a header."""
         settings = self.services.settings
         peer = self.request.remote_ip or ""
         named = self.request.headers.get(settings.proxy_header) if settings.trust_proxy else None
@@ -131,7 +131,7 @@ class Exchange(RequestHandler):
         await self.flush()
 
     async def refuse(self, error: ApiProblem) -> None:
-        """Answer before the body is read, then discard the body; closing the connection could lose the answer."""
+        """Answer before the body is read, then discard the body (closing the connection could lose the answer)."""
         self.refused = True
         self._write_problem(error)
         forget_origin(error)
@@ -218,7 +218,7 @@ class Exchange(RequestHandler):
         log_fault(value, self.request_id, self.request.method or "", self.template())
 
     def on_finish(self) -> None:
-        """Remove the request from those in progress after its answer was written."""
+        """Remove the request from the requests in progress after its answer was written."""
         self.services.in_flight.discard(self)
 
     def on_connection_close(self) -> None:
@@ -232,7 +232,7 @@ class Exchange(RequestHandler):
 def forwarded_address(header: str, hops: int) -> str | None:
     """Return the address that the outermost of `hops` trusted proxies appended to a header.
 
-    Returns None if the header has too few addresses.
+    Returns None if the header has too few entries, or if the entry is not an address.
     """
     entries = [entry.strip() for entry in header.split(",")]
     try:

@@ -48,9 +48,10 @@ def boundary_of(content_type: str) -> bytes:
 
 
 class MultipartReader:
-    """Splitter of a stream into parts: one `PartHead` for each, its bytes in pieces, and one `PartEnd`.
+    """Splitter of a stream into parts; each part gives one `PartHead`, its bytes in pieces, and one `PartEnd`.
 
-    `python-multipart` parses; this class limits the size of heads and the number of parts, and skips a preamble.
+    The package `python-multipart` parses the stream; this class limits the size of heads and the number of parts, and
+    skips a preamble.
     """
 
     def __init__(self, boundary: bytes, *, max_parts: int) -> None:
@@ -79,7 +80,7 @@ class MultipartReader:
         )
 
     def feed(self, data: bytes) -> list[Piece]:
-        """Return the heads, pieces and ends of parts that the next bytes complete.
+        """Parse the next bytes; return the heads, pieces and ends of parts that were found in them.
 
         Raises `BadRequestProblem` or `TooLargeProblem`.
         """
@@ -150,7 +151,7 @@ class MultipartReader:
 
 
 def _text(value: bytes) -> str:
-    """Decode a field or file name; browsers write quotation marks and line ends in it as `%22`, `%0D` and `%0A`."""
+    """Decode the name of a field or file; browsers write quotation marks and line ends as `%22`, `%0D` and `%0A`."""
     try:
         text = value.decode("utf-8")
     except UnicodeDecodeError:

@@ -68,7 +68,7 @@ class _Range:
 
 
 def choose(accept: str | None, offers: tuple[MediaType, ...]) -> MediaType:
-    """Return the offered media type that the client prefers; if it prefers several equally, the first of these.
+    """Return the offered media type that the client prefers; of several equally preferred ones, the first.
 
     Raises `NotAcceptableProblem`, which lists the offered types.
     """

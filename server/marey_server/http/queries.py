@@ -36,7 +36,7 @@ class PageQuery(Request):
 
 
 class CountedPageQuery(PageQuery):
-    """Query parameters that select one page of a list, and optionally request the number of all entries."""
+    """Query parameters that select one page of a list, and optionally ask for the number of all entries."""
 
     count: Literal["exact"] | None = Field(
         None, description="Return the length of the whole list, which is slow for long lists."

@@ -1,4 +1,4 @@
-"""Answers of handlers, and functions that encode them as bytes; these need no request and can run in any thread.
+"""Answers of handlers, and functions that encode answers as bytes; the functions can run in any thread.
 
 A reply is *settled* in its transaction, which loads the document, and *rendered*, which means encoded, after the
 transaction: encoding a long document takes longer than loading it, and other requests need the thread and the
@@ -33,7 +33,7 @@ before it takes a body from here.
 
 
 MakeTree = Callable[[], Mapping[str, Any]]
-"""Function that makes a document from loaded data; it does not use the database."""
+"""Function that makes a document from loaded data, without using the database."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +63,8 @@ Content = BaseModel | Mapping[str, Any] | bytes
 class Reply:
     """Answer of a handler: a model, a document tree, bytes with their media type, or nothing.
 
-    The ETag is made from `rev`: the `rev` of a resource, perhaps with more after a full stop. `location` is a path
-    below the API's root.
+    The ETag is made from the field `rev`, which is the `rev` of a resource, optionally followed by a full stop and more
+    text. `location` is a path below the API's root.
     """
 
     content: Content | Lasting | Loaded | None = None
@@ -76,7 +76,7 @@ class Reply:
 
 
 def with_role(content: Project | Collection) -> Reply:
-    """Return the answer with a document that shows the caller's role, which changes without its `rev`."""
+    """Return the answer for a document that shows the caller's role; the role can change without a new `rev`."""
     return Reply(content, rev=f"{content.rev}.{content.role or 'guest'}")
 
 

@@ -12,8 +12,8 @@ A resource names its `path` and declares its methods:
             return await self.answer(projects.read_project, project)
 
 A method gets the path's variables (`{fence:int}` as an int), `query` and `body` as declared. `self.answer` calls a
-function of the store with a transaction, in its own thread, and renders its result there; `self.look_up` and
-`self.change` only call it.
+function of the store with a transaction and renders the result, both in another thread; `self.look_up` and
+`self.change` only call a function.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ INLINE_BYTES = 4 * KIB
 GUEST_BODY_BYTES = 64 * KIB
 """Greatest size of a body that a caller without a token may send, such as a search in a public project."""
 ADMISSION_S = 5.0
-"""Time in seconds for which a caller who was admitted may send further bodies without another look at the database."""
+"""Time in seconds for which an admitted caller may send further bodies without another check in the database."""
 _METHODS = ("get", "post", "put", "patch", "delete")
 
 
@@ -213,7 +213,7 @@ class Resource(CallingExchange):
         return self.services.turns.take(self._client_with(token), reserved=reserved)
 
     async def _admit(self) -> None:
-        """Refuse callers who may not send the body before any of it is received or decoded.
+        """Refuse callers who may not send a body, before any of the body is received or decoded.
 
         The transaction of the request checks the caller again. Here, an earlier check of the same caller may be reused
         for `ADMISSION_S` seconds, except for results of jobs, whose bodies may be the largest.

@@ -37,7 +37,7 @@ class Route:
 
 @dataclass(slots=True)
 class _Node:
-    """Segment of a path, with the segments that may follow."""
+    """Segment of a path, with the segments that may follow it."""
 
     literals: dict[str, _Node] = field(default_factory=dict)
     variable: _Node | None = None

@@ -26,7 +26,8 @@ PIECE_BYTES = MIB
 class ByteRange:
     """Range of bytes from `first` to `last`, both included.
 
-    If `last` is None, the range ends with the last byte; if `first` is None, it consists of the final `last` bytes.
+    If `last` is None, the range ends with the last byte of the content. If `first` is None, the range consists of the
+    final `last` bytes of the content.
     """
 
     first: int | None

@@ -74,7 +74,8 @@ def decode_body(
 ) -> Any:
     """Return the tree in a body; the other arguments are those of `codecs.decode_tree`.
 
-    Raises `BadRequestProblem` if it cannot be decoded, and `InvalidProblem` if it contains values that are not allowed.
+    Raises `BadRequestProblem` if the body cannot be decoded, and `InvalidProblem` if the tree contains values that are
+    not allowed.
     """
     try:
         return codecs.decode_tree(

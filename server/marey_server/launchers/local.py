@@ -1,4 +1,4 @@
-"""Worker processes beside the server, on the same machine.
+"""Worker processes that a server starts on its own machine.
 
 A worker gets its token through a pipe to its standard input, which stays open: when the server ends, even by a crash,
 the pipe closes and the worker stops. Secrets are never passed in argument lists or environment variables. A worker gets
@@ -33,7 +33,7 @@ STOP_S = 20.0
 async def local_workers(
     count: int, *, url: str, token: str, cache: Path, log_form: LogForm, log_level: str
 ) -> AsyncIterator[None]:
-    """Keep `count` workers running while the `async with` block runs; at its end, stop them.
+    """Keep `count` workers running while the `async with` block runs; then stop the workers.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ from marey_schemas.processes.memory import keep_freed_memory
 from marey_server.errors import ApiProblem, TooLargeProblem
 
 FORK_SERVER, SINGLE = "fork-server", "single"
-"""Values of the third argument: fork children, which carry out the orders, or carry out the orders in this process."""
+"""Values of the third argument: `FORK_SERVER` forks children for the orders, `SINGLE` carries out the orders itself."""
 
 
 class Message(BaseModel):
@@ -81,7 +81,7 @@ def pack_tree(tree: Any) -> bytes:
 
 
 def unpack_tree(packed: bytes) -> Any:
-    """Decode a document, with its arrays, that `pack_tree` has encoded. Raises `TooLargeProblem` if it is too large."""
+    """Decode a document that `pack_tree` has encoded, and its arrays. Raises `TooLargeProblem` if it is too large."""
     try:
         return decode_tree(packed, MSGPACK)
     except CodecError as error:
@@ -120,7 +120,7 @@ class ChildAnswer(Message):
 
 
 def main() -> None:
-    """Load modules; then carry out the orders from the pipe until it closes, or fork children that do so."""
+    """Load modules; then carry out orders from the pipe until it closes, or fork children that carry out orders."""
     pipe = connect_to_parent()
     memory_bytes, forks, functions = int(sys.argv[2]), sys.argv[3] == FORK_SERVER, sys.argv[4:]
     keep_freed_memory()
@@ -137,7 +137,7 @@ def main() -> None:
 
 
 def carry_out_orders(pipe: Connection, *, memory_bytes: int) -> None:
-    """Call the function that each received `ChildOrder` names, and send the result or the error, until the pipe closes.
+    """For each received `ChildOrder`, call the function and send the result or the error, until the pipe closes.
 
     The functions may use `memory_bytes` more than this process uses now.
     """
@@ -152,7 +152,7 @@ def carry_out_orders(pipe: Connection, *, memory_bytes: int) -> None:
 
 
 def run(order: ChildOrder) -> bytes:
-    """Call the function that a `ChildOrder` names, and return the packed answer."""
+    """Call the function of a `ChildOrder`, and return the packed answer."""
     try:
         return _answer(order).pack()
     except MemoryError:

@@ -34,7 +34,7 @@ Tree = dict[str, Any]
 MAKE_DIFFERENCE = "marey_server.motions.comparing:make_difference"
 """Function that child processes run."""
 MOST_NUMBERS = 20_000_000
-"""Greatest number of values in the poses of both revisions; a child compares them within its processor time."""
+"""Greatest number of values in the poses of both revisions, so that a child can compare them within its time limit."""
 MOST_FIELDS = 1000
 """Greatest number of changed values in an answer."""
 
@@ -195,7 +195,7 @@ DESCRIBED: dict[str, frozenset[str]] = {
     "mapping": frozenset({"joints", "axes"}),
     "annotation": frozenset({"segments", "keyframes"}),
 }
-"""Members of parts that a difference does not list field by field, because it describes them in other ways."""
+"""Members of parts that a difference does not list field by field, but describes in other ways."""
 
 
 def _changed_fields(before: Mapping[str, Tree], after: Mapping[str, Tree]) -> list[FieldChange]:

@@ -1,4 +1,4 @@
-"""Coverage of streams of recorded frames: the seconds of motion at each speed and turn rate.
+"""Coverage of streams of recorded frames: the number of seconds of motion at each speed and turn rate.
 
 One transaction reads the row of a stream; a child process then computes the coverage.
 """
@@ -47,7 +47,7 @@ CACHED_BODIES = 32
 BEGIN_COVERAGE = "marey_server.motions.coverage:begin_coverage"
 LOOK_AT_COVERAGE = "marey_server.motions.coverage:look_at_coverage"
 ADVANCE_COVERAGE = "marey_server.motions.coverage:advance_coverage"
-"""Functions that child processes run."""
+"""Function that child processes run, like the functions above."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,9 +121,9 @@ class AdvancedStream(Message):
 
 
 def read_given(tx: Transaction, project: str, request: CoverageStreamCreate) -> Given:
-    """Return the skeleton and the evaluation that the request for a stream names, with their documents.
+    """Return the skeleton and the evaluation that a request for a stream refers to, with their documents.
 
-    Raises `NotFoundProblem` if one of them does not exist.
+    Raises `NotFoundProblem` if the skeleton or the evaluation does not exist.
     """
     projects.require(tx, project)
     skeleton = rig = evaluation = measured = None
@@ -168,8 +168,8 @@ def look_order(stream: Stream) -> bytes:
 def next_frames(held: Stream, frames: CoverageFrames) -> NextFrames | Tree:
     """Return the message that asks a child process to add the frames of a request to a stream.
 
-    If the request repeats the last one, the stored answer is returned instead. Raises `CoverageOffset` if the frames do
-    not start at the stream's offset.
+    If the request repeats the last request, the stored answer to that request is returned instead. Raises
+    `CoverageOffset` if the frames do not start at the stream's offset.
     """
     digest = _digest_of(frames)
     if (answer := answered_before(held, digest)) is not None:
@@ -196,7 +196,7 @@ def _digest_of(frames: CoverageFrames) -> str:
 
 
 def begin_coverage(packed: bytes) -> bytes:
-    """Start the stream that a packed `BeginOrder` describes; return it as a packed `BegunStream`."""
+    """Start the stream that a packed `BeginOrder` describes; return a packed `BegunStream`."""
     order = BeginOrder.unpack(packed)
     return begin(order.request, order.given()).pack()
 

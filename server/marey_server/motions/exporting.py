@@ -74,7 +74,8 @@ def find_unchanged_original(
 ) -> OriginalFile | None:
     """Return the file that a model, a tree or a graph was imported from; return None if the item was changed since.
 
-    Also return None for an item of another kind. Raises `NotFoundProblem` if the item or the revision does not exist.
+    Also return None for an item of another kind, and if `options` names a layout. Raises `NotFoundProblem` if the item
+    or the revision does not exist.
     """
     if kind not in (Kind.MODEL, Kind.GRAPH):
         return None

@@ -1,4 +1,4 @@
-"""Import of uploaded files: read and encoded in child processes, then stored, several in one transaction."""
+"""Import of uploaded files: they are read and encoded in child processes, then stored, several in one transaction."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ REFUSED_ALTOGETHER = (401, 403, 404, 499, 503, 507)
 
 READ_FILE = "marey_server.motions.reading:read_file"
 FIND_MAPPING = "marey_server.motions.reading:find_mapping"
-"""Functions that child processes run."""
+"""Function that child processes run, like the functions above."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class SourceFile:
 class PreparedImport:
     """File of an import after it was read, ready to be stored.
 
-    If there is nothing to store, `entry` is the entry of the file in the answer.
+    If there is nothing to store, `entry` is the answer's entry for the file.
     """
 
     name: str
@@ -68,7 +68,7 @@ class PreparedImport:
 
 
 def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
-    """Return the skeleton that the options of an import name. Raises `NotFoundProblem` if it does not exist."""
+    """Return the skeleton given in the options of an import. Raises `NotFoundProblem` if it does not exist."""
     with LOADING:
         from marey_motion.importing.items import GivenSkeleton
 
@@ -85,7 +85,7 @@ def plan(names: Sequence[str]) -> list[PlannedFile]:
 
 
 def planned_entry(planned: PlannedFile) -> PreparedImport | None:
-    """Return the entry of a companion file or of a file with a refused name; return None for files to be read."""
+    """Return the answer's entry for a companion file or a file with a refused name; None for a file to be read."""
     with LOADING:
         from marey_motion.importing.files import planned_entry
 
@@ -144,7 +144,7 @@ def new_skeletons(tx: Transaction, project: str, files: Sequence[PreparedImport]
 
 
 def firsts_of_skeletons(files: Sequence[PreparedImport], new: Collection[str]) -> dict[str, PreparedImport]:
-    """Return, for the digest of each new skeleton, the first file that contains the skeleton."""
+    """Return a mapping from the digest of each new skeleton to the first file that contains the skeleton."""
     firsts: dict[str, PreparedImport] = {}
     for file in files:
         for digest in new:
@@ -174,7 +174,7 @@ def found_mapping(answer: bytes) -> PreparedDocument:
 
 
 def add_mapping(files: Sequence[PreparedImport], digest: str, mapping: PreparedDocument) -> list[PreparedImport]:
-    """Add the part `mapping` to the skeleton with the given digest, in each file that contains it; return all files."""
+    """Add `mapping` to the skeleton with the given digest in each file that has this skeleton; return all files."""
 
     def with_mapping(draft: Draft) -> Draft:
         if draft.kind is not Kind.SKELETON:
@@ -188,7 +188,7 @@ def add_mapping(files: Sequence[PreparedImport], digest: str, mapping: PreparedD
 
 
 def refuse_with_skeleton(files: Sequence[PreparedImport], digest: str, error: ApiProblem) -> list[PreparedImport]:
-    """Return the files; each file that contains the skeleton with this digest is replaced by a refusal.
+    """Return the files, but with a refusal in place of each file that contains the skeleton with this digest.
 
     `error` is the reason why no joint mapping could be derived for the skeleton.
     """
@@ -221,7 +221,7 @@ def require_folder(tx: Transaction, project: str, folder: str) -> None:
 def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> list[ImportEntry]:
     """Store the original files and the items read from them; return one entry for each file.
 
-    A file that cannot be stored is refused and does not affect others.
+    A file that cannot be stored is refused and does not affect other files.
     """
     row = projects.require(tx, project)
     hold_off_purges(tx, row.id)
@@ -241,7 +241,7 @@ def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> l
 def _runs(files: Sequence[PreparedImport]) -> Iterator[list[PreparedImport]]:
     """Split files into groups of consecutive files that are stored together.
 
-    Each graph is a group of its own, because it can name models of earlier files, which must be stored first.
+    Each graph is a group of its own, because a graph can refer to models in earlier files, which must be stored first.
     """
     for is_graph, run in itertools.groupby(files, lambda file: file.graph is not None):
         if is_graph:
@@ -251,7 +251,7 @@ def _runs(files: Sequence[PreparedImport]) -> Iterator[list[PreparedImport]]:
 
 
 def _concerns_request(error: ApiProblem) -> bool:
-    """Return whether an error concerns the whole request; a missing role in a folder concerns only the files there."""
+    """Return whether an error concerns the whole request; a missing role in a folder concerns only files in it."""
     return error.status in REFUSED_ALTOGETHER and not isinstance(error, FolderRoleProblem)
 
 

@@ -1,6 +1,7 @@
 """Models from which requests draw samples.
 
-One transaction reads the documents of a model; a child process parses, caches and samples them.
+One transaction reads the documents of a model. A child process parses the documents, caches the model, and draws
+samples from it.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ if TYPE_CHECKING:  # numeric modules are loaded by children alone
 
 DRAW_SAMPLES = "marey_server.motions.models:draw_samples"
 WRITE_SAMPLES = "marey_server.motions.models:write_samples"
-"""Functions that child processes run."""
+"""Function that child processes run, like the functions above."""
 MODEL_CACHE_BYTES = 32 * MIB
 """Greatest size of a child's cache of parsed models; models with search trees have a cache of the same size."""
 LARGEST_ANSWER_BYTES = 32 * MIB
@@ -56,7 +57,7 @@ class LoadedModel:
 
 
 class PackedModel(Message):
-    """Documents of a model as bytes, with the tree and the mapping that searches use, if they exist."""
+    """Documents of a model as bytes; for searches also the search tree and the joint mapping, if these exist."""
 
     model: bytes
     hierarchy: bytes
@@ -108,7 +109,7 @@ def find_model(tx: Transaction, project: str, kind: Kind, item_id: str, revision
 
 
 def load_model(tx: Transaction, project: str, found: FoundModel) -> LoadedModel:
-    """Read the model's documents, with encoded arrays. Raises `NotFoundProblem` if its skeleton was deleted."""
+    """Read the model's documents, with encoded arrays. Raises `NotFoundProblem` if the model's skeleton was deleted."""
     model = items.load_part(tx, found.part)
     ref = model["skeleton"]
     skeleton = items.read_part(tx, project, Kind.SKELETON, ref["item"], "hierarchy", revision=ref["revision"])
@@ -147,7 +148,7 @@ def _usable_model(found: FoundModel, packed: bytes) -> UsableModel:
 
 
 def parse_model(loaded: LoadedModel) -> UsableModel:
-    """Return the model that its documents describe. Raises `InvalidProblem` if its numbers are not valid."""
+    """Return the model that the documents describe. Raises `InvalidProblem` if numbers of the model are not valid."""
     from marey_motion.documents import skeleton_from_document
     from marey_motion.errors import MotionError
     from marey_motion.modelling.primitive_documents import primitive_from_tree
@@ -194,7 +195,7 @@ def sample_document(found: FoundModel, model: UsableModel, count: int, seed: int
 def sample_file(
     found: FoundModel, model: UsableModel, count: int, seed: int, file_format: MotionFormat, unit: str
 ) -> ComputedFile:
-    """Return one sample as a file, or several as a ZIP archive of files.
+    """Return one sample as a file, or several samples as a ZIP archive of files.
 
     Raises `InvalidProblem` if the samples are too large, or if the format cannot represent them.
     """

@@ -29,9 +29,9 @@ PARTS_OF: dict[Kind, tuple[str, ...]] = {Kind.MODEL: ("model", "tree"), Kind.PRO
 class PredecessorOptions:
     """Options of the file formats of Marey's predecessor.
 
-    `end_index` and `form` apply to annotations, `layout` to models. By default, an unchanged model has the layout of
-    its imported file; other models have layout 3. `part` selects a model or its tree, or the alignment of an aligned
-    clip instead of its motion.
+    `end_index` and `form` apply to annotations, `layout` to models. By default, an unchanged model is exported as its
+    imported file; other models are written in layout 3. `part` selects a model or its tree, or the alignment of an
+    aligned clip instead of its motion.
     """
 
     end_index: EndIndex = DEFAULT_END_INDEX
@@ -50,8 +50,8 @@ class PredecessorOptions:
 def unchanged_original(kind: Kind, parts: Parts, options: PredecessorOptions) -> StoredOriginal | None:
     """Return the file that a model, a tree or a graph was imported from, or None if the requested part was changed.
 
-    Also return None for an item of another kind, and if `options` names a layout, because the file may have another
-    layout. The documents in `parts` may contain references to stored arrays in place of the arrays.
+    Also return None for an item of another kind, and if `options` specifies a layout, because the imported file may
+    have another layout. The documents in `parts` may contain references to stored arrays in place of the arrays.
     """
     if options.layout is not None:
         return None
@@ -122,7 +122,7 @@ def _annotation(part: Mapping[str, Any], options: PredecessorOptions) -> bytes:
 def _alignment(part: Mapping[str, Any]) -> bytes:
     """Return the alignment file of Marey's predecessor: the time function, and the sections between keyframes.
 
-    Sections are ranges of frames on the canonical timeline.
+    The time function gives the source frame at each canonical frame. Sections are ranges of canonical frames.
     """
     from marey_motion.formats.predecessor.alignment import write_predecessor_alignment
 

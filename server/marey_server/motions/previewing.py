@@ -1,4 +1,4 @@
-"""Previews of edits: read in one transaction, computed in a child process, and not stored."""
+"""Previews of edits: inputs are read in one transaction; results are computed in a child process and not stored."""
 
 from __future__ import annotations
 
@@ -40,9 +40,10 @@ MOST_SHOWN = 5_000_000
 
 @dataclass(frozen=True, slots=True)
 class PreviewSource:
-    """Inputs of a preview: commands, motions, and their skeletons and mappings.
+    """Inputs of a preview: the commands, the motions, and the motions' skeletons and joint mappings.
 
-    `hierarchies` maps items and revisions to skeletons, `mappings` maps items to their newest mappings.
+    `hierarchies` maps a skeleton's item and revision to its hierarchy; `mappings` maps the item to its newest joint
+    mapping.
     """
 
     edit: EditDocument
@@ -142,8 +143,8 @@ def preview_order(source: PreviewSource, request: EditPreviewRequest, encoding: 
 def make_preview(packed: bytes) -> bytes:
     """Carry out a `PreviewOrder` and return the document of the preview.
 
-    Raises `InvalidProblem` if the commands cannot be applied or the result does not have the requested frames, and
-    `TooLargeProblem` if the edit or the requested range is too large.
+    Raises `InvalidProblem` if the commands cannot be applied, or if the result does not have the requested frames.
+    Raises `TooLargeProblem` if the edit or the requested range is too large.
     """
     from marey_motion.documents import clip_to_document
     from marey_motion.kinematics import global_positions
@@ -203,7 +204,7 @@ def _edited(source: PreviewSource, most_work: float) -> tuple[EditedClip, ...]:
 
 
 def _clip_of(source: PreviewSource, tree: Tree) -> tuple[Clip, EditedBody]:
-    """Return a clip, and its skeleton with a mapping that is parsed when a command needs it. Raises `MotionError`."""
+    """Return a clip and its skeleton; the joint mapping is parsed when a command needs it. Raises `MotionError`."""
     from marey_motion.documents import clip_from_document, mapping_from_document, skeleton_from_document
     from marey_motion.editing.take import EditedBody
     from marey_motion.rigs import JointMapping, map_joints, require_trust

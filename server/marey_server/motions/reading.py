@@ -37,7 +37,7 @@ class FileOrder(Message):
     """Item, revision and hierarchy of the skeleton that the clips must use."""
 
     def file(self) -> FileToImport:
-        """Return the file with everything that its import needs."""
+        """Return the file with everything that is needed to import it."""
         given = None
         if self.skeleton is not None:
             item, revision, hierarchy = self.skeleton
@@ -73,7 +73,7 @@ class ReadDocument(Message):
 
 
 _READ_SKELETONS: LruCache[bytes, ReadDocument] = LruCache(max_entries=_SKELETONS_KEPT)
-"""Cache of a child process: encoded hierarchies by their JSON; many files of an upload have the same hierarchy."""
+"""Cache of a child process: encoded hierarchies by their JSON, because files of an upload often share a hierarchy."""
 _SKELETONS: LruCache[bytes, PreparedDocument] = LruCache(max_entries=_SKELETONS_KEPT)
 """Cache of the server process: hierarchies by the JSON that a child process has sent."""
 
@@ -127,7 +127,7 @@ class ReadGraph(Message):
 
 
 class ReadFile(Message):
-    """Items of a file, or the reason why it was refused."""
+    """Items of a file, or the reason why the file was refused."""
 
     items: tuple[ReadDraft, ...] = ()
     checks: tuple[Check, ...] = ()

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 ANSWER_SEARCH = "marey_server.motions.search_answers:answer_search"
 WRITE_SEARCH = "marey_server.motions.search_answers:write_search"
-"""Functions that child processes run."""
+"""Function that child processes run, like the functions above."""
 FAR_CM = 5.0
 """Error in cm, before inverse kinematics, above which a position constraint counts as out of the model's reach."""
 
@@ -49,7 +49,7 @@ CM = 0.01
 class SearchLimits:
     """Limits on the estimated computing time of a search, in nanoseconds of one thread.
 
-    `work` limits the search itself, `drawing_work` limits the drawing of samples for models without a stored tree.
+    `work` limits the search itself; `drawing_work` limits the drawing of samples for models without a stored tree.
     """
 
     work: float
@@ -59,7 +59,7 @@ class SearchLimits:
 class SearchOrder(Message):
     """Message that asks a child process to run a search.
 
-    A search has one or more steps; each searches one model for one motion.
+    A search has one or more steps; each step searches one model for one motion.
     """
 
     request: SearchRequest
@@ -185,7 +185,7 @@ def _steps_of(searchables: Sequence[Searchable], request: SearchRequest) -> tupl
 
 
 def _invalid(request: SearchRequest, error: Any) -> InvalidProblem:
-    """Return an `InvalidProblem` with a JSON Pointer to the constraint that the error names."""
+    """Return an `InvalidProblem` with a JSON Pointer to the constraint that caused the error."""
     where = str(error.where or "")
     if not request.steps:
         where = where.removeprefix("steps[0]").removeprefix(".")
@@ -256,7 +256,7 @@ def _errors(result: SearchResult, request: SearchRequest) -> tuple[ConstraintErr
 
 
 def _tolerance(constraint: SearchConstraint, unit: str) -> float:
-    """Return a constraint's tolerance in the unit of its error."""
+    """Return a constraint's tolerance in the unit in which the constraint's error is measured."""
     if isinstance(constraint, JointPositionConstraint | RootPositionConstraint):
         return constraint.tolerance_m / CM
     return float(getattr(constraint, f"tolerance_{unit}"))

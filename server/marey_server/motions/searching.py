@@ -1,6 +1,6 @@
-"""Models, with their search trees, in which motions are searched on request.
+"""Models and their search trees, which requests search for motions.
 
-One transaction reads the documents; a child process parses and caches them.
+One transaction reads the documents of a model; a child process parses and caches the documents.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from marey_motion.rigs import JointMapping
 
 MOST_DRAWING_WORK = 2e9
-"""Greatest cost of all trees that a request draws for models without a tree, in nanoseconds of one thread."""
+"""Greatest cost of drawing samples for all models without a tree in a request, in nanoseconds of one thread."""
 
 SearchableKey = tuple[str, str, str]
 
@@ -92,7 +92,7 @@ class Searchable:
 def find_searchables(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: SearchRequest
 ) -> list[FoundSearchable]:
-    """Return, for each step of the request, the model to search. Raises `NotFoundProblem` if one does not exist."""
+    """Return the model to search in each step of the request. Raises `NotFoundProblem` if a model does not exist."""
     if kind is not Kind.MODEL:
         raise NotFoundProblem(f"Only models can be searched, not an item of the kind {kind}.", code="not-a-model")
     wanted = [step.model or item_id for step in request.asked_steps]
@@ -101,7 +101,7 @@ def find_searchables(
 
 
 def load_searchable(tx: Transaction, project: str, found: FoundSearchable) -> LoadedSearchable:
-    """Read the documents of a model and its tree. Raises `NotFoundProblem` if its skeleton was deleted."""
+    """Read the documents of a model and its tree. Raises `NotFoundProblem` if the model's skeleton was deleted."""
     tree, mapping = (None if part is None else items.load_part(tx, part) for part in (found.tree, found.mapping))
     return LoadedSearchable(models.load_model(tx, project, found.model), tree, mapping)
 
@@ -150,7 +150,7 @@ def _parse_packed(packed: bytes, seed: int, most_work: float) -> Searchable:
 def parse_searchable(loaded: LoadedSearchable, seed: int, most_work: float) -> Searchable:
     """Return the parsed model with a tree.
 
-    Raises `InvalidProblem` if its numbers are not valid, and `TooLargeProblem` if drawing samples for a
+    Raises `InvalidProblem` if numbers of the model are not valid, and `TooLargeProblem` if drawing samples for a
     missing tree would take too long.
     """
     from marey_motion.documents import mapping_from_document

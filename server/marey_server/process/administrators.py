@@ -1,4 +1,4 @@
-"""Administrator tokens for the owner of the machine, created at the first start and to replace a lost token."""
+"""Administrator tokens for the owner of the machine: created at the first start, or to replace a lost token."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TOKEN_FILE = "admin.token"  # noqa: S105 - the name of a file
 
 
 def make_first_administrator(tx: Transaction, token_file: Path) -> None:
-    """Create the user `admin` in a database without users, and write its token to a file."""
+    """Create the user `admin` in a database without users, and write a token of this user to a file."""
     if users.ensure_first_administrator(tx) is not None:
         give_token(tx, users.FIRST_ADMINISTRATOR, token_file, name="first start")
 
@@ -22,9 +22,9 @@ def make_first_administrator(tx: Transaction, token_file: Path) -> None:
 def give_token(tx: Transaction, administrator: str | None, token_file: Path, *, name: str) -> None:
     """Create an administrator's token with every scope and no expiry, and write it to a private file.
 
-    The token belongs to the named administrator, or without a name to the administrator who was created first. The file
-    is written before the transaction commits, so that no valid token is lost if the process dies in between. Raises
-    `NotFoundProblem` if no active administrator has that name.
+    The token belongs to the user `administrator`, or if this is None, to the administrator who was created first. The
+    file is written before the transaction commits, so that no valid token is lost if the process dies in between.
+    Raises `NotFoundProblem` if no active administrator has this name.
     """
     tx.principal = users.administrator_principal(tx, administrator)
     wanted = TokenCreate(name=name, scopes=tx.principal.scopes, expires_in_s=None)

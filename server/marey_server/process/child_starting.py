@@ -1,4 +1,4 @@
-"""Start of child processes: on Linux, they are forked from a process that has loaded their modules; on other systems,
+"""Start of child processes: on Linux, children are forked from a process that has loaded the modules; on other systems,
 each child loads the modules itself.
 """
 
@@ -14,13 +14,13 @@ from marey_server.motions.child import FORK_SERVER, SINGLE
 
 CHILD_MODULE = "marey_server.motions.child"
 LOADED_FIRST = ("marey_server.motions.reading:load",)
-"""Functions that load modules and kernels in advance, so that the first tasks of children do not wait for this."""
+"""Functions that load modules and kernels in advance, so that a child's first task need not wait for them."""
 
 Loading = TypeVar("Loading", ChildProcess, ForkServer)
 
 
 class ChildStarter:
-    """Start of child processes that may use `memory_bytes` for their tasks; any thread may start children.
+    """Starter of child processes, each of which may use `memory_bytes` for its tasks; any thread may start children.
 
     All children are killed when the starter is closed.
     """

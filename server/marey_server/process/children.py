@@ -1,8 +1,8 @@
 """Child processes in which the server reads untrusted files and computes.
 
-Their number is limited, and users share them fairly. Each child has a thread, which starts it, sends it one task after
-another, and replaces it. When a child is free, it gets a task of the caller who uses the fewest children; no caller
-can use all of them.
+The number of children is limited, and users share them fairly. Each child has a thread, which starts it, sends it one
+task after another, and replaces it. When a child is free, it gets a task of the caller who uses the fewest children; no
+caller can use all of them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ T = TypeVar("T")
 ORDERS_PER_CHILD = 1000
 """Number of tasks after which a child process is replaced, so that memory leaks of libraries do not add up."""
 ABANDONED_S = 1.0
-"""Seconds in which a task may still end after its client has disconnected; starting a new child would take longer."""
+"""Time in seconds that a task may still run after its client has disconnected; replacing its child takes longer."""
 CLOSING_S = 10.0
 ASK_AGAIN_S = 5
 """Time in seconds after which a refused client may try again."""
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ChildLimits:
-    """Limits of the child processes: of all of them together, and of each task."""
+    """Limits of all child processes together, and limits of each task."""
 
     children: int
     requests: int
@@ -81,7 +81,7 @@ class ChildTask(Generic[T]):
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def assign(self, child: ConnectedChild | None) -> None:
-        """Set the child that runs this task, or None once the task has ended."""
+        """Set the child that runs this task; None when the task has ended."""
         with self._lock:
             self._child = child
 
@@ -95,13 +95,13 @@ class ChildTask(Generic[T]):
     def abandon(self) -> None:
         """Cancel the task, because its client has closed the connection.
 
-        If a child is still running the task `ABANDONED_S` later, that child is killed.
+        If a child is still running the task after `ABANDONED_S`, the child is killed.
         """
         if self.future.cancel():
             _after(ABANDONED_S, self.stop, "client-gone")
 
     def succeed(self, payload: bytes) -> None:
-        """End the task with the result that `read` returns for the bytes, or with the error that `read` raises."""
+        """End the task with what `read` returns for the bytes `payload`, or with the error that `read` raises."""
         try:
             result = self.read(payload)
         except Exception as error:  # noqa: BLE001 - whoever waits for the task gets it
@@ -121,7 +121,7 @@ class ChildTask(Generic[T]):
 
 
 class Children:
-    """Pool of child processes; they are started when they are first needed."""
+    """Pool of child processes; each is started when it is first needed."""
 
     def __init__(self, limits: ChildLimits, loaded_first: Sequence[str] = LOADED_FIRST, *, forks: bool = FORKS) -> None:
         self.limits = limits
@@ -220,7 +220,7 @@ class Children:
         thread.start()
 
     def _eligible(self) -> list[ChildTask[Any]]:
-        """Return the waiting tasks whose callers may use one more child; cancelled tasks are removed."""
+        """Return the waiting tasks of callers who may use one more child; cancelled tasks are removed."""
         self._waiting = [task for task in self._waiting if not task.future.cancelled()]
         using = Counter(task.caller for task in self._running)
         return [task for task in self._waiting if using[task.caller] < self.limits.children_each]
@@ -260,7 +260,7 @@ class Children:
     def _next_task(self, number: int) -> ChildTask[Any] | None:
         """Wait for the next task of the child with this number; None if the pool is closed.
 
-        Tasks go to the idle child with the lowest number, whose caches are most likely to contain what they need.
+        A task goes to the idle child with the lowest number, whose caches most likely contain what the task needs.
         """
         with self._changed:
             self._idle.add(number)
@@ -319,7 +319,7 @@ class Children:
             task.succeed(outcome.payload)
 
     def _problem_of_end(self, task: ChildTask[Any], status: int) -> ApiProblem:
-        """Return the error for a task whose child process ended while running it, and count the end in the metrics."""
+        """Return the error for a task whose child process ended during the task, and count the end in the metrics."""
         if task.stopped == "closing":
             return _stopping()
         if status == LOST:

@@ -22,15 +22,15 @@ THREAD_NAME = "marey-compute"
 RENDERING_THREADS = 3
 """Number of threads that render documents; one client, or all clients without a known token, may use all but one."""
 HOUSEKEEPING_THREADS = 3
-"""Number of threads for housekeeping: large commits, waiting merges, and garbage collection run at the same time."""
+"""Number of threads for housekeeping, one each for large commits, waiting merges, and garbage collection."""
 BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class ComputeThreads:
     """Three lanes (threads with a queue).
 
-    One has a thread for each processor, and one encodes answers. One is for the long computations of housekeeping, so
-    that these do not delay requests.
+    The first lane has a thread for each processor, the second encodes answers. The third is for the long computations
+    of housekeeping, which would otherwise delay requests.
     """
 
     def __init__(self, threads: int | None = None) -> None:
@@ -60,7 +60,7 @@ class ComputeThreads:
         return self._lane.submit(client, function, *args, **kwargs)
 
     def close(self) -> None:
-        """Start no more computations, and do not wait for running ones, because their clients have disconnected."""
+        """Start no more computations. Do not wait for running computations, because their clients have disconnected."""
         self._lane.close(wait=False)
         self.rendering.close(wait=False)
         self._housekeeping.close(wait=False)

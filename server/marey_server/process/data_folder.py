@@ -19,11 +19,11 @@ log = logging.getLogger(__name__)
 
 
 def prepare_data_folder(settings: Settings) -> None:
-    """Create the data folder, and remove the rights of other users to the server's files and folders in this folder.
+    """Create the data folder, and deny other users access to the server's files and folders in this folder.
 
-    Rights to the folder itself are removed as well, unless it contains files that do not belong to the server. An
-    SQLite file is created here, because SQLite would let everybody read it; SQLite gives its log files the rights of
-    the database.
+    Access to the data folder itself is denied as well, unless it contains files that do not belong to the server. An
+    SQLite file is created here, because SQLite would let everybody read it; SQLite gives its log files the same rights
+    as the database file.
     """
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     folder = settings.data.resolve()

@@ -1,7 +1,8 @@
-"""Free space of the disk with the data folder: a minimum below which nothing is stored, and a reserve for starting.
+"""Free space on the disk of the data folder: a minimum below which nothing is stored, and a reserve for starting.
 
 On a full disk, a server can neither start nor delete data, because SQLite needs space for its log. So a reserve file
-occupies some space. It is removed when the disk is full, and created again at the next start with enough free space.
+occupies some space. The file is deleted when the disk is full, and created again at the next start with enough free
+space.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ log = logging.getLogger(__name__)
 
 
 class DiskSpace:
-    """Free space of the disk that holds a folder; `floor_bytes` of it are kept for deletions and heartbeats."""
+    """Free space of the disk that holds a folder; `floor_bytes` are kept for deletions and heartbeats."""
 
     def __init__(self, folder: Path, floor_bytes: int) -> None:
         self._folder = folder

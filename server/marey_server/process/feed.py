@@ -1,4 +1,4 @@
-"""Wake-ups of waiting requests from the feed of events, which shows the changes of every server process.
+"""Waking of waiting requests after new events in the feed, which shows the changes of every server process.
 
 One task per process reads the feed after each commit, after each notification of Postgres, and also periodically, in
 case a notification was lost. So even many waiting requests cause no work while nothing changes.
@@ -91,7 +91,7 @@ class _FeedPosition:
     async def _announce_due(self) -> None:
         """Wake workers that wait for a kind of job if a retry of such a job has become due.
 
-        This reads the whole queue, so it is not done after each commit.
+        This function reads the whole queue, so it is not called after each commit.
         """
         if time.monotonic() < self._look_for_due_at_s:
             return

@@ -2,8 +2,8 @@
 
 It reclaims expired leases, shares cached results with waiting jobs, commits the outputs of jobs that have many outputs,
 merges waiting proposals, and deletes old or unreferenced data. Only the leading process does this work, but concurrent
-housekeeping would be safe, because every statement repeats its conditions. Each kind of work runs in a separate task,
-so that a failure does not affect the others.
+housekeeping would be safe, because every statement checks its conditions again. Each kind of work runs in a separate
+task, so that a failure does not affect other kinds of work.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ LONGEST_TICK_S = 5.0
 GARBAGE_EVERY_S = 3600.0
 FORGET_TRIES_EVERY_S = 60.0
 FIRST_GARBAGE_S = 60.0
-"""Seconds from the start to the first garbage collection; few, so that servers that run only an hour collect, too."""
+"""Seconds from the start to the first garbage collection; short, because some servers run only an hour."""
 
 
 @asynccontextmanager
 async def keeping_house(services: Services) -> AsyncIterator[None]:
-    """Run the periodic work while the `async with` block runs; at its end, give up the leadership."""
+    """Run the periodic work while the `async with` block runs; then end the leadership of this process."""
     holder = secrets.token_hex(8)
     tick_s = min(LONGEST_TICK_S, services.queue_policy.lease_ttl_s / 4)
     merges = WaitingMerges(services.database)
@@ -71,7 +71,7 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
 
 
 async def _give_up_lead(services: Services, holder: str) -> None:
-    """Give up the leadership; if the database is unreachable, the leadership ends when its lease expires."""
+    """End the leadership of this process; if the database is unreachable, the leadership ends with its lease."""
     try:
         await _write(services, leader.give_up_lead, LEAD, holder)
     except ApiProblem as error:
@@ -97,7 +97,7 @@ async def _repeat(services: Services, holder: str, first_s: float, every_s: floa
 async def _reap(services: Services, holder: str) -> None:
     """Reclaim every expired lease, page by page.
 
-    After a start or an interruption, this waits for a grace period, in which workers can renew their leases.
+    After a start or an interruption, first wait for a grace period, in which workers can renew their leases.
     """
     try:
         leads, may_reap = await _write(services, _look_round, holder, services.start_grace)
@@ -136,7 +136,7 @@ async def _share_results(services: Services, holder: str) -> None:
 
 
 async def _merge_waiting(services: Services, holder: str, merges: WaitingMerges) -> None:
-    """Merge the waiting proposals that now meet all conditions of a merge."""
+    """Merge the waiting proposals that now meet all requirements."""
     if await _write(services, _leads, holder):
         await _in_thread(services, merges.attempt)
 
@@ -167,7 +167,8 @@ async def _in_thread(services: Services, function: Callable[P, T], *args: P.args
 async def _forget_tries(services: Services, holder: str) -> None:
     """Delete the expired rows of the limits on sign-ins.
 
-    This takes little time: each sign-in adds three rows, and passwords are hashed one by one, so the rows are few.
+    This takes little time, because there are few rows: each sign-in adds three rows, and passwords are hashed one by
+    one.
     """
     if await _write(services, _leads, holder):
         while await _write(services, rate_limits.forget_ended) == rate_limits.FORGOTTEN_AT_ONCE:

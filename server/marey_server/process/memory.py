@@ -1,4 +1,4 @@
-"""Limit on the memory for requests: for their bodies until they are decoded, and for answers until they are sent."""
+"""Limit on the memory for requests: for bodies until they are decoded, and for answers until they are sent."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ UNKNOWN_CLIENTS = "unknown-clients"
 class RequestMemory:
     """Count of the bytes that requests hold. It is thread-safe.
 
-    If only one request holds bytes, it may exceed the total; the limits of a single request still apply.
+    If only one request holds bytes, this request may exceed the total; the limits of a single request still apply.
     """
 
     def __init__(self, total_bytes: int) -> None:
@@ -33,8 +33,8 @@ class RequestMemory:
     def take(self, owner: str, bytes_now: int, more: int, *, reserved: bool) -> None:
         """Count `more` bytes for `owner`, whose request already holds `bytes_now` bytes.
 
-        Reserved operations are limited only by the total, which is higher for them. Raises `UnavailableProblem` if a
-        limit would be exceeded.
+        Reserved operations are limited only by the total, which is higher for them by the fraction `RESERVED_SHARE`.
+        Raises `UnavailableProblem` if a limit would be exceeded.
         """
         with self._lock:
             others = self.held_bytes > bytes_now
@@ -73,8 +73,7 @@ class Holding:
     def grow(self, more: int) -> None:
         """Count more bytes of the request.
 
-        Raises `UnavailableProblem` if all requests together, or the requests of the client, hold too many bytes
-        already.
+        Raises `UnavailableProblem` if all requests together, or all requests of the client, would hold too many bytes.
         """
         self._memory.take(self._owner, self._bytes, more, reserved=self._reserved)
         self._bytes += more

@@ -1,7 +1,7 @@
 """Logs, request ids and metrics.
 
 Labels of metrics are route templates, methods and codes that the server defines, never values that a client sent. So
-metrics reveal no names, and their number grows neither with the data nor in an attack.
+metrics reveal no names, and the number of metrics grows neither with the data nor in an attack.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _MALFORMED = (
     "header line cannot start with whitespace",
     "no colon in header line",
 )
-"""Beginnings of Tornado's messages about malformed requests; the rest may quote what was received."""
+"""Beginnings of Tornado's messages about malformed requests; the rest of a message may quote what was received."""
 
 disable_created_metrics()  # type: ignore[no-untyped-call]  # times of the first count, which would double the text
 
@@ -48,7 +48,7 @@ access_log = logging.getLogger("marey_server.access_log")
 
 
 def request_id(given: str | None) -> str:
-    """Return the request id that the client sent if it is valid, else a new one."""
+    """Return the request id `given` by the client if it is valid, or else a new request id."""
     return given if given is not None and _SANE_ID.fullmatch(given) else secrets.token_hex(12)
 
 
@@ -176,7 +176,7 @@ class Metrics:
             self.received.inc(bytes_in)
 
     def count_stopped_child(self, reason: str, work: str) -> None:
-        """Count a child process that ended before its work was done; both labels are names in the server's code."""
+        """Count a child process that ended before its work was done; both arguments are names in the server's code."""
         self.children_stopped.labels(reason, work).inc()
 
     def watch(self, lanes: Mapping[str, Sized]) -> None:

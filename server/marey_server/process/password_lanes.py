@@ -1,8 +1,8 @@
 """Threads that hash passwords, and the part of a client's address for which sign-ins are limited.
 
 A hash takes 0.1 s and 32 MiB, so few run at once, and none in the threads of the database or of other computations.
-There is one thread for users at addresses from which they have signed in before, and one for all others.
-So other sign-ins do not delay these users, and use at most one processor.
+There is one thread for users at addresses from which they have signed in before, and one thread for all other sign-ins.
+So these other sign-ins do not delay known users, and use at most one processor.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PLACES = 16
 PLACES_PER_ADDRESS = 4
 """Greatest number of requests in a lane from one address."""
 IPV6_NETWORK_BITS = 64
-"""Length of the prefix of an IPv6 address that a provider assigns to one customer, who uses all addresses below it."""
+"""Length of the IPv6 prefix that a provider assigns to one customer, who can use all addresses with this prefix."""
 REFUSALS_REMEMBERED = 10_000
 
 
@@ -60,8 +60,8 @@ class PasswordLane:
     def place(self, address: str) -> Iterator[None]:
         """Count a request of an address while the `with` block runs.
 
-        Raises `TooManyRequestsProblem` if the address already has too many requests here, and `UnavailableProblem` if
-        there are too many in total.
+        Raises `TooManyRequestsProblem` if the address already has too many requests in this lane, and
+        `UnavailableProblem` if there are too many in total.
         """
         if self._places[address] >= PLACES_PER_ADDRESS:
             raise TooManyRequestsProblem(
@@ -93,7 +93,7 @@ class PasswordLane:
 
 
 class RefusedTries:
-    """Refused sign-ins, remembered until they are allowed again, so that repeating them does not reach the database."""
+    """Refused sign-ins, remembered until they are allowed again, so that repetitions do not reach the database."""
 
     def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -110,7 +110,7 @@ class RefusedTries:
                 raise too_many_sign_ins(limit, wait_s)
 
     def note(self, attempt: SignInTry, refusal: TooManyRequestsProblem) -> None:
-        """Remember how long a limit refuses further tries from this address, or for this name from this address."""
+        """Remember until when tries are refused: all from this address, or those for this name from this address."""
         limit: LimitScope = refusal.context["limit"]
         name = None if limit == "address" else attempt.name
         self._until.put((name, attempt.address), (self._clock() + refusal.context["wait_s"], limit))

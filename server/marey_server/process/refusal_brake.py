@@ -2,9 +2,8 @@
 
 Every request, even a refused one, takes a few milliseconds of the event loop. If two hundred connections send only
 refused requests, all other clients wait for seconds. So if the event loop is late, a client that was refused several
-times must wait before it is refused again, and the event loop has time for other clients. A client that was refused
-that often is also treated as a client without a known token, so that its requests begin after the requests of other
-clients.
+times must wait before it is refused again, and the event loop has time for other clients. Such a client is also treated
+as a client without a known token, so that its requests begin after the requests of other clients.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ class RefusalBrake:
         """Beginning of the window and number of refusals in it, by client."""
 
     def delay_s(self, client: str) -> float:
-        """Count a refusal of a client, and return the time in seconds that it must wait for the answer."""
+        """Count a refusal of a client, and return the time in seconds that the client must wait for the answer."""
         now_s = self._last_refusal_s = time.monotonic()
         if self._timer is None:
             self._measure_later(now_s)

@@ -36,7 +36,7 @@ from marey_server.store.jobs.reaper import StartGrace
 log = logging.getLogger(__name__)
 
 LARGEST_ANSWER_SHARE = 8
-"""Size of the cache of answers divided by the largest body in it; larger bodies would displace all others."""
+"""Size of the cache of answers divided by the size of the largest body in it; larger bodies are not cached."""
 ANSWER_ENTRY_BYTES = 512
 """Memory in bytes of an entry in the cache of answers, in addition to its body."""
 MODEL_CACHE_BYTES = 64 << 20
@@ -55,7 +55,7 @@ class Description:
 
 
 class Services:
-    """Database, threads, metrics and the state of a server that is starting, serving or draining."""
+    """Shared parts of a server process: database, threads, metrics, and whether the server is draining."""
 
     def __init__(
         self,
@@ -137,13 +137,13 @@ class Services:
             self.database.submit_write(SYSTEM, tokens.note_use, token_id)
 
     async def number_events(self) -> None:
-        """Number all committed events, so that they can be read; on SQLite they are numbered already."""
+        """Number all committed events, so that they can be read; on SQLite, events are numbered already."""
         numbered = 0 if self.database.is_sqlite else events.NUMBERED_AT_ONCE
         while numbered == events.NUMBERED_AT_ONCE:
             numbered = await asyncio.wrap_future(self.database.submit_write(SYSTEM, events.number_events))
 
     def end_attempt(self, lost: AuthorLostProblem) -> None:
-        """End a job whose author may no longer run it; if that fails, the job ends when its lease expires."""
+        """End a job whose author may no longer run the job; if this fails, the job ends when its lease expires."""
         with suppress(UnavailableProblem):
             self.database.submit_write(SYSTEM, end_for_lost_author, lost.job_id, lost.fence)
 

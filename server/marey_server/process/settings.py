@@ -87,8 +87,8 @@ class Settings(BaseSettings):
     write_timeout_s: float = Field(
         60.0,
         gt=0,
-        description="Seconds within which a client must read 64 KiB of an answer, or the rest of it; otherwise the "
-        "server closes the connection.",
+        description="Seconds within which a client must read 64 KiB of an answer, or the rest of the answer; otherwise "
+        "the server closes the connection.",
     )
     max_connections: int | None = Field(
         None,
@@ -114,8 +114,9 @@ class Settings(BaseSettings):
         10,
         ge=1,
         description="Greatest number of wrong passwords per minute for one user name from one address (in IPv6, one "
-        "network of 64 bits). All names from one address: ten times as many. One name from all addresses where it has "
-        "not signed in for 90 days: ten times as many at once, then this number per minute.",
+        "network of 64 bits). For all names from one address, the limit is ten times as high. Addresses from which a "
+        "user has not signed in for 90 days share another limit for this user's name: ten times as many at once, then "
+        "this number per minute.",
     )
     name_guesses_per_hour: int = Field(
         20,
@@ -138,12 +139,13 @@ class Settings(BaseSettings):
         ge=2,
         le=64,
         description="Processes in which the server reads uploaded files and computes on stored data; no user "
-        "can use all of them at the same time. Absent: one more than the number of processors, but 3 to 5.",
+        "can use all of them at the same time. Absent: one more than the number of processors, but at least 3 and at "
+        "most 5.",
     )
     warm_up: bool = Field(
         True,
         description="Compile missing kernels and start the child processes when the server starts. If false, the first "
-        "requests that need them wait for that.",
+        "requests that need kernels or child processes wait until these are ready.",
     )
     child_requests: int = Field(
         32,
@@ -198,9 +200,11 @@ class Settings(BaseSettings):
     user_followers: int = Field(
         256,
         ge=0,
-        description="Greatest number of open connections over which a user follows events.",
+        description="Greatest number of open connections over which a user may follow events.",
     )
-    user_items: int = Field(Quotas.user_items, ge=0, description="Greatest number of items that a user has created.")
+    user_items: int = Field(
+        Quotas.user_items, ge=0, description="Greatest number of existing items that a user has created."
+    )
     user_stored_bytes: int = Field(
         Quotas.user_stored_bytes,
         ge=0,

@@ -1,9 +1,9 @@
 """Line of requests whose headers have arrived: few begin in each round of the event loop, and clients take turns.
 
-The event loop handles everything that has arrived before it looks at the network again, and a request passes through it
-several times. If two hundred connections send requests without a pause, and all of them begin at once, each round takes
-two hundred times as long as a request, and all clients wait for several rounds. If a few begin in each round, a round
-takes some milliseconds, and a client waits for one request of every other client.
+In each round, the event loop first handles everything that has arrived, then looks at the network again; a request
+takes several rounds. If two hundred connections send requests without a pause, and all of them begin at once, each
+round takes two hundred times as long as a request, and all clients wait for several rounds. If a few begin in each
+round, a round takes some milliseconds, and a client waits for one request of every other client.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ RESERVED_PER_ROUND = 2
 The other places are offered to reserved operations only if no other request is waiting.
 """
 _ENDLESS = 2**62
-"""Limit of a line that is never reached, because the number of connections is limited already."""
+"""Limit of a line; it is never reached, because the number of connections is limited already."""
 
 
 class Turns:
@@ -36,9 +36,9 @@ class Turns:
         return len(self._reserved) + len(self._ordinary)
 
     def take(self, client: Client, *, reserved: bool) -> asyncio.Future[None] | None:
-        """Return a future that ends when a request may begin, or None if it may begin at once.
+        """Return a future that ends when the request may begin, or None if the request may begin at once.
 
-        With `reserved`, the request waits in the line of reserved operations, for which each round keeps places.
+        With `reserved`, the request waits in the line of reserved operations, which have `RESERVED_PER_ROUND` places.
         """
         if not self._in_round:
             self._in_round = True

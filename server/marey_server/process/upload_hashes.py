@@ -1,4 +1,4 @@
-"""Hashes of uploads, computed while they arrive, outside transactions."""
+"""Hashes of uploads, computed outside transactions while the uploads arrive."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class _RunningHash:
         self.offset += len(data)
 
     def digest(self) -> str:
-        """Sync the copy to disk if there is one, and return the digest of the bytes."""
+        """Sync the copy, if any, to disk; return the digest of the bytes."""
         if self.copy is not None:
             with open(self.copy, "rb") as file:
                 os.fsync(file.fileno())
@@ -62,7 +62,7 @@ class UploadHashes:
         self._lock = threading.Lock()
 
     def add(self, upload_id: str, offset: int, data: bytes) -> None:
-        """Hash a stored piece if it directly follows the bytes that are hashed; otherwise leave it to `finish`."""
+        """Hash a stored piece if it directly follows the bytes hashed so far; otherwise `finish` hashes it."""
         running = self._running(upload_id)
         with running.lock:
             if running.offset == offset:

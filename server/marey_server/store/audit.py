@@ -1,7 +1,7 @@
 """Audit log: the events that concern access and deletion, newest first.
 
-Entries are deleted only when they are older than the settings allow. They are changed only when an item is purged: its
-id then replaces its name.
+Entries are deleted only when they are older than the settings allow. They are changed only when an item is purged: in
+its entries, the id of the item then replaces the name.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _ORDER = listing.parse_order("-at,-seq", _KEYS, unique="seq")
 class AuditFilter(NamedTuple):
     """Filter of the audit log; None selects all entries.
 
-    `subject` is the id or the name of the object that was changed; a text with the form of an id is always an id.
-    Entries at the time `since` are selected, entries at the time `until` are not.
+    `subject` is the id or the name of the object that was changed; a text that looks like an id is always taken as an
+    id. Entries at the time `since` are selected, entries at the time `until` are not.
     """
 
     kind: str | None = None
@@ -68,7 +68,7 @@ def list_project_audit(tx: Transaction, name: str, wanted: AuditFilter, *, curso
 def _list(
     tx: Transaction, wanted: AuditFilter, of: list[ColumnElement[bool]], project_id: str, cursor: str | None, limit: int
 ) -> Page:
-    """Return a page of entries. On Postgres, call `number_events` before."""
+    """Return a page of entries. On Postgres, `number_events` must be called first."""
     number = events.number_of(tx)
     statement = (
         select(*_COLUMNS, number.label("number"), project.c.name.label("project"))

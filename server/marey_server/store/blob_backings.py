@@ -1,7 +1,7 @@
 """Backings that store the bytes of blobs; the rows of the table `blob` say which blobs exist.
 
-A backing is called inside the transaction that inserts or deletes the blob's row. That row is the lock: nobody else can
-write or remove the same bytes before the transaction ends.
+A backing is called inside the transaction that inserts or deletes the blob's row. This row is the lock: no other
+transaction can write or remove the same bytes before this transaction ends.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from marey_server.store.tables import blob, blob_chunk, upload_chunk
 
 CHUNK_BYTES = 2**20
 BYTES_PER_STATEMENT = 4 * CHUNK_BYTES
-"""Size in bytes of the rows that are inserted with one statement."""
+"""Total size in bytes of the rows that are inserted with one statement."""
 
 
 class BlobBacking(Protocol):
@@ -37,7 +37,7 @@ class BlobBacking(Protocol):
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
         """Yield bytes `start` to `stop` of a blob in pieces of at most `CHUNK_BYTES`.
 
-        If the backing has lost some of the bytes, fewer are yielded.
+        If the backing has lost some of the bytes, fewer bytes are yielded.
         """
         ...
 
@@ -46,7 +46,7 @@ class BlobBacking(Protocol):
         ...
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
-        """Yield digests of stored bytes that may have no row in `blob` and were written before a given time."""
+        """Yield digests of bytes that may have no row in `blob` and were stored over `older_than_s` seconds ago."""
         ...
 
     def remove_stray(self, digest: str) -> None:
@@ -65,7 +65,7 @@ class BlobBacking(Protocol):
         ...
 
     def check_writable(self) -> None:
-        """Raise `OSError` if bytes cannot be written."""
+        """Raise `OSError` if the backing cannot write bytes."""
         ...
 
 
@@ -98,7 +98,7 @@ def read_pieces(connection: Connection, upload_id: str, start: int, stop: int) -
 
 
 class DatabaseBlobs:
-    """Blobs stored in the database, in rows of 1 MiB; blobs from uploads stay in the rows of their pieces."""
+    """Blobs stored in the database in rows of 1 MiB; an upload that becomes a blob stays in the rows of its pieces."""
 
     def write(self, connection: Connection, contents: Mapping[str, Iterable[bytes]]) -> None:
         """Store the bytes of blobs in rows of 1 MiB, several rows with one statement."""
@@ -132,7 +132,7 @@ class DatabaseBlobs:
     def release(self, connection: Connection, digest: str) -> None:
         """Delete the rows of a blob's bytes, in the transaction that deletes the blob's row.
 
-        Pieces of an upload are deleted later, a few at a time, because they may be many.
+        If the blob was an upload, its pieces are deleted later, a few at a time, because there may be many.
         """
         connection.execute(delete(blob_chunk).where(blob_chunk.c.digest == digest))
 
@@ -144,7 +144,7 @@ class DatabaseBlobs:
         """Do nothing: there are no bytes without a row."""
 
     def new_copy(self) -> None:
-        """Return None: the pieces of an upload become the blob."""
+        """Return None: no copy is needed, because the stored pieces of an upload become the blob."""
 
     def adopt(self, copy: Path, digest: str) -> None:
         """Raise `AssertionError`: this backing makes no copies."""
@@ -167,7 +167,7 @@ class DirectoryBlobs:
         return self.root / digits[:2] / digits[2:]
 
     def write(self, connection: Connection, contents: Mapping[str, Iterable[bytes]]) -> None:  # noqa: ARG002
-        """Write the file of a blob, and replace a file that a rolled-back transaction left under its name."""
+        """Write the file of each blob, replacing a file that a rolled-back transaction may have left under its name."""
         for digest, chunks in contents.items():
             self._write(digest, chunks)
 
@@ -205,7 +205,7 @@ class DirectoryBlobs:
         """Do nothing, because the transaction may still be rolled back; garbage collection removes the file later."""
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
-        """Yield the digests of old files, and remove half-written files that a dead process left."""
+        """Yield the digests of old files; remove old unfinished files, which dead processes left."""
         newest = time.time() - older_than_s
         for folder in sorted(path for path in self.root.iterdir() if path.is_dir()):
             for path in folder.iterdir():
@@ -228,7 +228,7 @@ class DirectoryBlobs:
     def adopt(self, copy: Path, digest: str) -> None:
         """Sync a copy and rename it to the file of the blob.
 
-        Does nothing if an earlier try of the same transaction has done so.
+        Does nothing if an earlier try of the same transaction has renamed the copy already.
         """
         path = self._path(digest)
         path.parent.mkdir(exist_ok=True)

@@ -98,8 +98,8 @@ def put_blob(
 ) -> str:
     """Store bytes that the caller uploaded, and allow the caller to refer to them by their digest.
 
-    The bytes can be used in `project_id`; without it, in the projects of the caller's token. Raises `InvalidProblem` if
-    their digest is not `expected`.
+    The bytes can be used in the project `project_id`, or if this is None, in all projects that the caller's token
+    allows. Raises `InvalidProblem` if the digest of the bytes is not `expected`.
     """
     require_sender(tx.principal)
     places = places_of_sender(tx) if project_id is None else (project_id,)
@@ -132,9 +132,9 @@ EVERY_PROJECT = ""
 
 
 def places_of_sender(tx: Transaction) -> tuple[str, ...]:
-    """Return the ids of the projects in which bytes that the caller uploads can be used, or `EVERY_PROJECT`.
+    """Return the ids of the projects in which the caller can use bytes after uploading them, or `EVERY_PROJECT`.
 
-    Raises `ForbiddenProblem` if the caller's token is limited to projects, and its user may write in none of them.
+    Raises `ForbiddenProblem` if the caller's token is limited to projects in none of which the user may write.
     """
     names = scopes.projects_of(tx.principal.scopes, "write")
     if tx.principal.kind != "user" or EVERY_PROJECT in names:
@@ -187,7 +187,7 @@ def insert_new(tx: Transaction, table: Table, rows: Iterable[dict[str, Any]]) ->
 
 
 def _renew(tx: Transaction, table: Table, digests: Iterable[str]) -> set[str]:
-    """Reset the age of rows to zero, and lock these rows; return the digests of those that exist."""
+    """Reset the age of existing rows to zero, and lock these rows; return their digests."""
     there: set[str] = set()
     for some in in_lists(sorted(digests)):
         chosen = table.c.digest.in_(some)
@@ -202,7 +202,7 @@ def _renew(tx: Transaction, table: Table, digests: Iterable[str]) -> set[str]:
 def add_holder(tx: Transaction, digest: str, places: Iterable[str]) -> None:
     """Record that the caller has uploaded the bytes of a blob and may refer to the blob.
 
-    A user may refer to it in the projects `places`, an attempt of a job only in its own requests.
+    A user may refer to the blob in the projects `places`; an attempt of a job, only in requests of this attempt.
     """
     caller = tx.principal
     if caller.kind == "attempt":
@@ -217,13 +217,13 @@ def add_holder(tx: Transaction, digest: str, places: Iterable[str]) -> None:
 def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
     """Return the subset of digests that the caller may refer to.
 
-    The blobs of these digests cannot be deleted before the end of this transaction.
+    The blobs with the returned digests cannot be deleted before the end of this transaction.
     """
     return _renew(tx, blob, readable(tx, digests))
 
 
 def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
-    """Prevent the deletion of blobs that a job's parameters or result name, and let readers of its project read them.
+    """Keep the blobs to which a job's parameters or result refer, and let readers of the job's project read them.
 
     Raises `ConflictProblem` (`missing-blobs`) if a blob is not stored or the caller may not refer to it.
     """
@@ -251,7 +251,7 @@ def _name_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
 
 
 def missing_blobs(digests: Iterable[str], errors: Sequence[FieldError] = ()) -> ConflictProblem:
-    """Return the error for a document or job that names blobs that are not stored."""
+    """Return the error for a document or job that refers to blobs that are not stored."""
     detail = "The request refers to blobs that the server does not have; upload them first."
     return ConflictProblem(detail, code="missing-blobs", context={"missing": sorted(set(digests))}, errors=errors)
 
@@ -260,14 +260,14 @@ def missing_blobs(digests: Iterable[str], errors: Sequence[FieldError] = ()) -> 
 
 
 def readable(tx: Transaction, digests: Iterable[str]) -> set[str]:
-    """Return the digests whose blobs are stored and may be read or referred to by the caller."""
+    """Return the digests of stored blobs that the caller may read and refer to."""
     wanted = set(digests)
     held = _held(tx, wanted, since_us=0)
     return held | _referenced(tx, wanted - held)
 
 
 def missing(tx: Transaction, digests: Iterable[str]) -> list[str]:
-    """Return, in order, the digests whose bytes the caller must send before referring to them."""
+    """Return, in order, the digests of blobs that the caller must send before referring to them."""
     digests = list(dict.fromkeys(digests))
     there = _referenced(tx, digests)
     there |= _held(tx, [digest for digest in digests if digest not in there], since_us=tx.now_us - RENEW_US)
@@ -280,7 +280,7 @@ def require_readable(tx: Transaction, digest: str) -> int:
 
 
 def sizes_of_readable(tx: Transaction, digests: Collection[str]) -> dict[str, int]:
-    """Return the sizes of blobs in bytes, by digest. Raises `NotFoundProblem` if the caller may not read one."""
+    """Return the sizes of blobs in bytes, by digest. Raises `NotFoundProblem` if any may not be read."""
     sizes = sizes_of(tx, readable(tx, digests))
     for digest in digests:
         if digest not in sizes:
@@ -327,9 +327,10 @@ def _held(tx: Transaction, digests: Iterable[str], *, since_us: int) -> set[str]
 def _within_reach(caller: Principal) -> tuple[ColumnElement[bool], ...]:
     """Return SQL conditions that select, among the uploads of a user, those whose bytes the user's token may use.
 
-    The uploads are rows of `blob_holder`, each for one project or for every project. A token that may read in all
-    projects may use all uploads of its user. Any other token may use the uploads for the projects that its scopes name.
-    If one of its scopes is for all projects, it may also use the uploads for every project.
+    The uploads are rows of `blob_holder`; each row is valid in one project or in every project. A token that may read
+    in all projects may use all uploads of its user. Any other token may use the uploads that are valid in the projects
+    named in the token's scopes. If a scope of the token is for all projects, the token may also use the uploads that
+    are valid in every project.
     """
     if scopes.allows(caller.scopes, "read"):
         return ()

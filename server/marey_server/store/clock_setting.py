@@ -2,7 +2,7 @@
 
 The stored clock never goes back by itself. If a server once started with a clock that was years ahead, all leases,
 tokens and ages would be compared with that time. This module sets the stored clock to the time of this machine, and
-corrects all stored times that are later.
+corrects all stored times that are later than this.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ PAST = frozenset(
         "finished_us", "last_used_us", "purged_us", "since_us", "started_us", "updated_us",
     }
 )  # fmt: skip
-"""Columns of moments that have passed; none may lie in the future."""
+"""Columns of times in the past; no value may lie in the future."""
 WAITING = frozenset({"expires_us", "lease_expires_us", "next_us", "old_secret_until_us", "run_at_us", "until_us"})
 """Columns of times at which something ends or may go on.
 
@@ -39,7 +39,7 @@ A start time in the future is set to now, and the end time moves back by the sam
 
 @dataclass(frozen=True)
 class StoredClock:
-    """Latest time that a database has used (0 if none), and the time of this machine; microseconds since the epoch."""
+    """Latest time that a database has used (0 if none) and time of this machine, each in microseconds since 1970."""
 
     stored_us: int
     wall_us: int
@@ -50,12 +50,12 @@ class StoredClock:
 
 
 def read_clock(connection: Connection) -> StoredClock:
-    """Return the greatest time that the database contains, and the time of the computer's clock."""
+    """Return the latest time that the database has used, and the time of the machine's clock."""
     return StoredClock(stored_high_water_us(connection), wall_clock_us())
 
 
 def set_clock(connection: Connection) -> int:
-    """Set the stored clock to the time of this machine, and move later times back; return how many were moved.
+    """Set the stored clock to the time of this machine, and move later times back; return how many times were moved.
 
     Later times of past events are set to the new time. Leases end at the new time, so running jobs continue if their
     workers report, and are queued again otherwise. Tokens and time limits that were created with the wrong clock keep

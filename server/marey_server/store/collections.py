@@ -80,7 +80,7 @@ def at_or_below(path: str) -> ColumnElement[bool]:
 
 
 def read_collection(tx: Transaction, project: str, collection_id: str) -> Collection:
-    """Return a collection as a document, with the caller's role in it."""
+    """Return a collection as a document that contains the caller's role in the collection."""
     project_row = projects.require(tx, project)
     return _shown(tx, project_row, _find(tx, project_row, collection_id, _ALIVE))
 
@@ -113,14 +113,14 @@ def list_collections(
 
 
 def find_collection(tx: Transaction, project_row: ProjectRow, collection_id: str, *, lock: bool = False) -> Row[Any]:
-    """Return the row of a folder that is not deleted; with `lock`, it is locked. Raises `NotFoundProblem`."""
+    """Return the row of a folder that is not deleted; with `lock`, lock the row. Raises `NotFoundProblem`."""
     return _find(tx, project_row, collection_id, _ALIVE, lock=lock)
 
 
 def _find(
     tx: Transaction, project_row: ProjectRow, collection_id: str, state: ColumnElement[bool], *, lock: bool = False
 ) -> Row[Any]:
-    """Return the row of a collection; with `lock`, it is locked for this write. Raises `NotFoundProblem`."""
+    """Return the row of a collection in the given state; with `lock`, lock the row. Raises `NotFoundProblem`."""
     statement = select(collection).where(
         collection.c.id == collection_id, collection.c.project_id == project_row.id, state
     )
@@ -151,7 +151,7 @@ def _document(project_row: ProjectRow, rights: FolderRights, row: Row[Any]) -> C
 
 
 def create_collection(tx: Transaction, project: str, request: CollectionCreate) -> Collection:
-    """Create a folder and the folders above it. Raises `ConflictProblem` if it exists."""
+    """Create a folder, and missing folders above it. Raises `ConflictProblem` if the folder exists already."""
     project_row = projects.require(tx, project)
     rights_of_caller(tx, project_row).require(request.path.rpartition("/")[0], Role.CONTRIBUTOR)
     if _lock(tx, project_row.id, request.path) is not None:
@@ -211,8 +211,8 @@ def _lock_inside(tx: Transaction, project_row: ProjectRow, path: str) -> Sequenc
     """Lock all folders below the locked folder at `path`, and return their paths.
 
     No folder below `path` is changed or added before this write ends, because `ensure` locks the parent while it adds a
-    folder. While this function waits for the lock of a folder, subfolders may be added to it, so the search is repeated
-    until it finds no more folders.
+    folder. While this function waits for the lock of a folder, subfolders may be added to this folder, so the search is
+    repeated until there are no more unlocked folders.
     """
     statement = select(collection.c.path).where(*_inside(project_row, path)).order_by(collection.c.path)
     paths: Sequence[str] = []
@@ -253,7 +253,7 @@ def restore_collection(
 ) -> Collection:
     """Restore a deleted folder with the contents and the roles that were deleted along with it.
 
-    Raises `ConflictProblem` if another folder has its path now.
+    Raises `ConflictProblem` if another folder now has the same path.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)

@@ -1,7 +1,7 @@
 """Coverage streams: frames are sent during a recording, and each answer shows which motions are still missing.
 
 Each stream is one row, updated by compare-and-swap. The row holds the whole state of the stream, and the answer to the
-last request, so that a sender who missed the answer gets it by repeating the request.
+last request, so that a sender who did not receive the answer gets it by repeating the request.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class CoverageOffset(ConflictProblem):
 class NewStream:
     """Initial state of a stream.
 
-    `settings` are the members of `CoverageStream` that never change; `rig` is the skeleton of its poses.
+    `settings` are the members of `CoverageStream` that never change; `rig` is the skeleton of the stream's poses.
     """
 
     settings: Tree
@@ -83,7 +83,7 @@ class StreamStep:
 
 
 def create_stream(tx: Transaction, project: str, new: NewStream) -> Stream:
-    """Create a stream. Raises `ConflictProblem` if the project has too many."""
+    """Create a stream. Raises `ConflictProblem` if the project has too many streams."""
     project_row = projects.require(tx, project)
     tx.lock(f"coverage:{project_row.id}")
     count = select(func.count()).where(coverage_stream.c.project_id == project_row.id, ~_is_old(tx))
@@ -121,7 +121,7 @@ def read_to_advance(tx: Transaction, project: str, stream_id: str) -> Stream:
 
 
 def advance_stream(tx: Transaction, project: str, held: Stream, step: StreamStep) -> Tree:
-    """Store the next state of a stream if it is still at the state `held`, and return the answer.
+    """Store the next state of a stream if the stream is still in the state `held`, and return the answer.
 
     Raises `CoverageOffset` with the current offset if another request was faster, and `NotFoundProblem` if the stream
     was deleted.
@@ -140,12 +140,12 @@ def advance_stream(tx: Transaction, project: str, held: Stream, step: StreamStep
 
 
 def answered_before(stream: Stream, said: str) -> Tree | None:
-    """Return the stored answer if a request, with the digest `said`, repeats the last one, otherwise None."""
+    """Return the stored answer if a request with the digest `said` repeats the last request, otherwise None."""
     return stream.answer if stream.said == said else None
 
 
 def require_offset(stream: Stream, offset: int) -> None:
-    """Raise `CoverageOffset`, which contains the current offset of the stream, if `offset` is not that offset."""
+    """Raise `CoverageOffset`, with the current offset of the stream, if `offset` is not the current offset."""
     if stream.offset != offset:
         raise _elsewhere(stream)
 

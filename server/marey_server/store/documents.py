@@ -56,7 +56,7 @@ class PreparedDocument:
 
 
 def prepare_document(tree: Any, *, schema: str | None = None) -> PreparedDocument:
-    """Check a document against `schema`, or by default the schema that it names, and encode its arrays.
+    """Check a document against `schema`, by default the schema that the document names, and encode its arrays.
 
     Raises `InvalidProblem` with one entry for each fault.
     """
@@ -164,7 +164,8 @@ def store_document(tx: Transaction, content: Any, *, schema: str | None = None) 
 
     Storing the same document again adds no rows.
 
-    Raises `ConflictProblem` (`missing-blobs`) if it names blobs that the caller has not sent and may not read.
+    Raises `ConflictProblem` (`missing-blobs`) if the document names blobs that the caller has not sent and may not
+    read.
     """
     ready = prepared(content, schema=schema)
     store_documents(tx, [ready])
@@ -174,7 +175,7 @@ def store_document(tx: Transaction, content: Any, *, schema: str | None = None) 
 def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> dict[str, int]:
     """Store documents as `store_document` does, all with the same few statements.
 
-    Returns, by digest, the bytes for which each new document counts in quotas.
+    Returns, by digest, the number of bytes that each new document uses of a quota.
     """
     by_digest = {one.digest: one for one in contents}
     file_sizes = _require_files(tx, by_digest.values())
@@ -240,7 +241,7 @@ def store_variants(tx: Transaction, variants: Sequence[tuple[str, Tree]]) -> Non
 
 
 def _require_files(tx: Transaction, contents: Iterable[PreparedDocument]) -> dict[str, int]:
-    """Check that the caller may name the files, and return their sizes in bytes."""
+    """Check that the caller may use the files to which documents refer; return the sizes of the files in bytes."""
     naming = [one.files for one in contents if one.files]
     held = blobs.hold(tx, {digest for files in naming for digest in files.values()}) if naming else set()
     for files in naming:
@@ -263,7 +264,7 @@ def _refer(tx: Transaction, references: Iterable[tuple[str, str, str]]) -> None:
 
 
 def items_named_in(body: Tree) -> set[str]:
-    """Return the ids of the items that a document names: in its references, and as sources in the commands of an edit.
+    """Return the ids of the items that a document names in its references, or as sources in the commands of an edit.
 
     The fields of some documents are not checked, so texts that are too long for an id are ignored.
     """
@@ -292,7 +293,7 @@ _STORED_BYTES = Prepared(
 
 
 def stored_bytes_of(tx: Transaction, digests: Iterable[str]) -> dict[str, int]:
-    """Return, by digest, how many bytes a document uses of a quota: those of its text, its arrays and its files."""
+    """Return, by digest, how many bytes a document uses of a quota: the bytes of its text, its arrays and its files."""
     wanted = sorted(set(digests))
     return {
         row.digest: row.stored_bytes

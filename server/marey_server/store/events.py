@@ -7,7 +7,7 @@ gets a lower number than one that was already listed, writers do not wait for ea
 nothing but the tables.
 
 Entries of the audit log are events that are kept longer than others. The feed begins after the last event that was old
-enough to be deleted. Audit entries before this place are no longer part of the feed. So clients and webhooks, which
+enough to be deleted. Audit entries before this beginning are no longer part of the feed. So clients and webhooks, which
 follow the feed, never receive audit entries of a period whose other events were deleted.
 """
 
@@ -64,8 +64,8 @@ def list_events(
 ) -> list[Event]:
     """List the events after the one numbered `after`: of a project, or, for administrators, of the whole server.
 
-    With `subject`, only events of that object are listed. On Postgres, call `number_events` before. Raises
-    `GoneProblem` if events after `after` were deleted, unless `after` is 0, which means the oldest stored event.
+    With `subject`, only events of that object are listed. On Postgres, call `number_events` first. Raises `GoneProblem`
+    if events after `after` were deleted, unless `after` is 0, which means the oldest stored event.
     """
     require_kept(tx, after)
     after = start_of_feed(tx, after)
@@ -104,7 +104,7 @@ def _last_deleted(tx: Transaction) -> int:
 
 
 def start_of_feed(tx: Transaction, after: int) -> int:
-    """Return the number after which a client that has received the events up to `after` continues to read the feed."""
+    """Return the number of the event after which a client reads on, if it has received the events up to `after`."""
     return max(after, _last_deleted(tx))
 
 
@@ -112,9 +112,10 @@ def start_of_feed(tx: Transaction, after: int) -> int:
 
 
 def find_last_old(tx: Transaction, age_us: int) -> int | None:
-    """Return the number up to which all events of the feed are older than `age_us`; None if there are no such events.
+    """Return the number of the last event that may be deleted because it and all earlier ones are older than `age_us`.
 
-    At most `DELETED_AT_ONCE` events of the feed have numbers up to this one. The newest event is not among them.
+    Returns None if there is no such event. At most `DELETED_AT_ONCE` events of the feed have numbers up to the returned
+    one. The newest event is not among these events.
     """
     number = number_of(tx)
     oldest = select(number.label("number"), event.c.at_us).where(follows(tx, _last_deleted(tx)))
@@ -174,7 +175,7 @@ def _shown(row: Row[Any]) -> Event:
 
 
 def number_events(tx: Transaction) -> int:
-    """Give numbers to the oldest committed events that have none, and return how many there were; 0 on SQLite.
+    """Give numbers to the oldest committed events without a number; return how many events got one (0 on SQLite).
 
     Other transactions that number events wait until this one has committed.
     """
@@ -215,7 +216,7 @@ def newest_number(tx: Transaction) -> int:
 
 
 def read_news(tx: Transaction, after: int) -> News:
-    """Read the events after the one numbered `after`; return the topics of the waiting requests that they wake up."""
+    """Read the events after the one numbered `after`; return the topics of the requests that these events wake."""
     number = number_of(tx)
     rows = tx.execute(
         select(number.label("number"), event.c.project_id, event.c.subject)
@@ -234,7 +235,7 @@ def read_news(tx: Transaction, after: int) -> News:
 
 
 def _waiting_for_key(tx: Transaction, keys: Iterable[tuple[str, str]]) -> set[str]:
-    """Return the kinds of queued jobs with one of the given pairs of project and concurrency key."""
+    """Return the kinds of the queued jobs that have one of the given pairs of project id and concurrency key."""
     return {
         kind
         for project_id, key in keys

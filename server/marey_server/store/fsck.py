@@ -1,6 +1,6 @@
 """Checks of the store: its readiness to serve, the digests of blobs, and references between rows.
 
-The checks run beside a running server, in short reads of bounded size.
+The checks can run while a server runs, because they use short reads of bounded size.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def _check_page(
 
 
 def _check_file(tx: Transaction) -> list[StoreDefect]:
-    """Return the faults that SQLite finds in its file and its foreign keys; none for Postgres, which prevents them."""
+    """Return the faults that SQLite finds in its file and in foreign keys; none on Postgres, which prevents them."""
     if tx.is_postgres:
         return []
     pages = [row[0] for row in tx.execute(text("PRAGMA integrity_check(100)")) if row[0] != "ok"]
@@ -319,7 +319,7 @@ def _check_dataset(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return a fault for each entry of a version whose content is not in any revision of the project."""
+    """Return a fault for each entry of a version if no revision of the project has the content of the entry."""
     trees = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id == row.id)
     waiting = set(tx.execute(trees).scalars())
     seen: set[str] = set()
@@ -362,7 +362,7 @@ def _is_consistent(one: Row[Any], branches: set[str]) -> bool:
 
 
 def _check_job(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return a fault for each item that a job names without a row in `job_item`, from which purges find the jobs."""
+    """Return a fault for each item that a job names without a row in the table `job_item`, which purges rely on."""
     naming = NamingJob(row.id, row.inputs, {} if row.parent_id is not None else row.params, row.outputs or ())
     recorded = set(tx.execute(select(job_item.c.item_id).where(job_item.c.job_id == row.id)).scalars())
     return [

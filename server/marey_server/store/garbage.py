@@ -44,7 +44,7 @@ from marey_server.store.transaction import Transaction
 BATCH = 200
 """Number of rows, or of jobs, that are deleted in one transaction."""
 BATCH_BYTES = 16 * MIB
-"""Number of bytes that are deleted in one transaction, so that the writes of others do not wait long for it."""
+"""Number of bytes that are deleted in one transaction, so that other writes do not wait long for this transaction."""
 MOST_UPLOADS = 10_000
 """Greatest number of uploads that are deleted in one round; databases limit the parameters of a statement."""
 
@@ -93,9 +93,9 @@ def _collect(
 
 
 def _candidates(tx: Transaction, table: Table, grace_us: int, behind: str) -> list[str]:
-    """Return the next digests after `behind` that have had no references for `grace_us`, at most `BATCH`.
+    """Return at most `BATCH` digests, the next after `behind`, that have had no references for `grace_us`.
 
-    Their rows have at most `BATCH_BYTES` together; a single row may have more.
+    Together, the documents or blobs have at most `BATCH_BYTES`; a single one may have more.
     """
     rows = select(table.c.digest, table.c.size_bytes).where(table.c.digest > behind, *_garbage(tx, table, grace_us))
     chosen: list[str] = []
@@ -109,7 +109,7 @@ def _candidates(tx: Transaction, table: Table, grace_us: int, behind: str) -> li
 
 
 def _garbage(tx: Transaction, table: Table, grace_us: int) -> tuple[ColumnElement[bool], ...]:
-    """Return conditions for rows that may be deleted; the caller must exclude staged documents itself."""
+    """Return SQL conditions for rows that may be deleted; they do not exclude staged documents, so the caller must."""
     old = table.c.created_us < tx.now_us - grace_us
     if table is document:
         return old, ~exists().where(revision_part.c.document_digest == document.c.digest)
@@ -197,7 +197,7 @@ def _drop_old_keys(tx: Transaction) -> int:
 
 
 def _drop_ended_holdings(tx: Transaction) -> int:
-    """Delete the records of blobs that attempts uploaded before they ended or lost their jobs; return their number."""
+    """Delete the records of blobs uploaded by attempts that have ended or lost their jobs; return their number."""
     same_attempt = (job.c.id == attempt_blob.c.job_id, job.c.fence == attempt_blob.c.fence)
     held = exists().where(*same_attempt, job.c.state == RUNNING)
     return tx.execute(delete(attempt_blob).where(~held)).rowcount

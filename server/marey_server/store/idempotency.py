@@ -61,7 +61,7 @@ def finish(tx: Transaction, key: str, status: int, headers: Mapping[str, str], b
 
 
 def principal_key(principal: Principal) -> str:
-    """Return the owner of idempotency keys, as a text: an attempt, a user, or all callers of another kind together."""
+    """Return, as a text, who owns the caller's idempotency keys: an attempt, a user, or all callers of another kind."""
     if principal.kind == "attempt":
         return f"{principal.job_id}/{principal.fence}"
     return principal.user_id or principal.kind

@@ -124,7 +124,7 @@ def read_page(
     `identity` is JSON that distinguishes this list from every other: its subject and filters.
     """
     if not 1 <= limit <= MAX_LIMIT:
-        raise BadRequestProblem(f"limit must be between 1 and {MAX_LIMIT}.", code="bad-limit")
+        raise BadRequestProblem(f"The parameter `limit` must be between 1 and {MAX_LIMIT}.", code="bad-limit")
     if cursor is not None:
         statement = statement.where(order.after(read_cursor(tx, cursor, order, identity)))
     rows = tx.execute(statement.order_by(*order.clauses()).limit(limit + 1)).all()

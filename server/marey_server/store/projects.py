@@ -106,13 +106,13 @@ def require(
 ) -> ProjectRow:
     """Return the project `name` if the caller has the role and the scope that the transaction's operation declares.
 
-    `at_least` raises the declared role and never lowers it. `deleted=True` looks for the project of this name that was
-    deleted last. If the operation declares `in_folders`, a role in some folder suffices, but the result contains the
-    role in the project.
+    `at_least` can require a higher role than the declared one, but not a lower one. `deleted=True` looks for the
+    project of this name that was deleted last. If the operation declares `in_folders`, a role in some folder suffices,
+    but the result contains the role in the project.
 
     Raises `NotFoundProblem` if the caller may not know that the project exists, and `ForbiddenProblem` if the caller
-    lacks the role or the scope. An anonymous caller, who may have them after signing in, gets `UnauthenticatedProblem`
-    instead.
+    lacks the role or the scope. An anonymous caller gets `UnauthenticatedProblem` instead of `ForbiddenProblem`,
+    because signing in may help.
     """
     required = tx.required_role
     need = at_least if roles.includes(at_least, required.role) else required.role
@@ -144,7 +144,7 @@ def _has_role_in_a_folder(tx: Transaction, seen: ProjectRow, need: Role) -> bool
 def has_role_in_folders(
     project_id: str | ColumnElement[Any], user_id: str | ColumnElement[Any] | None, need: Role
 ) -> ColumnElement[bool]:
-    """Return the condition that a member of a project has at least a role in one of its folders, by an override."""
+    """Return the SQL condition that a member of a project has at least the role `need` in one of its folders."""
     mine = or_(folder_role.c.user_id == user_id, folder_role.c.user_id == EVERY_MEMBER)
     enough = folder_role.c.role.in_(roles.at_least(need))
     of_project = folder_role.c.project_id == project_id

@@ -1,10 +1,11 @@
-"""Exclusion of purges from the writes that they could break: writes that refer to items, or publish content of items.
+"""Lock that excludes purges during writes that a purge could break, such as a write that refers to items.
 
 Such a write reads items and then stores something that refers to them: a revision, an input of a job, a commit. Between
-the two, another request could delete and purge the items. So each of these writes first acquires a lock that excludes
-purges of its project, before it reads items and before it locks any row; many such writes run side by side. A purge
-waits until the writes that hold the lock have ended, and later writes wait until the purge has ended. Neither of them
-waits for this lock while it holds a row that the other needs, so there are no deadlocks.
+reading and storing, another request could delete and purge the items. So each of these writes first acquires a lock
+that excludes purges of its project, before it reads items and before it locks any row; many such writes run side by
+side. A purge waits until the writes that hold the lock have ended, and later writes wait until the purge has ended.
+Neither a purge nor such a write waits for this lock while it holds a row that the other needs, so there are no
+deadlocks.
 
 A commit is prepared in one transaction and recorded in a later one. The preparation reads the time of the project's
 last purge. Recording fails if another purge has followed.

@@ -261,7 +261,7 @@ def read_held(tx: Transaction, owner_id: str) -> Held:
 
 
 def recount(tx: Transaction) -> None:
-    """Count all items and bytes, and set the counters. Other writes of items wait until the end."""
+    """Count all items and bytes, and set the counters. Other writes of items wait until the transaction ends."""
     if tx.is_postgres:
         tx.execute(text("LOCK TABLE item IN SHARE ROW EXCLUSIVE MODE"))
     tx.execute(update(item).where(item.c.stored_bytes != BYTES_OF_ITEM).values(stored_bytes=BYTES_OF_ITEM))

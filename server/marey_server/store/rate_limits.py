@@ -31,7 +31,7 @@ class RateLimit:
     interval_us: int
 
     def latest_us(self, now_us: int) -> int:
-        """Return the greatest value that the time in the row may have for another event to be allowed now."""
+        """Return the latest time that the row may contain if another event is to be allowed now."""
         return now_us + (self.burst - 1) * self.interval_us
 
 

@@ -40,7 +40,8 @@ def change_row(
 ) -> Row[Any]:
     """Change the one row that meets `which`, if its `rev` is an expected one, and return the changed row.
 
-    Raises `absent` if there is no such row, and `PreconditionFailedProblem` with the current `rev` if it has changed.
+    Raises `absent` if there is no such row, and `PreconditionFailedProblem` with the current `rev` if the row has
+    changed.
     """
     expected = at_rev(table.c.rev, expected_rev)
     statement = update(table).where(*which, expected).values(**values, rev=table.c.rev + 1).returning(*table.c)

@@ -34,7 +34,7 @@ MAX_UPLOAD_BYTES = 16 * 2**30
 LIFETIME_US = 7 * DAY_US
 """Time without a new piece after which an upload is deleted."""
 PIECES_AT_ONCE = 8
-"""Number of pieces, each of at most 1 MiB, that one transaction deletes, so that others do not wait long for it."""
+"""Number of pieces, each of at most 1 MiB, that one transaction deletes, so that other writes do not wait long."""
 
 _HAS_BLOB = exists().where(blob.c.upload_id == upload.c.id)
 

@@ -82,10 +82,11 @@ def find_user(tx: Transaction, name: str) -> User:
 
 
 def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
-    """Return a user's numbers of items and bytes, with the limits. Only administrators may read those of others."""
+    """Return the items and bytes that a user has, and the limits. Only administrators may do this for another user."""
     if not scopes.allows(tx.principal.scopes, "read"):  # the numbers are about all projects of the user
         raise ForbiddenProblem(
-            "This request needs a token with the scope 'read' for all projects: quotas count items of all of them.",
+            "This request needs a token with the scope 'read' for all projects, because quotas count items of all "
+            "projects.",
             code="insufficient-scope",
         )
     return quotas.show_quotas(tx, "user", find_user(tx, name).id)
@@ -205,7 +206,7 @@ def stored_hash(tx: Transaction, name: str) -> str | None:
 
 
 def authenticated(tx: Transaction, name: str, verified_hash: str) -> Principal:
-    """Return the principal of a user whose password matched `verified_hash`, which must still be the user's.
+    """Return the principal of a user whose password matched `verified_hash`, which must still be the stored hash.
 
     Raises `UnauthenticatedProblem`.
     """

@@ -36,7 +36,7 @@ RENEW_EVERY_S = 5.0
 PAUSE_S = 0.02
 """Least time between two searches for work; under load, one search serves many events."""
 STOP_S = 3.0
-"""Time that attempts under way have when the server stops; they are repeated if they take longer."""
+"""Time in which running attempts may end when the server stops; attempts that take longer are repeated later."""
 
 log = logging.getLogger(__name__)
 
@@ -75,7 +75,7 @@ class Deliverer:
         """Webhooks whose task ended before it had sent everything; the next search for work starts them again."""
 
     async def run(self) -> None:
-        """Look for work whenever there are new events or a retry is due. A failure is logged and does not stop this."""
+        """Look for work whenever there are new events or a retry is due. A failure is logged, and the loop goes on."""
         with wakeups.listen([NUMBERED_EVENTS]) as listener:
             while True:
                 wait_s = RENEW_EVERY_S
@@ -139,7 +139,7 @@ class Deliverer:
         self._lead_until_s = asked_s + LEAD_TTL_S / 2
 
     def _leads(self) -> bool:
-        """Return whether this process leads, and its lease has enough time left that no other process can lead."""
+        """Return whether this process leads, and its lease has enough time left, so that no other process can lead."""
         return self._lead is not None and time.monotonic() < self._lead_until_s
 
     def _start(self, webhook_id: str) -> None:

@@ -2,7 +2,7 @@
 
 A host name is resolved for each attempt, and the connection goes to the address that was checked. So a name cannot lead
 to a private network, not even if its address changes after the check. Redirects are not followed, and the body of the
-answer is not used: neither of them appears in errors or logs.
+answer is not used: neither the target of a redirect nor the body appears in errors or logs.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class Sender:
 
 
 def _status(first_lines: Sequence[str]) -> int | None:
-    """Return the status in the last status line; earlier lines are those of interim answers, such as 100 Continue."""
+    """Return the status in the last status line; earlier ones belong to interim answers, such as 100 Continue."""
     with suppress(IndexError, ValueError):
         return int(first_lines[-1].split()[1])
     return None

@@ -1,7 +1,7 @@
 """Fixtures of the tests of user workflows: a real server with a real worker, a client, a command line and a project.
 
-Starting a server takes longer than most workflows. So all of them share one server per database, and each begins with
-a new project: `lab` is deleted after the test, which hides its contents and frees its name.
+Starting a server takes longer than most workflows. So all workflows share one server per kind of database, and each has
+a new project `lab`. The project is deleted after the test, which hides its contents and frees its name.
 """
 
 import contextlib
@@ -73,7 +73,7 @@ def run(server: ServerProcess, tmp_path: Path) -> CommandLine:
 
 @pytest.fixture
 def lab_of(new_lab: Callable[[], ProjectHandle]) -> Callable[..., ProjectHandle]:
-    """Function that creates the project `lab` and imports files and folders into one of its folders."""
+    """Function that creates the project `lab` and imports files and folders into one folder of the project."""
 
     def make(*paths: Path, collection: str = "walks") -> ProjectHandle:
         project = new_lab()

@@ -30,7 +30,7 @@ PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "archive-a-dataset.md"
 
 @pytest.fixture
 def project(lab_of: Callable[..., ProjectHandle], run: CommandLine, tmp_path: Path) -> ProjectHandle:
-    """A project with the dataset `gaits`: a merge of two versions, and a deleted clip that earlier versions have."""
+    """A project with the dataset `gaits`, whose history has a merge, and a deleted clip that is in earlier versions."""
     for name, step in (("walk", 0.5), ("turn", 0.6), ("fall", 0.7)):
         (tmp_path / f"{name}.bvh").write_bytes(write_bvh(generate_gait(1.3, step, 1.0)))
     made = lab_of(*(tmp_path / f"{name}.bvh" for name in ("walk", "turn", "fall")), collection="gaits/raw")

@@ -60,9 +60,9 @@ def run(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> Command:
-    """Function that runs a command and returns its output.
+    """Function that runs a command and returns its result.
 
-    The arguments and the output name the project of the test `lab`.
+    In the arguments and in the output, `lab` is the name of the project of the test.
     """
     monkeypatch.setenv("MAREY_URL", server.url)
     monkeypatch.setenv("MAREY_DATA", str(server.data))

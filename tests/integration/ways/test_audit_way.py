@@ -31,7 +31,7 @@ def blocks(language: str) -> list[str]:
 
 @pytest.fixture
 def project(marey: Marey, new_lab: Callable[[], ProjectHandle]) -> Iterator[ProjectHandle]:
-    """The project `lab`, of which Ada was a reader and is a contributor."""
+    """The project `lab`, in which Ada was a reader first and is now a contributor."""
     made = new_lab()
     if "ada" not in {one.name for one in marey.users.list()}:
         marey.users.create(UserCreate(name="ada"))

@@ -31,7 +31,7 @@ PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "evaluate.md"
 _, SECTION = PAGE.read_text(encoding="utf-8").split("## Find the version of a dataset that made the result worse")
 SECTION = SECTION.partition("\n## ")[0]
 GRID: dict[str, Any] = {"speeds_m_s": (1.0,), "turn_rates_deg_s": (-50.0, 50.0), "duration_s": 3.0, "baseline": False}
-"""Four trials, which turn both ways."""
+"""Grid of an evaluation with four trials, two for each direction of turn."""
 WORDS = ("--speeds", "1", "--turns=-50,50", "--duration", "3", "--no-baseline")
 """The options of `GRID` on the command line."""
 BISECT_WITHOUT_LIMIT = ("dataset", "bisect", "lab/gaits", "--good", "v1", "--metric", "offset_mean_m", *WORDS)
@@ -65,7 +65,7 @@ def moved(place: str, to: str) -> list[EntryChange]:
 
 
 def spoil(gaits: DatasetHandle) -> Commit:
-    """Record six more versions, and return the third, which has no left turns any more."""
+    """Record six more versions; return the third of these, which removes the left turns."""
     gaits.commit("Rename a walk", changes=moved("raw/walk 1 0", "raw/slow"))
     gaits.commit("Rename it again", changes=moved("raw/slow", "raw/slowest"))
     spoiled = gaits.commit("Drop the left turns", changes=removed(*LEFT_TURNS))

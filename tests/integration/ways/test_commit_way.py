@@ -63,9 +63,9 @@ def test_the_commands_of_the_page_commit_results(run: CommandLine, project: Proj
 
 
 def submit_after_others(project: ProjectHandle) -> Job:
-    """Submit a job that commits, and return it.
+    """Submit a job that commits its results, and return the job.
 
-    It starts after several other jobs, so that another user can commit before it does.
+    The job starts after several other jobs, so that another user has time to commit first.
     """
     (rig,) = (one for one in project.skeletons.list() if one.name == "target")
     inputs = {"clips": (CollectionInput(collection="gaits/raw"),), "skeleton": ItemInput(item=rig.id)}

@@ -59,7 +59,7 @@ def set_consent(project: ProjectHandle, name: str, days: int) -> None:
 
 
 def overrides(project: ProjectHandle) -> list[tuple[str, int]]:
-    """Return the reasons of the permissions in the project, and the numbers of clips."""
+    """Return the reason and the number of clips of each recorded use of clips without a valid consent."""
     page = project.transport.send("GET", f"{project.url}/events", params={"limit": 1000}).json()["items"]
     return [(one["body"]["reason"], one["body"]["count"]) for one in page if one["kind"] == "consent.overridden"]
 
@@ -135,7 +135,7 @@ def test_an_archive_with_an_earlier_version_of_a_deleted_clip_is_refused(
 
 
 def test_an_archive_of_annotations_does_not_hide_their_clips(run: CommandLine, project: ProjectHandle) -> None:
-    """Documents refer to the clips, so that the archive contains their motion, too."""
+    """The annotations refer to clips, so the archive also contains the motion of these clips."""
     run("annotation", "propose", "lab/raw/walk", "--into", "said")
     project.datasets.create("said", collection="said")
     project.datasets.at("said").commit("Steps")

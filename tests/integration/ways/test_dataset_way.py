@@ -38,7 +38,7 @@ class Walker:
         self.blocks = iter(re.findall(r"```sh\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL))
 
     def follow(self, **placeholders: str) -> list[str]:
-        """Run the commands of the next block of the page, and return their outputs."""
+        """Run the commands of the next block of the page, and return the output of each command."""
         block = next(self.blocks)
         for text, value in placeholders.items():
             assert text in block

@@ -36,7 +36,7 @@ PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "use-a-dataset-elsewhere.
 
 @pytest.fixture
 def project(lab_of: Callable[..., ProjectHandle], run: CommandLine, tmp_path: Path) -> ProjectHandle:
-    """A project with the dataset `gaits`: walks with take records, one of them the result of a job."""
+    """A project with the dataset `gaits`: walks with take records; one of the walks is the result of a job."""
     for name, step in (("walk", 0.5), ("turn", 0.6)):
         (tmp_path / f"{name}.bvh").write_bytes(write_bvh(generate_gait(1.3, step, 1.0)))
     made = lab_of(tmp_path / "walk.bvh", tmp_path / "turn.bvh", collection="gaits/raw")
@@ -233,7 +233,7 @@ def test_wrong_use_is_explained(run: CommandLine, project: ProjectHandle) -> Non
         "no meaning"
         in run("dataset", "export", "lab/gaits", "out", "--as", "lerobot", "--format", "bvh", status=2).stderr
     )
-    assert "the formats are" in run("dataset", "export", "lab/gaits", "out", "--format", "json", status=1).stderr
+    assert "not one of the formats" in run("dataset", "export", "lab/gaits", "out", "--format", "json", status=1).stderr
     assert "has no clips below" in run("dataset", "export", "lab/gaits", "out", "--path", "nothing", status=1).stderr
     run("dataset", "export", "lab/gaits@v1", "episodes", "--as", "lerobot")
     assert "is a LeRobotDataset" in run("upload", "episodes", "--project", "lab", status=1).stderr
@@ -265,7 +265,8 @@ def test_other_formats_come_back(
     run("dataset", "export", "lab/gaits@v1", "out", "--as", layout, "--format", "npz")
     assert "left out" not in run("upload", "out", "--project", "lab", "--collection", "copies").stderr
     refused = run("build-model", "out", "--project", "lab", "--name", "walks", status=2).stderr
-    assert "import it with `marey upload`, which also imports take records and consents" in " ".join(refused.split())
+    expected = "first import the folder with `marey upload`, which also imports take records and consents"
+    assert expected in " ".join(refused.split())
     for one in project.clips.list(collection="gaits"):
         again = clip(project, one.name, f"copies/{one.item.collection.removeprefix('gaits/')}")
         assert np.allclose(one.motion().poses, again.motion().poses, atol=1e-4)

@@ -51,7 +51,7 @@ def guest(server: ServerProcess, marey: Marey, tmp_path: Path) -> CommandLine:
 
 
 def code_in(output: str) -> tuple[str, str]:
-    """Return prefix and code that a command has printed."""
+    """Return the prefix and the code of an invitation that a command has printed."""
     found = dict(line.split() for line in output.splitlines())
     return found["prefix"], found["code"]
 

@@ -1,4 +1,4 @@
-"""Import and export of the predecessor's models, trees and graphs, on a real server."""
+"""Import and export of models, trees and graphs in the formats of Marey's predecessor, on a real server."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from marey_schemas.options.imports import ImportOptions
 pytestmark = pytest.mark.timeout(600)
 
 TAKES = 20
-"""More than one task of a retargeting takes."""
+"""Number of takes; more than one task of a retargeting job processes."""
 
 QUICK = ("model.leave_one_out=false", "model.folds=0", "model.report_samples=20", "tree.samples=500")
 QUICK_FLAGS = tuple(flag for choice in QUICK for flag in ("--set", choice))
@@ -35,7 +35,7 @@ CHANGED = "walk-003"
 
 @pytest.fixture
 def lab(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandle:
-    """A project with one skeleton; a folder beside its file contains takes that are not imported yet."""
+    """A project with one skeleton from `game.bvh`. The folder `takes` beside this file is not imported yet."""
     write_takes(tmp_path, TAKES)
     return lab_of(tmp_path / "game.bvh", collection="rigs")
 
@@ -46,7 +46,7 @@ def skeleton_path(lab: ProjectHandle) -> str:
 
 
 def attempts(marey: Marey, jobs: dict[str, Any]) -> dict[str, int]:
-    """Return the number of attempts of each step, including those of its tasks."""
+    """Return the number of attempts of each step, including the attempts of its tasks."""
     counts = {}
     for name, job in jobs.items():
         tasks = [one.id for one in marey.jobs.list("lab", filters={"parent": job["id"]})]

@@ -1,4 +1,4 @@
-"""The way from a collection to the clips of a study: the commands of the how-to page, on a real server."""
+"""Workflow from a collection to the clips of a study: the commands of the how-to page, on a real server."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ pytestmark = pytest.mark.timeout(300)
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "reduce-a-collection.md"
 TEXT = PAGE.read_text(encoding="utf-8")
 DURATIONS_S = {"take_02": 0.5, "take_10": 5.0, "take_12": 0.7}
-"""Durations of the clips that are too short or too long; all others last 1.5 seconds."""
+"""Durations of the clips that are too short or too long; all other clips last 1.5 seconds."""
 
 
 def blocks(language: str) -> list[list[str]]:
-    """The lines of each block of the page in a language."""
+    """Return the lines of each code block of the page that is in this language."""
     return [found.splitlines() for found in re.findall(rf"```{language}\n(.*?)```", TEXT, re.DOTALL)]
 
 
 @pytest.fixture
 def lab(new_lab: Callable[[], ProjectHandle], run: CommandLine) -> ProjectHandle:
-    """The project `lab`, and in the folder of the commands the takes and the table of the page."""
+    """The empty project `lab`. The folder in which commands run contains the takes and the table of the page."""
     (rows,) = blocks("csv")
     (run.folder / "takes.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     (run.folder / "takes").mkdir()
@@ -45,7 +45,7 @@ def lab(new_lab: Callable[[], ProjectHandle], run: CommandLine) -> ProjectHandle
 
 
 def words_of(printed: str) -> list[list[str]]:
-    """The cells of a printed table, without its lines."""
+    """Return the cells of each row of a printed table, without the rules between rows."""
     rows = [re.split(r"\s{2,}", line.strip()) for line in printed.splitlines()]
     return [row for row in rows if row != [""] and not row[0].startswith("─")]
 

@@ -52,7 +52,7 @@ def blocks(language: str) -> list[str]:
 
 
 def words(line: str, **values: str) -> list[str]:
-    """Return the words of a command of the page, without its name and with other values."""
+    """Return the arguments of a command of the page; `values` replaces words of the page by other values."""
     return [values.get(word, word) for word in shlex.split(line, comments=True)[1:]]
 
 

@@ -1,4 +1,4 @@
-"""Random choices of what users do, mostly such that it is possible in the present state of the model."""
+"""Random choices of operations, most of which are possible in the present state of the model."""
 
 from __future__ import annotations
 
@@ -45,21 +45,21 @@ KEYFRAMES = (Keyframe(1, "down"), Keyframe(2, "down"), Keyframe(2, "up"))
 
 @dataclass
 class Chooser:
-    """Choices of one step; `user` is the one who does it."""
+    """Chooses the operation of one step at random; `user` does this step in the project on the server `lab`."""
 
     chance: random.Random
     model: Model
     lab: str
     user: str
     serial: int
-    """Number of the step, for names and contents that differ from earlier ones."""
+    """Number of the step, which makes names and contents different from those of earlier steps."""
 
     @property
     def project(self) -> ModelProject:
         return self.model.projects[self.lab]
 
     def operation(self, kind: str) -> Operation | None:
-        """Return an operation of a kind, named like the methods below; None if there is nothing to do it with."""
+        """Return an operation; `kind` is the name of one of the methods below. None if nothing exists to operate on."""
         chosen: Callable[[], Operation | None] = getattr(self, kind)
         return chosen()
 
@@ -143,7 +143,7 @@ class Chooser:
         return None if name is None else self.commit_to(name, self._branch(name), right=right)
 
     def commit_to(self, name: str, branch: str, *, right: bool = False) -> CommitChanges | None:
-        """Return a commit of up to three changes to a branch; with `right`, it expects no wrong newest commit there."""
+        """Return a commit of up to three changes; unless `right`, it may expect a wrong newest commit of the branch."""
         dataset = self.project.datasets[name]
         changes = [self._change(name, branch) for _ in range(self.chance.randint(1, 3))]
         given = tuple(one for one in changes if one is not None)
@@ -234,7 +234,7 @@ class Chooser:
         return Labels(clip.content, frozenset(chosen), frozenset(keyframes))
 
     def _clip_of(self, annotation: ModelItem) -> Revision | None:
-        """Return the revision of the clip that an annotation labels, sometimes the newest one of this clip."""
+        """Return the revision of a clip that an annotation labels, or sometimes the newest revision of this clip."""
         labels = dict(annotation.revisions[-1].parts)["annotation"]
         assert isinstance(labels, Labels)
         for one in self.project.present():
@@ -249,7 +249,7 @@ class Chooser:
         return self.chance.choice(found) if found else None
 
     def _branch(self, name: str) -> str:
-        """Return a branch, mostly one that exists; seldom a tag."""
+        """Return the name of a branch, mostly of an existing one, or of a tag."""
         dataset = self.project.datasets[name]
         chosen = self.chance.choice(BRANCHES)
         return chosen if chosen in dataset.refs or self.chance.random() < 0.05 else "main"
@@ -262,7 +262,7 @@ class Chooser:
         return self.chance.choice(chosen)
 
     def _commit_for(self, name: str, branch: str, *, contained: bool) -> str:
-        """Return a commit, mostly one that a branch contains, or one that it does not contain."""
+        """Return a commit, mostly one that is in the branch, or with `contained=False` one that is not."""
         dataset = self.project.datasets[name]
         head = dataset.refs.get(branch)
         before = set() if head is None else self.model.ancestors([head])
@@ -270,7 +270,7 @@ class Chooser:
         return self.chance.choice(fitting) if fitting and self.chance.random() < 0.9 else self._commit(name)
 
     def _change(self, name: str, branch: str) -> EntryChange | None:
-        """Return a change of a version: mostly a put, else a removal or a move of an entry, mostly one that exists."""
+        """Return a change for a commit: mostly a put, else a removal or a move. Its entry mostly exists."""
         state = self.model.state(self.project.datasets[name].refs.get(branch))
         path, kind = self.chance.choice(PATHS), self.chance.choice(list(_KINDS))
         exists = bool(state) and self.chance.random() < 0.8
@@ -309,5 +309,5 @@ class Chooser:
 
 
 def some_dataset() -> ModelDataset:
-    """Return a dataset of the model as every project has it at first."""
+    """Return the dataset, without commits, that each project of the model has at the start."""
     return ModelDataset(folder="gaits")

@@ -28,7 +28,7 @@ class Combine(OnDataset):
         return f"{type(self).__name__}{'Preview' if self.preview else ''}{'Resolved' if self.resolutions else ''}"
 
     def common(self) -> dict[str, Any]:
-        """Return the members of the request that all kinds share."""
+        """Return the members that requests for merges, cherry-picks and reverts share."""
         sides = [Resolution(path=key[0], kind=key[1], take=side) for key, side in self.resolutions.items()]
         return {
             "into": self.into, "version": self.version, "resolutions": tuple(sides), "preview": self.preview,
@@ -48,7 +48,7 @@ class Combine(OnDataset):
         return None if self.into in dataset.tags else dataset.refs.get(self.into)
 
     def refusal(self, model: Model) -> str | None:
-        """Return the code of the error for a branch that cannot be merged into."""
+        """Return the code of the expected error if nothing can be merged into the branch, or else None."""
         dataset = self.dataset(model)
         if self.into not in dataset.refs:
             return "no-version"
@@ -57,7 +57,7 @@ class Combine(OnDataset):
         return "no-commits" if dataset.refs[self.into] is None else None
 
     def settle(self, model: Model, outcome: Outcome, base: str | None, theirs: str | None) -> Merged | None:
-        """Compare the outcome with the expected merge; return the merge if it is to be recorded."""
+        """Compare the outcome with the expected merge; return this merge if the model must record it, or else None."""
         head = self.head(model)
         merged = merge_states(model.state(base), model.state(head), model.state(theirs), self.resolutions)
         if self.resolutions.keys() - merged.decided:
@@ -112,7 +112,7 @@ class Merge(Combine):
 
 @dataclass(frozen=True)
 class Pick(Combine):
-    """Cherry-pick of a commit, or with `undo` its revert."""
+    """Cherry-pick of a commit, or with `undo` the revert of a commit."""
 
     undo: bool = False
     parent: Any = None

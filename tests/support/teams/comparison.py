@@ -46,7 +46,7 @@ class Comparison:
             assert {one.name for one in found if one.kind is RefKind.TAG} == dataset.tags
 
     def version(self, name: str, digest: str) -> None:
-        """Compare the commit, the entries and the log of a version; each entry needs an item that has its content."""
+        """Compare the commit, the entries and the log of a version; an item must have the content of each entry."""
         handle, made = self._handle(name), self._model.commits[digest]
         commit = handle.at(digest)
         assert (commit.digest, commit.parents, commit.author) == (digest, made.parents, made.author)
@@ -60,7 +60,7 @@ class Comparison:
         assert [one.digest for one in handle.log(digest)] == self._model.first_parents(digest)
 
     def contents_are_there(self) -> None:
-        """Check that each entry of each version has an item with its content."""
+        """Check that an item exists for each entry of each version."""
         for name, dataset in self._project.datasets.items():
             trees = {frozenset(self._model.commits[digest].state.items()): digest for digest in sorted(dataset.commits)}
             for digest in trees.values():
@@ -85,7 +85,7 @@ class Comparison:
             assert found == {one.id: (one.key[0], len(one.revisions), one.tags) for one in present}, self._lab
 
     def everything(self) -> None:
-        """Compare all versions of all datasets, the documents of their entries, and the items."""
+        """Compare all branches, tags and versions of all datasets, the documents of all entries, and the items."""
         self.refs()
         self.items()
         for name, dataset in self._project.datasets.items():
@@ -107,7 +107,10 @@ class Comparison:
                 self._clients.servers[self._lab].blobs.fetch(value.file)  # compares the digest
 
     def files(self, database: Database, *, collected: bool) -> None:
-        """Check that needed files are stored, and after a garbage collection that those of purged items are not."""
+        """Check that needed files are stored and, if `collected`, that files of purged items are not.
+
+        With `collected`, all garbage was collected before this check.
+        """
         every = [content for one in self._project.items.values() for content in one.revisions]
         kept = [content for one in self._project.items.values() if one.status != "purged" for content in one.revisions]
         kept += self._model.committed(self._lab)

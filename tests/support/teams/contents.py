@@ -14,11 +14,11 @@ from marey_schemas.kinds import Kind
 
 FRAMES, JOINTS = 12, 2
 Parts = tuple[tuple[str, Hashable], ...]
-"""Parts of a revision or an entry, by name: pairs of name and description."""
+"""Parts of a revision or an entry, as pairs (name, description of the part)."""
 
 
 class Content(NamedTuple):
-    """Content of a revision: its kind, and a description of each of its parts."""
+    """Content of a revision: the kind of the item, and a description of each part."""
 
     kind: Kind
     parts: Parts
@@ -75,20 +75,20 @@ class Labels(NamedTuple):
 
 
 def references_of(content: Content) -> set[Content]:
-    """Return the contents to which a content refers, directly or through others."""
+    """Return all contents to which a content refers, directly or through other contents."""
     direct = {value.skeleton for _, value in content.parts if isinstance(value, Motion)}
     direct |= {value.clip for _, value in content.parts if isinstance(value, Labels)}
     return direct.union(*(references_of(one) for one in direct))
 
 
 def files_of(content: Content) -> set[str]:
-    """Return the digests of the files that a content, or a content to which it refers, names."""
+    """Return the digests of all files that are named in a content, or in the contents to which it refers."""
     found = {value.file for _, value in content.parts if isinstance(value, Info) and value.file is not None}
     return found.union(*(files_of(one) for one in references_of(content)))
 
 
 def document(value: Hashable, reference: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return the document of a part; `reference` is its reference to a revision, if it has one."""
+    """Return the document of a part; `reference` is the document's reference to a revision, if it needs one."""
     match value:
         case Hierarchy(bone_cm):
             return skeleton_tree(JOINTS, bone_m=bone_cm / 128)
@@ -118,7 +118,7 @@ def same_document(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
 
 @cache
 def part_digest(value: Hashable) -> str:
-    """Return the content digest of a part: that of its document, which names other content by digest, not by id."""
+    """Return the content digest of a part: the digest of its document, in which references are digests, not ids."""
     return document_digest(portable(value))
 
 

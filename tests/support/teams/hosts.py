@@ -32,14 +32,14 @@ class Host:
         self.database = database
 
     def arm(self, steps: int) -> None:
-        """Let the server die at a step from now on. A server in this process cannot die; this does nothing then."""
+        """Let the server die `steps` steps from now. Does nothing for a server in this process, which cannot die."""
 
     def disarm(self) -> bool:
-        """Withdraw the order to die; start the server again if it has died. Return whether it has."""
+        """Withdraw the order to die; if the server has died, start it again. Return whether the server had died."""
         return False
 
     def client(self, token: str) -> tuple[Marey, Line]:
-        """Return a client of the server, and its connection."""
+        """Return a client of the server, and the transport of this client."""
         line = Line(self)
         return Marey(self.url, token, retries=RETRIES, http=line), line
 
@@ -114,7 +114,7 @@ class Nursery:
 
 
 class Line(httpx.BaseTransport):
-    """Connections to a server, which lose answers on demand, and start the server again after its death."""
+    """Transport to a server, which loses answers on demand, and starts the server again after the server has died."""
 
     def __init__(self, host: Host) -> None:
         self.lose = 0
@@ -143,7 +143,7 @@ class Line(httpx.BaseTransport):
 
 @contextlib.contextmanager
 def mortal_hosts(databases: dict[str, tuple[str, Database]], folder: Path) -> Iterator[dict[str, Host]]:
-    """Run servers with databases, given by name with their addresses, in processes of their own."""
+    """Run a server in a process of its own for each name; `databases` contains address and database by name."""
     nursery = Nursery(folder / "servers.log")
     try:
         yield {name: MortalHost(database, url, folder / name, nursery) for name, (url, database) in databases.items()}
@@ -153,7 +153,7 @@ def mortal_hosts(databases: dict[str, tuple[str, Database]], folder: Path) -> It
 
 @contextlib.contextmanager
 def local_hosts(databases: dict[str, tuple[str, Database]], folder: Path) -> Iterator[dict[str, Host]]:
-    """Run servers with databases, given by name with their addresses, in threads of this process."""
+    """Run a server in a thread of this process for each name; `databases` contains address and database by name."""
     with contextlib.ExitStack() as stack:
         yield {
             name: Host(stack.enter_context(running(database, folder / name)).address, database)

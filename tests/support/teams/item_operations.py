@@ -20,7 +20,7 @@ from marey_schemas.purges import PurgeAnswer
 
 @dataclass(frozen=True)
 class Revision:
-    """Revision of an item to which a document refers."""
+    """Revision of an item, as the target of a reference in a document."""
 
     item: str
     number: int
@@ -33,7 +33,7 @@ class Revision:
 
 @dataclass(frozen=True)
 class CreateItem(Operation):
-    """Creation of an item with a content; `of` is the revision to which its documents refer."""
+    """Creation of an item with a content; `of` is the revision to which documents of the item refer."""
 
     name: str
     folder: str
@@ -70,13 +70,13 @@ class CreateItem(Operation):
 
 @dataclass(frozen=True)
 class OnItem(Operation):
-    """Operation on an item, in whatever state it is."""
+    """Operation on an item, which may be present, deleted or purged."""
 
     item: str
     kind: Kind
 
     def forbidden(self, model: Model, outcome: Outcome) -> None:
-        """Fail unless the outcome says that the user lacks the role, or that there is no such item to read first."""
+        """Fail unless the outcome says that the user lacks the role, or that the item (read first) is absent."""
         refuse(outcome, 403, *(() if self.found(model).status == "present" else (404, 410)))
 
     def read(self, clients: Clients) -> ItemHandle:
@@ -88,7 +88,7 @@ class OnItem(Operation):
         return self.project(model).items[self.item]
 
     def absent(self, model: Model, outcome: Outcome) -> bool:
-        """Return whether the item is not there, after a check that the outcome says so."""
+        """Return whether the item is deleted or purged in the model; if so, check that the outcome says this."""
         status = self.found(model).status
         if status != "present":
             refuse(outcome, 404 if status == "deleted" else 410)
@@ -120,7 +120,7 @@ class Revise(OnItem):
         self._add(model, same_content=False)
 
     def _add(self, model: Model, *, same_content: bool) -> None:
-        """Add a revision if the content changes, or although it is the same."""
+        """Add a revision if the content changes; with `same_content`, also if it does not change."""
         item = self.found(model)
         assert item.status == "present"
         content = item.revisions[-1].replaced(self.part, self.value)
@@ -201,7 +201,7 @@ class RestoreItem(OnItem):
 
 @dataclass(frozen=True)
 class Purge(Operation):
-    """Purge of one deleted item, or of all of the project."""
+    """Purge of one deleted item, or of all deleted items of the project."""
 
     role = Role.OWNER
     item: str | None = None
@@ -233,7 +233,7 @@ class Purge(Operation):
             project.update(item_id, status="purged")
 
     def _check(self, model: Model, wanted: set[str], purged: set[str]) -> None:
-        """Fail unless all items that nothing needs, and none that something needs, were purged."""
+        """Fail if an item was purged although something needs it, or not purged although certainly nothing needs it."""
         known = purged & self.project(model).items.keys()
         assert known <= wanted
         held = {one for one in wanted if model.is_held(self.lab, one)}

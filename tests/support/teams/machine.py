@@ -27,7 +27,7 @@ WEIGHTS = {
     "purge_item": 3, "purge_all": 1, "commit": 14, "commit_folder": 4, "check_out": 2, "create_branch": 4,
     "create_tag": 2, "delete_ref": 1, "reset": 2, "merge": 10, "revert": 5, "cherry_pick": 5, "copy": 5, "archive": 2,
 }  # fmt: skip
-"""Operations of one user, and how often each is chosen."""
+"""Kinds of operations of one user, and the relative frequency with which each is chosen."""
 USERS = ("mia", "mia", "mia", "ann", "ann", "ben", "ben", "rea")
 MAINTAINERS = ("mia", "ann")
 NEEDS_ROLE = {
@@ -36,9 +36,12 @@ NEEDS_ROLE = {
         ("delete_item", "restore_item", "check_out", "delete_ref", "reset", "copy", "archive"), MAINTAINERS
     ),
 }
-"""Users whose roles allow the operations that not every contributor may do; they mostly do them."""
+"""Users who are allowed to do operations for which the role contributor is not enough, by kind of operation.
+
+Mostly, one of these users is chosen for such an operation.
+"""
 MOST_STEPS, MOST_STEPS_OF_COPIES = 80, 600
-"""Greatest number of steps after which a server dies. Most requests have fewer; a copy consists of many requests."""
+"""Greatest number of steps after which a server dies. Most requests take fewer steps; a copy takes many requests."""
 
 
 class Diverged(AssertionError):
@@ -48,7 +51,8 @@ class Diverged(AssertionError):
 class TeamsMachine(RuleBasedStateMachine):
     """Users who change items and versions in a project that exists on two servers.
 
-    Each step draws a number, from which all its random choices follow: programs then have many kinds of operations.
+    Hypothesis draws only one number for each step, as the seed of all random choices in the step. This gives programs
+    with more kinds of operations.
     """
 
     only: tuple[str, ...] = ()
@@ -66,7 +70,7 @@ class TeamsMachine(RuleBasedStateMachine):
             self._begin(lab)
 
     def _begin(self, lab: str) -> None:
-        """Create a skeleton, a clip and its labels; on one server, commit them to two branches."""
+        """Create a skeleton, a clip and an annotation; on one server, also commit these items to two branches."""
         rig = Content.of(Kind.SKELETON, {"hierarchy": Hierarchy(64)})
         self.session.do(CreateItem(lab, "rig", "rigs", rig), "ben")
         choose = Chooser(random.Random(0), self.session.model, lab, "ben", 0)
@@ -118,7 +122,7 @@ class TeamsMachine(RuleBasedStateMachine):
         return outcome
 
     def _combine(self, operation: Combine, who: str, chance: random.Random) -> None:
-        """Preview a merge, then do it with resolutions of its conflicts, or without."""
+        """Preview a merge, then do the merge, either with resolutions of its conflicts or without."""
         preview = self.session.do(replace(operation, preview=True), who)
         chosen: dict[tuple[str, Kind], Side] = {}
         if chance.random() < 0.7 and not isinstance(preview, Refused):
@@ -160,7 +164,7 @@ class TeamsMachine(RuleBasedStateMachine):
         self.world.counts["Look"] += 1
 
     def _race(self, choose: Chooser, chance: random.Random) -> None:
-        """Let two users change the same branch, or one of them remove what the other one commits."""
+        """Let two users change the same branch, or let one user delete or purge an item that the other user commits."""
         mine = choose.commit(right=True)
         if mine is None:
             return
@@ -195,12 +199,12 @@ def _fate(chance: random.Random) -> Fate:
 
 
 def _without_loss(fate: Fate) -> Fate:
-    """Return a fate without lost answers."""
+    """Return the same fate, or `FINE` if answers would be lost."""
     return FINE if fate.lost else fate
 
 
 def _removal(choose: Chooser, commit: CommitChanges) -> Operation | None:
-    """Return the deletion, or the purge, of an item that a commit names."""
+    """Return the deletion of an item that a commit puts, or the purge if the item is deleted already."""
     for one in commit.changes or ():
         if isinstance(one, PutEntry):
             item = choose.project.items[one.item]

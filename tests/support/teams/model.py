@@ -33,14 +33,14 @@ class ModelItem:
     name: str
     revisions: tuple[Content, ...]
     refers: frozenset[str]
-    """Ids of the items to which its documents refer."""
+    """Ids of the items to which documents of this item refer."""
     tags: frozenset[str] = frozenset()
     status: str = "present"
     """`present`, `deleted` or `purged`."""
 
     @property
     def key(self) -> Key:
-        """Path and kind, which no two present items share."""
+        """Path and kind; no two present items have the same pair."""
         return f"{self.folder}/{self.name}".lstrip("/"), self.kind
 
     @property
@@ -75,13 +75,13 @@ class ModelProject:
     items: dict[str, ModelItem] = field(default_factory=dict)
     datasets: dict[str, ModelDataset] = field(default_factory=dict)
     loose_files: dict[str, str] = field(default_factory=dict)
-    """Files that were uploaded and that nothing refers to yet: the user who uploaded each, by digest."""
+    """Uploaded files to which nothing refers yet: the user who uploaded the file, by digest."""
 
     def present(self) -> list[ModelItem]:
         return [one for one in self.items.values() if one.status == "present"]
 
     def occupied(self, key: Key, besides: str = "") -> bool:
-        """Return whether a present item has a path and kind."""
+        """Return whether a present item other than `besides` has this path and kind."""
         return any(one.key == key and one.id != besides for one in self.present())
 
     def update(self, item_id: str, **changes: Any) -> None:
@@ -107,7 +107,7 @@ class Model:
     projects: dict[str, ModelProject] = field(default_factory=lambda: {STUDIO: ModelProject(), PARTNER: ModelProject()})
     commits: dict[str, Made] = field(default_factory=dict)
     trees: dict[str, State] = field(default_factory=dict)
-    """Entries by the digest of their tree, on both servers."""
+    """Entries of versions, by the digest of the tree of these entries, on both servers."""
 
     def copy(self) -> Model:
         projects = {name: one.copy() for name, one in self.projects.items()}
@@ -122,7 +122,7 @@ class Model:
         return {} if digest is None else self.commits[digest].state
 
     def in_order(self, commits: Iterable[str]) -> list[str]:
-        """Return commits in the order in which they were made, so that equal programs make equal choices."""
+        """Return `commits` in the order of their creation, so that equal programs make equal choices."""
         wanted = set(commits)
         return [one for one in self.commits if one in wanted]
 
@@ -143,7 +143,7 @@ class Model:
         return shared - self.ancestors(parent for one in shared for parent in self.commits[one].parents)
 
     def first_parents(self, digest: str) -> list[str]:
-        """Return a commit and those before it, along the first parents."""
+        """Return a commit, then its first parent, the first parent of that parent, and so on."""
         found = [digest]
         while parents := self.commits[found[-1]].parents:
             found.append(parents[0])
@@ -157,10 +157,10 @@ class Model:
         return set(contents_of(self.commits[digest].state for digest in digests))
 
     def certainly_free(self, lab: str, going: Iterable[str]) -> bool:
-        """Return whether nothing but `going` themselves can need the items `going`.
+        """Return whether it is certain that nothing needs the items `going`, apart from other items of `going`.
 
-        Merges and copies create items without the knowledge of the model. Such items have contents of versions, or
-        contents that these refer to.
+        The server may have items that the model does not know, because merges and copies have created them. The content
+        of such an item is in a version, or content in a version refers to it.
         """
         ids = set(going)
         contents = {content for one in ids for content in self.projects[lab].items[one].revisions}
@@ -171,15 +171,15 @@ class Model:
         return not (contents & needed) and not any(one.refers & ids for one in others)
 
     def is_held(self, lab: str, item_id: str) -> bool:
-        """Return whether a present item refers to an item.
+        """Return whether another present item refers to an item.
 
-        Whether versions need it, the model does not know, because another item may have the same content.
+        Versions may also need the item, which the model cannot know, because another item may have the same content.
         """
         others = [one for one in self.projects[lab].items.values() if one.id != item_id and one.status == "present"]
         return any(item_id in one.refers for one in others)
 
     def needed_files(self) -> set[str]:
-        """Return the files that some version, or some item that was not purged, names."""
+        """Return the digests of files that are named in a version, or in an item that was not purged."""
         contents = set(contents_of(made.state for made in self.commits.values()))
         for project in self.projects.values():
             contents |= {

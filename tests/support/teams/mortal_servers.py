@@ -1,11 +1,12 @@
 """Process that forks servers which die at a chosen step: `mortal_servers.py`, with orders as JSON lines on its input.
 
 A step of a server is an SQL statement, a commit, or a point of `marey_server.faults`. An order names a file with a
-counter of eight bytes, which the server shares with the test: while it is positive, each step decreases it, and the
-server kills itself (SIGKILL) when it reaches zero, before this step. The counter is then `FIRED`.
+counter of eight bytes, which the server shares with the test. While the counter is positive, each step decreases it.
+The step that would decrease it to zero sets it to `FIRED` instead, and the server kills itself (SIGKILL) before it does
+this step.
 
-The order to start a server again is answered after its process has ended. When the input ends, all servers are killed.
-A fork takes a hundredth of the time of a new process.
+An order for a server that already runs kills this server first, and then starts it again. When the input ends, all
+servers are killed. Forking takes a hundredth of the time that starting a new process takes.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class Countdown:
 
     @property
     def left(self) -> int:
-        """Number of steps that are left, 0 if no death is ordered, `FIRED` after a death."""
+        """Number of steps until the server dies; 0 if it must not die, `FIRED` after it has died."""
         return int(COUNTER.unpack(self._shared)[0])
 
     @left.setter
@@ -50,7 +51,7 @@ class Countdown:
         COUNTER.pack_into(self._shared, 0, steps)
 
     def step(self, *_args: Any, **_options: Any) -> None:
-        """Count a step of this process, and die if it is the last one."""
+        """Count a step of this process, and kill this process if the step is the last one."""
         with self._lock:
             left = self.left
             if left <= 0:

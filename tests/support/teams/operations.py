@@ -1,6 +1,6 @@
 """What users do: the base of all operations, and commits, branches and tags.
 
-An operation sends its request, and then compares the outcome with the model, which takes over the expected effect.
+An operation sends its request, compares the outcome with the expectation of the model, and then changes the model.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from marey_schemas.datasets.commits import Commit, CommitCreate, EntryChange, Mo
 from marey_schemas.datasets.naming import RefKind
 
 RACED = frozenset({"branch-moved", "purged-meanwhile"})
-"""Codes of the errors for requests that another request has overtaken; to send them again is right."""
+"""Error codes of requests that another request has overtaken; a client should then send the request again."""
 
 
 class Refused(NamedTuple):
@@ -35,13 +35,13 @@ class Refused(NamedTuple):
 
 
 class Failed(NamedTuple):
-    """Error that the client itself raised."""
+    """Error that the client raised itself, without a refusal by the server."""
 
     error: MareyError
 
 
 Outcome = Any
-"""`Refused`, `Failed`, or the answer."""
+"""`Refused`, `Failed`, or the answer of the server to a request that succeeded."""
 
 
 def attempt(operation: Operation, clients: Clients) -> Outcome:
@@ -90,21 +90,21 @@ class Operation(ABC):
 
     @abstractmethod
     def send(self, clients: Clients) -> Any:
-        """Do it, and return the answer."""
+        """Do the operation on the server, and return the answer."""
 
     @abstractmethod
     def absorb(self, model: Model, clients: Clients, outcome: Outcome) -> None:
-        """Fail unless the outcome is what the model expects; otherwise bring its effect into the model."""
+        """Check that the outcome is as the model expects, and then apply the effect of the operation to the model."""
 
     def forbidden(self, model: Model, outcome: Outcome) -> None:
         """Fail unless the outcome says that the user lacks the role."""
         refuse(outcome, 403)
 
     def assume(self, model: Model) -> None:  # noqa: B027 - most operations are repeated
-        """Bring the effect into the model although no answer has arrived. Needed only for requests without repeats."""
+        """Apply the effect to the model although no answer has arrived. Needed if a repetition gets another answer."""
 
     def again(self, outcome: Outcome, second: Outcome) -> None:  # noqa: B027 - most have nothing to check
-        """Check the outcome of the same operation when it was sent once more after its success."""
+        """Check the outcome `second` of the operation when it was sent again after it had succeeded with `outcome`."""
 
     def project(self, model: Model) -> ModelProject:
         return model.projects[self.lab]
@@ -132,7 +132,7 @@ class OnDataset(Operation):
         return self.project(model).datasets[self.name]
 
     def record(self, model: Model, branch: str, commit: Commit, made: Made) -> None:
-        """Check a new commit, and add it to the model as the newest one of a branch."""
+        """Check a new commit, and add it to the model as the newest commit of a branch."""
         assert commit.parents == made.parents
         assert commit.author == made.author
         assert commit.entries == len(made.state)

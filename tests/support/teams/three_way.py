@@ -27,15 +27,16 @@ State = Mapping[Key, Entry]
 
 
 def by_path(key: Key) -> tuple[str, str]:
-    """Return the place of a key in the order of entries; no path contains a character before the tabulator."""
+    """Return the sort key of an entry: the path, ended by a tab because no character of a path sorts before a tab."""
     return f"{key[0]}\t", key[1].value
 
 
 def follow(before: State, after: State) -> dict[Key, Key | None]:
-    """Return where each entry of a version is in another one; None: it was removed.
+    """Return the key that each entry of `before` has in `after`; None if the entry was removed.
 
-    An entry stays itself as long as it keeps a part. Others are followed to new entries of the same kind: those with
-    the same content first, then the one at the same path, then those with one equal part.
+    An entry with an unchanged key and at least one unchanged part is the same entry. Each remaining entry is paired
+    with a new entry of the same kind: if possible, with one that has the same content, else with the one at the same
+    path, else with one that has an equal part.
     """
     found: dict[Key, Key | None] = {key: key for key in before if key in after and _share(before[key], after[key])}
     gone = sorted((key for key in before if key not in found), key=by_path)
@@ -79,13 +80,13 @@ def changed_entries(before: State, after: State) -> int:
 
 @dataclass
 class Merged:
-    """Result of a merge; conflicts without a resolution are still as on our side in `state`."""
+    """Result of a merge; in `state`, entries with an unresolved conflict are as on our side."""
 
     state: dict[Key, Entry]
     conflicts: list[tuple[Key, tuple[str, ...]]] = field(default_factory=list)
-    """The key that a resolution names, and the parts in conflict; two conflicts about one path have the same key."""
+    """For each conflict, the key that its resolution must name, and the parts in conflict. Keys may repeat."""
     decided: set[Key] = field(default_factory=set)
-    """Keys of the resolutions that decided a conflict."""
+    """Keys of those resolutions that decided a conflict."""
 
 
 class Located(NamedTuple):
@@ -100,7 +101,7 @@ def _at(state: State, key: Key | None) -> Located | None:
 
 
 def merge_states(base: State, ours: State, theirs: State, take: Mapping[Key, Side]) -> Merged:
-    """Apply what their side changed to our side; `take` are the resolutions."""
+    """Apply the changes from `base` to `theirs` to `ours`; `take` contains the resolutions of conflicts."""
     mine, their = follow(base, ours), follow(base, theirs)
     merged = Merged(dict(ours))
     results: list[tuple[Located | None, Located]] = []
@@ -132,7 +133,7 @@ Three = tuple[Located | None, Located | None, Located | None]
 def _changes(
     base: State, ours: State, theirs: State, mine: Mapping[Key, Key | None], their: Mapping[Key, Key | None]
 ) -> list[Three]:
-    """Return what their side changed: each entry in the base, on our side and on their side, in the order of paths."""
+    """Return each entry that differs between `base` and `theirs`, as (base, ours, theirs), in the order of paths."""
     found: list[Three] = [
         (_at(base, old), _at(ours, mine[old]), _at(theirs, now))
         for old, now in their.items()
@@ -173,7 +174,7 @@ def _decide(
 def _clashes(
     base: Located | None, ours: Located | None, theirs: Located | None
 ) -> tuple[dict[str, Hashable], tuple[str, ...]]:
-    """Return the parts that were merged themselves, and the names of those that exclude each other."""
+    """Return merged content by part, where both sides could be merged, and the names of parts in conflict."""
     if ours is None or theirs is None:
         return {}, ("entry",)
     merged: dict[str, Hashable] = {}
@@ -205,7 +206,7 @@ def _combined(
     clashes: tuple[str, ...],
     choice: Side,
 ) -> Located:
-    """Return the entry with the changes of both sides; where these exclude each other, `choice` decides."""
+    """Return the entry with the changes of both sides; `choice` is the side to take where they are in conflict."""
     assert ours is not None
     assert theirs is not None
     first, second = (ours, theirs) if choice is Side.OURS else (theirs, ours)
@@ -230,7 +231,7 @@ def _combined(
 
 
 def merge_labels(base: Labels, ours: Labels, theirs: Labels) -> Labels | None:
-    """Merge the labels of a clip one by one; return None if the changes of both sides exclude each other."""
+    """Merge the labels of a clip one by one; return None if the two sides have made conflicting changes."""
     clips = base.clip, ours.clip, theirs.clip
     if len({dict(one.parts)["motion"] for one in clips}) > 1 or _excludes(*clips):
         return None
@@ -252,7 +253,7 @@ def merge_labels(base: Labels, ours: Labels, theirs: Labels) -> Labels | None:
 
 
 def _kept_or_added(base: frozenset[Label], ours: frozenset[Label], theirs: frozenset[Label]) -> frozenset[Label]:
-    """Return the labels that both sides have kept, and those that one side has added."""
+    """Return the labels that both sides have kept, and the labels that at least one side has added."""
     return (base & ours & theirs) | (ours - base) | (theirs - base)
 
 
@@ -262,7 +263,10 @@ def _replaced_twice(
     theirs: frozenset[Hashable],
     instead: Callable[[Hashable, Hashable], bool],
 ) -> bool:
-    """Return whether both sides have removed a label and put different ones in its place."""
+    """Return whether both sides have removed a label and replaced it by different labels.
+
+    `instead(new, old)` states whether `new` replaces `old`.
+    """
     return any(
         {one for one in ours - base if instead(one, old)} != {one for one in theirs - base if instead(one, old)}
         for old in base - ours - theirs

@@ -1,4 +1,4 @@
-"""What users do between datasets: copies (push and pull), archives, and checkouts into folders."""
+"""What users do with whole versions: copies to other datasets, archives, and checkouts into folders."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Transfer(Operation):
         return dataset.refs.get(self.version, self.version)
 
     def arrive(self, model: Model, head: str, branch: str) -> bool:
-        """Bring the commits into the model; return whether the branch is at the newest of them now."""
+        """Add the commits up to `head` to the target dataset of the model; return whether `branch` is now at `head`."""
         datasets = model.projects[self.to_lab].datasets
         target = datasets.setdefault(self.to, ModelDataset(folder=self.to))
         target.commits |= model.ancestors([head])
@@ -108,8 +108,8 @@ class ArchiveAndImport(Transfer):
 class CheckOut(OnDataset):
     """Checkout of a version into the folder of a dataset.
 
-    The server chooses which items it changes, restores and creates, so the model reads all items of the folder
-    again, after a check that the folder has the entries of the version.
+    The server chooses which items it changes, restores and creates. So, after a check that the folder has the entries
+    of the version, the model takes over all items of the folder from the server.
     """
 
     role = Role.MAINTAINER

@@ -1,4 +1,4 @@
-"""Two servers with users, and the steps of a program there: operations whose answers are lost, or whose server dies."""
+"""Two servers with users, and the steps of a program: operations, during which answers get lost or servers die."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class Fate(NamedTuple):
     lost: int = 0
     """Number of answers to writes that are lost."""
     dies_after: int | None = None
-    """Number of steps after which the server dies; None: it does not."""
+    """Number of steps after which the server dies; None if it does not die."""
 
     @property
     def label(self) -> str:
-        """The name under which it is counted."""
+        """Name of this fate in logs; empty if nothing happens."""
         return "lost answer" if self.lost else "death" if self.dies_after else ""
 
 
@@ -86,15 +86,15 @@ class Session:
     done: list[tuple[Operation, str, Outcome]] = field(default_factory=list)
     """Commits and merges that have succeeded, to be repeated."""
     log: list[str] = field(default_factory=list)
-    """What was done, for messages of failures."""
+    """Operations and their outcomes as text, for messages of failed tests."""
 
     @property
     def history(self) -> str:
-        """The last operations and their outcomes, one in each line."""
+        """The last operations and their outcomes, one per line."""
         return "\n".join(self.log[-40:])
 
     def comparison(self, lab: str) -> Comparison:
-        """Return a comparison of a server with the model, for the owner of the project."""
+        """Return a comparison of the server `lab` with the model, through the client of the project's owner."""
         return Comparison(self.model, lab, self.clients["ann"])
 
     def do(self, operation: Operation, who: str, fate: Fate = FINE) -> Outcome:
@@ -124,7 +124,7 @@ class Session:
         return outcome
 
     def _do_again(self, operation: Operation, clients: Clients) -> Outcome:
-        """Repeat an operation without an answer: the first time it had its whole effect, or none."""
+        """Repeat an operation that got no answer; its first run must have had all of its effect, or none."""
         self.world.counts["(repeated without knowing)"] += 1
         outcome = attempt(operation, clients)
         self.log.append(f"{clients.user}: repeated -> {outcome}")
@@ -140,7 +140,7 @@ class Session:
         return outcome
 
     def repeat(self, operation: Operation, who: str, first: Outcome) -> None:
-        """Send a write once more, as after a lost answer: the answer is the same, and nothing else changes."""
+        """Send a write again, as after a lost answer; the answer must be the same, and nothing may change."""
         operation.again(first, attempt(operation, self.clients[who]))
         self.world.counts["(repeated writes)"] += 1
 
@@ -160,8 +160,8 @@ class Session:
     def race(self, operations: Mapping[str, Operation], fate: Fate = FINE) -> None:
         """Let users do one operation each at the same time.
 
-        The outcomes must be those of some order, except that an operation may be refused because another one has
-        overtaken it; then it has no effect.
+        The outcomes must be possible for some order of the operations. In addition, an operation may be refused because
+        another operation has overtaken it; the refused operation then has no effect.
         """
         host = self.world.hosts[next(iter(operations.values())).lab]
         outcomes: dict[str, Outcome] = {}
@@ -184,7 +184,7 @@ class Session:
         self._explain(operations, outcomes)
 
     def _explain(self, operations: Mapping[str, Operation], outcomes: Mapping[str, Outcome]) -> None:
-        """Find an order of operations that explains their outcomes, and bring its effect into the model."""
+        """Find an order of the operations that explains all outcomes, and apply the operations to the model."""
         assert outcomes.keys() == operations.keys(), "an operation ended with an unexpected error"
         overtaken = [who for who, one in outcomes.items() if isinstance(one, Refused) and one.code in RACED]
         assert len(overtaken) < len(operations), f"nobody has won: {outcomes}"
@@ -212,7 +212,7 @@ class Session:
     def _orders(
         operations: Mapping[str, Operation], outcomes: Mapping[str, Outcome], overtaken: Sequence[str]
     ) -> Iterator[tuple[str, ...]]:
-        """Yield the orders in which operations can have had an effect; those without an answer may have had none."""
+        """Yield the orders in which operations can have had effects. Operations without an answer may have had none."""
         certain = [who for who in operations if who not in overtaken and not _unanswered(outcomes[who])]
         uncertain = [who for who in operations if _unanswered(outcomes[who])]
         for count in range(len(uncertain) + 1):
@@ -222,7 +222,7 @@ class Session:
     # -- housekeeping -----------------------------------------------------------------------------------------------
 
     def collect_garbage(self, lab: str, *, a_day_later: bool) -> None:
-        """Collect garbage beside the running server, now or as if all uploads were older than the time of grace."""
+        """Collect garbage while the server runs, now or as if the grace period of all uploads had passed."""
         host = self.world.hosts[lab]
         if a_day_later:
             garbage.collect_garbage(host.database, grace_us=-1)

@@ -1,4 +1,4 @@
-"""Range of versions between a good one and a bad one, and the search in it, without a server."""
+"""Range of versions between a good and a bad version, and the search in this range, without a server."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from marey_schemas.datasets.commits import Commit
 
 
 class ListedVersions:
-    """Versions whose names are their numbers; each follows earlier ones. `read` are the versions that were listed."""
+    """Versions whose names are their numbers; parents have lower numbers. `read` are the versions that were listed."""
 
     def __init__(self, parents: Sequence[Sequence[int]]) -> None:
         self.parents = parents

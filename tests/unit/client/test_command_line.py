@@ -1,4 +1,4 @@
-"""Command line, where no server is needed."""
+"""Command line, as far as it can be tested without a server."""
 
 import contextlib
 import json
@@ -306,7 +306,7 @@ def test_who_asks_for_an_item_at_a_folder_is_told_that_it_is_one(
         return httpx.Response(200, content=json.dumps({"items": members, "next_cursor": None}))
 
     script.answers = [page(), page(folder)]
-    with pytest.raises(WrongUsage, match=r"^lab/raw is a folder; marey ls lab/raw lists it$"):
+    with pytest.raises(WrongUsage, match=r"^lab/raw is a folder; `marey ls lab/raw` lists it$"):
         find(script.marey())
     script.answers = [page(), page()]
     with pytest.raises(WrongUsage, match=r"^there is .* at lab/raw; `marey ls lab` lists the project$"):
@@ -526,7 +526,7 @@ SERVER = "http://server.test"
 def rotating(
     script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> Callable[[Credential], list[Any]]:
-    """Run `marey token rotate` with a credential; return the ids of the rotations that were sent so far."""
+    """Function that runs `marey token rotate` with a credential; returns the ids of all rotations sent so far."""
 
     def rotate(credential: Credential) -> list[Any]:
         monkeypatch.setattr(tokens, "connect", lambda context: script.marey())

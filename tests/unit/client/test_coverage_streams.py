@@ -1,4 +1,4 @@
-"""Recordings that the SDK sends to coverage streams: each frame once, continued at the offset of the last answer."""
+"""Recordings that the SDK sends to coverage streams: each frame once; the last answer's offset is where to continue."""
 
 from datetime import UTC, datetime
 from typing import Any

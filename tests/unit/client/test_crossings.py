@@ -20,7 +20,7 @@ NOTHING = cast(Any, None)
 
 @dataclass
 class TabledValues(VersionEvaluations):
-    """Values of the metric by version; a version without a value cannot be evaluated. `read` are those asked for."""
+    """Values of the metric by version; a version without a value cannot be evaluated. `read` are evaluated versions."""
 
     values: Mapping[str, float] = field(default_factory=dict)
     read: list[str] = field(default_factory=list)
@@ -38,7 +38,7 @@ def tabled(values: Mapping[str, float], dataset: Any = NOTHING) -> TabledValues:
 def searched(
     parents: Sequence[Sequence[int]], values: Mapping[str, float], limit: Limit | None = None, good: str = "0"
 ) -> tuple[Crossing, list[str]]:
-    """Return the result of a search up to the last version, and the versions that were evaluated."""
+    """Search in the versions from `good` to the last; return the result, and the versions that were evaluated."""
     versions = ListedVersions(parents)
     evaluations = tabled(values, versions)
     return find_crossing(read_range(versions, good, str(len(parents) - 1)), evaluations, limit), evaluations.read

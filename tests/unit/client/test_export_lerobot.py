@@ -1,4 +1,4 @@
-"""Exports to LeRobotDataset v3.0, read as its specification says: by pyarrow, with numpy alone."""
+"""Exports to LeRobotDataset v3.0, read as the specification of the format says, with only pyarrow and numpy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pipelines as their submitters follow them."""
+"""Pipelines in the SDK: submission, waiting, cancellation, and explanations of failed steps."""
 
 import json
 from datetime import UTC, datetime

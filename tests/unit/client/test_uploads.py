@@ -18,7 +18,7 @@ DATA = bytes(range(251)) * 100
 class UploadServer:
     """Simulated server that stores the bytes of one upload.
 
-    `faults` are raised instead of answers, each after a number of bytes of a piece was stored.
+    A number n in `faults` breaks the connection of one request, after n bytes of its piece were stored.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Pins: every installed package has one version with hashes, and the layers contain what the extras require."""
+"""Pins: every installed package has one version with hashes, and the pin files contain what the extras require."""
 
 import re
 import tomllib
@@ -19,7 +19,7 @@ def name_of(requirement: str) -> str:
 
 
 def required(extra: str) -> set[str]:
-    """Return the names that an extra requires, with those of the extras that it includes."""
+    """Return the names of the packages that an extra requires, including those of extras that it includes."""
     names: set[str] = set()
     for one in PYPROJECT["project"]["optional-dependencies"][extra]:
         included = re.match(r"marey\[(.*)\]", one)
@@ -46,7 +46,7 @@ def test_a_layer_pins_what_its_extra_requires(layer: str) -> None:
 
 
 def test_a_pin_names_the_extras_that_other_packages_require() -> None:
-    """Otherwise, pip finds no pin for `coverage[toml]` as soon as a newer version than the pinned one is published."""
+    """Otherwise, pip finds no pin for `coverage[toml]` as soon as a version newer than the pinned one is published."""
     pinned = {name: text for pins in PINS.values() for name, text in pins.items()}
     missing = []
     for package in filter(lambda one: name_of(one.name) in pinned, distributions()):

@@ -1,4 +1,4 @@
-"""The canonical frame, and back."""
+"""Conversion of motions to the canonical frame of reference, and back."""
 
 import numpy as np
 import pytest

@@ -32,9 +32,9 @@ def on_the_ground(points: Floats, turn_rad: float, x: float, z: float) -> Floats
 
 
 def minimised(a: Floats, b: Floats, weights: Floats) -> float:
-    """Return the least weighted mean of squared distances of points a, b (P, 3) over turns and shifts.
+    """Return the weighted mean of squared distances between points a and b (P, 3) after the best turn and shift.
 
-    The minimum is found by search.
+    A numeric search finds the turn about the vertical and the shift on the ground.
     """
     shares = weights / weights.sum()
 

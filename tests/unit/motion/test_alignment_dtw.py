@@ -50,8 +50,9 @@ def cheapest_way(costs: Floats, max_run: int | None = None) -> float | None:
 def links_between_layers(max_run: int | None) -> list[tuple[int, tuple[int, int], int]]:
     """Return (layer, step, layer to which the step leads) for each step; each layer contains every cell once.
 
-    A layer is defined by the last steps of a path: 0 is a step in both motions, then 1 to `max_run` steps in a row in
-    the first motion alone, then equally many in the second alone. Without a limit there is one layer.
+    The layer of a path depends on its last steps. In layer 0, the last step was in both motions. In the next `max_run`
+    layers, the last 1 to `max_run` steps were in the first motion alone; in the last `max_run` layers, they were in the
+    second motion alone. Without a limit there is one layer.
     """
     if max_run is None:
         return [(0, step, 0) for step in STEPS]

@@ -1,4 +1,4 @@
-"""Divisions of clips, the sections between them, and alignments that keep the sections."""
+"""Division of clips into sections by labels, and alignments that match sections of the same number."""
 
 from collections.abc import Callable
 from functools import partial

@@ -1,4 +1,4 @@
-"""Time functions: computed from paths, inverted, and applied to motions."""
+"""Time functions (time warps): computed from alignment paths, inverted, and applied to motions."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,9 +19,9 @@ from marey_motion.motion import Motion
 
 @st.composite
 def paths(draw: Callable[..., Any]) -> Ints32:
-    """Draw paths of allowed steps through at least two frames of each motion.
+    """Draw alignment paths of allowed steps through at least two frames of each motion.
 
-    Most have at most three steps in a row in one motion.
+    Most paths have at most three steps in a row that advance in only one motion.
     """
     steps = draw(st.lists(st.sampled_from(["11", "11", "10", "01", "110", "1000", "0001", "01111"]), min_size=1))
     moves = {"11": [(1, 1)], "10": [(1, 0), (1, 1)], "01": [(0, 1), (1, 1)]}

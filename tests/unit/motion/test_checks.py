@@ -1,4 +1,4 @@
-"""Findings about a motion: present if the motion has the fault, with joints, frames and numbers, else absent."""
+"""Checks of a motion: a finding is reported only if the motion has the fault, with joints, frames and numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Constraints in ranges of frames, and their use to refine samples."""
+"""Constraints in ranges of frames, and the refinement of samples of a model by constraints."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""The commands `constrain` and `plant_feet`, from their JSON to the resulting poses."""
+"""The edit commands `constrain` and `plant_feet`, from the JSON of a command to the resulting poses."""
 
 import json
 from collections.abc import Callable

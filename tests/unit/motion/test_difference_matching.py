@@ -14,7 +14,7 @@ ANGLES_RAD = np.radians([0.0, 3.0, 10.0, 40.0])
 
 
 def poses_of(kinds: list[int]) -> Poses:
-    """Return frames of one joint that has one of four rotations, above a root that does not move."""
+    """Return frames with a root that does not move and one joint, whose rotation is one of four, chosen by `kinds`."""
     halves = ANGLES_RAD[kinds] / 2.0
     zeros = np.zeros_like(halves)
     rotations = np.stack((np.cos(halves), np.sin(halves), zeros, zeros), axis=-1)[:, None]
@@ -87,7 +87,7 @@ def test_frames_that_differ_entirely_for_long_are_replaced() -> None:
 
 
 def far_away(start: int, stop: int, count: int) -> Poses:
-    """Return constant frames in which joint and root have other values in one range."""
+    """Return frames that are all equal, except that joint and root have other values in one range."""
     poses = poses_of([0] * count)
     poses.roots[start:stop] = 5.0
     poses.rotations[start:stop] = poses_of([3]).rotations[0]

@@ -58,7 +58,7 @@ def record(database: MatchingDatabase) -> TrialRecord:
 
 
 def undisturbed(database: MatchingDatabase, first: int, ticks: int) -> TrialRecord:
-    """Return the record of a trial that plays consecutive rows on the root with which they were recorded."""
+    """Return the record of a trial that plays consecutive rows, with the root path of these rows in the database."""
     rows = np.arange(first, first + ticks, dtype=np.int32)
     nothing = np.full(ticks, np.nan)
     return TrialRecord(
@@ -74,7 +74,7 @@ def undisturbed(database: MatchingDatabase, first: int, ticks: int) -> TrialReco
 
 
 def jump(database: MatchingDatabase, before: int, after: int, ticks: int = 60) -> TrialRecord:
-    """Return the record of a trial that plays rows from `before` on, and after half of the ticks rows from `after` on.
+    """Return the record of a trial that plays rows from `before` on, and in its second half rows from `after` on.
 
     The root does not move.
     """

@@ -1,4 +1,4 @@
-"""Contact sheets: their contents, and that they can be drawn for any clip."""
+"""Contact sheets (a row of small figures for each clip): their contents, and that any clip can be drawn."""
 
 import io
 from concurrent.futures import ThreadPoolExecutor

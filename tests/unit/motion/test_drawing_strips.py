@@ -1,4 +1,4 @@
-"""Strips of small figures: the positions of bodies on the page, and the parts of them that are drawn."""
+"""Strips of small figures: where the bodies are on the page, and which parts of a body are drawn."""
 
 import numpy as np
 import pytest

@@ -23,7 +23,7 @@ FRAMES: dict[str, Callable[[int, dict[str, Any]], int]] = {
     "resample": lambda frames, given: int((frames - 1) * 45 / 60) + 1,
     "retime": lambda frames, given: int((frames - 1) / 0.7) + 1,
 }
-"""Number of frames of all clips that a command makes of a walk of some frames; commands not listed keep the number."""
+"""Total number of frames after a command, as a function of the frames before. Commands not listed keep the number."""
 
 
 def edit_of(*commands: dict[str, Any]) -> EditDocument:

@@ -129,7 +129,7 @@ def test_the_interval_of_skewed_changes_reaches_farther_to_the_long_side() -> No
 
 
 def efron_bounds(changes: Floats) -> Iterator[float]:
-    """Yield the bias-corrected and accelerated bounds of the mean as in Efron (1987), with other resamples."""
+    """Yield the bias-corrected and accelerated bounds of the mean as in Efron (1987), from other random resamples."""
     normal, random, count = NormalDist(), np.random.default_rng(6), len(changes)
     means = np.sort(random.choice(changes, (20_000, count)).mean(axis=1))
     bias = normal.inv_cdf(np.mean(means < changes.mean()))

@@ -32,7 +32,7 @@ TRIALS = suite_trials(OPTIONS)
 
 
 def searched_record(trial: Trial, number: int) -> TrialRecord:
-    """Return a random record that follows the reference of the trial, with a search every six ticks and a few jumps."""
+    """Return a random record that follows the trial's reference path, with a search every six ticks and a few jumps."""
     asked = reference(trial)
     ticks = asked.tick_count
     generator = np.random.default_rng(number)

@@ -1,4 +1,4 @@
-"""Ranking of clips from other collections by the gaps that they fill, if they can be blended with the set."""
+"""Ranking of clips from other collections by the coverage gaps that they fill, if the set can blend with them."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,4 @@
-"""Coverage during a recording: the same windows as afterwards for any division of the frames, and the next targets."""
+"""Coverage during a recording: frames in pieces of any length give the same windows as a whole clip; next targets."""
 
 import math
 from collections.abc import Iterator

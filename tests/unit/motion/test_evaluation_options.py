@@ -1,4 +1,4 @@
-"""The parameters of an evaluation are the options of the computation, and a few of the job."""
+"""Parameters of evaluation jobs: the options of the computation and a few more; options of old documents."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Parts of databases have the same rows as the whole, without a new computation."""
+"""Selection of clips from a matching database: rows are copied from the whole database, not computed again."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Similarity of the poses in a cell, compared with the distances of all pairs of frames."""
+"""Similarity of the poses in a cell of speed and turn rate, compared with the distances of all pairs of frames."""
 
 from dataclasses import replace
 from typing import Any
@@ -25,12 +25,12 @@ from marey_motion.matching.record import Status
 
 
 def straight_walks(count: int = 3, seconds: float = 5.0, **given: Any) -> list[Track]:
-    """Return clips of one speed, hence in one cell, that differ in the phase of their gait."""
+    """Return clips of one speed, so all in one cell, that differ in the phase of the gait."""
     return named([arc_track(1.0, 0.0, seconds, phase=0.4 * number, **given) for number in range(count)])
 
 
 def brute_force(database: MatchingDatabase, rows: Ints) -> Floats:
-    """Return the distance of each row from the nearest of the given rows of another source."""
+    """Return the distance of each of these rows from the nearest of these rows that has another source."""
     points = database.pose_points[rows].astype(np.float64)
     apart = np.linalg.norm(points[:, None] - points[None], axis=-1).sum(axis=-1)
     sources = source_of_rows(database)[rows]

@@ -171,9 +171,9 @@ REAL = EvaluationOptions(duration_s=15.0, families=("circle",))
 
 @pytest.fixture(scope="module")
 def bandai(mocap: Path) -> tuple[MatchingDatabase, MatchingDatabase]:
-    """A database of walks and runs that hardly turn, and one of turns from another collection.
+    """A database of walks and runs that hardly turn, and a database of turns from another collection.
 
-    Both use the body of the first collection.
+    Both databases use the body of the first collection.
     """
     straight, turns = (
         [SourceClip(path.stem, path.stem, read_motion(path.read_bytes(), path.name).clip) for path in paths]

@@ -1,4 +1,4 @@
-"""Other weights give the same results as a database built with them, and groups are ranked by their effect."""
+"""Sweeps of weights: results equal those of a database built with the weights; groups are ranked by effect."""
 
 from math import radians
 from typing import Any

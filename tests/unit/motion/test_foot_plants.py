@@ -40,7 +40,7 @@ def _feet(skeleton: Skeleton, clip: Clip | None = None) -> list[Foot]:
 
 
 def _sliding(clip: Clip, size_m: float = 0.02) -> Motion:
-    """Return the motion with a slow oscillation of the root, which moves the feet so little that contacts are found."""
+    """Return the motion with a slow oscillation of the root; the feet slide, but so little that contacts are found."""
     motion = Motion.of(clip)
     t = np.arange(clip.frame_count) / clip.frame_rate_hz
     wobble = size_m * np.stack((np.sin(3.1 * t), 0.3 * np.sin(2.3 * t + 1.0), np.cos(2.7 * t)), axis=1)

@@ -89,7 +89,7 @@ def test_radians_are_read_as_radians() -> None:
 
 
 def in_radians(text: str, *angles: str) -> str:
-    """Return the text with these angles, which end lines, converted to radians."""
+    """Return the text with these angles converted to radians; an angle must be the last number of its line."""
     for angle in angles:
         words = [word if word.isalpha() else repr(float(np.radians(float(word)))) for word in angle.split()]
         text = text.replace(f" {angle}\n", f" {' '.join(words)}\n")

@@ -1,4 +1,4 @@
-"""Detection of the format of a file, first by its bytes."""
+"""Detection of the format of a file by its bytes, or else by its name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The predecessor's clips and skeletons: handedness, both of their forms, and every encoding."""
+"""Clips and skeletons of Marey's predecessor: handedness, both forms of each document, and every encoding."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_skeletons_survive_both_forms(body: Skeleton, form: SkeletonForm) -> Non
 
 
 def described(document: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return all nodes of a skeleton document, in either of its forms."""
+    """Return all nodes of a skeleton document, which may have either form."""
     if "jointDescs" in document:
         return list(document["jointDescs"])
     nodes = [document["root"]]

@@ -1,4 +1,4 @@
-"""The predecessor's documents for aligned clips."""
+"""Documents of Marey's predecessor for aligned clips."""
 
 import json
 from collections.abc import Callable

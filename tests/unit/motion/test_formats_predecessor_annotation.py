@@ -1,4 +1,4 @@
-"""Reading and writing of the predecessor's annotations."""
+"""Reading and writing annotations in the format of Marey's predecessor."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Reading and writing of the predecessor's graphs of models."""
+"""Reading and writing graphs of models in the format of Marey's predecessor."""
 
 import copy
 import json
@@ -75,7 +75,7 @@ def test_a_graph_without_a_start_is_refused_by_the_field_that_is_missing() -> No
             "walk/begin: a transition leads to the node 'walk:99', which",
         ),
         (["start_node"], "idle", "'start_node' must be a list of two names"),
-        (["start_node"], ["idle", "99"], "names the node"),
+        (["start_node"], ["idle", "99"], "refers to the node"),
     ],
 )
 def test_damaged_graphs_are_refused_by_the_node(path: list[str], value: object, told: str) -> None:

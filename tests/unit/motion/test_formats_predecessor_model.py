@@ -1,4 +1,4 @@
-"""The predecessor's motion primitives: reading of every layout, and writing of the layouts 3 and 2."""
+"""Motion primitives of Marey's predecessor: reading every file layout, and writing layouts 3 and 2."""
 
 import copy
 import dataclasses

@@ -1,4 +1,4 @@
-"""Reading and writing of the predecessor's cluster trees."""
+"""Reading and writing cluster trees in the format of Marey's predecessor."""
 
 import copy
 import json

@@ -54,9 +54,9 @@ def on_the_ground(clip: Clip, turn_rad: float, shift: tuple[float, float]) -> Cl
 
 
 def game_walk() -> tuple[Clip, MatchingBody]:
-    """Return a walk of a skeleton whose root is on the ground below the pelvis, and its body.
+    """Return a walk of a skeleton whose root is on the ground below the pelvis, and the body of this skeleton.
 
-    The root has other local axes than the world.
+    The local axes of the root differ from those of the world.
     """
     target = game_skeleton()
     source = WALK.skeleton
@@ -67,7 +67,7 @@ def game_walk() -> tuple[Clip, MatchingBody]:
 
 
 def left_behind(clip: Clip) -> tuple[Clip, MatchingBody]:
-    """Return the clip below a rotated reference joint that does not move, and its body.
+    """Return the clip below an added, rotated root that does not move, and the body of the new skeleton.
 
     The hips move by position channels.
     """
@@ -130,7 +130,7 @@ class TestPoses:
 
 class TestWhatMustNotMatter:
     def test_half_a_turn_and_a_shift_on_the_ground_change_no_feature(self) -> None:
-        """Both are exact in single precision, on a grid of 1/4096 m, so only rounding in double precision remains."""
+        """Positions are on a grid of 1/4096 m, so that the turn and the shift are exact in single precision."""
         poses = WALK.poses.copy()
         poses[:, :3] = np.round(poses[:, :3] * 4096) / 4096
         clip = replace(WALK, poses=poses)
@@ -144,7 +144,7 @@ class TestWhatMustNotMatter:
 
     @pytest.mark.parametrize("turn_rad", [0.3, 1.9, -2.6])
     def test_any_turn_and_shift_change_no_more_than_clips_can_hold(self, turn_rad: float) -> None:
-        """Clips are in single precision: 5e-7 m at 8 m from the origin, or 2e-5 m/s for differences over 1/30 s."""
+        """Clips have single precision: errors of 5e-7 m at 8 m from the origin, so of 2e-5 m/s over 1/30 s."""
         there = built(on_the_ground(WALK, turn_rad, (4.0, -7.0)))
         np.testing.assert_allclose(there.features, built(WALK).features, atol=5e-5)
 
@@ -159,7 +159,7 @@ class TestWhatMustNotMatter:
         assert one.poses.tobytes() == other.poses.tobytes()
 
     def test_other_clips_change_no_row(self) -> None:
-        """Neighbouring clips do not change them either: no row looks across the boundary of a clip."""
+        """Even neighbouring parts of one take change no row, because no row looks across the boundary of a clip."""
         parts = [SourceClip("a", "a", WALK.sliced(0, 90)), SourceClip("b", "b", WALK.sliced(90, 180))]
         both = build_database(parts, BODY)
         for part, entry in zip(parts, both.clips, strict=True):
@@ -256,7 +256,7 @@ class TestFrames:
         assert not built(straight).clips[0].in_place
 
     def test_a_file_in_centimetres_is_the_same_clip_as_one_in_metres(self) -> None:
-        """The tolerance is that of the files: six decimals in centimetres, four in metres."""
+        """The tolerance follows from the decimals in the files: six in centimetres, four in metres."""
         features = []
         for unit, scale_m in (("cm", 0.01), ("m", 1.0)):
             data = write_bvh(WALK, unit=unit)

@@ -1,4 +1,4 @@
-"""Loops: rows look ahead across the seam, filters run across it, and rounds follow each other on the ground."""
+"""Loops: rows look ahead and filters run across the seam; each round continues where the one before ended."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ def long_walk(request: pytest.FixtureRequest) -> Clip:
 
 
 def test_a_round_of_a_walk_is_like_that_part_of_the_walk(long_walk: Clip) -> None:
-    """A stride that is cut out and marked as a loop has the same rows as this part of the walk."""
+    """A stride that is cut out of a walk and marked as a loop has the same rows as in the walk."""
     length = stride_frames(long_walk)
     loop, walk = built(long_walk.sliced(120, 120 + length)), built(long_walk, loop=False)
     part = slice(120, 120 + length)
@@ -67,7 +67,7 @@ def test_rows_look_ahead_to_where_playing_on_leads(long_walk: Clip) -> None:
 
 
 def test_a_loop_that_begins_elsewhere_has_the_same_rows(long_walk: Clip) -> None:
-    """A round that begins at another frame has the same rows in another order."""
+    """If the loop is cut at another frame, its rows are the same in another order."""
     length = stride_frames(long_walk)
     motion = Motion.of(long_walk.sliced(120, 120 + length))
     positions = motion.positions(long_walk.skeleton)

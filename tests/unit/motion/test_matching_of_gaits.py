@@ -1,8 +1,8 @@
 """Motion matching on whole bodies: generated gaits are converted to a database and then played.
 
-The torso of a body sways with the steps and leans into a curve. So its root is centimetres away from the path for which
-the gait was generated, and its circles are a little smaller and slower. Tolerances that are larger than rounding errors
-allow for this.
+The torso sways with the steps and leans into a curve. So the root is centimetres away from the path for which the gait
+was generated, and it moves on slightly smaller circles at a slightly lower speed. Tolerances that are larger than
+rounding errors allow for this.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
 FOLLOWS = ("time", "path", "open_loop")
 EXACT = ControllerOptions(root_inertialisation=False)
 LEAN_M = 0.04
-"""The torso is at most so far inside the curve that the feet run."""
+"""Greatest distance in metres between the torso and the curve of the feet, towards the inside."""
 
 
 def circle(speed: float, turn_rate_deg: float, **options: float) -> Trial:
@@ -71,7 +71,7 @@ def static_errors(record: TrialRecord, trial: Trial) -> tuple[float, float]:
 
 @pytest.fixture(scope="module")
 def takes() -> list[SourceClip]:
-    """Twenty-four takes by as many walkers, turning left and right with different gaits."""
+    """Twenty-four takes, each of another walker, that turn left and right with different gaits."""
     return [SourceClip(f"clip_{number:02d}", made.name, made.clip) for number, made in enumerate(generate_dataset())]
 
 
@@ -200,7 +200,7 @@ def places(database: MatchingDatabase, record: TrialRecord) -> list[tuple[str, i
 def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(
     takes: list[SourceClip], follow: str
 ) -> None:
-    """Only the circle is compared: on the straight approach, both trials would begin with the same row."""
+    """Trials have no straight approach before the circle, because both trials would begin it with the same row."""
     closed = database_of(takes, DatabaseOptions(mirroring="add"))
     options = ControllerOptions(follow=follow)
     for speed, turn_rate_deg in ((1.3, 40.0), (2.0, 60.0), (1.0, 100.0)):

@@ -45,7 +45,7 @@ def clips_of(rows: int, frames: int) -> Ints:
 
 
 def gait_like(rows: int, dimensions: int, rng: Generator) -> Floats:
-    """Return clips of 90 rows, each the sum of a few harmonics of its own stride about its own mean."""
+    """Return clips of 90 rows; each clip is the sum of a few harmonics with a stride and a mean of its own."""
     clips = -(-rows // 90)
     time = np.arange(90)[:, None, None] / 60
     orders = np.arange(1, 4)
@@ -91,7 +91,7 @@ DATABASES = (gait_like, gaussian, quantised, constant, denormal, tiny_squares, f
 
 
 def queries_for(rows: Floats, count: int, rng: Generator) -> Floats:
-    """Return queries: rows, rows moved by a little or by one step of float32, and mixtures of two rows."""
+    """Return queries: rows, rows changed slightly or by one step of float32, and mixtures of two rows."""
     first, second = rng.integers(0, len(rows), (2, count))
     queries = rows[first].copy()
     half = rows.shape[1] // 2
@@ -148,7 +148,10 @@ def test_differences_that_float32_cannot_show_still_decide(data: DataObject) -> 
 
 
 def test_distances_whose_squares_float32_barely_holds_still_decide() -> None:
-    """The squares are about ten of the smallest steps of float32: half of the rows round to 270, the others to 256."""
+    """Each squared difference is about ten times the smallest positive float32, and is rounded to a multiple of it.
+
+    In float32, the sum is 270 of these steps for half of the rows and 256 for the others; the true sums differ little.
+    """
     rng = np.random.default_rng(2)
     step = 2.0**-149
     up, down = np.full(27, 9.51), np.repeat([10.49, 8.6], [13, 14])

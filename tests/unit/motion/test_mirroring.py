@@ -23,7 +23,7 @@ def partners_of(skeleton: Skeleton) -> NDArray[np.int32]:
 
 
 def wild(skeleton: Skeleton, seed: int, *, translated: tuple[int, ...] = ()) -> Clip:
-    """Return a clip of random rotations, one frame for each joint."""
+    """Return a clip of 20 frames of random rotations and root positions; joints in `translated` also move."""
     rng = np.random.default_rng(seed)
     rotations = rng.standard_normal((20, skeleton.joint_count, 4))
     rotations /= np.linalg.norm(rotations, axis=-1, keepdims=True)
@@ -55,7 +55,7 @@ def random_turns(count: int, seed: int) -> NDArray[np.float64]:
 
 
 def own_axes() -> Skeleton:
-    """Return the studio skeleton with random local axes, which differ between both sides."""
+    """Return the studio skeleton with random local axes, which are different on the left and the right side."""
     plain = studio_skeleton()
     return with_rest_pose(plain, random_turns(plain.joint_count, 3))
 

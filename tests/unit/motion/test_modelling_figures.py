@@ -336,7 +336,7 @@ def test_odd_models_are_drawn_and_nothing_is_cut_off(odd: str) -> None:
 
 
 def many(count: int) -> AlignedSet:
-    """Return so many walks; only a few of them are generated, because this takes long."""
+    """Return `count` walks, most of them copies of 20 generated walks, because generating takes long."""
     aligned = walks(20)
     clips = []
     for number in range(count):

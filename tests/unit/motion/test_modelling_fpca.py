@@ -72,7 +72,7 @@ def test_components_are_those_of_an_independent_library() -> None:
 
 
 def test_the_share_of_variance_counts_every_component() -> None:
-    """A truncated decomposition, which lacks the last components, would state a share of 95 % that is too high."""
+    """A truncated decomposition lacks the last components, so it would state a share of variance that is too high."""
     coefficients = some(9, 5)
     deviations = np.linalg.svd((coefficients - coefficients.mean(axis=0)).reshape(9, -1), compute_uv=False)
     share = np.cumsum(deviations**2) / np.sum(deviations**2)
@@ -148,7 +148,7 @@ def turning(turns: float, frames: int = 60) -> Floats:
 
 
 def test_a_turn_beyond_half_a_turn_stays_in_one_piece() -> None:
-    """If each frame were compared with one pose, the signs of its quaternions would change during the turn."""
+    """If each frame were compared with one fixed pose, the signs of quaternions would change during the turn."""
     rotations = turning(0.9)
     jumping = rotations * np.where(rotations @ rotations[0, 0] < 0.0, -1.0, 1.0)[..., None]
     assert np.abs(np.diff(jumping, axis=0)).max() > 1.0
@@ -174,7 +174,7 @@ def test_root_axes_are_scaled_one_by_one_and_a_still_one_is_left() -> None:
 
 
 def test_a_joint_weighs_what_a_step_of_it_moves_the_body() -> None:
-    """The bones lie in a plane and rotate about its normal, so that the direction of the rotation shortens no lever."""
+    """All bones lie in a plane, and joints rotate about the normal of this plane, so levers have their full length."""
     skeleton = chain(5)
     pose = np.concatenate((np.zeros(3), np.tile([1.0, 0.0, 0.0, 0.0], 5)))
     weights = jacobian_weights(skeleton, pose[None])

@@ -97,14 +97,14 @@ def test_components_are_tried_as_long_as_each_has_two_examples_for_every_dimensi
 
 
 def test_one_kind_in_many_dimensions_is_one_component() -> None:
-    """The published method, Akaike's criterion with up to 40 components, finds 24 components in such data."""
+    """The published method (Akaike's criterion, up to 40 components) finds 24 components in such data."""
     one_kind = np.random.default_rng(2).standard_normal((89, 12)) * np.linspace(3.0, 0.3, 12)
     assert len(fit_mixture(one_kind).mixture.weights) == 1
 
 
 @pytest.mark.slow
 def test_identical_examples_give_identical_mixtures_every_time() -> None:
-    """Without a seed, the number of components differed from run to run."""
+    """Formerly the fit had no seed, and the number of components differed from run to run."""
     random = np.random.default_rng(4)
     examples = np.concatenate([random.standard_normal((25, 2)) + 3.0 * random.standard_normal(2) for _ in range(4)])
     first, second = (fit_mixture(examples, seed=3) for _ in range(2))

@@ -1,4 +1,4 @@
-"""Constraints and Equation 1, compared with forward kinematics of whole motions and explicit formulas."""
+"""Constraints and the objective of a search (Herrmann et al. 2019, Equation 1), compared with plain computations."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -107,7 +107,7 @@ def test_errors_are_those_of_the_whole_motions() -> None:
 
 
 def kept_within(count: int) -> tuple[MotionPrimitive, Floats]:
-    """Return a model whose motions last 0.9 to 1.1 s, and latent vectors of which many would last shorter or longer."""
+    """Return a model that limits durations to 0.9 to 1.1 s, and latent vectors, many of them beyond these limits."""
     free, _ = walking()
     latents = free.sample(count, 1)
     lasting = free.durations_s(latents)
@@ -135,7 +135,10 @@ def test_times_are_those_of_motions_that_are_kept_within_their_range() -> None:
 
 
 def cut_off(count: int) -> tuple[MotionPrimitive, Floats]:
-    """Return a model that limits its time steps to the middle half of those of its latent vectors, and such vectors."""
+    """Return latent vectors, and a model that limits time steps to the middle half of those of the vectors.
+
+    The model comes first in the result.
+    """
     free, _ = walking()
     latents = free.sample(count, 1)
     drawn = np.log(np.diff(free.time_functions(latents), axis=1))

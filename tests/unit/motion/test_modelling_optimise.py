@@ -1,4 +1,4 @@
-"""Refinement of motions: closed forms if there are any, and general properties otherwise."""
+"""Refinement of motions, compared with closed forms where these exist, and else checked for general properties."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -197,7 +197,7 @@ def test_a_target_out_of_all_reach_and_all_proportion_is_approached_as_far_as_ro
 
 def test_slopes_without_any_curvature_are_damped_instead_of_failing() -> None:
     class Flat:
-        """Objective with a constraint on which no number has an effect, and with a prior that is constant."""
+        """Objective whose error is always 1, although its derivatives are stated as 1e20; the prior is constant."""
 
         priors = (LatentMixture(np.ones(1), np.zeros((1, 2)), 1e40 * np.eye(2)[None]),)
 

@@ -190,9 +190,7 @@ def test_what_lies_between_samples_is_told_from_samples_and_costs_what_it_says()
 
 
 def own_keyframes(**options: Any) -> tuple[list[Objective], SampleTree, list[tuple[JointPositionConstraint]], Floats]:
-    """Return one search for each example of a model of walks.
-
-    A search puts the left wrist where its example has it at the keyframe.
+    """Return a search for each example of a model of walks: the target is the example's own left wrist at a keyframe.
 
     Returns the objectives by example, the tree of the model, the constraints by example, and the latent vectors (m, L)
     of the examples.

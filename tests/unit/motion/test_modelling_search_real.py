@@ -1,4 +1,4 @@
-"""Search in a model of real raised hands, for positions of the wrist in takes that were not used to train it."""
+"""Search in a model of real takes that raise a hand; targets are wrist positions from takes left out of training."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -71,7 +71,7 @@ def _on_one_skeleton(clips: list[Clip]) -> list[Clip]:
 def _search_all(
     trained: TrainedPrimitive, unseen: list[AlignedClip], body: MatchingBody
 ) -> tuple[Floats, Floats, Flags]:
-    """Return the errors after search and after refinement in cm, and whether likelihoods are like those of examples."""
+    """Return the errors in cm after the search and after refinement, and whether results are as likely as examples."""
     primitive, joints = trained.primitive, dict(body.standard_joints)
     least = np.percentile([one.log_likelihood for one in trained.report.examples], 1)
     tree = build_tree(primitive, 1, end_effectors=[joints[name] for name in END_EFFECTORS])

@@ -37,7 +37,7 @@ def tree() -> SampleTree:
 
 
 def walk_to(*places: Any) -> list[Step]:
-    """Return steps of one second, which end near these places on the ground."""
+    """Return one step of a walk for each place, constrained to end there on the ground."""
     return [
         Step(walking()[0], (RootPositionConstraint(at="end", target_m=place, tolerance_m=0.05),), standard_joints())
         for place in places

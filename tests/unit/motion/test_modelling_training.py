@@ -1,4 +1,4 @@
-"""Training of motion primitives from aligned examples, and its report."""
+"""Training of motion primitives from aligned examples, and the report of the training."""
 
 import dataclasses
 from typing import Any

@@ -1,4 +1,4 @@
-"""Trees of samples: their contents and construction, which is the same every time."""
+"""Trees of samples: their contents, and that building a tree again gives the same tree."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Errors have a text, a place and a code, and can be sent between processes."""
+"""Errors of the motion library have a text, a place and a code, and can be sent between processes."""
 
 import pickle
 

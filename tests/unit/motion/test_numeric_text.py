@@ -1,4 +1,4 @@
-"""Numbers parsed from text equal those of Python, and texts for which Python is too liberal are refused."""
+"""Numbers parsed from text equal those that Python parses; some texts that only Python accepts are refused."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def resting(skeleton: Skeleton) -> Clip:
 
 
 def tumbling(skeleton: Skeleton, frames: int = 200, seed: int = 4) -> Clip:
-    """Return a clip of random rotations, some of them half turns, which no body can perform."""
+    """Return a clip of random rotations that no real body can perform; some of the rotations are half turns."""
     generator = np.random.default_rng(seed)
     rotations = quaternions.normalise(generator.normal(size=(frames, skeleton.joint_count, 4)))
     rotations[0] = quaternions.identity()
@@ -147,7 +147,7 @@ def assert_changes_nothing(plan: RetargetPlan) -> None:
 
 
 def assert_pelvis_travels(source: Actor, target: Actor, clip: Clip, result: Clip, plan: RetargetPlan) -> None:
-    """Check that the pelvis of the result moves like that of the source, times the scale."""
+    """Check that the pelvis of the result moves like the pelvis of the source, times the scale."""
     expected = plan.scale * kinematics.global_positions(clip)[:, source.joint("pelvis")].astype(np.float64)
     found = kinematics.global_positions(result)[:, target.joint("pelvis")].astype(np.float64)
     assert np.abs(found - expected).max() < 1e-6
@@ -167,7 +167,7 @@ def after_rest_pose(clip: Clip) -> Clip:
 
 
 def with_lowered_arms(skeleton: Skeleton, angle_deg: float) -> Skeleton:
-    """Return the skeleton with both arms lowered at rest, from a pose that stretches them out sideways."""
+    """Return the skeleton with both arms lowered at rest; `skeleton` stretches the arms out sideways."""
     rest = skeleton.rest_rotations.copy()
     for name, sign in (("LeftArm", -1.0), ("RightArm", 1.0)):
         arm = skeleton.index_of(name)
@@ -177,7 +177,7 @@ def with_lowered_arms(skeleton: Skeleton, angle_deg: float) -> Skeleton:
 
 
 def algorithm_1(source: SimpleNamespace, target: Actor, plan: RetargetPlan, frame: int) -> Floats:
-    """Return the local rotations (K, 4) of one pose, computed joint by joint as in Algorithm 1 of the paper."""
+    """Return the local rotations (K, 4) of one pose, computed joint by joint (Herrmann et al. 2019, Algorithm 1)."""
     source_global = kinematics.global_rotations(source.clip).astype(np.float64)[frame]
     target_global = quaternions.identity(target.skeleton.joint_count)
     local = target.skeleton.rest_rotations.copy()
@@ -378,7 +378,7 @@ def test_bones_that_translations_moved_are_told_with_their_joints(studio: Actor,
 
 
 def bones_followed_by_numpy(clip: Clip, joints: dict[str, int]) -> tuple[AnyFloats, dict[str, float]]:
-    """Return rotations (F, 4·J) and largest turns in degrees, computed by the formula in numpy, bone by bone."""
+    """Return what `follow_moved_bones` returns, computed in numpy: rotations (F, 4·J) and largest turns in degrees."""
     still = replace(clip, translations=None, translated_joints=())
     rigid, moved = (kinematics.global_positions(one).astype(np.float64) for one in (still, clip))
     turned, largest = kinematics.global_rotations(clip).astype(np.float64), {}

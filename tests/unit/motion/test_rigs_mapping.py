@@ -116,7 +116,7 @@ def test_a_known_rig_is_recognised_and_every_joint_gets_its_standard_name(body: 
 
 
 def with_a_sword(skeleton: Skeleton, hand: int) -> Skeleton:
-    """Return the skeleton with two more joints that hang from a hand and reach farther than its fingers."""
+    """Return the skeleton with two more joints that hang from a hand and reach farther than the hand's fingers."""
     return replace(
         skeleton,
         joint_names=(*skeleton.joint_names, "grip", "blade"),

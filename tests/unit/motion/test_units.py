@@ -1,4 +1,4 @@
-"""Unit and axes of a file, inferred from the body, with a question to the user if they are unclear."""
+"""Unit and axes of a file: inferred from the body, or asked from the user if they remain unclear."""
 
 from __future__ import annotations
 

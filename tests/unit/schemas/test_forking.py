@@ -1,4 +1,4 @@
-"""Child processes that are forked from a process which has loaded their modules."""
+"""Child processes that are forked from a process in which the modules that they need are already loaded."""
 
 import os
 import signal
@@ -27,7 +27,7 @@ def server() -> Iterator[ForkServer]:
 
 
 def ids_from(child: ConnectedChild) -> list[int]:
-    """Return the ids of four processes: the one that loaded the child's module, its parent, itself, and its session."""
+    """Return four ids: the process that loaded the child's module, the child's parent, the child, and its session."""
     child.send(b"who")
     answer = child.receive(WAIT_S)
     assert answer is not None

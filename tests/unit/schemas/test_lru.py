@@ -1,4 +1,4 @@
-"""Cache of recently used values: which values it keeps, and which it removes first."""
+"""Cache of recently used values: which values stay in the cache, and which are removed first."""
 
 import threading
 

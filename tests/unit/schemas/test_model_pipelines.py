@@ -1,4 +1,4 @@
-"""Conversion of a plan to jobs, from takes to a model, with the inputs of each job."""
+"""Conversion of a plan for a model to a pipeline of jobs, from takes to the model, with the inputs of each job."""
 
 from typing import Any
 

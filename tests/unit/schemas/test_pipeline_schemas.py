@@ -1,4 +1,4 @@
-"""Pipelines: the order of their steps, and the inputs that a step names."""
+"""Documents of pipelines: the order of the steps, and the inputs of each step."""
 
 from typing import Any
 

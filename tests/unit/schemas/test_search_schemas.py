@@ -1,4 +1,4 @@
-"""Requests for searches: one unit per quantity, and the spellings of release 0.1."""
+"""Requests for searches: one unit per quantity, and the field names of release 0.1."""
 
 import json
 

@@ -65,7 +65,7 @@ def test_what_does_not_get_smaller_is_stored_raw() -> None:
 @given(data=st.data())
 @settings(max_examples=examples(300))
 def test_quaternions_with_any_low_bits_come_back_to_the_bit(data: st.DataObject) -> None:
-    """No tile is decoded after it is encoded, so the prediction must be exact for all bits that it accepts."""
+    """The encoder does not verify tiles by decoding, so its prediction must be exact for all values that it accepts."""
     frames, joints, lead = data.draw(st.integers(1, 40)), data.draw(st.integers(1, 6)), data.draw(st.integers(0, 3))
     random = np.random.default_rng(data.draw(st.integers(0, 2**32)))
     turned = random.normal(0, 10.0 ** random.uniform(-30, 1, (joints, 4)), (frames, joints, 4))

@@ -54,7 +54,7 @@ def serve(
     most: int = 4,
     busy: Callable[[Kept], Collection[object]] = lambda _: (),
 ) -> None:
-    """Run a test with connections that the event loop accepts, and a function that connects a client."""
+    """Call `work` with a function that connects a client, while an event loop accepts connections."""
 
     async def main() -> None:
         server = Kept(lambda _request: None)

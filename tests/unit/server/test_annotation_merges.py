@@ -1,4 +1,4 @@
-"""Versions in which two people have labelled one clip: merged, picked, undone, and committed by jobs."""
+"""Versions in which two people have labelled one clip: merges, cherry-picks, reverts, and commits by jobs."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class LabellingDesk(CommittingDesk):
         return answer
 
     def pick(self, *, undo: bool = False, **fields: Any) -> MergeAnswer:
-        """Repeat or undo a commit on `main`."""
+        """Cherry-pick a commit to `main`, or with `undo` revert it there."""
         request = PickRequest(**fields)
         prepared = self.read(datasets.prepare_pick, "lab", "gaits", request, undo=undo)
         answer: MergeAnswer = self.write(datasets.record_merge, "lab", "gaits", request, prepared)
@@ -249,13 +249,13 @@ def test_the_commit_of_a_job_merges_fewer_annotations_since_others_wait(
 
 
 def leave_no_room(tx: Transaction) -> None:
-    """Limit each project to the items that it has."""
+    """Set the limit of items of each project to the number of items that the project has."""
     for row in tx.execute(select(holding).join(project, project.c.id == holding.c.owner_id)).all():
         tx.execute(update(holding).where(holding.c.owner_id == row.owner_id).values(limits={"items": row.items}))
 
 
 def test_a_merge_needs_no_room_for_items(labelling: LabellingDesk) -> None:
-    """The item of merged labels is in no folder, so that it counts as little as a deleted one."""
+    """The new item with the merged labels is in no folder, so it does not count towards the limit of items."""
     labelling.label(OURS)
     labelling.label(THEIRS, "trial")
     labelling.write(leave_no_room)

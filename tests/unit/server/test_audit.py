@@ -1,4 +1,4 @@
-"""Audit log in the store: which functions change events, retention beside the feed and webhooks, indexes, upgrades."""
+"""Audit log in the store: which functions change events, how long entries are kept, indexes, and upgrades."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def changes_of_events() -> Iterator[tuple[str, str, str]]:
 
 
 def _changes_event(call: ast.Call) -> str | None:
-    """Return `delete` or `update` if a call makes such a statement for the table of events."""
+    """Return `delete` or `update` if a call builds such a statement for the table of events, or None."""
     named = call.func
     if isinstance(named, ast.Name) and named.id in CHANGING:
         target = ast.unparse(call.args[0])
@@ -128,7 +128,10 @@ def test_old_events_are_deleted_and_audit_entries_stay(lab: Lab, clock: Adjustab
 
 
 def test_the_feed_shows_no_audit_entries_from_before_the_events_that_remain(lab: Lab, clock: AdjustableClock) -> None:
-    """A follower who begins at 0 gets whole periods, and no number after which it could not continue."""
+    """A follower who begins at 0 gets only events from periods that are still complete.
+
+    So the follower gets no event number after which it could not continue.
+    """
     set_role(lab, Role.CONTRIBUTOR)
     last = lab.events()[-1].seq
     clock.advance(11 * DAY_S)
@@ -274,7 +277,7 @@ def test_each_filter_of_the_server_has_an_index_in_the_order_of_the_log(
 
 
 def index_of(lab: Lab, read: Callable[..., Any], *of: str, **wanted: Any) -> str:
-    """Return the index with which SQLite reads the first page of a log, without sorting."""
+    """Return the index that SQLite uses for the first page of a log; fail if SQLite sorts entries."""
     statements: list[tuple[str, Any]] = []
 
     def note(_connection: Any, _cursor: Any, statement: str, parameters: Any, *_others: Any) -> None:

@@ -1,4 +1,4 @@
-"""Clock of an SQLite database: refused if it is implausible, and set back together with all stored times."""
+"""Clock of an SQLite database: refused if implausible; a command sets the clock back with all stored times."""
 
 import re
 import time

@@ -275,7 +275,7 @@ class DatasetMachine(RuleBasedStateMachine):
             assert origins.parts["hierarchy"].commit.digest == self.model.origin(at, path)
 
     def _look_for_removal(self, at: str, path: str) -> None:
-        """Expect that the error for a missing entry names the commit that removed it, or none if it never existed."""
+        """Check that the error for a missing entry names the commit that removed it, or none if it never existed."""
         chain = self.model.first_parents(at)
         had = [path in self.model.state(one) for one in chain]
         removed_by = chain[had.index(True) - 1] if any(had) else None
@@ -298,7 +298,7 @@ class DatasetMachine(RuleBasedStateMachine):
 
     @contextmanager
     def _unless_impossible(self, branch: str, path: str, number: int | None) -> Iterator[bool]:
-        """Expect an error in the `with` block if the model cannot change the path; yield whether it can."""
+        """Yield whether the model can change the path; if not, expect an error in the `with` block."""
         if branch in self.model.tags or branch not in self.model.refs:
             codes = ("is-tag", "no-version")
         elif self.model.state(self.model.refs[branch]).get(path) == number:

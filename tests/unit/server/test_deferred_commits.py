@@ -1,4 +1,4 @@
-"""Commits of the outputs of jobs with many outputs, which the server makes after the last task has ended."""
+"""Deferred commits: the server commits the outputs of a job with many outputs after its last task has ended."""
 
 import asyncio
 from collections.abc import Callable
@@ -40,7 +40,10 @@ def few_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], object]], list[str]]:
-    """A function that lets `action` run once between the plan of a commit and its record; it returns the plans made."""
+    """Function that lets an action run once, after a commit is planned and before it is recorded.
+
+    It returns a list to which each plan is added.
+    """
 
     def arrange(action: Callable[[], object]) -> list[str]:
         plans: list[str] = []
@@ -174,7 +177,7 @@ def test_a_branch_that_moves_during_each_plan_leaves_the_job_for_later(
 
 
 def delete_and_purge(gaits: CommittingDesk, *found: str) -> list[PurgeAnswer]:
-    """Delete items, and ask for the purge of all deleted items; return the answer."""
+    """Delete these items, and purge all deleted studies; return the answer."""
     for item in found:
         gaits.write(items.delete_item, "lab", Kind.STUDY, item, expected_rev=None)
     request = PurgeRequest(collection="", kind=Kind.STUDY)
@@ -234,7 +237,7 @@ def test_a_commit_is_planned_again_after_a_purge(
 def test_chunks_that_a_purged_dataset_had_too_are_stored_again(
     gaits: CommittingDesk, meanwhile: Callable[[Callable[[], object]], list[str]]
 ) -> None:
-    """The branch moves, too, so that the last write makes its tree from chunks of the plan."""
+    """The branch also moves meanwhile, so that the last write builds a new tree from the chunks of the plan."""
     (thing,) = gaits.desk.things(1, "far")
     for one in (CommittingDesk(gaits.desk, "other"), gaits):
         one.change(PutEntry(path="own", item=thing))

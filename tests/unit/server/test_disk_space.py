@@ -21,7 +21,7 @@ SetFree = Callable[[int], None]
 
 @pytest.fixture
 def set_free(monkeypatch: pytest.MonkeyPatch) -> SetFree:
-    """Function that simulates a disk with this number of free bytes in addition to the reserve."""
+    """Function that simulates a disk with a number of free bytes, in addition to the reserve."""
 
     def set_bytes(free: int) -> None:
         def usage(folder: Path) -> SimpleNamespace:

@@ -28,9 +28,9 @@ def open_transaction(database: Database) -> Iterator[Transaction]:
 
 
 class Overlap:
-    """Writers with overlapping transactions, one that numbers events, and a follower that reads in between.
+    """Writers with overlapping transactions, a transaction that numbers events, and a follower that reads in between.
 
-    On SQLite, where transactions do not overlap, each is committed at once.
+    On SQLite, where transactions do not overlap, each transaction is committed at once.
     """
 
     def __init__(self, lab: Lab) -> None:
@@ -60,7 +60,7 @@ class Overlap:
                 self.open[name] = stack.pop_all()
 
     def follow(self) -> None:
-        """Read the feed after the last event that was received."""
+        """Read the events of the feed that follow the last received event."""
         for one in self.lab.read(events.list_events, "lab", after=self.last):
             assert one.seq > self.last
             self.last = one.seq
@@ -108,7 +108,7 @@ def test_an_order_by_insertion_would_lose_events(lab: Lab, monkeypatch: pytest.M
 
 
 def test_events_do_not_wait_for_transactions_that_are_open(lab: Lab) -> None:
-    """Open transactions in another database of the same cluster do not delay events either."""
+    """Open transactions, even in another database of the same cluster, do not delay events of other transactions."""
     if lab.database.is_sqlite:
         return
     elsewhere = sqlalchemy.create_engine(lab.database.url.set(database="postgres"))

@@ -71,7 +71,7 @@ def test_events_are_for_members_and_administrators(lab: Lab) -> None:
 
 
 def once(tx: Transaction, key: str = "k", fingerprint: str = "f", *, fail: bool = False) -> StoredAnswer | None:
-    """Append to the title of the project, but only once for each idempotency key.
+    """Append a letter to the project's title, but only once for each idempotency key.
 
     Returns the stored answer of an earlier request with the key, or None.
     """

@@ -28,7 +28,7 @@ LOG = declared("GET", "/projects/{project}/audit")
 
 
 class Follower:
-    """Client that reads the feed page by page, and after a refusal continues where the refusal says."""
+    """Client that reads the feed page by page; after a refusal, it continues after the event that the refusal names."""
 
     def __init__(self, lab: Lab, last: int) -> None:
         self.lab = lab
@@ -66,7 +66,10 @@ class World:
         self.follower = Follower(lab, lab.database.read(SYSTEM, events.newest_number))
 
     def do(self, turn: str) -> None:
-        """Write an event, read a page as the follower, or let six days pass, and then delete old events."""
+        """Write an event (`ordinary`, `audited`), read a page (`read`), or let six days pass.
+
+        With `retire`, old events are deleted after the six days.
+        """
         if turn in ("ordinary", "audited"):
             self._write(turn)
         elif turn == "read":
@@ -112,7 +115,7 @@ class World:
         assert [one.subject for one in reversed(page.items) if one.subject in self.numbers] == self.audited
 
     def _check_beginner(self) -> None:
-        """A client that begins at 0 gets all events from some place on, and is never refused."""
+        """Check that a client that begins at 0 is never refused, and gets all events after some event."""
         beginner = Follower(self.lab, 0)
         while beginner.last < max(self.numbers.values(), default=0):
             beginner.read()
@@ -121,7 +124,7 @@ class World:
         assert own == list(self.numbers)[len(self.numbers) - len(own) :]
 
     def _check_webhook(self) -> None:
-        """Events that wait for delivery, and those that are reported as missed, are all that were recorded."""
+        """Check that the events to deliver and the number of events reported as missed add up to all events."""
         batch = self.lab.database.read(SYSTEM, outbox.next_batch, self.hook, 0)
         assert batch is not None
         waiting = [one for one in batch.deliveries if one.kind != outbox.MISSED_KIND]
@@ -172,7 +175,7 @@ def test_followers_and_webhooks_know_of_every_event_or_how_far_they_were_deleted
 def test_a_feed_that_showed_old_audit_entries_would_be_found(
     lab: Lab, clock: AdjustableClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Check that the property fails if the feed, for a client at 0, begins with the audit entries that were kept."""
+    """Check that the test above would fail if the feed showed a client at 0 the audit entries that are kept longer."""
     monkeypatch.setattr(events, "start_of_feed", lambda _tx, after: after)
     world = World(lab, clock)
     for turn in ("audited", "ordinary", "wait", "wait", "ordinary", "retire"):

@@ -1,4 +1,4 @@
-"""Errors of fields, which have the same form for bodies, documents and parameters of jobs."""
+"""Errors of fields: the same form for request bodies, documents, and parameters of jobs."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Roles in folders: who may set them, where they end, and what jobs, checkouts and received versions may write."""
+"""Roles in folders: who may set them, when they end, and what jobs, checkouts and received versions may write."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_roles_end_with_the_membership_and_with_the_purge_of_the_folder(lab: Lab
 
 
 def test_roles_end_when_a_member_becomes_an_owner(lab: Lab) -> None:
-    """They would have no effect, and return unnoticed when the owner becomes a member with fewer rights again."""
+    """An owner's roles in folders would have no effect, but apply again, unnoticed, if the owner is made a member."""
     folder = make_folder(lab, "a")
     reader = name_of(lab.reader)
     for user in (reader, EVERY_MEMBER):
@@ -370,7 +370,7 @@ def test_a_reader_runs_jobs_that_write_to_the_readers_folder(studio: Studio) -> 
 def test_rights_are_read_before_items_are_read_and_jobs_are_locked(
     studio: Studio, monkeypatch: pytest.MonkeyPatch, operation: str
 ) -> None:
-    """Otherwise a submission could miss a move, or wait for a change of roles while others wait for its jobs."""
+    """Otherwise a submission could miss the move of a folder, or lock jobs while it waits for a change of roles."""
     studio.put("contributor")
     first = studio.submit(studio.rob, "errand", into="team")
     last = studio.submit(studio.rob, "errand", into="team", after=(first,))
@@ -430,7 +430,10 @@ def test_results_follow_the_inputs_into_their_folders(studio: Studio) -> None:
 def test_the_folders_of_results_are_those_that_are_known_before_the_job(
     kind: str, params: dict[str, Any], named: dict[str, str | None], into: str, folders: list[str]
 ) -> None:
-    """An input that is None is the result of another job; one in `team/below` was such a result in an earlier try."""
+    """The folder of an input is None if the input is a future result of another job.
+
+    Inputs in `team/below` are pinned results of a job that wrote to the subfolder `below`.
+    """
 
     def pin(folder: str | None) -> dict[str, Any]:
         if folder is None:

@@ -55,7 +55,7 @@ def findings(lab: Lab) -> set[str]:
 
 
 def damage(lab: Lab, *statements: Any) -> None:
-    """Change rows directly in the database, also in violation of foreign keys."""
+    """Run statements that damage the database; foreign keys are not checked."""
     with lab.database.engine.connect() as connection:
         driver = connection.connection.driver_connection
         if lab.database.is_sqlite:

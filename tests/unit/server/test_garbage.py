@@ -103,7 +103,7 @@ def test_a_job_cannot_keep_what_its_author_may_not_refer_to(lab: Lab) -> None:
 def test_whoever_takes_something_up_while_it_is_collected_gets_it_or_is_told(
     lab: Lab, clock: AdjustableClock, open_database: Callable[..., Any], taker: str, first: str
 ) -> None:
-    """Two connections: the first one writes and waits before it commits, the second one starts meanwhile."""
+    """The first of two transactions waits between its write and its commit; the second one starts meanwhile."""
     lab.write(blobs.put_blob, FILE)
     lab.write(documents.store_document, TREE)
     clock.advance(LONG_S)

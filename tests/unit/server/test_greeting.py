@@ -16,7 +16,7 @@ USUAL = "http://127.0.0.1:8460"
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working directory, which contains a data folder with a token at its default place."""
+    """The working directory, which contains a data folder at the default place, with a token."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "marey-data").mkdir()
     (tmp_path / "marey-data" / "admin.token").write_text("marey_very_secret")

@@ -15,7 +15,7 @@ from marey_server.store.items import Draft
 
 
 def read_file(name: str, *, joints: int = 3, seed: int = 0) -> Any:
-    """Return the result of reading a file: a skeleton of three joints, and a clip with `joints` of them."""
+    """Return the result of reading a file: a skeleton of three joints, and a clip that fits it if `joints` is 3."""
     rig = f"{name}#skeleton"
     motion = motion_tree({"output": rig}, joints=joints, seed=seed)
     drafts = (

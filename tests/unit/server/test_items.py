@@ -223,7 +223,7 @@ def test_a_change_of_a_state_that_has_passed_is_refused_and_changes_nothing(lab:
 
 @pytest.mark.parametrize("second", ["part", "name", "delete"])
 def test_of_two_changes_at_once_one_wins(lab: Lab, rig: Item, open_database: Callable[..., Any], second: str) -> None:
-    """The first change writes and waits before it commits; the second one starts meanwhile, for the same state."""
+    """The first change waits between its write and its commit. Meanwhile, the second one starts from the same state."""
     clip = lab.add_clip(rig)
     other = open_database()
     written, outcome = threading.Event(), []

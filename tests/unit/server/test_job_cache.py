@@ -1,4 +1,4 @@
-"""Cache keys of jobs: folder of the results, newest revisions, and kinds without a key."""
+"""Cache keys of jobs: effect of the results' folder and of newest revisions, and job kinds without a cache key."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ def clips(desk: Desk, *names: str, collection: str = "walks") -> list[str]:
 
 
 def annotations(desk: Desk, clip: str) -> dict[str, str]:
-    """Create a folder with one annotation of a clip; return the folder as the input of a job."""
+    """Create a folder with one annotation of a clip; return a job input that refers to this folder."""
     said = {"schema": "marey/annotation@1", "clip": {"item": clip, "revision": 1}, "layer": "a", "segments": []}
     desk.publish(Draft("said", Kind.ANNOTATION, "said", {"annotation": said}, collection="said"))
     return {"collection": "said"}
@@ -41,7 +41,7 @@ def refused(desk: Desk, kind: str, inputs: dict[str, Any], params: dict[str, Any
 
 
 def shares(desk: Desk, *job: Any, **fields: Any) -> bool:
-    """Return whether a job gets the result of another job that was completed before it."""
+    """Submit a job; return whether it gets the result of another job that was completed before."""
     return desk.job(submit(desk, *job, **fields)).cached_from is not None
 
 

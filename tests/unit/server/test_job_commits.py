@@ -1,4 +1,4 @@
-"""Jobs that commit their outputs: one transaction publishes the outputs and moves the branch, or neither happens."""
+"""Jobs that commit their outputs: one transaction both publishes the outputs and moves the branch."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -86,7 +86,7 @@ def test_an_entry_that_was_removed_meanwhile_is_a_conflict(gaits: CommittingDesk
 
 
 def test_commits_of_others_to_the_same_branch_are_all_kept(gaits: CommittingDesk) -> None:
-    """Several jobs that started from one commit end one after another."""
+    """Several jobs start from the same commit, and end one after another."""
     jobs = [gaits.submit(into=f"made{number}", cache="off", params={"number": number}) for number in range(5)]
     for number in range(5):
         gaits.work(f"a{number}", facts={"number": number})
@@ -481,7 +481,7 @@ def test_the_folder_of_a_dataset_goes_on_from_the_commit_of_a_job(desk: Desk) ->
 
 
 def test_outputs_of_one_name_are_numbered(gaits: CommittingDesk) -> None:
-    """Skeletons of an import may have one name: equal ones are one item, different ones are numbered."""
+    """An import may give several skeletons the same name: equal skeletons become one item, others get numbers."""
     gaits.submit(into="made")
     lease = gaits.desk.claim()
     drafts = [

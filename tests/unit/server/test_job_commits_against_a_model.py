@@ -1,4 +1,4 @@
-"""Jobs that commit, compared with a model, while users commit, protect and create branches."""
+"""Jobs that commit, compared with a model, while users commit, create branches and protect branches."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Model:
     """Jobs that made a commit."""
 
     def complete(self, job: Running) -> str:
-        """End a job as the server should, and return its expected state and the result of its commit."""
+        """End a job in the model; return the expected result of its commit, or `failed` if the job must fail."""
         if job.results and job.branch in self.protected:
             return "failed"
         wanted: dict[str, int | None] = dict(job.results)
@@ -90,7 +90,7 @@ class Model:
 
 
 def applied(state: State, changes: dict[str, int | None]) -> State:
-    """Return a state after changes; None removes a name."""
+    """Return a state after changes; the value None removes a path."""
     return {name: number for name, number in {**state, **changes}.items() if number is not None}
 
 
@@ -202,7 +202,7 @@ class CommittingMachine(RuleBasedStateMachine):
 
     @invariant()
     def every_branch_has_the_entries_and_commits_of_the_model(self) -> None:
-        """One transaction reads everything, because this check runs after each step."""
+        """One transaction reads everything, to be fast, because this check runs after each step."""
         self.gaits.read(self._compare)
 
     def _compare(self, tx: Transaction) -> None:

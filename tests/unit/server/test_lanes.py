@@ -19,7 +19,7 @@ STRANGER, OTHER = Client("192.0.2.1", known=False), Client("192.0.2.2", known=Fa
 
 @pytest.fixture
 def release() -> Iterator[threading.Event]:
-    """An event for which tests let calls wait; it is set at the end of the test at the latest."""
+    """An event for which calls of a test wait; if the test does not set it, it is set after the test."""
     event = threading.Event()
     yield event
     event.set()
@@ -110,7 +110,7 @@ class Tree:
 
 
 def test_a_refused_call_keeps_nothing_that_its_functions_used() -> None:
-    """Otherwise, only the garbage collector frees the bodies of refused requests, and it stops all threads for this."""
+    """Otherwise, only the garbage collector would free the bodies of refused requests, and it stops all threads."""
     trees: list[weakref.ref[Tree]] = []
 
     def check(tree: Tree) -> None:

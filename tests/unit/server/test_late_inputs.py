@@ -1,4 +1,4 @@
-"""Jobs whose inputs are outputs of other jobs: they get these inputs as if they were submitted after those jobs."""
+"""Late inputs (outputs of other jobs): a job gets them as if it had been submitted after the other jobs."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -206,7 +206,7 @@ def test_a_chain_that_was_computed_before_is_done_when_it_is_submitted(desk: Des
 def test_a_long_chain_that_was_computed_before_is_served_in_portions(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No transaction may occupy the database for as long as publishing a whole pipeline takes."""
+    """One transaction must not publish a whole pipeline, because it would occupy the database for too long."""
     monkeypatch.setattr(result_cache, "MOST_SHARED_OUTPUTS", 3)
 
     def submit_chain() -> list[str]:

@@ -1,4 +1,4 @@
-"""Leader election: one leader at a time, and a fence that increases whenever the leader changes."""
+"""Leader election among servers: one leader at a time, and a fence number that grows when the leader changes."""
 
 from tests.support.database_fixtures import AdjustableClock
 

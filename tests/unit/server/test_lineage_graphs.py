@@ -112,7 +112,7 @@ def test_a_graph_holds_what_a_search_of_all_links_finds(lab: Lab, edges: Edges) 
 
 
 def reached(start: int, edges: Edges, step: int) -> dict[int, int]:
-    """Return the nodes that can be reached in one direction, with their distances."""
+    """Return the nodes that can be reached from `start` in one direction of the edges, with their distances."""
     found = {start: 0}
     queue = [start]
     for one in queue:

@@ -1,4 +1,4 @@
-"""Imports of the motion library in threads of the server."""
+"""Python imports of the motion library in threads of the server."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from marey_server.motions import annotating, importing
 from marey_server.motions.loading import LOADING
 
 SLOW = ("marey_motion", "marey_server.motions.reading")
-"""What takes long to import; the module of the server imports the motion library itself."""
+"""Modules that take long to import; the second one imports the motion library."""
 
 
 def imports_in(function: ast.FunctionDef) -> set[int]:

@@ -27,7 +27,7 @@ def head(field: str, file_name: str | None = None) -> bytes:
 
 
 def read(body: bytes, cuts: Sequence[int] = (), max_parts: int = 100) -> list[tuple[PartHead, bytes]]:
-    """(head, bytes) of every part, fed in pieces."""
+    """Return (head, bytes) of every part of a body that the parser gets in pieces, cut at `cuts`."""
     reader = MultipartReader(BOUNDARY, max_parts=max_parts)
     places = [0, *sorted(cuts), len(body)]
     found = []

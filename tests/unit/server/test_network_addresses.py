@@ -1,4 +1,4 @@
-"""Addresses that webhooks may be sent to, as a table."""
+"""Table of network addresses to which webhooks may or may not be sent."""
 
 from ipaddress import ip_network
 

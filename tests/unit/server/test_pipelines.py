@@ -1,4 +1,4 @@
-"""Pipelines: all of their jobs are submitted or none, and each starts when those it needs have succeeded."""
+"""Pipelines: all jobs of a pipeline are submitted or none; a job starts when the jobs that it needs have succeeded."""
 
 from typing import Any
 

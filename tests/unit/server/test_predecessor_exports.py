@@ -1,4 +1,4 @@
-"""Exports to the predecessor's formats: unchanged originals and newly written files."""
+"""Exports to formats of Marey's predecessor: unchanged originals and newly written files."""
 
 import json
 from collections.abc import Mapping

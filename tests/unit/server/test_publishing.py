@@ -252,7 +252,10 @@ def test_what_was_made_from_something_that_changed_is_stale_through_any_number_o
 
 
 def item_that_was_added_to(lab: Lab) -> tuple[Published, Published]:
-    """Publish a clip, and a clip made of it that gets a part which has this clip as its source; return both clips."""
+    """Publish a clip, and a second clip made from it; then add a part to the second clip, made from that clip itself.
+
+    Returns both clips.
+    """
     clip, _ = publish(lab, clip_draft(), rig_draft())
     (step,) = publish(lab, Draft("s", Kind.STUDY, "step", {"study": {"n": 1}}, sources={"clips": [(clip.item, 1)]}))
     made, _ = publish(lab, replace(clip_draft("made", seed=1), sources={"step": [(step.item, 1)]}), rig_draft())

@@ -646,7 +646,7 @@ def test_a_job_that_named_an_item_after_the_preparation_loses_its_name_too(house
 
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 def test_jobs_are_found_by_the_items_that_they_name(house: House) -> None:
-    """The preview of a purge reads neither all jobs nor all items of the project, as the plans of SQLite show."""
+    """The query plans of SQLite show that the preview of a purge reads neither all jobs nor all items."""
     thing = house.add("thing")
     job = house.desk.submit("square", inputs={"things": ({"item": thing},)})
     house.delete(thing)
@@ -725,7 +725,7 @@ def test_blobs_of_jobs_are_not_counted_as_freed(house: House) -> None:
 
 
 def test_files_that_jobs_imported_or_made_of_a_purged_item_are_released(house: House) -> None:
-    """A job that imported a file, and one that exported it, keep no copy of the content."""
+    """Neither the job that imported a file, nor the job that exported the item, keeps a copy of the content."""
     source, archive = b"s" * 3000, b"a" * 4000
     made = house.desk.submit("sum")
     lease = house.desk.claim()

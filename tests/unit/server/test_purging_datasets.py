@@ -26,7 +26,7 @@ from marey_server.store.tables import proposal_comment as comments
 from marey_server.store.transaction import Transaction
 
 EMPTY_TREE = 1
-"""Number of chunks of the tree without entries, which each first commit stores and no commit needs."""
+"""Number of chunks of the empty tree, which the first commit of a dataset stores and no commit needs afterwards."""
 
 
 def add(desk: Desk, name: str, content: object = 1) -> str:

@@ -71,7 +71,7 @@ class QueriedLab(Lab):
         self.clips: list[Item] = self.read(items.list_items, "lab", Kind.CLIP, limit=100).items
 
     def _measure(self, tx: Transaction) -> None:
-        """Publish facets of every third clip; revise two of these, and publish facets of one of them again."""
+        """Publish facets of every third clip; then revise two of these clips, and publish new facets of one of them."""
         project = projects.require(tx, "lab")
         measured = items.list_items(tx, "lab", Kind.CLIP, sort="name", limit=100).items[::3]
         for number, clip in enumerate(measured):
@@ -116,7 +116,7 @@ def folded(field: str, text: str) -> str:
 
 
 def meets(field: str, operator: str, value: Any, wanted: Any) -> bool:
-    """Return whether a value of a clip meets a condition for one wanted value."""
+    """Return whether the value of a clip's field meets the condition `operator` `wanted`."""
     if operator == "~":
         return folded(field, wanted) in folded(field, value)
     if field == "folder":
@@ -277,7 +277,7 @@ SHARED_VALUES = {
     "subject": "02", "action": "walk", "take": "7b", "licence": '"CC-BY 4.0"', "shoot_day": "2025-03-01",
 }  # fmt: skip
 READS_ALL = "(project_id=? AND kind=?)"
-"""Part of SQLite's plan if all clips are read."""
+"""Text that is in SQLite's query plan if all clips are read."""
 
 
 @pytest.mark.parametrize(

@@ -663,7 +663,7 @@ def test_more_shared_results_than_fit_one_transaction_are_served_bit_by_bit(desk
 
 
 LONG_PATH = "/".join(["long" * 50] * 5)
-"""Where a collection of 20 letters and more finds no place any more."""
+"""Path of a folder that is so long that a subfolder with a name of 20 letters would exceed the limit for paths."""
 
 
 def test_a_job_that_cannot_have_a_shared_result_stops_neither_its_source_nor_others(desk: Desk) -> None:

@@ -52,7 +52,7 @@ def _forget_jobs(tx: Transaction) -> None:
 
 
 class QueueMachine(RuleBasedStateMachine):
-    """State machine in which single jobs equal those of the model, and connected jobs meet general conditions."""
+    """State machine: single jobs must be as in the model, and connected jobs must meet general conditions."""
 
     def __init__(self, desk: Desk, clock: StillClock) -> None:
         super().__init__()
@@ -156,7 +156,7 @@ class QueueMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.claims)
     @rule(data=st.data(), most=st.integers(1, 4))
     def claim_again(self, data: st.DataObject, most: int) -> None:
-        """Repeat a claim, as if its answer was lost; the answer contains the leases that are still held."""
+        """Repeat a claim, as if its answer was lost; the new answer must contain the leases that are still held."""
         claim_id = data.draw(st.sampled_from(sorted(self.claims)))
         held = [lease for lease in self.claims[claim_id] if self._holds(lease)]
         if not held:
@@ -235,7 +235,7 @@ class QueueMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.said)
     @rule(data=st.data())
     def say_again(self, data: st.DataObject) -> None:
-        """Repeat a request that was answered, perhaps much earlier; it changes nothing."""
+        """Repeat a request that was answered, perhaps long ago; the repetition must change nothing."""
         what, lease, write_id = data.draw(st.sampled_from(self.said))
         before = self._rows()
         answer = (

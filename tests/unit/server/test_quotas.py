@@ -1,4 +1,4 @@
-"""Quotas of users: not exceeded even by concurrent requests, and available again when something ends."""
+"""Quotas of users: concurrent requests cannot exceed a quota, and used quota becomes free when something ends."""
 
 import os
 import random

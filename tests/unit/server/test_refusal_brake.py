@@ -12,7 +12,7 @@ from marey_server.process.refusal_brake import FREE_REFUSALS, LONGEST_S, TOLERAT
 
 
 def in_a_loop(function: Callable[[], Awaitable[None]]) -> Callable[[], None]:
-    """Return a test function that runs an asynchronous test in an event loop."""
+    """Return a synchronous test function that runs an asynchronous one in an event loop."""
 
     def run() -> None:
         asyncio.run(function())  # type: ignore[arg-type]

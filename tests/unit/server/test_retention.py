@@ -20,7 +20,7 @@ OUTPUT = b"frame after frame\n" * 10
 
 
 def ended(desk: Desk, *, log: bytes = OUTPUT) -> str:
-    """Return a job that has ended, with a log, and that has published nothing."""
+    """Run a job that writes a log and publishes nothing; return its id."""
     submitted = desk.submit()
     lease = desk.claim()
     assert lease.job == submitted

@@ -1,4 +1,4 @@
-"""Limits on wrong passwords: shared by servers, bounded, and without effect on the owner of an account."""
+"""Limits on wrong passwords: shared by all servers, deleted when they end, and harmless to owners of accounts."""
 
 import asyncio
 import time
@@ -41,7 +41,7 @@ def clock() -> AdjustableClock:
 
 
 def guess(database: Database, name: str = "ann", address: str = "10.0.0.1") -> str | None:
-    """Count a try to sign in; return the scope of the limit that refuses it, or None."""
+    """Count a try to sign in; return which limit refuses the try, or None."""
     try:
         database.write(ANONYMOUS, sign_ins.count, SignInTry(name, address, PER_MINUTE))
     except TooManyRequestsProblem as refusal:

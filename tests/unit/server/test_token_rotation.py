@@ -1,4 +1,4 @@
-"""Rotation of tokens: one successor for each token, which can be requested again, and revocations of all of them."""
+"""Rotation of tokens: each token has one successor, which can be requested again; all can be revoked together."""
 
 import threading
 from collections.abc import Callable

@@ -28,7 +28,7 @@ class Arrivals:
             turn.add_done_callback(lambda _turn: self.begun.append(name))
 
     async def all_begin(self) -> list[str]:
-        """Wait until no request waits, and return the names of those that waited, in the order in which they began."""
+        """Wait until all waiting requests have begun; return their names in the order in which they began."""
         at_once = len(self.begun)
         while len(self.turns):
             await asyncio.sleep(0)

@@ -40,7 +40,7 @@ def send(lab: Lab, upload_id: str, pieces: tuple[Any, ...], data: bytes = DATA) 
 def finish(lab: Lab, upload_id: str) -> uploads.StoredUpload:
     """Finish an upload, and return its state.
 
-    The bytes are hashed again, as by a server process that has not received them.
+    The bytes are hashed again, as if another server process had received them.
     """
     hashes = UploadHashes(lab.database)
     upload = lab.read(uploads.read_upload, upload_id)

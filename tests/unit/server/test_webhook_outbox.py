@@ -1,4 +1,4 @@
-"""Work of the sender of webhooks in the store: positions, outcomes, leads, and events that were deleted."""
+"""Deliveries of webhooks in the store: positions in the feed, outcomes, loss of the lead, and deleted events."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TEN_DAYS = Retention(events_days=10, logs_days=0, jobs_days=0)
 
 
 class Desk:
-    """A webhook for new folders, and the sender that leads."""
+    """A webhook for new folders, and the leading sender of webhooks."""
 
     def __init__(self, lab: Lab, *kinds: Any) -> None:
         self.lab = lab

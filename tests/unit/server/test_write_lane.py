@@ -29,7 +29,7 @@ def user_names(database: Database) -> list[str]:
 
 @pytest.fixture
 def submit_all(database: Database) -> Callable[..., Any]:
-    """Function that submits writes while another write runs, so that all of them wait; it returns their futures."""
+    """Function that submits writes while another write runs, so that all of them wait; returns the futures."""
 
     def submit(*functions: Any) -> list[Future[Any]]:
         let_go = threading.Event()

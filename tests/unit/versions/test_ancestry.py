@@ -19,7 +19,7 @@ class Listed(NamedTuple):
 
 
 def history(parents: Sequence[Sequence[int]]) -> dict[str, Listed]:
-    """Return commits by digest, which is the number of the commit; each commit follows earlier ones."""
+    """Return commits by digest; a digest is the number of the commit, and parents have lower numbers."""
     found: dict[str, Listed] = {}
     for place, before in enumerate(parents):
         names = [str(one) for one in before]

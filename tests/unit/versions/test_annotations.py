@@ -50,7 +50,7 @@ def layers(draw: st.DrawFn) -> Segments:
 
 @st.composite
 def edited(draw: st.DrawFn, before: Segments) -> Segments:
-    """The segments after a person has removed, relabelled, shortened and added some."""
+    """Draw the segments that remain after a person has removed, relabelled, shortened and added some segments."""
     after: list[LabelledRange] = []
     for one in before:
         what = draw(st.sampled_from(["keep", "keep", "keep", "remove", "relabel", "shorten"]))
@@ -81,7 +81,7 @@ edited_keyframes = st.tuples(keyframe_lists, keyframe_lists, keyframe_lists)
 def expected(
     sides: tuple[tuple[One, ...], ...], replaces: Callable[[One, One], bool], excludes: Callable[[One, One], bool]
 ) -> tuple[One, ...] | LabelClash[One]:
-    """The right result, found by comparing all pairs."""
+    """Return the correct result of the merge, found by comparing all pairs."""
     base, ours, theirs = map(set, sides)
     mine, their = ours - base, theirs - base
     removed: set[One] = set()
@@ -163,7 +163,7 @@ def test_the_examples_reach_both_outcomes(merge: Callable[..., Any], cases: st.S
 
 
 def test_ten_thousand_segments_and_keyframes_are_merged_in_a_moment() -> None:
-    """Comparing all pairs of these would take minutes, also where most of them are in conflict."""
+    """Comparing all pairs would take minutes, both with conflicts and without."""
     base = [LabelledRange(10 * place, 10 * place + 5, "a") for place in range(10_000)]
     ours, theirs = ([one._replace(label=label) for one in base] for label in "bc")
     frames = [LabelledFrame(10 * place, "a") for place in range(10_000)]

@@ -31,7 +31,7 @@ AT = "2026-11-23T10:00:00.000000Z"
 
 @dataclass
 class Example:
-    """Archive that is composed of single members."""
+    """Archive that tests compose member by member."""
 
     members: dict[ArchiveMember, bytes] = field(default_factory=dict)
     head: str = ""
@@ -74,9 +74,9 @@ def put(path: str, parts: dict[str, str], *tags: str) -> dict[str, Any]:
 
 
 def example() -> Example:
-    """Return an archive of two versions of a clip, which refers to a skeleton and names a file.
+    """Return an archive of two versions with a clip, whose documents refer to a skeleton and a file.
 
-    The second version removes another entry.
+    The second version changes the tags of the clip and removes another entry.
     """
     made = Example()
     skeleton = made.revision("skeleton", {"hierarchy": made.document({"schema": "marey/skeleton@1", "joints": []})})
@@ -117,9 +117,9 @@ def test_an_archive_gives_back_versions_documents_arrays_and_files() -> None:
 
 
 def later_part() -> tuple[Example, dict[str, Any]]:
-    """Return an archive of the second version alone, and the line of its change.
+    """Return an archive of only the second version, and the line that describes its change.
 
-    The entry keeps a part of the first version.
+    The changed entry keeps a part from the first version, which the archive lacks.
     """
     whole = example()
     made = Example(head=whole.head)

@@ -16,7 +16,7 @@ History = Mapping[str, Sequence[str]]
 
 
 def history(parents: Sequence[Sequence[int]]) -> dict[str, list[str]]:
-    """Return the parents of each commit by its digest, which is the number of the commit."""
+    """Return the parents of each commit; a digest is the number of the commit."""
     return {str(place): [str(one) for one in before] for place, before in enumerate(parents)}
 
 
@@ -35,10 +35,11 @@ def search(commits: History, bad: str, is_bad: Callable[[str], bool | None]) -> 
 
 
 def most_tests(commits: int) -> int:
-    """Return the number of tests that are enough if each leaves at most two thirds of the commits, and half a commit.
+    """Return how many tests are enough for n commits if a test leaves at most 2 n / 3 + 1/2 commits.
 
-    Follow the parent with more ancestors from the newest commit down to the first one with at most two thirds of the
-    commits. The one before has more than two thirds, so this one has at least half of that, less half a commit.
+    Why such a test exists: go from the newest commit to the parent with more ancestors, again and again, until a commit
+    has at most 2 n / 3 ancestors, itself included. Its child has more than 2 n / 3, so this commit has more than
+    n / 3 - 1/2. A test of this commit leaves either its ancestors or all other commits.
     """
     return 0 if commits == 1 else 1 + most_tests((4 * commits + 3) // 6)
 

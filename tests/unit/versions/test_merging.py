@@ -95,7 +95,7 @@ def test_the_order_of_the_sides_matters_for_their_names_only(base: State, ours: 
 @settings(max_examples=examples(300), deadline=None)
 @given(states, states, states)
 def test_nothing_of_either_side_disappears(base: State, ours: State, theirs: State) -> None:
-    """A part that one side has changed is in the result or in a conflict, or both sides have changed it equally."""
+    """A part that a side has changed is in the result or in a conflict, unless the other side removed the entry."""
     result, merged = merge(base, ours, theirs)
     in_conflict = [side for one in merged.conflicts for side in (one.base, one.ours, one.theirs) if side is not None]
     kept = [parts for value in result.values() for parts in value["parts"].items()]
@@ -115,7 +115,7 @@ def test_nothing_of_either_side_disappears(base: State, ours: State, theirs: Sta
 def test_each_content_is_that_of_a_side_or_is_listed_as_combined(
     base: State, ours: State, theirs: State, take: Side | None
 ) -> None:
-    """The content of a combined entry is not stored yet."""
+    """A combined entry has parts of both sides, so its content is not stored yet and must be listed."""
     _, undecided = merge(base, ours, theirs)
     resolutions = {one.key: take for one in undecided.conflicts} if take else {}
     result, merged = merge(base, ours, theirs, resolutions)
@@ -217,7 +217,7 @@ def test_two_entries_that_come_to_one_place_are_a_conflict() -> None:
 
 
 def test_documents_of_parts_that_both_sides_have_changed_are_merged() -> None:
-    """The other parts, the tags and the paths of the entry are merged as always."""
+    """Other parts, tags and paths of an entry are merged as usual."""
     base, key = state(a=entry("1", "1"), b=entry("5")), key_of("b", "clip")
     ours, theirs = state(a=entry("2", "1", "x"), b=entry("6")), state(a=entry("3", "2"), b=entry("7"))
     asked: list[ChangedPart] = []

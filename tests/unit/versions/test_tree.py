@@ -1,4 +1,4 @@
-"""Trees of entries: their shape, changes, reading and differences, compared with dictionaries."""
+"""Trees of entries, compared with dictionaries: shape, changes, reading and differences."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_a_tree_without_its_entries_is_the_empty_tree() -> None:
 
 
 class Counting(ChunksInMemory):
-    """Store that counts the chunks that are loaded, and the bytes that are stored."""
+    """Store of chunks that counts how many chunks are loaded and how many bytes are stored."""
 
     loaded = 0
     stored_bytes = 0

@@ -34,7 +34,7 @@ def test_killing_a_child_ends_the_sending_of_a_message_that_it_does_not_read(chi
 
 @pytest.fixture
 def in_use(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
-    """Return, for each signal that was sent, whether its process id still belonged to a child of this process."""
+    """List with one value per signal sent: whether the signal's process id still belonged to a child process."""
     found: list[bool] = []
     send = os.killpg
 
@@ -47,7 +47,7 @@ def in_use(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
 
 
 def test_a_child_that_was_killed_gets_no_further_signal(child: ChildProcess, in_use: list[bool]) -> None:
-    """After that, its process id may belong to another process."""
+    """After the end of the child, its process id may belong to another process."""
     child.kill(grace_s=0.0)
     in_use.clear()
     child.kill(grace_s=0.0)

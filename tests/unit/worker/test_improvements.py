@@ -1,4 +1,4 @@
-"""The functions of `compare`, `suggest`, `optimise` and `sweep`, with a project in memory instead of a server."""
+"""The functions of four job kinds (`compare`, `suggest`, `optimise`, `sweep`), with a project in memory."""
 
 import json
 from dataclasses import replace
@@ -30,7 +30,7 @@ class LoggedProject(ProjectInMemory):
 
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LoggedProject:
-    """A project with three walks and a clip that no trial needs, and without cached skeletons of earlier tests."""
+    """A project with three walks and one clip that no trial needs; the cache of skeletons is empty."""
     monkeypatch.setattr(matching_clips, "_cache", LruCache(max_entries=1))
     made = LoggedProject(tmp_path)
     for speed, turn_rate in ((1.25, -50), (1.25, 0), (1.25, 50), (4.0, 0)):

@@ -15,7 +15,7 @@ ARRIVES, NEVER_ARRIVES, ANSWER_IS_LOST = "arrives", "never arrives", "answer is 
 
 
 class Api:
-    """Simulated server that stores a log; `fates` states what happens to the next pieces."""
+    """Simulated server that stores a log; `fates` lists what happens to the next pieces of the log, one by one."""
 
     def __init__(self, limit: int = 1000) -> None:
         self.log = b""

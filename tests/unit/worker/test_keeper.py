@@ -1,4 +1,4 @@
-"""Renewal of leases, and checks before results are published."""
+"""Renewal of a job's lease by heartbeats, and checks before results are published."""
 
 import threading
 import time

@@ -47,13 +47,13 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ProjectInMemory:
 
 
 def move(project: ProjectInMemory, into: str, **of_all: Any) -> None:
-    """Change the fields of all clips that are inputs, and the folder of the results."""
+    """Set the folder of the results to `into`, and fields of all input clips to the values of `of_all`."""
     project.into = into
     project.inputs["clips"] = tuple(pin.model_copy(update=of_all) for pin in project.inputs["clips"])
 
 
 def again(project: ProjectInMemory, position: int, **changes: Any) -> None:
-    """Add another input that equals one of the clips except for these changes."""
+    """Add a copy of the input clip at `position` as another input, with these fields changed."""
     pin = project.inputs["clips"][position]
     twin = pin.model_copy(update=changes)
     project.parts[twin.item, twin.revision, "motion"] = project.parts[pin.item, pin.revision, "motion"]

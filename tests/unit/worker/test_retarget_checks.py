@@ -22,7 +22,7 @@ from marey_worker.kinds import retarget
 
 
 def counted_follows(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Return a list of the clips for which `follow_moved_bones` is called from now on."""
+    """Return a list that grows with each call of `follow_moved_bones`, by the clip of this call."""
     calls = []
 
     def follow(clip: Clip, joints: dict[str, int]) -> FollowedBones:

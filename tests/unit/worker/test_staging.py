@@ -1,4 +1,4 @@
-"""The last results of a job are stored while the child runs the next job."""
+"""The server stores the last results of a job while the worker's child process already runs the next job."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from tests.support.fake_server import FakeServer
 def being_stored(server: FakeServer, **terms: object) -> str:
     """Submit a job with two results, and return its id.
 
-    The server stores the results only after the job was removed from `slow`.
+    The server stores the results only after the test removes the job from `server.slow`.
     """
     server.slow.add(job := f"maker{len(server.leased) + len(server.jobs)}")
     server.submit("make", {"results": 2}, job=job, **terms)
@@ -19,7 +19,7 @@ def being_stored(server: FakeServer, **terms: object) -> str:
 
 
 def running(server: FakeServer, folder: Path, how: str = "wait") -> str:
-    """Submit a job that runs until `let_go`, wait until it runs, and return its id."""
+    """Submit a job that runs until `let_go` is called; wait until the job runs, and return its id."""
     job = server.submit("misbehave", {"how": how, "folder": str(folder)})
     server.until((folder / "started").exists)
     return job

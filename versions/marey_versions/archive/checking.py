@@ -97,7 +97,7 @@ class _Check:
 
 
 def check_archive(archive: Archive, on_progress: OnProgress = lambda _done, _all: None) -> None:
-    """Check that an archive contains all that its commits refer to, unchanged, and nothing else.
+    """Check that an archive contains everything to which its commits refer, unchanged, and nothing else.
 
     If an archive has only the later part of a history, the entries of its versions are not compared with the digests in
     its commits, because this needs the earlier versions; the server compares them when it imports the archive. Raises

@@ -18,7 +18,7 @@ from marey_versions.tree.chunks import digest_of
 
 SCHEMA = "marey/archive@1"
 MANIFEST = "archive.json"
-"""Name of the last member. An archive without it was not written to its end."""
+"""Name of the last member. An archive without this member is incomplete."""
 MOST_BYTES = 256 * MIB
 """Greatest size of a member that is read into memory; only files may be larger."""
 
@@ -32,7 +32,7 @@ class MemberKind(StrEnum):
 
     COMMIT = "commits"
     CHANGES = "changes"
-    """Entries that differ between a commit and its first parent; the digest of the commit names the member."""
+    """Entries that differ between a commit and its first parent; the digest in the name is that of the commit."""
     REVISION = "revisions"
     """Revision that documents refer to: its kind, and the content digests of its parts."""
     DOCUMENT = "documents"

@@ -162,8 +162,8 @@ class Archive:
     def versions(self) -> Versions:
         """Compute the entries of all versions from the changes of their commits.
 
-        Raises `BadArchive` if the entries of a version do not have the digest that its commit names, or if the archive
-        has only the later part of a history.
+        Raises `BadArchive` if the entries of a version do not have the digest in its commit, or if the archive has only
+        the later part of a history.
         """
         if self.manifest.base:
             earlier = self.manifest.base[0]

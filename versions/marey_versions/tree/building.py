@@ -2,9 +2,10 @@
 
 The rule depends on keys alone, so that a changed value never moves an end. The entry or child with the key k at level l
 ends its chunk if the first 4 bytes of SHA-256 of the text "l k", read as a big-endian number, are below 2^32 / n. In
-leaves n is `MEAN_ENTRIES`, above them `MEAN_CHILDREN`. There are two exceptions. The first member of a chunk never ends
-it, so that each level has at most about half as many chunks as the level below. A chunk with `LONGEST` times n members
-ends in any case, so that keys which somebody has chosen on purpose cannot make a chunk arbitrarily large.
+leaves n is `MEAN_ENTRIES`, in the chunks above the leaves it is `MEAN_CHILDREN`. There are two exceptions. The first
+member of a chunk never ends it, so that each level has at most about half as many chunks as the level below. A chunk
+with `LONGEST` times n members ends in any case, so that keys which somebody has chosen on purpose cannot make a chunk
+arbitrarily large.
 """
 
 from __future__ import annotations
@@ -49,14 +50,14 @@ class Splitter(Generic[T]):
         return not self._open
 
     def add(self, key: str, one: T) -> tuple[T, ...] | None:
-        """Add a key with its value; return the chunk that it ends, or None."""
+        """Add a key with its value. If the key ends a chunk, return this chunk, otherwise None."""
         self._open.append(one)
         if len(self._open) == 1 or (len(self._open) < self._most and not self._is_end(key)):
             return None
         return self._take()
 
     def finish(self) -> Iterator[tuple[T, ...]]:
-        """Yield the last chunk if its last key did not end it; otherwise, yield nothing."""
+        """Yield a last chunk with the keys since the last end of a chunk; yield nothing if there are no such keys."""
         if self._open:
             yield self._take()
 
@@ -70,7 +71,7 @@ class Splitter(Generic[T]):
 
 
 class ChunkWriter:
-    """Collector of new chunks, which stores those that belong to the new tree."""
+    """Collector of new chunks; it stores the chunks that belong to the new tree."""
 
     def __init__(self, store: ChunkStore) -> None:
         self.reader = ChunkReader(store)

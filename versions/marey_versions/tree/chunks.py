@@ -18,7 +18,7 @@ MOST_CHUNK_BYTES = 8 * 2**20
 
 
 class DamagedChunk(Exception):
-    """A chunk that is missing, or whose bytes are not those of a chunk with its digest."""
+    """A chunk is missing, or its bytes are not those of a chunk with its digest."""
 
 
 class Child(NamedTuple):

@@ -15,7 +15,7 @@ COMPARED_TOGETHER = 256
 
 
 class Changed(NamedTuple):
-    """Key whose values in two trees differ; a value is None where the tree does not have the key."""
+    """Key whose values in two trees differ; a value is None if the tree does not have the key."""
 
     key: str
     before: Value | None
@@ -104,7 +104,7 @@ def _inside(children: Sequence[Child], within: KeyRange) -> list[Child]:
 
 
 def _expanded(reader: ChunkReader, children: Sequence[Child], level: int) -> list[Child]:
-    """Return the children of the chunks of `level` that `children` refer to."""
+    """Return the children of those chunks of `level` to which `children` refer."""
     chunks = reader.below(children, level)
     return list(chain.from_iterable(chunk.children for chunk in chunks if isinstance(chunk, Branch)))
 

@@ -23,7 +23,7 @@ LOADED_TOGETHER = 256
 
 
 class ChunkReader:
-    """Reader of chunks in a store, which loads several at a time and remembers the chunks that it has loaded."""
+    """Reader of chunks from a store; it loads several chunks at a time and remembers them."""
 
     def __init__(self, store: ChunkStore) -> None:
         self._store = store
@@ -53,7 +53,7 @@ class ChunkReader:
         return [self._known[digest] for digest in digests]
 
     def below(self, children: Sequence[Child], level: int) -> list[Chunk]:
-        """Return the chunks of `level` that `children` refer to.
+        """Return the chunks of `level` to which `children` refer.
 
         Raises `DamagedChunk` if a chunk does not have the level, last key and number of entries that its parent states.
         """
@@ -84,7 +84,7 @@ class Tree:
         return self.get_several([key]).get(key)
 
     def get_several(self, keys: Iterable[str]) -> dict[str, Value]:
-        """Return the values of the keys that the tree has."""
+        """Return the values of those keys that the tree has."""
         wanted = sorted(set(keys))
         found: dict[str, Value] = {}
         for leaf, inside in leaves_with(self._reader, self.root, wanted):

@@ -34,9 +34,10 @@ class Unusable(NamedTuple):
 
 @dataclass
 class Candidates:
-    """Matching databases of candidates by group name, and folders whose clips cannot be used.
+    """Matching databases of candidates, by name of the group, and folders whose clips cannot be used.
 
-    The databases have the options and the normaliser of the evaluated set.
+    A group contains the clips of one folder that have the same skeleton. The databases have the options and the
+    normaliser of the evaluated set.
     """
 
     databases: dict[str, MatchingDatabase] = field(default_factory=dict)

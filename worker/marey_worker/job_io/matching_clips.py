@@ -55,7 +55,7 @@ _cache: LruCache[bytes, MatchingClips] = LruCache(max_entries=MOST_KEPT)
 class ClipSet:
     """Clips of a matching database, with their trims and loops.
 
-    Together with the options and the normaliser, they determine the database. `trims` maps items to half-open ranges of
+    These clips, the options and the normaliser determine the database. `trims` maps items to half-open ranges of
     frames; `loops` lists the items that are loops; `rig` is the skeleton revision whose joint mapping is used.
     """
 
@@ -109,7 +109,7 @@ def read_clips(context: Context, params: EvaluateParams, options: DatabaseOption
 def read_evaluated_clips(
     context: Context, evaluation: PinnedInput, document: Mapping[str, Any], options: DatabaseOptions
 ) -> MatchingClips:
-    """Return the matching database of an evaluation's clips, with the revisions and the normaliser that it used.
+    """Return the matching database of an evaluation's clips, with the revisions and the normaliser of the evaluation.
 
     Raises `JobRefused` if the evaluation does not list its clips.
     """

@@ -26,8 +26,8 @@ class ResultPlaces:
     def take(self, kind: Kind, collection: str, *names: str) -> None:
         """Reserve names in a collection below `into` for results.
 
-        Raises `MotionError` if a name is too long or already reserved, or if its result would replace an input; then no
-        name is reserved.
+        Raises `MotionError`, and reserves no name, if a name is too long or already reserved, or if the result of this
+        name would replace an input.
         """
         for name in names:
             self._require_free(kind, collection, name)
@@ -43,7 +43,7 @@ class ResultPlaces:
     def keep(self, pin: PinnedInput) -> None:
         """Reserve the folder and name of an input for the result that is made from this input.
 
-        Raises `MotionError` if they are reserved for another result.
+        Raises `MotionError` if this place is reserved for another result.
         """
         self._require_free(pin.kind, pin.collection, pin.name)
         self._taken.add((pin.kind, pin.collection, pin.name))

@@ -1,4 +1,4 @@
-"""Kind `annotate`: creates annotations of clips whose segments and keyframes an algorithm proposes."""
+"""Kind `annotate`: annotates clips with segments and keyframes that an algorithm proposes."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ STEPS = 3
 
 
 def run(context: Context, params: CompareParams) -> dict[str, Any]:
-    """Compare two evaluations; the result counts the changes and names the document and the report.
+    """Compare two evaluations; the result counts the changes, and refers to the document and the report.
 
     Raises `JobRefused` if the evaluations have different normalisers, options or scenarios.
     """

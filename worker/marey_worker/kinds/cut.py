@@ -59,7 +59,7 @@ class _Cutting:
         self._refusals = Refusals(context)
 
     def run(self) -> dict[str, Any]:
-        """Cut all clips; return the number of pieces, their number by label, and the refused annotations."""
+        """Cut all clips; return the number of pieces in total and by label, and the refused annotations."""
         labels: Counter[str] = Counter()
         todo = self._read()
         self._require_pieces(todo)
@@ -100,7 +100,7 @@ class _Cutting:
 
         If clips are inputs of the job, name and folder are those at the time of submission: results are cached for jobs
         with the same inputs, so later changes must not affect the results. Raises `MotionError` if the clip is not an
-        input of the job although other clips are, and `NoSuchThing` if it does not exist.
+        input of the job although other clips are, and `NoSuchThing` if the clip does not exist.
         """
         if not self._clips:
             return self._context.item(Kind.CLIP, clip.item)
@@ -113,7 +113,7 @@ class _Cutting:
         return self._clip_pins.get((clip.item, clip.revision), self._clips[clip.item])
 
     def _named(self, annotation: Annotation, clip: Item | PinnedInput) -> Iterator[tuple[Segment, str]]:
-        """Yield each selected segment with the name of its piece, numbered among all segments with the same label."""
+        """Yield each selected segment with the name of its piece; all segments with the same label are numbered."""
         numbers: Counter[str] = Counter()
         for one in annotation.segments:
             numbers[one.label] += 1

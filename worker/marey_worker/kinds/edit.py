@@ -32,7 +32,8 @@ def run(context: Context, params: EditParams) -> dict[str, Any]:
     """Apply the commands to every clip of the job.
 
     A clip that cannot be edited is listed as a refusal in the result, with code and reason. Raises `JobRefused` if the
-    commands or the places of the results are missing or ambiguous, or if a clip that a command names cannot be used.
+    commands or the places of the results are missing or ambiguous, or if a clip to which a command refers cannot be
+    used.
     """
     return _Editing(context, params).run()
 
@@ -156,7 +157,7 @@ class _Editing:
     def _info(self, pin: PinnedInput, stored: dict[str, Any] | None) -> ClipInfo:
         """Return the part `info` of a result: the part `info` of the clip without its checks, and the applied edit.
 
-        The consent is the strictest one of the clip and of the clips that the commands name.
+        The consent is at least as strict as the consents of the clip and of all clips to which the commands refer.
         """
         edit = None if self._edit_pin is None else self._edit_pin.as_input().model_dump()
         done = {
@@ -200,7 +201,7 @@ class _Editing:
 def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | None, EditDocument]:
     """Return the edit item and its commands; the item is None if the parameters of the job contain the commands.
 
-    Raises `JobRefused` if neither or both of them give commands, or if the item is not valid.
+    Raises `JobRefused` if both the item and the parameters give commands, if neither does, or if the item is not valid.
     """
     (pin,) = context.inputs.get("edit", ()) or (None,)
     if (pin is None) == (not params.commands):
@@ -214,7 +215,7 @@ def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | No
 
 
 def _wanted_sources(context: Context, edit: EditDocument) -> dict[str, PinnedInput]:
-    """Return the clips that commands name, by id. Raises `JobRefused` if a clip is missing or given twice."""
+    """Return the clips to which commands refer, by id. Raises `JobRefused` if a clip is missing or given twice."""
     given = [pin for pin in context.inputs.get("sources", ()) if pin.item in edit.sources]
     found = {pin.item: pin for pin in given}
     if len(found) < len(given):
@@ -222,7 +223,7 @@ def _wanted_sources(context: Context, edit: EditDocument) -> dict[str, PinnedInp
     missing = [item for item in edit.sources if item not in found]
     if missing:
         raise JobRefused(
-            "source-missing", f"the commands name {', '.join(missing)}, which the input `sources` does not contain"
+            "source-missing", f"the commands refer to {', '.join(missing)}, which the input `sources` does not contain"
         )
     return found
 

@@ -32,7 +32,7 @@ Headline = dict[str, float | int | None]
 
 
 def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
-    """Simulate the trials of this task by motion matching; the result names the file with the records of the trials."""
+    """Simulate the trials of this task by motion matching; the result refers to the file with their records."""
     options = EvaluationOptions.of(params)
     trials = _trials(params, options)[context.task.position :: context.task.size]
     clips = read_clips(context, params, options.database)
@@ -90,7 +90,7 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
 
 
 def _trials(params: EvaluateParams, options: EvaluationOptions) -> tuple[Trial, ...]:
-    """Return all trials of the suite. Raises `JobRefused` if a figure is requested for a trial outside the suite."""
+    """Return all trials of the evaluation. Raises `JobRefused` if a figure is requested for a trial not among them."""
     with refusing_motion_errors():
         trials = suite_trials(options)
     if unknown := set(params.trial_figures) - {trial.name for trial in trials}:
@@ -129,7 +129,7 @@ def headline_of(result: EvaluationResult) -> Headline:
 def facets_of(result: EvaluationResult, pins: Sequence[PinnedInput]) -> tuple[ItemFacets, ...]:
     """Return how much each evaluated clip was used in the trials, as facets (published numbers) of the clip.
 
-    The use of a mirrored copy is added to that of the clip itself.
+    The use of a mirrored copy is added to the use of the clip itself.
     """
     used = {source.uid: source for source in sum_by_source(result.clips, result.usage)}
     return tuple(

@@ -32,7 +32,7 @@ class _File(NamedTuple):
 
 
 def run(context: Context, params: ExportParams) -> dict[str, Any]:
-    """Write the clips of the job to an archive; the result names it, and lists the clips that cannot be written.
+    """Write the clips of the job to an archive; the result refers to it, and lists the clips that cannot be written.
 
     The result also lists the clips whose consent has ended: these are written only if the parameters of the job allow
     it. Raises `JobRefused` if no clip can be written.

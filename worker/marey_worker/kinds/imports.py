@@ -21,7 +21,7 @@ from marey_worker.job_io.staged_results import StagedResults
 
 
 def run(context: Context, params: ImportParams) -> dict[str, Any]:
-    """Import every file of the job; the result has an entry for each file, and a faulty file does not affect others."""
+    """Import every file of the job; the result has an entry for each file. A faulty file does not affect the others."""
     return _Importing(context, params).run()
 
 

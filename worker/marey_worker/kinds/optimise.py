@@ -17,7 +17,7 @@ from marey_worker.job_io.matching_clips import refusing_motion_errors
 
 
 def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
-    """Remove and add clips while this improves the set; the result names the document that lists the steps."""
+    """Remove and add clips while this improves the set; the result refers to the document that lists the steps."""
     evaluated = read_evaluated_set(context)
     candidates = read_candidates(context, evaluated)
     with refusing_motion_errors():

@@ -34,7 +34,7 @@ def run(context: Context, params: SweepParams) -> dict[str, Any]:
 
 
 def gather(context: Context, params: SweepParams, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Combine the rows of all tasks in order, rank the groups of features by their effect, and store the document."""
+    """Combine the results of all tasks in order, rank groups of features by their effect, and store the document."""
     # Task i of n has made the settings i, i + n, i + 2n and so on.
     longest = max(len(result["rows"]) for result in results)
     found = [result["rows"][turn] for turn in range(longest) for result in results if turn < len(result["rows"])]

@@ -63,7 +63,7 @@ def run(context: Context, params: TreeParams) -> dict[str, Any]:
 
 
 def _require_same_place(context: Context, pin: PinnedInput) -> None:
-    """Raise `JobRefused` if the model was moved or renamed, because the output would then not be its next revision."""
+    """Raise `JobRefused` if the model was moved or renamed; the output would then not be its next revision."""
     now = context.item(Kind.MODEL, pin.item)
     if (now.collection, now.name) != (pin.collection, pin.name):
         raise JobRefused("model-moved", f"{pin.path} was moved or renamed while the job waited; submit the job again")

@@ -40,7 +40,9 @@ def add_to(app: typer.Typer) -> None:
 def create_archive(
     context: typer.Context,
     place: VersionPlace,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write, such as gaits.tar; it is replaced.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="File to write, such as gaits.tar; an existing file is replaced.")
+    ],
     since: Annotated[
         list[str] | None,
         typer.Option(
@@ -52,9 +54,9 @@ def create_archive(
     allow_expired_consent: AllowExpiredConsent = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write a version, all versions before it, and everything that they contain to one file, and check it.
+    """Write a version, all versions before it, and everything that they contain to one file, and check the file.
 
-    If the command is interrupted, repeat it: it continues the file whose name ends in .part.
+    If the command is interrupted, run it again: it continues to write the unfinished file, whose name ends in .part.
     """
     at = parse(place, version=True)
     with connect(context) as marey, progress() as advance:
@@ -121,7 +123,7 @@ def import_archive(
 
     The versions keep their digests, authors and times. Only data that the server lacks is sent. The import changes no
     folder: check out the version to get its clips. If the branch has versions that the archive lacks, the branch does
-    not move; merge the imported version into the branch.
+    not move; then merge the imported version into it.
     """
     at = parse(place)
     with connect(context) as marey, _opened(file), progress() as advance:
@@ -134,7 +136,7 @@ def import_archive(
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Archive]:
-    """Open an archive for the `with` block; if the file is damaged or no archive, the command ends with an error."""
+    """Open an archive for the `with` block; the command fails if the file is damaged or is not an archive."""
     from marey_versions.archive.members import BadArchive
     from marey_versions.archive.reading import Archive
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from marey_schemas.queue.jobs import Job
 
 OPTIONS = replace(EVALUATE, without=(*EVALUATE.without, "name", "report", "trial_figures"))
-"""Options of the evaluations, except those of the name and of the report.
+"""Options of the evaluations, except the name and the options of the report.
 
 Each evaluation is named after its version, and no report is made.
 """
@@ -39,16 +39,19 @@ def add_to(dataset: typer.Typer) -> None:
 def bisect(
     context: typer.Context,
     place: DatasetPlace,
-    good: Annotated[str, typer.Option(help="Good version: a branch, a tag or a commit.")],
+    good: Annotated[str, typer.Option(help="Version that is known to be good: a branch, a tag or a commit.")],
     metric: Annotated[
         str,
         typer.Option(
-            help="Headline metric of the evaluation, such as offset_mean_m; an unknown name lists all metrics."
+            help="Headline metric of the evaluation, such as offset_mean_m. An unknown name prints the list of all "
+            "metrics."
         ),
     ],
     params: Chosen,
     job: Chosen,
-    bad: Annotated[str, typer.Option(help="Bad version, after the good one: a branch, a tag or a commit.")] = "main",
+    bad: Annotated[
+        str, typer.Option(help="Later version that is known to be bad: a branch, a tag or a commit.")
+    ] = "main",
     above: Annotated[float | None, typer.Option(help="Versions with a value above this one are bad.")] = None,
     below: Annotated[float | None, typer.Option(help="Versions with a value below this one are bad.")] = None,
     half_way: Annotated[
@@ -57,7 +60,11 @@ def bisect(
     ] = False,
     path: Annotated[str, typer.Option(help="Folder of the dataset whose clips are evaluated; default: all.")] = "",
     first_parent: Annotated[
-        bool, typer.Option("--first-parent", help="At a merge, follow only the branch into which it merged.")
+        bool,
+        typer.Option(
+            "--first-parent",
+            help="At each merge, follow only its first parent: the branch into which another version was merged.",
+        ),
     ] = False,
     into: Annotated[
         str | None,
@@ -69,11 +76,15 @@ def bisect(
     trim: Trims = None,
     normaliser: Normaliser = None,
     preview: Annotated[
-        bool, typer.Option("--preview", help="Show how many versions and evaluations there are, without evaluating.")
+        bool,
+        typer.Option(
+            "--preview",
+            help="Show the number of versions, and how many evaluations are expected, but evaluate nothing.",
+        ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find the first version, after a good one, at which a metric of the evaluation has crossed a value.
+    """Find the first bad version after a good one: a metric of its evaluation has crossed the limit.
 
     Evaluates the good and the bad version, then versions between them. Each evaluation roughly halves the candidates
     for the first bad version. Versions that cannot be evaluated are skipped; if this leaves several candidates, all of
@@ -121,7 +132,7 @@ def _limit(above: float | None, below: float | None, half_way: bool) -> Limit | 
 
 @contextmanager
 def _interruptible(evaluations: VersionEvaluations) -> Iterator[None]:
-    """Show the progress of the evaluations, and say how an interrupted search is continued."""
+    """Show the progress of the evaluations; after an interruption, print how to continue the search."""
     trials = evaluations.params.trial_count
     try:
         with progress() as advance:

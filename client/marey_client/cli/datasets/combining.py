@@ -24,18 +24,22 @@ CommitMessage = Annotated[str, typer.Option("--message", "-m", help="Message of 
 Preview = Annotated[bool, typer.Option("--preview", help="Show the result without recording it.")]
 Ours = Annotated[
     list[str] | None,
-    typer.Option(metavar="PATH:KIND", help="Resolve this conflict with the content of the branch; may be repeated."),
+    typer.Option(
+        metavar="PATH:KIND", help="Resolve the conflict in this entry with the content of the branch; may be repeated."
+    ),
 ]
 Theirs = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="PATH:KIND", help="Resolve this conflict with the content of the other version; may be repeated."
+        metavar="PATH:KIND",
+        help="Resolve the conflict in this entry with the content of the other version; may be repeated.",
     ),
 ]
 Base = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="PATH:KIND", help="Resolve this conflict with the content before both changes; may be repeated."
+        metavar="PATH:KIND",
+        help="Resolve the conflict in this entry with the content before both changes; may be repeated.",
     ),
 ]
 Parent = Annotated[
@@ -43,8 +47,8 @@ Parent = Annotated[
     typer.Option(
         min=1,
         max=2,
-        help="For a merge commit: number of the parent with which it is compared to find its changes; 1 is the branch "
-        "before the merge, 2 is the version that was merged into it.",
+        help="Needed for a merge commit: its changes are the differences from this parent. 1 is the branch "
+        "before the merge, 2 is the version that was merged into the branch.",
     ),
 ]
 
@@ -66,8 +70,8 @@ def merge(
     base: Base = None,
     as_json: AsJson = False,
 ) -> None:
-    """Merge a version into a branch. Changes of different parts of one entry are combined, and so are labels of
-    different frames in one annotation.
+    """Merge a version into a branch. Changes of different parts of one entry are combined. In an annotation, labels of
+    different frames are combined, too.
 
     If both sides have changed the same part of an entry, nothing is merged until each such conflict is decided by
     --ours, --theirs or --base. The exit status is 1 while a conflict is left.
@@ -205,7 +209,7 @@ def _print_result(found: MergeAnswer, into: str) -> None:
 
 
 def _print_reason(conflict: EntryConflict) -> None:
-    """Print why an annotation could not be merged, and the segments of each side that exclude each other."""
+    """Print why an annotation could not be merged, and the segments of both sides that cannot be combined."""
     from marey_schemas.datasets.merges import Side
 
     if conflict.reason:

@@ -19,14 +19,16 @@ TargetPlace = Annotated[
     str | None,
     typer.Argument(
         metavar="[PROJECT/DATASET]",
-        help="Dataset that receives the versions; created if it does not exist. Default: the same project and name.",
+        help="Dataset that receives the versions; it is created if it does not exist. Default: the same project "
+        "and name.",
     ),
 ]
 TokenFile = Annotated[
     Path | None,
     typer.Option(
         "--other-token-file",
-        help="File with a token for the other server; default: the token that marey login stored for that server.",
+        help="File with a token for the other server; default: the token that `marey login` stored for the other "
+        "server.",
     ),
 ]
 Branch = Annotated[
@@ -57,8 +59,8 @@ def push(
     """Copy a version and all versions before it to a dataset on another server, or in another project.
 
     Only data that the other dataset lacks is sent, and the versions keep their digests, authors and times. A tag is
-    copied with its version. The copy changes no folder: check out the version to get its clips. If the other branch has
-    versions that your dataset lacks, the branch does not move; pull it, merge, and push again.
+    copied with its version. The copy changes no folder: check out the version to get its clips. If the target branch
+    has versions that your dataset lacks, the target branch does not move: pull these versions, merge, and push again.
     """
     with connect(context) as here, connect_other(to, token_file, here) as there:
         _copy(here, there, place, target, branch, as_json, server=to)

@@ -54,7 +54,7 @@ def parse(text: str, *, version: bool = False) -> NamedVersion:
 
 
 def imported(at: NamedVersion, made: ImportedVersion, *, server: str | None = None) -> str:
-    """Return a sentence about an import for the user, which ends with the command to run next.
+    """Return a sentence for the user about an import; it ends with the command to run next.
 
     If the branch moved to the imported version, this next command checks out the branch; otherwise, it merges the
     version into the branch. `server` is the address of the server with the dataset if another server was named for it.

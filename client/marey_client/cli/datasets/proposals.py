@@ -36,10 +36,10 @@ CommitSeen = Annotated[
     str | None,
     typer.Option(
         "--commit",
-        help="Commit that you have reviewed; the command is refused if the proposal has a newer one.",
+        help="Commit that you have reviewed. The command is refused if the proposal has a newer commit.",
     ),
 ]
-Number = Annotated[int, typer.Argument(min=1, help="Number of the proposal; marey proposal ls lists the numbers.")]
+Number = Annotated[int, typer.Argument(min=1, help="Number of the proposal; `marey proposal ls` lists the numbers.")]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -197,7 +197,7 @@ def review(
     commit: CommitSeen = None,
     as_json: AsJson = False,
 ) -> None:
-    """Review the newest commit of a proposal. A later commit makes an approval stale."""
+    """Review the newest commit of a proposal. After a later commit, an approval does not count any more."""
     at = parse(place)
     with connect(context) as marey:
         made = at.on(marey).proposals.at(number).review(verdict, text, commit=commit)
@@ -216,7 +216,7 @@ def check(
     job: Annotated[
         str | None,
         typer.Option(
-            help="Id of the job that ran the check; the state succeeded is accepted only if this job has succeeded."
+            help="Id of the job that ran the check. The state `succeeded` is accepted only if this job has succeeded."
         ),
     ] = None,
     link: Annotated[str | None, typer.Option(help="Address of a page about the check.")] = None,
@@ -245,7 +245,10 @@ def merge(
     theirs: Theirs = None,
     base: Base = None,
     when_green: Annotated[
-        bool, typer.Option("--when-green", help="If approvals or checks are missing, merge as soon as all are present.")
+        bool,
+        typer.Option(
+            "--when-green", help="If approvals or checks are missing, let the server merge as soon as all are present."
+        ),
     ] = False,
     withdraw: Annotated[
         bool, typer.Option("--withdraw", help="Cancel the merge that an earlier --when-green requested.")
@@ -279,7 +282,7 @@ def _outcome(found: Proposal) -> str:
 
 @proposal.command("close")
 def close(context: typer.Context, place: DatasetPlace, number: Number, as_json: AsJson = False) -> None:
-    """Close a proposal without merging it; only its author and maintainers may do this."""
+    """Close a proposal without a merge; only the author of the proposal and maintainers may do this."""
     at = parse(place)
     with connect(context) as marey:
         found = at.on(marey).proposals.at(number).close()
@@ -299,7 +302,8 @@ def protect(
         bool, typer.Option("--direct-commits", help="Allow commits and merges without a proposal.")
     ] = False,
     approvals: Annotated[
-        int, typer.Option(min=0, help="Number of approvals that a proposal needs, not counting its author's.")
+        int,
+        typer.Option(min=0, help="Number of approvals that a proposal needs; approvals by its author do not count."),
     ] = 0,
     checks: Annotated[
         list[str] | None,

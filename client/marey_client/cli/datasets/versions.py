@@ -75,7 +75,7 @@ def list_datasets(context: typer.Context, project_name: ProjectName, as_json: As
 def commit(
     context: typer.Context,
     place: DatasetPlace,
-    message: Annotated[str, typer.Option("--message", "-m", help="What has changed, and why.")],
+    message: Annotated[str, typer.Option("--message", "-m", help="Message of the commit: what has changed, and why.")],
     branch: Annotated[str, typer.Option(help="Branch to which the new version is added.")] = "main",
     as_json: AsJson = False,
 ) -> None:
@@ -95,8 +95,9 @@ def log(
     path: Annotated[
         str,
         typer.Option(
-            help="Entry or folder. Only versions that changed it or anything below it are listed, each with the "
-            "numbers of entries that were added, removed, moved or changed there since its first parent."
+            help="Entry or folder. List only versions that changed this entry or an entry below this folder. Each is "
+            "listed with the numbers of entries at this path that were added, removed, moved or changed since "
+            "its first parent."
         ),
     ] = "",
     most: Annotated[int, typer.Option("--limit", "-n", min=1, help="Greatest number of versions to list.")] = 20,
@@ -104,8 +105,8 @@ def log(
 ) -> None:
     """List a version and the versions before it, newest first.
 
-    At a merge, the list continues only with the first parent, which is the branch into which the version was merged.
-    The list therefore contains the merge itself, but not the merged versions.
+    At a merge, the list continues only with the first parent, which is the branch into which another version was
+    merged. The list contains the merge itself, but not the versions that were merged.
     """
     at = parse(place, version=True)
     with connect(context) as marey:
@@ -223,7 +224,7 @@ def blame(
     kind: Annotated[str, typer.Option(help="Kind of the entry.")] = "clip",
     as_json: AsJson = False,
 ) -> None:
-    """Show the last commit that changed each part of an entry, its tags and its path, with author and time."""
+    """For each part of an entry, its tags and its path, show the last commit that changed it, with author and time."""
     at = parse(place, version=True)
     with connect(context) as marey:
         found = at.on(marey).blame(path.strip("/"), kind_named(kind), at.version)

@@ -23,7 +23,7 @@ OPTIONS: dict[str, Any] = {
     "speeds_m_s": (1.0, 1.5, 2.0, 2.5, 3.0),
     "turn_rates_deg_s": (-100.0, -50.0, 0.0, 50.0, 100.0),
 }
-"""Options of the evaluation: every other speed and turn rate of the published suite, 50 trials instead of 162."""
+"""Options of the evaluation: every second speed and turn rate of the published suite, so 50 trials instead of 162."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class DemoEvaluation:
 
     @property
     def selection(self) -> str:
-        """A text that says which of the clips were evaluated, and by which rule they were chosen."""
+        """A text that says which clips were evaluated, and by which rule these clips were chosen."""
         return (
             f"of {self.clips} retargeted clips: those whose root moves at least {TRAVEL_M:g} m within "
             f"{TRAVEL_WINDOW_S:g} s from at least half of the frames"
@@ -59,10 +59,10 @@ def evaluate_locomotion(
     folder: Path,
     advance: Advance,
 ) -> DemoEvaluation:
-    """Evaluate those of the clips that show locomotion, with their content in `version`; write the report to `folder`.
+    """Evaluate the locomotion clips among `clips`, with their content in `version`; write the report to `folder`.
 
-    `clips` maps the paths of the version's entries to their clips; `root` is the name of their root joint. If no clip
-    is locomotion, or if there is no version because there are no clips, nothing is evaluated.
+    `clips` maps the paths of entries in the version to clips; `root` is the name of the root joint of all clips. If no
+    clip is locomotion, or if there is no version because there are no clips, nothing is evaluated.
     """
     chosen = []
     for done, (path, clip) in enumerate(clips.items()):

@@ -27,9 +27,9 @@ REASONS_SHOWN = 12
 
 @dataclass
 class DemoReport:
-    """Results of the demonstration and places of its files.
+    """Results of the demonstration, and the paths of the files that it wrote.
 
-    `seconds` is the time of each step: import, retarget, files, version, evaluate.
+    `seconds` is the duration of each step: import, retarget, files, version, evaluate.
     """
 
     entries: Sequence[ImportEntry]
@@ -96,7 +96,7 @@ class DemoReport:
 
 
 def print_report(report: DemoReport) -> None:
-    """Print the quality of the motion, a table of figures, the reasons of refusals, and the places of all files."""
+    """Print the quality of the motion, a table of numbers, the reasons for refusals, and the paths of all files."""
     typer.echo(f"{report.evaluation.sentence}\n")
     print_rows(_rows(report))
     for step, reason in report.refused[:REASONS_SHOWN]:
@@ -118,7 +118,7 @@ def print_report(report: DemoReport) -> None:
 
 
 def _command() -> str:
-    """Return the command that starts `marey`: the path of this program if `marey` is not in a folder of `PATH`."""
+    """Return the command that starts `marey`: its name if a folder of `PATH` contains it, otherwise its path."""
     return "marey" if shutil.which("marey") else shlex.quote(sys.argv[0])
 
 

@@ -1,6 +1,6 @@
 """Demonstration: takes are imported, retargeted to a second skeleton, drawn, exported, versioned, and evaluated.
 
-All steps use a local server and the same requests as any other program.
+All steps send requests to a local server, as any other client program does.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ SHEET_TAKES = 8
 
 
 def demonstrate(motion: Path | None, *, data: Path, keep_serving: bool, as_json: bool) -> None:
-    """Run the demonstration; a second run with the same folder `data` uses the results of the first run again."""
+    """Run the demonstration; a second run with the same folder `data` reuses the results of the first run."""
     os.environ.setdefault("MAREY_LOG_LEVEL", "warning")
     with embedded.server_in_thread(data, workers=1) as url, Marey(url, read_secret(data / ADMIN_TOKEN)) as marey:
         files = find_files([motion]) if motion else _generated_takes(data / "generated")
@@ -117,7 +117,7 @@ class Story:
         return {clip.path: clip for clip in clips if clip.id in imported}
 
     def _results(self, sources: Mapping[str, ClipHandle]) -> list[ClipHandle]:
-        """Return the retargeted clips of the given sources, sorted by path."""
+        """Return the clips that were retargeted from the given sources, sorted by path."""
         clips = self.project.clips.list(collection=RESULTS)
         return sorted((clip for clip in clips if _source_path(clip) in sources), key=lambda clip: clip.path)
 
@@ -142,7 +142,7 @@ class Story:
     def _contact_sheet(self, pairs: Sequence[tuple[ClipHandle, ClipHandle]], total: int) -> Path | None:
         """Draw pairs of source and result side by side; return the path of the image, or None if there are no pairs.
 
-        `total` is the number of all pairs, from which `pairs` were chosen.
+        `total` is the number of all pairs; `pairs` are a selection from them.
         """
         if not pairs:
             return None
@@ -170,7 +170,7 @@ def _generated_takes(folder: Path) -> FoundFiles:
 
 
 def _game_skeleton_parts() -> dict[str, Any]:
-    """Return a skeleton with other names, proportions, rest pose and axes than the skeleton of the takes."""
+    """Return a skeleton whose joint names, proportions, rest pose and axes differ from those of the takes' skeleton."""
     documents = embedded.room("marey_motion.documents", "all")
     rigs = embedded.room("marey_motion.rigs", "all")
     skeleton = embedded.room("marey_motion.gait", "all").game_skeleton()

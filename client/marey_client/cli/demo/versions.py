@@ -1,4 +1,4 @@
-"""Versions of the results in the demonstration: they are committed, one is edited on a branch, merged, and tagged."""
+"""Versions in the demonstration: the results are committed, one is edited on a branch, and the merge is tagged."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ SHORTEST_FRAMES = 30
 class DemoVersion:
     """Tagged version that contains the results of the demonstration; one of them is smoothed.
 
-    `edited` is the path of the smoothed clip, and `picture` the file that shows what smoothing changed; both are None
-    if all clips are too short.
+    `edited` is the path of the smoothed clip. `picture` is the file that shows what smoothing changed. Both are None if
+    all clips are too short.
     """
 
     tag: str
@@ -82,7 +82,7 @@ def version_results(
 
 
 def _is_numbered(ref: Ref) -> bool:
-    """Return whether a ref is a tag of the demonstration, such as `v1`; users may have set others."""
+    """Return whether a ref is a tag named like the tags of the demonstration, such as `v1`; users may set others."""
     return ref.kind is RefKind.TAG and re.fullmatch(r"v[0-9]{1,9}", ref.name) is not None
 
 

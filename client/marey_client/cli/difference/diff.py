@@ -32,8 +32,8 @@ def diff(
     after: Annotated[
         str | None,
         typer.Argument(
-            help="Second revision, of the same item or of another item of the same kind. Default: the first argument "
-            "is compared with the revision before it."
+            help="Revision to compare with: of the same item, or of another item of the same kind. Default: the "
+            "first argument is compared with the revision before it."
         ),
     ] = None,
     picture: Annotated[

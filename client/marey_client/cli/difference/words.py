@@ -1,4 +1,4 @@
-"""Differences between revisions in words, for people who know motion but not the form of the documents."""
+"""Descriptions of differences between revisions, for people who know motion data but not the form of the documents."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NO_DIFFERENCE = "no difference"
 MOST_LINES = 20
 """Greatest number of joints, segments or fields that are listed; the others are only counted."""
 MOST_SPANS = 3
-"""Greatest number of ranges of time that are listed for a joint."""
+"""Greatest number of time ranges that are listed for a joint."""
 LEAST_TURN_DEG = 0.05
 LEAST_SHIFT_CM = 0.05
 THROUGHOUT = 0.95
@@ -170,7 +170,7 @@ def _size(change: Exceeding, unit: str, threshold: float, motion: MotionDifferen
 
 
 def _number(value: float) -> str:
-    """Return a number with three significant digits, or with all digits before the decimal point if there are more."""
+    """Return a number with three significant digits, or with all integer digits if the number has more than three."""
     return f"{value:.3g}" if value < 999.5 else f"{value:,.0f}"
 
 
@@ -262,7 +262,7 @@ def _shift(change: SegmentChange) -> int | None:
 
 
 def _common_shift(changes: Sequence[SegmentChange]) -> int | None:
-    """Return the shift in frames that more than half of the changes, and at least three, have in common; else None."""
+    """Return the shift in frames that more than half of the changes share, if at least three do; otherwise None."""
     shifts = [shift for one in changes if (shift := _shift(one)) is not None]
     most = max(set(shifts), key=shifts.count, default=None)
     return most if most is not None and shifts.count(most) >= 3 and 2 * shifts.count(most) > len(changes) else None
@@ -329,7 +329,7 @@ def _fields(difference: Difference) -> Iterator[str]:
 
 
 def _check(change: FieldChange) -> str:
-    """Return the code of an import warning that was added or removed; else the JSON pointer of the changed value."""
+    """Return the code of an import warning that was added or removed; for other changes, the JSON pointer."""
     value = change.after if change.before is None else change.before
     return str(value["code"]) if isinstance(value, dict) and "code" in value else change.pointer
 

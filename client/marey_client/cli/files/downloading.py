@@ -46,7 +46,7 @@ def download(
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
     unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
     restored: Annotated[
-        bool, typer.Option(help="Export aligned clips with the time and place of their source clips.")
+        bool, typer.Option(help="Export aligned clips with the timing and position of their source clips.")
     ] = False,
     allow_expired_consent: AllowExpiredConsent = None,
     as_json: AsJson = False,
@@ -54,10 +54,10 @@ def download(
     """Write clips to files: one clip, or all clips in a folder and below.
 
     Aligned clips are written only if the folder contains no other clips. After `@`, name a revision of the clip, or a
-    version of the dataset. Other items, such as edits and evaluations, are written with `--format json`, models and
-    annotations also with `--format predecessor`.
+    version of the dataset. Other items, such as edits and evaluations, are written with `--format json`. For models and
+    annotations, there is also `--format predecessor`.
 
-    An existing file is replaced; if several clips would have the same file name, the later ones get a number.
+    An existing file is replaced; if several clips would have the same file name, later clips get a number.
     """
     if format not in EXPORT_FORMATS:
         raise WrongUsage(f"{format!r} is not a format; the formats are {', '.join(EXPORT_FORMATS)}")
@@ -77,7 +77,7 @@ def download(
 
 
 class _Exported(NamedTuple):
-    """Item to write to a file, and the revision to write; the revision None means the newest one."""
+    """Item to write to a file, and its revision to write; None means the newest revision."""
 
     item: ItemHandle
     revision: int | None

@@ -69,18 +69,22 @@ def ls(
         str | None, typer.Option(help="List only items with one of these tags, separated by commas.")
     ] = None,
     find: Annotated[
-        str, typer.Option(help="List only items whose names contain this text, also those in subfolders.")
+        str, typer.Option(help="List only items whose names contain this text, including items in subfolders.")
     ] = "",
     query: QueryText = None,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Instead of a list, count the items that each condition of --query hides.")
+        bool,
+        typer.Option("--explain", help="Print no list, but count the items that each condition of --query excludes."),
     ] = False,
     stale: Annotated[
-        bool, typer.Option("--stale", help="List only results of which an input has a newer revision.")
+        bool, typer.Option("--stale", help="List only stale results: an input of the result has a newer revision now.")
     ] = False,
     sort: Annotated[
         str,
-        typer.Option(help="Column by which the items are sorted; with a minus sign before it, in reverse (-updated)."),
+        typer.Option(
+            help="Column by which the items are sorted; a minus sign before the column reverses the order, as in "
+            "-updated."
+        ),
     ] = "name",
     columns: Annotated[
         str,
@@ -89,7 +93,9 @@ def ls(
             f"or {FACET_PREFIX}NAME for a number that a job published."
         ),
     ] = DEFAULT_COLUMNS,
-    deleted: Annotated[bool, typer.Option("--deleted", help="List removed items, in the folder and below.")] = False,
+    deleted: Annotated[
+        bool, typer.Option("--deleted", help="List removed items in the folder and its subfolders.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """List the contents of a folder."""
@@ -174,7 +180,7 @@ def _sorted(items: Sequence[ItemHandle], column: str, *, reverse: bool) -> list[
 
 
 def _stale(items: Sequence[ItemHandle]) -> list[ItemHandle]:
-    """Return the outdated items: since they were made, one of their inputs has got a newer revision."""
+    """Return the stale items: an input has got a newer revision since the item was made."""
     with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
         answers = pool.map(lambda one: one.staleness().stale, items)
         return [one for one, stale in zip(items, answers, strict=True) if stale]
@@ -246,7 +252,7 @@ def show(
         str | None,
         typer.Option(
             help="Print only one part of the item, as JSON, such as motion or info of a clip; without this option, "
-            "marey show lists the parts."
+            "`marey show` lists the parts."
         ),
     ] = None,
     history: Annotated[bool, typer.Option("--history", help="Show every revision and its inputs.")] = False,

@@ -26,7 +26,7 @@ ERRORS_SHOWN = 20
 
 
 class _RecordChange(NamedTuple):
-    """Values to set in the record of a clip, and where they come from."""
+    """Values to set in the record of a clip, and the place from which the values come."""
 
     clip: ClipHandle
     values: Mapping[str, Any]
@@ -43,7 +43,9 @@ def record(
     place: Annotated[str, typer.Argument(help="A clip or a folder of clips: project/folder[/name].")],
     values: Annotated[
         list[str] | None,
-        typer.Option("--set", help="Field and value, as in action=walk; an empty value removes the field. Repeatable."),
+        typer.Option(
+            "--set", help="Field and value, as in action=walk; an empty value removes the field; may be repeated."
+        ),
     ] = None,
     table: Annotated[
         Path | None,
@@ -54,7 +56,9 @@ def record(
     ] = None,
     column: Annotated[
         list[str] | None,
-        typer.Option(help="Column of the table and the field that it fills, as in 'Shoot Date=shoot_day'; repeatable."),
+        typer.Option(
+            help="Column of the table and the field that it fills, as in 'Shoot Date=shoot_day'; may be repeated."
+        ),
     ] = None,
     query: QueryText = None,
 ) -> None:

@@ -34,7 +34,7 @@ def add_to(app: typer.Typer) -> None:
 
 def upload(
     context: typer.Context,
-    places: Annotated[list[Path], typer.Argument(help="Motion files, or folders of them.")],
+    places: Annotated[list[Path], typer.Argument(help="Motion files, or folders with motion files.")],
     project: Annotated[str, typer.Option(help="The project that receives the files.")],
     options: Chosen,
     left_handed: Annotated[
@@ -45,8 +45,8 @@ def upload(
     """Import motion files. Refused files are listed with a reason.
 
     Importing the same file again changes nothing; a changed file of the same name becomes a new revision of its clip.
-    Clips in a folder that `marey dataset export` wrote keep their paths, and get the take records and tags that they
-    had then.
+    If `marey dataset export` wrote a folder, its clips get the paths, take records and tags that they had when they
+    were exported.
     """
     from marey_client.imports import find_files, left_out_text
     from marey_schemas.options.imports import ImportOptions

@@ -16,7 +16,7 @@ MOST_SHOWN = 80
 """Greatest number of characters shown of a text that is not valid."""
 
 ANONYMOUS_HINT = (
-    "no token was found: run marey login, or give --token-file. A server on this machine stores a token in the file "
+    "no token was found: run `marey login`, or give --token-file. A server on this machine stores a token in the file "
     "admin.token of its data folder; the variable MAREY_DATA can name this folder."
 )
 

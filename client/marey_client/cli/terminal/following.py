@@ -59,8 +59,8 @@ SEEDED_JOB = _CommittingJob("marey_schemas.queue.jobs:JobCreate", only=("seed", 
 Sources = Annotated[
     list[str],
     typer.Argument(
-        help="Clips, folders of clips, or versions of datasets, all of one project: project/folder[/name[@revision]], "
-        "project/dataset@version[/folder]."
+        help="Clips, folders of clips, or versions of datasets, all in one project: "
+        "project/folder[/name[@revision]] or project/dataset@version[/folder]."
     ),
 ]
 Into = Annotated[str, typer.Option(help="Folder for the results, in the same project.")]
@@ -114,7 +114,8 @@ def follow(
             return marey.jobs.wait(submitted.id, on_progress=show)
     except KeyboardInterrupt:
         print_message(
-            f"{seen.id} continues on the server; marey job show {seen.id} shows it, marey job cancel {seen.id} stops it"
+            f"{seen.id} continues on the server; `marey job show {seen.id}` shows it, "
+            f"`marey job cancel {seen.id}` stops it"
         )
         raise
 

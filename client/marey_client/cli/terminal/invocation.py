@@ -15,17 +15,17 @@ if TYPE_CHECKING:
     from marey_client.credentials import Credential
     from marey_client.marey import Marey
 
-ProjectName = Annotated[str, typer.Argument(help="Name of the project; marey project ls lists all names.")]
-UserName = Annotated[str, typer.Argument(help="Name of the user; marey user ls lists all names.")]
-JobId = Annotated[str, typer.Argument(help="Id of the job; marey job ls lists the ids.")]
+ProjectName = Annotated[str, typer.Argument(help="Name of the project; `marey project ls` lists all names.")]
+UserName = Annotated[str, typer.Argument(help="Name of the user; `marey user ls` lists all names.")]
+JobId = Annotated[str, typer.Argument(help="Id of the job; `marey job ls` lists the ids.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 QueryText = Annotated[
     str | None,
     typer.Option(
         "--query",
         "-q",
-        help="Select only items that meet a query, also those in subfolders, as in 'subject = 02 and frames > 120'; "
-        "the reference of queries lists the fields.",
+        help="Select only items that meet a query, such as 'subject = 02 and frames > 120', including items in "
+        "subfolders. The fields are listed in the reference of queries, in the documentation.",
     ),
 ]
 AllowExpiredConsent = Annotated[

@@ -68,7 +68,7 @@ def remove_segment(layer: Layer, at: int) -> Layer:
 
 
 def split_segment(layer: Layer, at: int, label: str | None) -> Layer:
-    """Cut a segment in two at a frame, which becomes the first frame of the second part.
+    """Cut a segment in two. The frame `at` becomes the first frame of the second part.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def split_segment(layer: Layer, at: int, label: str | None) -> Layer:
 
 
 def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", "nearest"]) -> Layer:
-    """Merge a segment with a neighbour: the result keeps the segment's label and includes the gap between them.
+    """Merge a segment with a neighbour: the result keeps the segment's label and includes the gap between the two.
 
     The nearest neighbour is the one with the smaller gap; if both gaps are equal, the next one.
 
@@ -252,7 +252,7 @@ def remove_keyframe(layer: Layer, label: str, frame: int) -> Layer:
 
     Raises
     ------
-    AnnotationError    if it does not exist
+    AnnotationError    if the keyframe does not exist
     """
     gone = Keyframe(label, frame)
     place = layer.place_of(gone)
@@ -292,11 +292,11 @@ COMMANDS: Mapping[str, Callable[..., Layer]] = {
         clear,
     )
 }
-"""Function of each command by its name; it takes a layer and returns the changed layer."""
+"""Functions by the names of the commands; each function takes a layer and returns the changed layer."""
 
 
 def piece_of(layer: Layer, segment: Segment, start: int, end: int) -> Layer:
-    """Make the layer of a clip that is cut to the frames [start, end), with one segment and its keyframes.
+    """Make the layer for a clip that is cut to the frames [start, end); it keeps one segment and its keyframes.
 
     Parameters
     ----------

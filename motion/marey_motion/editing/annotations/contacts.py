@@ -15,7 +15,7 @@ from marey_motion.matching.body import MatchingBody
 from marey_schemas.options.annotations import ContactOptions
 
 LEAVING_FACTOR = 1.6
-"""Hysteresis: a contact ends when the foot is faster than this factor times the speed below which a contact begins."""
+"""Hysteresis: a contact begins below a speed, and ends when the foot is faster than this factor times that speed."""
 SMOOTHING_S = 0.045
 
 
@@ -50,7 +50,7 @@ def foot_speed(points: NDArray[np.floating], frame_rate_hz: float) -> Floats:
     """Compute the speed of the slowest point of a foot, without outliers.
 
     While a foot rolls from heel strike to toe off, first its heel does not move, then its toe. The ankle is close to
-    the heel, so the slower one of ankle and toe is slow during the whole contact.
+    the heel, so the slower of these two points is slow during the whole contact.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """One layer of annotation over a clip: segments, keyframes and their checks.
 
-Frames are counted from 0; a segment [start, end) is half open, so its last frame is `end - 1` and adjacent segments
-share a number: where one ends, the next starts. Segments of a layer do not overlap.
+Frames are counted from 0; a segment [start, end) is half open, so its last frame is `end - 1`, and the `end` of a
+segment equals the `start` of an adjacent next segment. Segments of a layer do not overlap.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ class Keyframe(NamedTuple):
 
 @dataclass(frozen=True)
 class Layer:
-    """Segments, which do not overlap, and keyframes of a clip, both sorted by time.
+    """Segments and keyframes of a clip, both sorted by time. The segments do not overlap.
 
     Two keyframes may share a frame if their labels differ. Segments and keyframes may be given in any order.
 
     Raises
     ------
-    AnnotationError    naming the invalid segment or keyframe
+    AnnotationError    if a segment or keyframe is invalid; the error names it
     """
 
     frame_count: int
@@ -89,13 +89,13 @@ class Layer:
 
         Returns
         -------
-        first, stop : int    range of indices; if it is empty, a new segment is to be inserted there
+        first, stop : int    range of indices; if no segment overlaps, `first` = `stop` is the index for a new segment
         """
         first = bisect_right(self.segments, start, key=_end)
         return first, max(first, bisect_left(self.segments, end, key=_start))
 
     def with_segments(self, first: int, stop: int, *segments: Segment) -> Layer:
-        """Replace a range of segments with others. Only the new segments and their neighbours are checked.
+        """Replace a range of segments with other segments. Only the new segments and their neighbours are checked.
 
         Parameters
         ----------
@@ -116,7 +116,7 @@ class Layer:
         return self._changed((*self.segments[:first], *segments, *self.segments[stop:]), self.keyframes)
 
     def place_of(self, keyframe: Keyframe) -> int:
-        """Find the index at which a keyframe is, or would be inserted, in the order of time.
+        """Find the index of a keyframe in the order of time, or the index where it would be inserted.
 
         Parameters
         ----------
@@ -129,7 +129,7 @@ class Layer:
         return bisect_left(self.keyframes, _moment(keyframe), key=_moment)
 
     def with_keyframes(self, first: int, stop: int, *keyframes: Keyframe) -> Layer:
-        """Replace a range of keyframes with others. Only the new keyframes and their neighbours are checked.
+        """Replace a range of keyframes with other keyframes. Only the new keyframes and their neighbours are checked.
 
         Parameters
         ----------
@@ -150,7 +150,7 @@ class Layer:
         return self._changed(self.segments, (*self.keyframes[:first], *keyframes, *self.keyframes[stop:]))
 
     def _changed(self, segments: tuple[Segment, ...], keyframes: tuple[Keyframe, ...]) -> Layer:
-        """Replace fields with values that are known to be valid."""
+        """Return a copy with other segments and keyframes, which are known to be valid."""
         made = object.__new__(Layer)
         for name, value in (("frame_count", self.frame_count), ("segments", segments), ("keyframes", keyframes)):
             object.__setattr__(made, name, value)
@@ -179,7 +179,7 @@ def require_segments(segments: Sequence[Segment], frame_count: int) -> None:
 
     Raises
     ------
-    AnnotationError    naming the first invalid segment
+    AnnotationError    if a segment is invalid; the error names the first such segment
     """
     for segment in segments:
         _require_label(segment.label, str(segment))

@@ -29,7 +29,7 @@ REST_S = 0.1
 def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: VelocityMinimaProposal | None = None) -> Layer:
     """Propose a keyframe `pause` at each minimum of the joints' mean speed, and segments `movement` between them.
 
-    The first segment starts at the start of the clip, and the last segment ends at its end.
+    The first segment starts with the clip, and the last segment ends with the clip.
 
     Parameters
     ----------
@@ -62,12 +62,13 @@ def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: VelocityMini
 
 
 def propose_reaches(clip: Clip, body: MatchingBody, options: WristContactProposal | None = None) -> Layer:
-    """Propose a segment `reach_left` or `reach_right` each time a wrist leaves its rest position and returns.
+    """Propose a segment `reach_left` or `reach_right` each time the wrist leaves its rest position and returns.
 
-    The rest position is the position of the wrist at the start of the clip: horizontally relative to the hips and the
-    body's heading, vertically the height above the ground. A segment begins and ends where the distance of the wrist
-    from rest has a minimum. The keyframe `contact` marks the first frame in which the hand is at its far position; the
-    keyframe `release`, if the options ask for it, marks the last one.
+    Only the wrist of `options.hand` is considered; for "either", the wrist that moves farther from rest. The rest
+    position is the position of the wrist at the start of the clip: horizontally relative to the hips and the body's
+    heading, vertically the height above the ground. A segment begins and ends where the distance of the wrist from rest
+    has a minimum. In each segment, the keyframe `contact` marks the first frame in which this distance is at least
+    `options.arrived` times its maximum; if `options.release` is set, the keyframe `release` marks the last such frame.
 
     Parameters
     ----------

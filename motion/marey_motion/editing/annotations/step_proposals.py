@@ -23,14 +23,14 @@ SHORTEST_FLIGHT_S = 0.04
 
 
 def propose_steps(clip: Clip, body: MatchingBody, options: StepsProposal | None = None) -> Layer:
-    """Propose a segment for each step: from the contact of one foot to the next contact of the other.
+    """Propose a segment for each step: from the contact of one foot to the next contact of the other foot.
 
     The label names the foot that swings. `step_left` and `step_right` are steps of a walk; `run_left` and `run_right`
     are steps with a phase in which no foot touches the ground. The first step after standing has the prefix `start_`
     and begins where the foot leaves the ground; the last step before standing has the prefix `stop_`; a step with
     standing before and after it has the prefix `single_`. Periods of standing have the label `standing`. Incomplete
     steps, turns on the spot, jumps, side steps and backward steps have no segment. The keyframe `passing` marks the
-    frame at which the swinging foot passes the other, if it does.
+    frame in which the swinging foot passes the other foot, if there is such a frame.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class _Step(NamedTuple):
 def _standing(stances: tuple[list[Stance], ...], clip: Clip, standing_s: float) -> list[Stance]:
     """Find the periods of at least `standing_s` seconds in which both feet are on the ground.
 
-    `stances` are those of the left and of the right foot.
+    `stances` are the stances of the left and of the right foot.
     """
     both = [Stance(max(a.start, b.start), min(a.end, b.end)) for a in stances[0] for b in stances[1]]
     return sorted(one for one in both if one.end - one.start >= max(1.0, standing_s * clip.frame_rate_hz))

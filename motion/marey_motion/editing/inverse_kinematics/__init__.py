@@ -1,3 +1,4 @@
-"""Inverse kinematics: poses that meet targets of joints, by cyclic coordinate descent, a closed form for two bones, or
-damped least squares.
+"""Inverse kinematics: poses in which joints meet given targets.
+
+The solvers are cyclic coordinate descent, a closed form for two bones, and damped least squares.
 """

@@ -1,4 +1,4 @@
-"""Cyclic coordinate descent: each joint in turn gets the rotation that is best for all targets that it can move."""
+"""Cyclic coordinate descent: each joint in turn gets the rotation that is best for all targets below that joint."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ STAYING = 1e-9
 def _pair_up(targets, frame, k, body, place, tips, turns, matrix):  # type: ignore[no-untyped-def]
     """Fill `matrix` (3, 3) with the sum Σ w·b·aᵀ over the pairs of vectors (a, b) that the targets define for joint k.
 
-    Joint k rotates the vector a, and the target is reached when a coincides with b; w is the squared scale of the
-    target's error, for orientations half of it. `place` is the position of joint k; `tips` and `turns` are positions
-    and rotations of the targets' points. Returns the number of pairs, and a and b of the last position or look-at
-    pair as unit vectors.
+    Joint k rotates the vector a, and the target is reached when a coincides with b. The weight w is the squared scale
+    of the target's error, or half of that square for orientations. `place` is the position of joint k; `tips` and
+    `turns` are positions and rotations of the targets' points. Returns the number of pairs, and the unit vectors along
+    a and b of the last pair of a position or look-at target.
     """
     matrix[:] = 0.0
     pairs = 0
@@ -93,7 +93,7 @@ def _add_pair(matrix, weight, a, b):  # type: ignore[no-untyped-def]
 def _davenport(matrix, form):  # type: ignore[no-untyped-def]
     """Fill `form` with Davenport's matrix (4, 4) of the sum `matrix` from `_pair_up`.
 
-    Its eigenvector of the largest eigenvalue is the best rotation as a quaternion (q-method).
+    The eigenvector of the largest eigenvalue of `form` is the best rotation, as a quaternion (q-method).
     """
     trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
     form[0, 0] = trace
@@ -175,7 +175,7 @@ def _best_turn(pairs, start, end, matrix, form, vectors):  # type: ignore[no-unt
 
 @compiled
 def _hinge_turn(limit, spin, local, flexible, matrix):  # type: ignore[no-untyped-def]
-    """Compute the local rotation of a hinge, moved by a share `flexible` towards its best angle within the limits.
+    """Compute the local rotation of a hinge after turning it by a share `flexible` of the way to its best angle.
 
     `limit` is the joint's row of `JointChains.limits`, `spin` its rotation in the world, `local` its local rotation,
     and `matrix` the sum from `_pair_up`.
@@ -205,7 +205,7 @@ def _hinge_turn(limit, spin, local, flexible, matrix):  # type: ignore[no-untype
 
 @compiled
 def _turned_joint(body, k, spin, local, pairs, start, end, work):  # type: ignore[no-untyped-def]
-    """Compute the new local rotation of joint k, from its rotation in the world `spin` and its local rotation.
+    """Compute the new local rotation of joint k from the rotation `spin` in the world and the local rotation `local`.
 
     `pairs`, `start` and `end` are the results of `_pair_up`.
     """
@@ -253,8 +253,7 @@ def _sweep(body, targets, frame, local, work):  # type: ignore[no-untyped-def]
 def descend(body, targets, ends, roots, rotations, work, found):  # type: ignore[no-untyped-def]
     """Solve each frame independently; change `rotations` (F, K, 4) in place, and fill the `SolverResult` `found`.
 
-    `ends` holds the three criteria for ending: the maximum number of sweeps, and the tolerances in metres and in
-    radians.
+    `ends` holds the three stopping criteria: the maximum number of sweeps, and the tolerances in metres and in radians.
     """
     most_sweeps, tolerance_m, tolerance_rad = ends
     best = np.empty(rotations.shape[1:])

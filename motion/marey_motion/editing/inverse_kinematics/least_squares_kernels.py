@@ -50,7 +50,8 @@ LIMIT_REACHED_RAD = 1e-9
 def _turned_error(kind, error, gaze, wished, turn, drift):  # type: ignore[no-untyped-def]
     """Compute the change of an angular error if the joint turns by `turn` and the target direction by `drift`.
 
-    Both are small rotation vectors. `gaze` and `wished` are the unit directions of the look-at axis and of its target.
+    `turn` and `drift` are small rotation vectors; `gaze` and `wished` are the unit directions of the look-at axis and
+    of its target.
     """
     if kind == ORIENTATION:
         # The inverse left Jacobian of the rotation group at `error`.
@@ -79,8 +80,8 @@ def _look_change(gaze, wished, turn):  # type: ignore[no-untyped-def]
 def _fill_column(targets, frame, c, error, tip, turn, move, spin, jacobian, column):  # type: ignore[no-untyped-def]
     """Fill a column of the Jacobian: the derivatives of the error of target `c` with respect to one unknown.
 
-    `tip` and `turn` are position and rotation of the target's point, `error` is its error. A unit change of the unknown
-    moves the point by `move` and turns it by `spin`.
+    `tip` and `turn` are position and rotation of the target's point; `error` is the error of the target. A unit change
+    of the unknown moves the point by `move` and turns it by `spin`.
     """
     if targets.kinds[c] == POSITION:
         axes = targets.axes
@@ -102,7 +103,7 @@ def _fill_column(targets, frame, c, error, tip, turn, move, spin, jacobian, colu
 def fill_jacobian(body, targets, frame, work, jacobian):  # type: ignore[no-untyped-def]
     """Fill `jacobian` (3·C, 3·V + 3): the derivatives of the scaled errors of C targets.
 
-    They are derivatives with respect to displacements of the V movable joints and of the root.
+    The unknowns are the displacements of the V movable joints and of the root.
     """
     jacobian[:] = 0.0
     columns = 0
@@ -131,9 +132,9 @@ def fill_jacobian(body, targets, frame, work, jacobian):  # type: ignore[no-unty
 
 @compiled
 def _displace(body, local, root, first_local, first_root, work):  # type: ignore[no-untyped-def]
-    """Fill `work.displacement` (3·V + 3,), and return the weighted sum of its squares.
+    """Fill `work.displacement` (3·V + 3,), and return the weighted sum of the squared displacements.
 
-    These are the displacements of the V movable joints and of the root, from the initial pose (`first_local`,
+    The displacements are those of the V movable joints and of the root, from the initial pose (`first_local`,
     `first_root`) to the pose (`local`, `root`).
     """
     columns, cost = 0, 0.0
@@ -238,7 +239,7 @@ def _fill_step(work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _block(work, v, over):  # type: ignore[no-untyped-def]
-    """Exclude the direction `over` from further steps of movable joint v.
+    """Exclude the direction `over` from further steps of the movable joint `v`.
 
     `work.blocked` counts the excluded directions of each joint. `work.outward` contains the excluded direction if
     there is one, and the only direction that remains free if there are two. Returns False, without a change, if all
@@ -318,7 +319,7 @@ def _prepare(body, targets, frame, work):  # type: ignore[no-untyped-def]
 def _try_step(body, damping, local, root, work):  # type: ignore[no-untyped-def]
     """Take a damped step from the pose `local` and `root`; fill `work.trial` and `work.trial_root` with the new pose.
 
-    Joints at their limits slide along them.
+    Joints at a limit slide along this limit.
     """
     _fill_softness(body, damping, work)
     work.blocked[:] = 0
@@ -384,7 +385,7 @@ def _solve_frame(body, targets, frame, offsets, ends, local, root, work, before,
 def solve_frames(body, targets, ends, roots, rotations, work, found):  # type: ignore[no-untyped-def]
     """Solve each frame independently; change `roots` (F, 3) and `rotations` (F, K, 4) in place.
 
-    Also fills the `SolverResult` `found`. `ends` holds the three criteria for ending: the maximum number of steps, and
+    Also fills the `SolverResult` `found`. `ends` holds the three stopping criteria: the maximum number of steps, and
     the tolerances in metres and in radians.
     """
     for f in range(rotations.shape[0]):

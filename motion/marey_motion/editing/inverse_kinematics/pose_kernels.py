@@ -49,7 +49,7 @@ def place_joints(parents, offsets, root, local, spins, places):  # type: ignore[
 def place_tips(targets, spins, places, tips, turns):  # type: ignore[no-untyped-def]
     """Fill `tips` (C, 3) and `turns` (C, 4): positions of the targets' points, and rotations of their joints.
 
-    `spins` (K, 4) and `places` (K, 3) are rotations and positions of all joints; all are in the world.
+    `spins` (K, 4) and `places` (K, 3) are rotations and positions of all joints. All four arrays are in the world.
     """
     for c in range(targets.kinds.shape[0]):
         k = targets.joints[c]
@@ -109,8 +109,8 @@ def weigh_errors(targets, frame, tips, turns, errors, tolerance_m, tolerance_rad
 def measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad):  # type: ignore[no-untyped-def]
     """Fill positions, rotations and errors in `work` for the pose `local` (K, 4) and `root` (3,).
 
-    `frame` selects the values of the targets, and `offsets` (K, 3) are those of the joints. Returns the weighted sum
-    of the squared errors, and whether all targets are reached.
+    `frame` selects the values of the targets, and `offsets` (K, 3) are the offsets of the joints. Returns the weighted
+    sum of the squared errors, and whether all targets are reached.
     """
     place_joints(body.parents, offsets, root, local, work.spins, work.places)
     place_tips(targets, work.spins, work.places, work.tips, work.turns)
@@ -154,7 +154,7 @@ def within_limits(row, q):  # type: ignore[no-untyped-def]
 
 @compiled
 def _within_ellipse(x, y, width, height):  # type: ignore[no-untyped-def]
-    """Move the point (x, y) towards the centre until it is inside the ellipse with half axes `width` and `height`."""
+    """Move the point (x, y) towards 0 until the point is inside the ellipse with the half axes `width` and `height`."""
     if width <= 0.0:
         x = 0.0
     if height <= 0.0:

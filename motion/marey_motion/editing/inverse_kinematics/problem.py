@@ -1,6 +1,6 @@
 """Targets and movable joints, packed into arrays for the kernels of inverse kinematics.
 
-Only the joints between the root and the targets matter; these K joints are numbered with parents before children.
+Only the K joints between the root and the targets matter; they are numbered so that parents come before children.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class JointChains(NamedTuple):
     parents, offsets : (K,), (F or 1, K, 3) index of each joint's parent, and offset from it in metres
     movable, stiffness : (K,) whether a solver may turn the joint, and its resistance, from 0 (turns freely) to below 1
     limited, limits : (K,), (K, 14) whether the joint has limits, and the limits as `JointLimit.row`
-    carries : (K, C) whether each target moves with the joint
+    carries : (K, C) whether a target moves with a joint
     root_moves : whether a solver may shift the root
     """
 
@@ -53,10 +53,10 @@ class Targets(NamedTuple):
 
     Parameters
     ----------
-    kinds, joints : (C,) kind of each target (0 position, 1 orientation, 2 look-at), and index of its joint
+    kinds, joints : (C,) kind of each target (0 position, 1 orientation, 2 look-at), and index of the target's joint
     values : (F or 1, C, 4) position, quaternion or point to look at, in the world
     axes : (C, 3) 1 for each coordinate of a position that counts, else 0
-    directions, offsets : (C, 3) look-at axis, and place of the target's point, in the frame of the joint
+    directions, offsets : (C, 3) look-at axis and place of the target's point, both in the frame of the joint
     scales : (C,) factors of the errors
     """
 
@@ -89,7 +89,7 @@ class Placing(NamedTuple):
     ----------
     spins, places : (K, 4), (K, 3) rotations and positions of the joints in the world
     tips, turns, errors : (C, 3), (C, 4), (C, 3) positions of the targets' points, rotations of their joints, errors
-    matrix, form, vectors : (3, 3), (4, 4), (4, 4) for the best rotation of a joint
+    matrix, form, vectors : (3, 3), (4, 4), (4, 4) intermediate results in the search for a joint's best rotation
     """
 
     spins: Floats
@@ -166,7 +166,7 @@ class IkProblem(NamedTuple):
 
         Parameters
         ----------
-        regularisation_m : float    cost of a displacement of one radian, as an error in metres
+        regularisation_m : float    error, in metres, that costs as much as a displacement of one radian
 
         Returns
         -------
@@ -233,7 +233,7 @@ def pose_problem(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], 
 
     Raises
     ------
-    EditError    naming the target and its defect
+    EditError    if a target is invalid; the error names the target and its defect
     """
     for number, target in enumerate(targets):
         if not 0 <= target.joint < skeleton.joint_count:

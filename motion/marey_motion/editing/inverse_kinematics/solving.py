@@ -1,8 +1,9 @@
 """Inverse kinematics: joint rotations that bring points, orientations and look-at axes to their targets.
 
 There are three solvers. Each solves frames independently: the result for a frame does not depend on other frames. No
-solver returns a pose with a larger error than the given pose. The error is the weighted sum of squares in metres, with
-`ANGLE_LENGTH_M` metres per radian. If the given pose violates limits, it is brought within them before the comparison.
+solver returns a pose with a larger error than the given pose. The error is the weighted sum of the squared errors of
+all targets; an angle counts as `ANGLE_LENGTH_M` metres per radian. If the given pose violates limits, the pose is
+brought within the limits before the comparison.
 """
 
 from __future__ import annotations
@@ -62,8 +63,9 @@ class TwoBoneLimb:
     Parameters
     ----------
     start, middle, end : indices of shoulder, elbow, wrist, or hip, knee, ankle
-    hinge : unit axis in the middle joint's frame about which the limb bends. It is used where the limb is nearly
-        straight, or a little overstretched, so that its pose does not define the axis; if None, the axis is arbitrary
+    hinge : unit axis about which the limb bends, in the frame of the middle joint. It is used where the limb is nearly
+        straight or a little overstretched, because such a pose does not define an axis; if None, an arbitrary axis is
+        used there
     """
 
     start: int
@@ -97,9 +99,9 @@ def limb_ending_at(
     Parameters
     ----------
     skeleton : Skeleton    J joints
-    mapping : JointMapping    its standard joints
+    mapping : JointMapping    standard joints of the skeleton
     joint : int    index of the joint
-    axes : mapping of str to JointAxes, optional    axes by joint name (`rigs.guess_axes`); without them the bending
+    axes : mapping of str to JointAxes, optional    axes by joint name (`rigs.guess_axes`); if None, the bending
         direction of straight limbs is unknown
 
     Returns
@@ -136,12 +138,12 @@ def solve(
     skeleton : Skeleton    J joints
     motion : Motion    F frames, which stay unchanged
     targets : sequence of targets    C targets
-    freedom : Freedom    joints that may turn
+    freedom : Freedom    joints that may turn; if `freedom.joints` is None and a limb is given, only the limb turns
     limb : TwoBoneLimb, optional    a limb that may turn
-    solver : str    "auto", "ccd", "two_bone" or "least_squares". "auto" uses the two-bone solver if a limb is
-        given, joints have no limits, and the targets are a position of the limb's end in all axes and, optionally, an
-        orientation of its end. In all other cases, "auto" uses least squares; also if the limb turns out to be too
-        short in any of the frames, and other joints or the root may move.
+    solver : str    "auto", "ccd", "two_bone" or "least_squares". "auto" uses the two-bone solver if a limb is given,
+        joints have no limits, and the targets are a position of the limb's end in all axes and, optionally, an
+        orientation of this end. Otherwise, "auto" uses least squares. It also uses least squares if the limb is too
+        short in any frame, and other joints or the root may move.
     options : SolverOptions    tolerances and iterations
 
     Returns
@@ -150,7 +152,7 @@ def solve(
 
     Raises
     ------
-    EditError    naming the invalid target, or if the solver cannot be used for these targets
+    EditError    if a target is invalid (the error names it), or if the solver cannot be used for these targets
     """
     asked = limb_targets(targets, limb)
     if solver == "two_bone" or (solver == "auto" and asked is not None and not freedom.limits):
@@ -184,9 +186,9 @@ def solve_ccd(
 ) -> SolvedPoses:
     """Solve by cyclic coordinate descent: each joint in turn, from the targets to the root, gets its best rotation.
 
-    The best rotation is, for one target, the shortest rotation that aims at it (Wright 2015); for several targets, the
-    solution of Wahba's problem for all of them (Davenport's q-method); for a hinge, the best angle within its limits.
-    The best pose of all sweeps is returned.
+    For one target, the best rotation is the shortest rotation that aims at the target (Wright 2015). For several
+    targets, it is the solution of Wahba's problem (Davenport's q-method). For a hinge, it is the best angle within the
+    limits of the hinge. The best pose of all sweeps is returned.
 
     Parameters
     ----------
@@ -202,7 +204,7 @@ def solve_ccd(
 
     Raises
     ------
-    EditError    naming the target that is invalid
+    EditError    if a target is invalid; the error names it
     """
     from marey_motion.editing.inverse_kinematics import ccd_kernels
 
@@ -246,7 +248,7 @@ def solve_least_squares(
 
     Raises
     ------
-    EditError    naming the target that is invalid
+    EditError    if a target is invalid; the error names it
     """
     from marey_motion.editing.inverse_kinematics import least_squares_kernels
 
@@ -270,7 +272,7 @@ def solve_two_bone(
     damping_zone_rad: float = 0.0,
     options: SolverOptions = _OPTIONS,
 ) -> SolvedPoses:
-    """Bring the end of a limb to a position in closed form; a limb that cannot reach it is stretched towards it.
+    """Bring the end of a limb to a position in closed form; a limb that is too short is straightened towards it.
 
     The middle joint opens or closes in the plane of the limb; then the limb is aimed (Lee and Shin 1999, 5.3).
 
@@ -279,12 +281,13 @@ def solve_two_bone(
     skeleton : Skeleton    J joints
     motion : Motion    F frames
     limb : TwoBoneLimb    the limb
-    position : PositionTarget    target of its end
-    orientation : OrientationTarget, optional    orientation of the end
-    ending : str    without an orientation, "carried" keeps the end's local rotation and "held" its orientation in the
-        world
-    damping_zone_rad : float    angle from the straight limb, in radians, within which the change of the middle joint is
-        damped, so that the joint does not snap (Kovar, Schreiner and Gleicher 2002); a target there is missed slightly
+    position : PositionTarget    target of the limb's end
+    orientation : OrientationTarget, optional    orientation of the limb's end
+    ending : str    used without `orientation`: "carried" keeps the local rotation of the limb's end, "held" keeps its
+        orientation in the world
+    damping_zone_rad : float    within this angle of the straight limb, in radians, changes of the middle joint are
+        damped, so that the joint does not snap (Kovar, Schreiner and Gleicher 2002); targets that need such angles are
+        missed slightly
     options : SolverOptions    tolerances
 
     Returns
@@ -293,7 +296,7 @@ def solve_two_bone(
 
     Raises
     ------
-    EditError    if the joints form no limb or the targets do not belong to its end
+    EditError    if the joints form no limb, or the targets do not belong to the limb's end
     """
     from marey_motion.editing.inverse_kinematics import two_bone_kernels
 
@@ -347,7 +350,7 @@ def _kernel_limb(
 
 
 def _keep_better(problem: IkProblem, before: Floats, found: SolverResult) -> None:
-    """Restore the given pose and its errors in each frame in which the closed form increased the error.
+    """Restore the given pose and its errors in each frame whose error was increased by the closed form.
 
     `before` (F, K, 4) are the given local rotations. The error can increase if the wrist turns a tool away from its
     target. In all other frames, the number of iterations is set to 1.

@@ -20,7 +20,7 @@ from marey_motion.skeleton import Skeleton
 from marey_schemas.editing.constraints import Axes
 
 ANGLE_LENGTH_M = 0.01 / math.radians(5.0)
-"""Weight of angles against positions, in metres per radian: an error of five degrees counts as much as a centimetre."""
+"""Weight of angles relative to positions, in metres per radian: an error of five degrees counts as one centimetre."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class OrientationTarget:
 
 @dataclass(frozen=True, eq=False)
 class LookAtTarget:
-    """Point at which an axis of a joint, such as the gaze, should be directed.
+    """Point that an axis of a joint, such as the gaze, should be directed at.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ Target = PositionTarget | OrientationTarget | LookAtTarget
 
 @dataclass(frozen=True, eq=False)
 class JointLimit:
-    """Limits of a joint's rotation from a reference: a twist about an axis, then a swing of the axis.
+    """Limits of a joint's rotation from a reference rotation: of a twist about an axis, then of a swing of this axis.
 
     Parameters
     ----------
@@ -189,8 +189,8 @@ class SolverOptions:
     ----------
     tolerance_m, tolerance_rad : largest error at which a target counts as reached
     most_iterations : maximum number of sweeps (cyclic coordinate descent) or steps (least squares)
-    regularisation_m : cost of a displacement of one radian, or of one metre of the root, as an error in metres (least
-        squares only)
+    regularisation_m : error, in metres, that costs as much as turning a joint by one radian, or shifting the root by
+        one metre (least squares only)
     """
 
     tolerance_m: float = 1e-4
@@ -214,7 +214,7 @@ class Freedom:
     ----------
     joints : indices of the joints that may turn; None for all joints between the root and a target
     root_moves : whether the root may be shifted (least squares only)
-    limits : limits by joint index; a joint outside its limits is brought within them first
+    limits : limits by joint index; a joint outside its limits is first brought within the limits
     stiffness : stiffness by joint index, from 0 (turns freely, the default) to below 1
     """
 
@@ -232,7 +232,7 @@ class Freedom:
 
 
 def chain_of(skeleton: Skeleton, effector: int, top: int) -> tuple[int, ...]:
-    """List the joints from one joint up to another.
+    """List the joints from one joint up to another joint above it.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ CARRIED, HELD, GIVEN = 0, 1, 2
 
 @compiled
 def bend_at(distance, first, second):  # type: ignore[no-untyped-def]
-    """Compute the angle between two joined bones whose outer ends are `distance` apart, in radians; π if straight.
+    """Compute the angle, in radians, between two joined bones whose outer ends are `distance` apart; π if straight.
 
     `first` and `second` are the lengths of the bones.
     """
@@ -91,13 +91,13 @@ def _bent(upper, fore, wished, hinge):  # type: ignore[no-untyped-def]
 def _turn_from_hinge(along, across, cosine, wished):  # type: ignore[no-untyped-def]
     """Compute the angle, about the upper bone, from a limb's hinge to the axis about which the limb is to bend.
 
-    `wished` is the bend in radians. A nearly straight limb bends about its hinge, even if it is a little overstretched,
-    and keeps an existing bend to the side. A bent limb continues to bend about the axis of its present bend.
+    `wished` is the bend in radians. A nearly straight limb, even a little overstretched, bends about its hinge and
+    keeps an existing bend to the side. A bent limb continues to bend about the axis of its present bend.
 
     Parameters
     ----------
-    along, across : components of the current axis of the bend, along the hinge and across it; the length of the axis is
-        the sine of the bend
+    along, across : components of the current axis of the bend, along the hinge and across the hinge; the length of the
+        axis is the sine of the bend
     cosine : cosine of the current angle between the bones
     """
     sine = math.hypot(along, across)
@@ -148,8 +148,8 @@ def _reach(limb, body, offsets, root, local, target, rotation, work):  # type: i
 def _turn(body, work, local, k, turn):  # type: ignore[no-untyped-def]
     """Rotate joint k of the pose `local` by `turn`, a rotation about world axes.
 
-    `turn` was computed for the pose before any joint of the limb was turned. `work.spins` are the rotations of the
-    joints in the world in that pose.
+    `turn` was computed for the pose before any joint of the limb was turned. In that pose, `work.spins` are the
+    rotations of the joints in the world.
     """
     parent = body.parents[k]
     spin = product(turn, rotation_at(work.spins, k))

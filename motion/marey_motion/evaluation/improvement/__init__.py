@@ -1,1 +1,1 @@
-"""Improvements of a data set: removable clips, clips that fill holes in its coverage, and better feature weights."""
+"""Improvements of a data set: clips to remove, clips that fill holes in its coverage, and better feature weights."""

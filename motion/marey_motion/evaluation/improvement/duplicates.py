@@ -3,7 +3,7 @@
 Two frames are compared by points relative to the root: the pose joints, and the future root at each horizon, so that
 walks with equal poses but different turns differ. The distance of two clips is computed from their best alignment in
 time (`alignment.dtw`): the mean distance between points is summed over the aligned frames and divided by the number of
-frames of the longer clip. It is in metres, and 0 for the same frames of clips with equal content.
+frames of the longer clip. The distance is in metres; it is 0 for the same frames of clips with equal content.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class NearDuplicate:
 
 @dataclass(frozen=True)
 class NearDuplicates:
-    """Pairs within the threshold, nearest first, with the numbers of aligned pairs and of all pairs."""
+    """Pairs within the threshold, nearest first, with the number of aligned pairs and the number of all pairs."""
 
     pairs: tuple[NearDuplicate, ...]
     threshold_cm: float
@@ -129,8 +129,8 @@ class _Families:
         """Find the near-duplicates of source `number` among later sources, up to the distance `limit_m` per frame.
 
         Returns the near-duplicates, the number of clips that were aligned with the source, and the number of all later
-        clips. The source is compared with the later sources and with their mirrored copies. Its own mirrored copy is
-        left out: mirroring both clips of a pair does not change their distance.
+        clips. The source is compared with the later sources and with their mirrored copies. The mirrored copy of source
+        `number` is not compared, because mirroring both clips of a pair does not change their distance.
         """
         one, others = self._first[number], np.arange(self._first[number + 1], len(self._clips))
         near: dict[int, list[NearDuplicate]] = {}
@@ -175,14 +175,14 @@ def spared_sources(
 ) -> tuple[tuple[str, NearDuplicate], ...]:
     """Choose the source clips that can be spared: after their removal, no pair of near-duplicates is left.
 
-    Of each pair, the source that is displayed for fewer ticks is removed. If both are displayed for equally many ticks,
-    the shorter source is removed; if they are also equally long, the source with the higher uid is removed.
+    Of each pair, the source that is displayed for fewer ticks is removed. If the numbers of ticks are equal, the
+    shorter source is removed; if the durations are equal, too, the source with the higher uid is removed.
 
     Parameters
     ----------
     database : MatchingDatabase    the clips
     duplicates : NearDuplicates    the pairs
-    ticks : mapping of str to int    ticks displayed, by source
+    ticks : mapping of str to int    number of ticks for which each source is displayed, by uid
 
     Returns
     -------

@@ -20,7 +20,7 @@ from marey_schemas.options.evaluation import EvaluationOptions
 ProgressCallback = Callable[[int, int, str], None]
 
 MOST_FRAMES = 200
-"""Maximum number of frames of a candidate that are compared with the set.
+"""Maximum number of frames of a candidate clip that are compared with the set.
 
 If more frames of the candidate lie in holes, every k-th of these frames is compared.
 """
@@ -28,7 +28,7 @@ If more frames of the candidate lie in holes, every k-th of these frames is comp
 
 @dataclass(frozen=True)
 class FilledCell:
-    """A cell of the grid that lacks data, and the number of missing seconds that a candidate provides."""
+    """A cell of the grid that lacks data, and the number of missing seconds that a candidate clip provides."""
 
     speed_m_s: float
     turn_rate_deg_s: float
@@ -42,17 +42,18 @@ class Filling:
 
     Parameters
     ----------
-    collection : name of its collection
+    collection : name of the collection that contains the clip
     seconds : duration of the clip
-    cells : the cells that it helps to fill, most seconds first
-    filled_s : seconds that it fills, summed over the cells
-    blendable_share : share of its frames in these cells that can be blended with a frame of the set; None if the source
-        has another skeleton
+    cells : the cells that the clip helps to fill; the cell that gains most seconds comes first
+    filled_s : missing seconds that the clip provides, summed over the cells
+    blendable_share : share of the clip's frames in these cells that can be blended with a frame of the set; None if the
+        clip has another skeleton
     measured : number of frames compared
-    needs_retarget : whether it has another skeleton and must be retargeted before its share can be measured
-    score : filled_s times blendable_share, by which candidates are ranked; candidates without a share follow, ranked by
-        filled_s
-    coverage_index : coverage index of the set with this candidate
+    needs_retarget : whether the clip has another skeleton, and must be retargeted before `blendable_share` can be
+        measured
+    score : `filled_s` times `blendable_share`, by which candidates are ranked; candidates without a share come after
+        all others, ranked by `filled_s`
+    coverage_index : coverage index of the set after this clip is added
     """
 
     collection: str
@@ -70,7 +71,7 @@ class Filling:
 
 @dataclass(frozen=True)
 class Addition:
-    """One step of filling: a candidate, and its gain if all earlier candidates are already in the set."""
+    """One step of filling: a candidate clip, and its gain after the candidates of all earlier steps were added."""
 
     filling: Filling
     filled_s: float
@@ -93,7 +94,7 @@ def rank_fillings(
     Parameters
     ----------
     database : MatchingDatabase    the set
-    coverage : Coverage    its coverage
+    coverage : Coverage    coverage of the set
     collections : mapping of str to MatchingDatabase    databases by name, of any skeleton, at the set's frame rate
     options : EvaluationOptions    grid and minimum seconds per cell
     threshold_m : float    distance up to which a frame can be blended, metres, as in `similarity`
@@ -136,10 +137,11 @@ def plan_fillings(
     collections: Mapping[str, MatchingDatabase],
     options: EvaluationOptions,
 ) -> tuple[Addition, ...]:
-    """Order candidates: each step adds the candidate that supplies most of the data still missing.
+    """Order candidate clips: each step adds the clip that supplies the most seconds of data that are still missing.
 
     The seconds that a candidate supplies are multiplied by its blendable share; a candidate with a share of 0 is left
-    out. Candidates of another skeleton come after all others. The order ends when no candidate supplies missing data.
+    out. Candidates of another skeleton come after all others. The list ends when no candidate supplies missing data any
+    more.
 
     Parameters
     ----------
@@ -184,8 +186,8 @@ def source_seconds(
 
     Returns
     -------
-    dict of str to (seconds, rows, cells)    by source: its seconds (V, O) in each cell; for each of its windows, the
-        first row, and the flat index of the cell, -1 outside the map
+    dict of str to (seconds, rows, cells)    for each source: the seconds (V, O) in each cell; the first row of each
+        window; and the flat index of each window's cell, -1 outside the map
     """
     coverage = measure_coverage(database, options)
     rows, cells = window_rows(database, coverage), window_cells(coverage)
@@ -199,7 +201,7 @@ def source_seconds(
 
 
 def _less(missing: Floats, seconds: Floats, options: EvaluationOptions) -> Floats:
-    """Compute the seconds that each cell still lacks: `missing` (V, O), less the `seconds` (V, O) of data added.
+    """Compute the seconds that each cell still lacks: `missing` (V, O) minus the `seconds` (V, O) of added data.
 
     A value below half a frame is set to 0.
     """

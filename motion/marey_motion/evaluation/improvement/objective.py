@@ -1,4 +1,4 @@
-"""The objective of an optimisation: one number for a data set, to be minimised."""
+"""The objective of an optimisation: one number that rates a data set; lower is better."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from marey_motion.evaluation.result import TrialResult
 from marey_schemas.options.improvement import ObjectiveOptions
 
 HEADLINES = ("offset_mean", "abs_se_v", "abs_se_omega_deg", "pose_cost_mean", "transitions_per_s")
-"""Metrics that are reported for a changed data set."""
+"""Headline metrics: the metrics that are reported for a changed data set."""
 
 
 def objective_value(weights: ObjectiveOptions, results: Sequence[TrialResult], seconds: float) -> float:
@@ -37,7 +37,7 @@ def objective_value(weights: ObjectiveOptions, results: Sequence[TrialResult], s
 
 
 def headline_means(results: Sequence[TrialResult]) -> dict[str, float]:
-    """Compute the mean of each headline metric over the trials in which it has a value; 0 if there are none.
+    """Compute the mean of each headline metric over the trials in which it is defined; 0 if there are no such trials.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Optimisation of a data set: clips are removed or added one by one while that lowers an objective.
+"""Optimisation of a data set: clips are removed or added one by one, as long as this lowers an objective.
 
 Every step tries all candidates, each by simulating the trials that it can change, and applies the best one. The
-objective decreases with every step, so no set is visited twice and the loop ends. The log of the steps is enough to
-continue later.
+objective decreases with every step, so no set is visited twice and the loop ends. An optimisation can be continued
+later from the log of its steps.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class OptimisationStep:
 
     Parameters
     ----------
-    sources : the removed or added source, or all sources that no trial needs if these are removed in one step
+    sources : the removed or added source; if all sources that no trial needs are removed in one step, all of these
     absent : the sources that are not in the set after the step, in ascending order
     objective : objective after the step, metres
     metrics : headline metrics after the step
@@ -51,7 +51,7 @@ class OptimisationStep:
 
 @dataclass(frozen=True)
 class Optimisation:
-    """Steps of an optimisation, beginning with the unchanged set ("start"), and the reason for its end.
+    """Steps of an optimisation, beginning with the unchanged set ("start"), and the reason why the optimisation ended.
 
     `ended` is "no gain" if no candidate lowers the objective enough, and "steps" or "evaluations" if the maximum number
     of steps or of evaluations is reached.
@@ -74,14 +74,14 @@ def optimise(
 
     Parameters
     ----------
-    simulation : Resimulation    simulation over a database that contains the clips of the set and all clips that may be
-        added (`selection.joined`)
+    simulation : Resimulation    simulation over a database (`selection.joined`) that contains the clips of the set and
+        all clips that may be added
     options : OptimisationOptions    objective and budget
     absent : collection of str    sources that may be added; all other sources are the set
     log : sequence of OptimisationStep    earlier steps to continue from; `absent` must then list the sources that were
         absent before the first of these steps
     made : callable, optional    called with every new step
-    progress : callable, optional    called as progress(candidates tried, total of this step, uid)
+    progress : callable, optional    called as progress(candidates tried, candidates of this step, uid)
 
     Returns
     -------
@@ -160,7 +160,7 @@ class _Search:
     def best_step(self, last: OptimisationStep, progress: ProgressCallback | None) -> OptimisationStep | None:
         """Choose the step, after the step `last`, that lowers the objective most.
 
-        Returns None if no step lowers it enough, or if the budget is spent.
+        Returns None if no step lowers the objective enough, or if the budget is spent.
         """
         candidates = self._candidates(frozenset(last.absent))
         best: tuple[float, Action, tuple[str, ...], Sources] | None = None
@@ -203,7 +203,7 @@ class _Search:
         return candidates
 
     def _additions(self, absent: Sources) -> list[str]:
-        """List at most `consider` absent sources to try; sources that supply most of the missing seconds come first.
+        """List at most `consider` absent sources to try, in descending order of the missing seconds that they supply.
 
         A cell lacks data if the present sources have less than `_least` seconds in it. Sources whose addition would
         exceed `max_data_s` are left out.

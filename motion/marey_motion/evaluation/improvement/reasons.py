@@ -8,7 +8,7 @@ from marey_motion.evaluation.improvement.redundancy import Removal
 from marey_motion.evaluation.improvement.unused import UnusedClip, UnusedRange
 
 NOTICEABLE_M = 0.0005
-"""Change of the mean distance from the path in metres; smaller changes are not given as a number."""
+"""Smallest change of the mean distance from the path, in metres, that is given as a number."""
 
 
 def why_unused_clip(clip: UnusedClip) -> str:

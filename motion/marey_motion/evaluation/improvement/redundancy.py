@@ -1,4 +1,4 @@
-"""Redundancy of the clips of a data set: the effect of leaving out each used clip, and a plan for several removals."""
+"""Redundancy of clips in a data set: the effect of leaving out each used clip, and a plan for several removals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Removal:
     trials : number of trials that need the clip; all other trials stay identical
     changes : changes of the suite's headline metrics, after minus before
     harm : change of the objective without its term for the amount of data, metres; negative if the removal helps
-    harm_per_s : harm per second of data saved, by which removals are ranked, the least first
+    harm_per_s : `harm` per second of data saved; removals are ranked by this number, the least harmful first
     """
 
     source: str
@@ -59,15 +59,15 @@ def leave_one_out(
     consider: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> tuple[Removal, ...]:
-    """Measure the effect of leaving out each source that a trial needs; sort by harm per second of data, least first.
+    """Measure the effect of leaving out each source that a trial needs; sort by harm per second of data, lowest first.
 
     Parameters
     ----------
     simulation : Resimulation    the suite over the set
     objective : ObjectiveOptions    measure of harm
     removed : collection of str    sources that are removed already
-    consider : int, optional    number of sources to try, starting with those that the fewest trials need, then in the
-        order of uids; all if None
+    consider : int, optional    number of sources to try; sources that fewer trials need come first, then the order is
+        that of the uids; all if None
     progress : callable, optional    called as progress(sources done, total, uid)
 
     Returns
@@ -105,8 +105,8 @@ def plan_removals(
 ) -> tuple[PlannedRemoval, ...]:
     """Plan removals: each step removes the source that harms least per second of data saved.
 
-    Every step is simulated, so its metrics equal those of an evaluation of the remaining clips. The plan ends early if
-    nothing more can be removed. Progress counts steps.
+    Every step is simulated, so the metrics of a step equal the metrics of an evaluation of the remaining clips. The
+    plan ends early if nothing more can be removed. Progress counts steps.
 
     Parameters
     ----------

@@ -10,8 +10,8 @@ clips, for three reasons:
 A trial needs a clip if it displays or chooses one of the clip's rows. Removing clips that a trial does not need leaves
 the trial bit-identical. By induction, the trial is unchanged up to each search; at the search, the cheapest row is
 still available, and still the first among equally cheap rows. So after a removal, only the trials that need a removed
-clip are simulated again. The same is true if clips were removed before. So the result of a trial over some of the clips
-is reused after further removals, as long as the clips that the trial needs remain.
+clip are simulated again. The same is true if other clips were removed before: the result of a trial is reused after
+further removals, as long as all clips that the trial needs remain.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ NONE: Sources = frozenset()
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a trial over some clips, and the sources whose rows the trial displayed or chose."""
+    """Result of a trial over some clips, and the sources whose rows were displayed or chosen in the trial."""
 
     result: TrialResult
     needed: Sources
@@ -88,7 +88,7 @@ class Resimulation:
 
         Returns
         -------
-        tuple of Outcome    one per trial, in their order
+        tuple of Outcome    one per trial, in the order of the trials
 
         Raises
         ------
@@ -123,7 +123,7 @@ class Resimulation:
 
         Returns
         -------
-        tuple of TrialResult    one per trial, in their order
+        tuple of TrialResult    one per trial, in the order of the trials
         """
         return tuple(outcome.result for outcome in self.outcomes(removed))
 
@@ -226,7 +226,7 @@ def needed_rows(
     database : MatchingDatabase    the clips
     index : SearchIndex    the index that the trial was run with
     trial : Trial    the trial
-    record : TrialRecord    its record
+    record : TrialRecord    record of the trial
     options : EvaluationOptions    options of the evaluation
 
     Returns

@@ -19,7 +19,7 @@ from marey_motion.skeleton import SAME_OFFSET_M, same_hierarchy
 
 
 def source_of(clip: DatabaseClip) -> str:
-    """Return the uid of a clip's source: the clip itself or, for a mirrored copy, the clip that was mirrored.
+    """Return the uid of a clip's source, which is the clip itself or, for a mirrored copy, the clip that was mirrored.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def rows_of_sources(clips: Sequence[DatabaseClip], sources: Collection[str]) -> 
 
     Returns
     -------
-    (N,) bool    True for their rows
+    (N,) bool    True for the rows of these sources
 
     Raises
     ------
@@ -96,7 +96,7 @@ def _by_row(database: MatchingDatabase) -> dict[str, Any]:
 
 
 def joined(first: MatchingDatabase, second: MatchingDatabase) -> MatchingDatabase:
-    """Join two databases with the same skeleton and options; the result has the normaliser of the first.
+    """Join two databases with the same skeleton and options; the result has the normaliser of the first database.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def joined(first: MatchingDatabase, second: MatchingDatabase) -> MatchingDatabas
 
     Returns
     -------
-    MatchingDatabase    all clips
+    MatchingDatabase    the clips of both databases
 
     Raises
     ------
@@ -156,7 +156,7 @@ def same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> bool:
 
     Returns
     -------
-    bool    True if clips of both can be mixed
+    bool    True if clips of both databases can be mixed
     """
     one, other = first.body.skeleton, second.body.skeleton
     if first.body.pose_joints != second.body.pose_joints or one.joint_count != other.joint_count:

@@ -45,11 +45,11 @@ class Suggestions:
     ----------
     unused : data whose removal changes no trial
     redundant : all clips that were tried, ranked by the harm of their removal per second saved
-    plan : a sequence of removals, starting from the set without its unused clips
+    plan : a sequence of removals from the set without its unused clips
     spared : near-duplicates to remove, each with the pair to which it belongs; the other clip of the pair stays
-    fillings, additions : clips of other collections that fill holes: each measured alone, and a sequence in which each
-        is measured after all earlier ones
-    tried : number of needed clips that were left out one at a time, and number of all needed clips
+    fillings, additions : clips of other collections that fill holes. In `fillings`, each is measured alone; `additions`
+        is a sequence in which each is measured after all earlier clips were added
+    tried : number of clips that were left out one at a time, and number of all clips that a trial needs
     """
 
     result: EvaluationResult
@@ -80,7 +80,7 @@ def suggest(
     Parameters
     ----------
     database : MatchingDatabase    the set
-    result : EvaluationResult    its evaluation with all records
+    result : EvaluationResult    evaluation of the set, with all records
     collections : mapping of str to MatchingDatabase, optional    other collections to search for clips, by name; of any
         skeleton
     options : SuggestionOptions, optional    options
@@ -134,7 +134,7 @@ def _redundancy(
 ) -> tuple[tuple[Removal, ...], tuple[PlannedRemoval, ...]]:
     """Rank the clips by the harm of their removal, and plan several removals.
 
-    Both start from the set without its unused clips, whose sources are `gone`.
+    Both computations start from the set without the unused clips, whose sources are `gone`.
     """
     found = leave_one_out(
         simulation, how.objective, removed=gone, consider=how.consider, progress=stages.within("leaving out")

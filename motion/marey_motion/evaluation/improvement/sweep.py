@@ -1,4 +1,4 @@
-"""Evaluations of one suite with different weights of the feature groups, to find the groups that matter."""
+"""Evaluations of one suite with different weights of the feature groups, to find out which groups matter."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SweepRow:
 
 @dataclass(frozen=True)
 class Influence:
-    """Influence of one feature group on the objective, over the settings that vary only this group's weight.
+    """Influence of one feature group on the objective, over the settings that differ only in this group's weight.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class Influence:
 
 
 def vary_each_group(options: DatabaseOptions, factors: Sequence[float]) -> tuple[FeatureWeights, ...]:
-    """List the given weights, then variants in each of which the weight of one group is multiplied by one factor.
+    """List the given weights, then variants: in each variant, the weight of one group is multiplied by one factor.
 
     Parameters
     ----------

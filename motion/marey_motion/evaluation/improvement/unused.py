@@ -6,13 +6,13 @@ of a used clip is unneeded if it is far from every needed frame, in two respects
 
 * It is more than `MARGIN_BEFORE_S` before the needed frame, or more than the look-ahead plus `MARGIN_AFTER_S` after it.
 * It is outside the `reselect_window_s` around the needed frame. Within this window, a search may not choose rows of the
-  displayed clip; a cut there would make them rows of another clip, which may be chosen.
+  displayed clip; a cut there would turn these rows into rows of another clip, which may be chosen.
 
 Removing the rows of unneeded frames changes neither the needed rows, nor the rows that follow them, nor their features.
-The margins also contain all frames from which filters and differences computed the features of needed frames. If
-instead the recording itself is cut there, it is sampled and filtered again, which rounds differently, and frames near
-the cut have no frames to look ahead to. The result is then nearly, but not exactly, the same, so such a cut is not
-reported as safe.
+The margins also contain all frames from which filters and differences computed the features of needed frames. If the
+recording itself is cut instead, it is sampled and filtered again, which rounds differently, and frames near the cut
+have no frames to look ahead to. The trials then stay nearly, but not exactly, the same, so a cut of the recording is
+not reported as safe.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MARGIN_AFTER_S = MARGIN_BEFORE_S
 
 @dataclass(frozen=True)
 class UnusedClip:
-    """A source clip that no trial needs: neither the clip itself nor its mirrored copy."""
+    """A source clip that no trial needs: neither the clip itself nor its mirrored copy is needed."""
 
     source: str
     name: str
@@ -50,7 +50,7 @@ class UnusedClip:
 
 @dataclass(frozen=True)
 class UnusedRange:
-    """Frames [start, stop) of a source that no trial needs, neither in the clip nor in its mirrored copy.
+    """Frames [start, stop) of a source clip that no trial needs, neither from the clip nor from its mirrored copy.
 
     Frames are counted at the database's rate from the clip's first row. Times are counted from the start of the
     recording, which can be before the first row.
@@ -71,7 +71,7 @@ class UnusedRange:
 
 @dataclass(frozen=True, eq=False)
 class Unused:
-    """Data whose removal changes no trial: whole sources, ranges of other sources, and a mask (N,) of their rows."""
+    """Data whose removal changes no trial: whole sources, ranges of other sources, and a mask (N,) of these rows."""
 
     clips: tuple[UnusedClip, ...]
     ranges: tuple[UnusedRange, ...]
@@ -79,7 +79,7 @@ class Unused:
 
     @property
     def seconds(self) -> float:
-        """Seconds of data saved by removing all of it, without mirrored copies."""
+        """Seconds saved by removing all of this data, without mirrored copies."""
         return sum(clip.seconds for clip in self.clips) + sum(part.seconds for part in self.ranges)
 
 

@@ -1,4 +1,4 @@
-"""Readers and writers of the documents of the predecessor, the system of Herrmann et al. (2019) that Marey replaces."""
+"""Readers and writers for documents of Marey's predecessor, the system of Herrmann et al. (2019)."""
 
 from marey_motion.formats.predecessor.clips import write_predecessor, write_predecessor_skeleton
 from marey_motion.formats.predecessor.documents import read_predecessor

@@ -1,8 +1,8 @@
-"""The predecessor's alignment of a clip: its sections in canonical frames, and its time function.
+"""Alignment of a clip by Marey's predecessor: sections in canonical frames, and a time function (time warp).
 
 The time function gives a whole frame number of the source clip for each canonical frame, so it is constant where
-several canonical frames correspond to one frame of the source. Some programs wrote it as a string of JSON within the
-document.
+several canonical frames correspond to one frame of the source. Some programs wrote the time function as a string of
+JSON within the document.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MOST_FRAME = 2**31 - 1
 
 @dataclass(frozen=True, eq=False)
 class PredecessorAlignment:
-    """An alignment read from a document of the predecessor.
+    """An alignment read from a document of Marey's predecessor.
 
     Parameters
     ----------
@@ -41,12 +41,12 @@ class PredecessorAlignment:
 
 
 def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
-    """Read the alignment of a clip.
+    """Read the alignment of a clip from a document of Marey's predecessor.
 
     Parameters
     ----------
     data : bytes    content of the file
-    file : str    its name, for messages
+    file : str    name of the file, for messages
 
     Returns
     -------
@@ -54,7 +54,7 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
 
     Raises
     ------
-    FormatError    naming the invalid field
+    FormatError    if a field is missing or invalid; the error names it
     """
     document = decode_document(data, file)
     frames = number_array(_list(document, TIME_FUNCTION, file), file, TIME_FUNCTION)
@@ -79,7 +79,7 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
 
 
 def write_predecessor_alignment(time_function: Floats, sections: Sequence[tuple[int, int]] = ()) -> bytes:
-    """Write sections, and a time function that is rounded to whole frames.
+    """Write an alignment for Marey's predecessor: sections, and a time function that is rounded to whole frames.
 
     Parameters
     ----------
@@ -102,8 +102,8 @@ def write_predecessor_alignment(time_function: Floats, sections: Sequence[tuple[
 def as_increasing(frames: NDArray[np.int64], source_frames: int) -> Floats:
     """Make a time function of whole frames strictly increasing.
 
-    If several canonical frames have the same source frame, only the middle one keeps it; the others get source frames
-    that are interpolated linearly.
+    If several canonical frames have the same source frame, only the middle one of them keeps this source frame; for the
+    rest, source frames are interpolated linearly.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def as_increasing(frames: NDArray[np.int64], source_frames: int) -> Floats:
 
 
 def _list(document: Mapping[str, Any], name: str, file: str) -> list[Any]:
-    """Read a list that may be encoded as a string of JSON, once or twice."""
+    """Read a list, which may be encoded once or twice as a string of JSON."""
     value = document.get(name)
     for _ in range(2):
         if isinstance(value, str):

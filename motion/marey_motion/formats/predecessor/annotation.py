@@ -1,4 +1,4 @@
-"""The predecessor's annotations: the documents in its data base, and the files it exports.
+"""Annotations of Marey's predecessor: the documents in its database, and the files that it exports.
 
 An annotation has one of three forms:
 
@@ -6,8 +6,8 @@ An annotation has one of three forms:
 * sections by label, `{"sections": {label: [{"start_idx", "end_idx"}]}}`;
 * the frames of each label, `{"semantic_annotation": {label: [frames]}}`.
 
-In some programs of the predecessor, the last frame of a section is `end_idx`, in others it is the frame before. The
-documents do not say which, so the reader has an option for it.
+In some programs of the predecessor, the last frame of a section is `end_idx`; in other programs, it is the frame before
+`end_idx`. The documents do not say which, so `read_predecessor_annotation` has the option `end_index`.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ def read_predecessor_annotation(
     end_index: EndIndex = DEFAULT_END_INDEX,
     labels: Sequence[str] | None = None,
 ) -> Layer:
-    """Read an annotation of a clip, in any of its forms.
+    """Read an annotation of a clip by Marey's predecessor, in any of the three forms.
 
     Parameters
     ----------
     data : bytes    content of the file
-    file : str    its name, for messages
+    file : str    name of the file, for messages
     frame_count : int    frames of the clip
     end_index : str    "inclusive" if the last frame of a section is `end_idx`, as in the predecessor's editor;
-        "exclusive" if it is the frame before, as in the predecessor's time warping
+        "exclusive" if the last frame is the frame before `end_idx`, as in the predecessor's time warping
     labels : sequence of str, optional    labels to read; all labels by default. If sections of different labels
         overlap, read one label at a time, since a layer has no overlapping segments. Sections without labels are called
         "section 1" and so on.
@@ -55,7 +55,8 @@ def read_predecessor_annotation(
 
     Raises
     ------
-    FormatError    naming the invalid label and section; also if sections overlap or exceed the clip
+    FormatError    if a section is invalid (the error names label and section), overlaps another section, or exceeds the
+        clip
     """
     return layer_of_document(decode_document(data, file), file, frame_count, end_index=end_index, labels=labels)
 
@@ -84,7 +85,7 @@ def layer_of_document(
 
     Raises
     ------
-    FormatError    naming the label and section
+    FormatError    if a section is invalid; the error names label and section
     """
     if isinstance(document.get(SEMANTIC), dict):
         found = _frames_by_label(document[SEMANTIC], file)
@@ -106,11 +107,11 @@ def layer_of_document(
 def write_predecessor_annotation(
     layer: Layer, *, form: AnnotationForm = DEFAULT_FORM, end_index: EndIndex = DEFAULT_END_INDEX
 ) -> bytes:
-    """Write an annotation as JSON.
+    """Write an annotation as JSON for Marey's predecessor.
 
-    The predecessor has no keyframes; they are written under `keyframes`, which other programs ignore. The form "list"
-    does not contain the labels. The form "frames" does not contain the boundary between adjacent segments with the same
-    label.
+    The predecessor has no keyframes; keyframes are written under `keyframes`, which the predecessor ignores. The form
+    "list" does not contain the labels. The form "frames" does not contain the boundary between adjacent segments with
+    the same label.
 
     Parameters
     ----------
@@ -173,7 +174,7 @@ def _section(section: Any, label: str, end_index: EndIndex, file: str) -> Segmen
 
 
 def _frames_by_label(by_label: Mapping[str, Any], file: str) -> list[Segment]:
-    """Group frames by label into contiguous runs."""
+    """Group the frames of each label into runs of consecutive frames."""
     found: list[Segment] = []
     for label, given in by_label.items():
         frames = np.unique(np.array(_frames(given, label, file), dtype=np.int64))

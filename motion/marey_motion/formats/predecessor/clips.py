@@ -1,9 +1,9 @@
-"""Reader and writer of the clip documents that the predecessor stores in its data base.
+"""Reader and writer of the clip documents that Marey's predecessor stores in its database.
 
 Lengths are centimetres. Stored clips are mirrored in x for a left-handed engine: a translation (x, y, z) is stored as
 (-x, y, z) and a rotation (w, x, y, z) as (-w, -x, y, z), so the same conversion serves for reading and writing. The
-root's translation is added to the root's offset. A clip names its joints but not their hierarchy: it needs its skeleton
-document.
+root's translation is added to the root's offset. A clip document contains the names of the joints, but not their
+hierarchy, so reading a clip needs its skeleton document, too.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def motion_of_document(
     document : dict    the decoded document
     file : str    name of the file, for messages
     skeleton : bytes, optional    content of the file with the skeleton document
-    skeleton_file : str    its name, for messages
+    skeleton_file : str    name of this file, for messages
     frame_rate_hz : float, optional    replaces the document's rate
 
     Returns
@@ -57,13 +57,13 @@ def motion_of_document(
 
     Raises
     ------
-    FormatError    naming the field, and the joint if there is one
+    FormatError    if a document is invalid; the error names the field, and the joint if there is one
     """
     if "poses" not in document and "frames" not in document:
         return read_skeleton_document(document, file)
     if skeleton is None:
         raise FormatError(
-            "a clip document names its joints but not their hierarchy; import it together with its skeleton document",
+            "a clip document contains no hierarchy of its joints; import it together with its skeleton document",
             code="skeleton-missing",
             file=file,
         )
@@ -76,12 +76,13 @@ def motion_of_document(
 
 
 def write_predecessor(clip: Clip, *, form: ClipForm = "poses", encoding: Encoding = "bson.bz2") -> bytes:
-    """Write a clip as a document of the predecessor.
+    """Write a clip as a document of Marey's predecessor.
 
     Parameters
     ----------
     clip : Clip    F frames
-    form : str    "poses" for one row of numbers per frame, "frames" for one object per frame, as the engine reads them
+    form : str    "poses" for one row of numbers per frame; "frames" for one object per frame, the form that the engine
+        reads
     encoding : str    "json", "bson" or "bson.bz2"
 
     Returns
@@ -122,7 +123,7 @@ def write_predecessor(clip: Clip, *, form: ClipForm = "poses", encoding: Encodin
 def write_predecessor_skeleton(
     skeleton: Skeleton, *, form: SkeletonForm = "database", encoding: Encoding = "json"
 ) -> bytes:
-    """Write a skeleton document, in the form of the predecessor's data base or in the form of its files.
+    """Write a skeleton document of Marey's predecessor, in the form of its database or in the form of its files.
 
     Parameters
     ----------
@@ -151,7 +152,7 @@ def _clip_fields(document: dict[str, Any], file: str) -> tuple[list[str], NDArra
         poses = _engine_rows(field_of(document, "frames", list, file), file)
         frame_time_s = field_of(document, "frameTime", (int, float), file)
     if len(set(names)) != len(names):
-        raise FormatError("the joint sequence names a joint twice", file=file)
+        raise FormatError("the joint sequence contains a joint twice", file=file)
     width = 3 + 4 * len(names)
     if poses.ndim != 2 or len(poses) == 0 or poses.shape[1] < width:
         raise FormatError(
@@ -179,7 +180,7 @@ def _engine_rows(frames: list[Any], file: str) -> NDArray[np.float64]:
 def _fill_motion(source: SourceMotion, names: list[str], poses: NDArray[np.float64], file: str) -> None:
     """Set the rotations and root positions of `source`, which already has its skeleton, from the poses of a clip.
 
-    Joints that the clip does not contain get their rest rotation.
+    Joints that are missing from the clip get their rest rotation.
     """
     indices = {name: joint for joint, name in enumerate(source.joint_names)}
     unknown = next((name for name in names if name not in indices), None)

@@ -1,4 +1,4 @@
-"""Reading of any file of the predecessor: a motion, a model, a tree of a model's samples, or a graph of models."""
+"""Reader of any file of Marey's predecessor: a motion, a model, a tree of a model's samples, or a graph of models."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def read_predecessor(
     companion_name: str = "the skeleton document",
     frame_rate_hz: float | None = None,
 ) -> SourceMotion | SourceDocument:
-    """Read a file of the predecessor: a motion, which stays in its own unit and axes, or a document without motion.
+    """Read a file of Marey's predecessor: a motion, which stays in its own unit and axes, or a document without motion.
 
     Parameters
     ----------
     data : bytes    content of the file
-    file : str    its name, for messages
+    file : str    name of the file, for messages
     companion : bytes, optional    the skeleton document of a clip
-    companion_name : str    its name, for messages
+    companion_name : str    name of the file of the skeleton document, for messages
     frame_rate_hz : float, optional    replaces the document's rate
 
     Returns
@@ -43,7 +43,7 @@ def read_predecessor(
 
     Raises
     ------
-    FormatError    naming the field, and the joint if there is one
+    FormatError    if a document is invalid; the error names the field, and the joint if there is one
     """
     document = decode_document(data, file)
     subject = _subject_of(document)
@@ -63,9 +63,9 @@ def _subject_of(document: Mapping[str, Any]) -> Subject | None:
 
 
 def model_name(stem: str) -> str:
-    """Derive the name of a model from its file: `walk_leftStance` from `walk_leftStance_quaternion_mm`.
+    """Derive the name of a model from the name of its file: `walk_leftStance` from `walk_leftStance_quaternion_mm`.
 
-    The stem may still contain a suffix, such as `walk_mm.bson` from `walk_mm.bson.bz2`.
+    The stem may still contain a suffix: it is `walk_mm.bson` for the file `walk_mm.bson.bz2`.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def model_name(stem: str) -> str:
 
 
 def pair_trees(names: Sequence[str]) -> dict[str, str]:
-    """Find the tree of each model among files, by their names, as in `walk_mm.json` and `walk_cluster_tree.json`.
+    """Find the tree of each model by the names of the files, such as `walk_mm.json` and `walk_cluster_tree.json`.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ def decode_document(data: bytes, file: str) -> dict[str, Any]:
     Parameters
     ----------
     data : bytes    content of the file
-    file : str    its name, for messages
+    file : str    name of the file, for messages
 
     Returns
     -------

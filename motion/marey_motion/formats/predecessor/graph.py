@@ -1,6 +1,6 @@
-"""The predecessor's graphs of models: nodes with transitions, and the node where sequences start.
+"""Graphs of models of Marey's predecessor: nodes with transitions, and the node where sequences start.
 
-A document contains the nodes by action and by the id of the model in the predecessor's data base. It has the form
+A document contains the nodes by action and by the id that the model has in the predecessor's data base. The form is
 `{"nodes": {action: {model id: {"name", "type", "transitions": {"action:model": {"action_name", "model_name",
 "model_id"}}}}}, "start_node": [action, model]}`; some programs write `startNode`. Transitions and the start node refer
 to a model by its id or by its name.
@@ -25,11 +25,11 @@ Place = tuple[str, str]
 
 @dataclass(frozen=True)
 class GraphNode:
-    """Node of a graph: a model that is a primitive of an action.
+    """Node of a graph: the model (motion primitive) of one part of an action.
 
     Parameters
     ----------
-    model_id : id of the model in the predecessor's data base
+    model_id : id of the model in the data base of Marey's predecessor
     type : type of the node, one of `TYPES`
     transitions : nodes that may follow
     """
@@ -41,7 +41,7 @@ class GraphNode:
 
 @dataclass(frozen=True)
 class PredecessorGraph:
-    """A graph of models: its nodes by action and model, and the action and model of its start node."""
+    """A graph of models: the nodes by action and model, and the action and model of the start node."""
 
     nodes: Mapping[Place, GraphNode]
     start: Place
@@ -96,7 +96,7 @@ def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGrap
 
 
 def write_predecessor_graph(graph: PredecessorGraph, *, encoding: Encoding = "json") -> bytes:
-    """Write a graph; its start node is written under both field names that programs read.
+    """Write a graph; the start node is written under both names that programs read, `start_node` and `startNode`.
 
     Parameters
     ----------
@@ -167,5 +167,5 @@ def _start(document: Mapping[str, Any], known: Mapping[tuple[str, str], Place], 
         raise FormatError(f"field {name!r} must be a list of two names: an action and a model", file=file)
     start = known.get((str(given[0]), str(given[1])))
     if start is None:
-        raise FormatError(f"field {name!r} names the node {given!r}, which does not exist", file=file)
+        raise FormatError(f"field {name!r} refers to the node {given!r}, which does not exist", file=file)
     return start

@@ -1,4 +1,4 @@
-"""The predecessor's motion primitives, in the four layouts that were published (see `model_layouts`).
+"""Motion primitives of Marey's predecessor, in the four layouts that were published (see `model_layouts`).
 
 The documents are right-handed, with lengths in centimetres and quaternions w, x, y, z. The root's translation is added
 to the root's offset. Arrays of coefficients have the shape (coefficient, channel).
@@ -53,7 +53,8 @@ class PredecessorModel:
     primitive : the model in Marey's units and conventions
     layout : layout of the document
     animated_joints : joints whose rotations are in the document; all other joints keep their rest rotation
-    time_form : form of the document's time function; None if it has none, so that the model runs at constant speed
+    time_form : form of the document's time function (see `time_functions`); None if the document has no time function,
+        so that the model runs at constant speed
     time_error_frames : largest difference between the time functions of `primitive` and of the document, in frames
     """
 
@@ -70,7 +71,7 @@ def read_predecessor_model(data: bytes, file: str, *, skeleton: Skeleton | None 
     Parameters
     ----------
     data : bytes    content of the file
-    file : str    its name, for messages
+    file : str    name of the file, for messages
     skeleton : Skeleton, optional    skeleton of the model, needed if the document contains none
 
     Returns
@@ -154,9 +155,10 @@ def _constant_speed(frames: int) -> PredecessorTime:
 
 
 def _functions(part: Document, what: str, file: str) -> tuple[SplineBasis, Floats, Floats]:
-    """Read the spatial or temporal functions, as coefficients of n splines for D channels.
+    """Read the spatial or temporal functions, as n spline coefficients for each of D channels.
 
-    `what` names the part for messages. Returns the splines, the mean (n, D) and the k components (k, n, D).
+    `what` is the name of the part, for messages. Returns the spline basis, the mean (n, D) and the components (k, n,
+    D).
     """
     basis = _basis(part, what, file)
     start, stop = basis.span
@@ -198,7 +200,7 @@ def _functions(part: Document, what: str, file: str) -> tuple[SplineBasis, Float
 def _basis(part: Document, what: str, file: str) -> SplineBasis:
     """Make the splines of a part from its knots.
 
-    The oldest models contain the numbers of coefficients and frames instead of knots.
+    The oldest models contain the number of coefficients and the number of frames instead of knots.
     """
     if "knots" not in part and "n_frames" in part:
         frames, count = (field_of(part, name, int, file) for name in ("n_frames", "n_coeffs"))
@@ -237,15 +239,15 @@ def _check_size(frames: int, coefficients: int, what: str, file: str) -> None:
 def _animated(parts: ModelParts, basis: SplineBasis, mean: Floats, skeleton: Skeleton, file: str) -> list[str]:
     """List the joints that the model rotates.
 
-    `mean` (n, D) are the coefficients of its mean motion. Raises `FormatError` if the skeleton lacks a joint, or if
-    all rotations of a frame are zero.
+    `mean` (n, D) contains the coefficients of the model's mean motion. Raises `FormatError` if the skeleton lacks a
+    joint, or if all rotations of a frame are zero.
     """
     animated = parts.animated_joints or list(skeleton.joint_names)
     if mean.shape[1] != 3 + 4 * len(animated):
         message = f"the mean has {mean.shape[1]} channels, but {len(animated)} joints need {3 + 4 * len(animated)}"
         raise FormatError(message, code="joints-mismatch", file=file)
     if len(set(animated)) != len(animated):
-        raise FormatError("field 'animated_joints' names a joint twice", file=file)
+        raise FormatError("field 'animated_joints' contains a joint twice", file=file)
     unknown = next((name for name in animated if name not in skeleton), None)
     if unknown is not None:
         raise FormatError("the skeleton has no joint of this name", code="joints-mismatch", file=file, joint=unknown)
@@ -259,8 +261,8 @@ def _on_skeleton(
 ) -> tuple[Floats, Floats]:
     """Extend the functions of the `animated` joints to all J joints of the skeleton, and convert them to metres.
 
-    `maxima` (3,) are factors of the root's translation. Returns the mean (n, 3 + 4·J) and the components
-    (k, n, 3 + 4·J), in which all other joints keep their rest rotations.
+    `maxima` (3,) are factors of the root's translation. Joints that are not in `animated` keep their rest rotations.
+    Returns the mean (n, 3 + 4·J) and the components (k, n, 3 + 4·J).
     """
     rest = np.concatenate((np.zeros(3), skeleton.rest_rotations.ravel()))
     columns = columns_of(animated, skeleton)
@@ -275,7 +277,7 @@ def _on_skeleton(
 
 
 def columns_of(animated: list[str] | tuple[str, ...], skeleton: Skeleton) -> NDArray[np.int64]:
-    """Select the channels of a pose for the root's translation and some joints' rotations, in order.
+    """List the columns of a pose that contain the root's translation and the rotations of some joints, in order.
 
     Parameters
     ----------
@@ -284,14 +286,14 @@ def columns_of(animated: list[str] | tuple[str, ...], skeleton: Skeleton) -> NDA
 
     Returns
     -------
-    (3 + 4·k,) int64    columns of a pose (3 + 4·J)
+    (3 + 4·k,) int64    indices into a pose of 3 + 4·J numbers
     """
     joints = np.array([skeleton.index_of(name) for name in animated], dtype=np.int64)
     return np.concatenate((np.arange(3), (3 + 4 * joints[:, None] + np.arange(4)).ravel()))
 
 
 def _time(parts: ModelParts, frames: int, file: str) -> PredecessorTime:
-    """Read the time function from the first channel; further channels contain semantic annotations and are ignored."""
+    """Read the time function: the first channel of the time part; other channels are semantic annotations, not read."""
     assert parts.time is not None
     basis, mean, vectors = _functions(parts.time, "time", file)
     if basis.frame_count != frames:

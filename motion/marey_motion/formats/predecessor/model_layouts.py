@@ -1,10 +1,10 @@
 """Conversion of the four layouts of motion primitives of Marey's predecessor to one form.
 
-A model consists of a spatial part (the poses over canonical time), a temporal part (the time function) and a Gaussian
-mixture of latent vectors. Layouts 1 and 2 are flat: fields such as `eigen_vectors_spatial` contain the spatial part,
-and fields `*_temporal_semantic*` (layout 1) or `*_time*` (layout 2) contain the temporal part. Layout 3 has one object
-for each part: `sspm` (spatial), `tspm` (temporal) and `gmm` (mixture). The layout `static` has only a mean motion, in
-the field `spatial_coeffs`.
+A model consists of a spatial part (the poses over canonical time), a temporal part (the time function, which warps
+time) and a Gaussian mixture of latent vectors. Layouts 1 and 2 are flat: fields such as `eigen_vectors_spatial` contain
+the spatial part, and fields `*_temporal_semantic*` (layout 1) or `*_time*` (layout 2) contain the temporal part. Layout
+3 has one object for each part: `sspm` (spatial), `tspm` (temporal) and `gmm` (mixture). The layout `static` has only a
+mean motion, in the field `spatial_coeffs`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Document = Mapping[str, Any]
 
 DEFAULT_FRAME_TIME_S = 1.0 / 30.0
 LARGEST = 1e12
-"""Greatest absolute value of a number in a model of the motion of a body."""
+"""Greatest absolute value that a number in a model may have."""
 
 
 def layout_of(document: Document) -> Layout | None:
@@ -37,7 +37,7 @@ def layout_of(document: Document) -> Layout | None:
 
     Returns
     -------
-    str or None    "1", "2", "3" or "static"; None if it is not a model
+    str or None    "1", "2", "3" or "static"; None if the document is not a model
     """
     if isinstance(document.get("sspm"), dict) and "gmm" in document:
         return "3"

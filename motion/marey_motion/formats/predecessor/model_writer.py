@@ -1,8 +1,8 @@
-"""Writer of motion primitives in the predecessor's layouts 3 and 2.
+"""Writer of motion primitives in layouts 3 and 2 of Marey's predecessor.
 
 The documents are right-handed, with lengths in centimetres and times in canonical frames. The spatial
-part is written exactly. The time function is converted to the predecessor's own form (see `time_functions`), which
-represents it approximately.
+part is written exactly. The time function is converted to a form of the predecessor (see `time_functions`), with an
+approximation error.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def _flat_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...])
 
 
 def _space(primitive: MotionPrimitive, animated_joints: tuple[str, ...]) -> tuple[Floats, Floats]:
-    """Compute spline coefficients of the animated joints: their mean (n, D), and k components (k, n, D).
+    """Compute spline coefficients of the animated joints: the mean (n, D), and k components (k, n, D).
 
     n is the number of coefficients of each of the D channels. The root's position is in centimetres, relative to its
     offset in the skeleton.

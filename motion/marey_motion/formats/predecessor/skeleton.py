@@ -1,7 +1,8 @@
-"""The predecessor's skeleton documents: the form in its data base, and the form inside its files and models.
+"""Skeleton documents of Marey's predecessor: the form in the data base, and the form inside files and models.
 
-The data base form lists joints (`jointDescs`) and is mirrored in x like its clips; the file form nests nodes under
-`root` and is right-handed. Both are in centimetres. Nodes without children are tips of chains, not joints.
+The data base form lists joints (`jointDescs`) and is mirrored in x, like the clips in the data base. The file form
+nests nodes under `root` and is right-handed. Both are in centimetres. Nodes without children are tips of chains, not
+joints.
 """
 
 from __future__ import annotations
@@ -86,11 +87,11 @@ def _listed_nodes(document: Document, file: str) -> list[tuple[str, str | None, 
     for node in document["jointDescs"]:
         name = field_of(node, "name", str, file)
         if name in listed:
-            raise FormatError("jointDescs names the joint twice", file=file, joint=name)
+            raise FormatError("jointDescs contains the joint twice", file=file, joint=name)
         listed[name] = node
         for child in text_list(node, "children", file):
             if child in parents:
-                raise FormatError("two joints name this joint as their child", file=file, joint=child)
+                raise FormatError("two joints list this joint as their child", file=file, joint=child)
             parents[child] = name
     unknown = next((child for child in parents if child not in listed), None)
     roots = [name for name in listed if name not in parents]

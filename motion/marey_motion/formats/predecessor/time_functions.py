@@ -1,7 +1,7 @@
-"""Conversion of time functions between the predecessor's models and Marey's, in both directions.
+"""Conversion of time functions (time warps) between models of Marey's predecessor and models of Marey.
 
-A time function t(x) maps each canonical frame x, from 0 to N - 1, to a frame of an example; it depends on a vector g of
-scores. Marey's model contains ln(t(x + 1) - t(x)), which is linear in g. The predecessor has two forms:
+A time function t(x) maps each canonical frame x, from 0 to N - 1, to a frame of an example. It is determined by a
+vector g of scores. Marey's model contains ln(t(x + 1) - t(x)), which is linear in g. The predecessor has two forms:
 
 * `coefficients` (layouts 1 and 3, and layout 2 by its later training program): t(x) is a spline whose coefficients are
   cumsum(exp(mean + g · eigen)) - 1. The logarithm of the slope of t is not linear in g. `as_log_slopes` approximates it
@@ -34,7 +34,7 @@ WRITTEN_COEFFICIENTS = 8
 
 @dataclass(frozen=True, eq=False)
 class PredecessorTime:
-    """Time function in one of the forms of the predecessor's models.
+    """Time function (warp from canonical time to the frames of an example) in a form of the predecessor's models.
 
     Parameters
     ----------
@@ -104,10 +104,10 @@ def as_log_slopes(
 
 
 def components_of(basis: SplineBasis, mean: Floats, directions: Floats, variances: Floats) -> FunctionalComponents:
-    """Make components from directions; their projections are the pseudo-inverse of the directions.
+    """Make components from directions; the projections of the components are the pseudo-inverse of the directions.
 
-    The variance that the components do not explain is unknown. Therefore, `energy` contains cumulative shares of the
-    variance that all components explain together, instead of the total variance.
+    The variance that the components do not explain is unknown. Therefore, `energy` contains cumulative shares not of
+    the total variance, but of the variance that all components explain together.
 
     Parameters
     ----------
@@ -194,8 +194,8 @@ def _basis_over(steps: int) -> SplineBasis:
 
     If `steps` is at most `KNOTS_AT_MOST`, there are at least as many coefficients as steps, so that any function is
     represented exactly. The knots are then at all steps except the second and the last but one. Evenly spaced knots
-    would drift away from the steps to places between them, where interpolation amplifies rounding. A basis for longer
-    functions has fewer knots, and only approximates them.
+    would not coincide with the steps, and interpolation would amplify rounding errors. A basis for longer functions has
+    fewer knots, and only approximates them.
     """
     if steps <= DEGREE:
         return SplineBasis.clamped(steps, DEGREE + 1)

@@ -1,8 +1,7 @@
-"""The predecessor's cluster trees over samples of a model, as nested nodes, and their conversion from and to Marey's
-trees.
+"""Cluster trees of Marey's predecessor: samples of a model in nested nodes. Conversion from and to Marey's trees.
 
 A document holds `data` (samples), `features`, `options` and `root`; a node is `{mean, indices, children}`. Marey's tree
-contains the samples in the order of the tree, in single precision; the means are computed from them.
+contains the samples in the order of the tree, in single precision; Marey computes the means from the samples.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ def read_predecessor_tree(data: bytes, file: str) -> SampleTree:
     Parameters
     ----------
     data : bytes    content of the file
-    file : str    its name, for messages
+    file : str    name of the file, for messages
 
     Returns
     -------
@@ -102,12 +101,12 @@ def tree_of_document(document: Mapping[str, Any], file: str) -> SampleTree:
 
 
 def write_predecessor_tree(tree: SampleTree, spatial: int, branching: int, *, encoding: Encoding = "json") -> bytes:
-    """Write a tree.
+    """Write a tree as a document of the predecessor.
 
     Parameters
     ----------
     tree : SampleTree    the samples
-    spatial : int    number of spatial components of a latent vector; these are the features
+    spatial : int    number of spatial components of a latent vector; they are written as the features of a sample
     branching : int    largest number of children of a node
     encoding : str    "json", "bson" or "bson.bz2"
 

@@ -1,4 +1,4 @@
-"""Check of how closely a search reaches positions of hands and feet from examples that the model does not know."""
+"""Check of searches: the errors with which they reach hand and foot positions of examples left out of training."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from marey_schemas.options.searching import RefineOptions
 from marey_schemas.search_constraints import JointPositionConstraint
 
 REACHING = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
-"""Standard joints for whose positions the check searches."""
+"""Standard joints for which the check sets target positions."""
 
 HELD_OUT_EVERY = 5
 LEAST_EXAMPLES = 10
@@ -40,7 +40,7 @@ class SearchCheck:
     ----------
     examples, joints : (n,) uid of the example and standard name of the joint whose position is the target
     frames : (n,) canonical frame at which the positions of that joint differ most between the examples
-    searched_cm, refined_cm : (n,) error of the best sample of the tree, before and after refining it
+    searched_cm, refined_cm : (n,) error of the best sample of the tree, before and after refinement
     """
 
     examples: tuple[str, ...]

@@ -49,7 +49,7 @@ def tolerance_of(constraint: SearchConstraint) -> float:
 
 
 def frame_at(primitive: MotionPrimitive, at: Moment) -> float:
-    """Convert a moment to a canonical frame.
+    """Convert the time of a constraint to a canonical frame.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def joint_index(primitive: MotionPrimitive, name: str, standard_joints: Mapping[
     Parameters
     ----------
     primitive : MotionPrimitive    the model
-    name : str    either name
+    name : str    name in the skeleton, or standard name
     standard_joints : mapping of str to int    joint index by standard name
 
     Returns

@@ -24,7 +24,7 @@ from marey_schemas.search_constraints import (
 )
 
 FAR_AWAY_M = 1000.0
-"""Distance of a point to look at, in metres, that represents a direction to look in."""
+"""A direction to look in is replaced by a point to look at, which is this far away, in metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Finished:
 
 
 def finish_motion(steps: Sequence[Step], found: FoundMotion, mapping: JointMapping) -> Finished:
-    """Bring joints exactly to their targets at the frames nearest to the constraints' moments.
+    """Bring joints exactly to their targets at the frames nearest to the times of the constraints.
 
     Only the limb, or the chain up to the pelvis, moves; the position of the body and the timing stay the same.
 

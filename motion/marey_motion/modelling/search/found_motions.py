@@ -25,7 +25,7 @@ class FoundMotion:
 
     Parameters
     ----------
-    motion : F frames in the world; the last frame of a step is the first of the next one
+    motion : F frames in the world; the last frame of a step is the first frame of the next step
     starts : first frame of each step
     passed : for each step, frames of real time (N,) that have passed at each canonical frame
     """
@@ -37,12 +37,12 @@ class FoundMotion:
     passed: tuple[Floats, ...]
 
     def frame_of(self, step: int, primitive: MotionPrimitive, at: Moment) -> int:
-        """Find the frame of the motion that is nearest to a moment of a step.
+        """Find the frame of the motion that is nearest to a given time of a step.
 
         Parameters
         ----------
         step : int    number of the step
-        primitive : MotionPrimitive    its model
+        primitive : MotionPrimitive    the model of the step
         at : str or float    label of a keyframe, "start", "end", or a canonical frame
 
         Returns

@@ -46,9 +46,10 @@ class Rows(NamedTuple):
     Parameters
     ----------
     kinds : (m,) kinds of constraints, numbered in `objective_kernels`
-    items : (m,) index of the tracked point or of the clock
+    items : (m,) index of the tracked point or, for a time, index of the canonical frame among the `Clocks`
     targets : (m, 4) position, quaternion, direction, heading or time
-    axes : (m, 3) for positions, 1 for each coordinate that counts; for directions, the axis in the joint's frame
+    axes : (m, 3) for positions, 1 for each coordinate that is constrained, else 0; for directions, the axis in the
+        joint's frame
     """
 
     kinds: Ints
@@ -63,7 +64,7 @@ class Linearised(NamedTuple):
     Parameters
     ----------
     points : (n, 3) the tracked points in the world, metres
-    point_slopes : (n, 3, W) their derivatives
+    point_slopes : (n, 3, W) derivatives of the tracked points
     residuals : (3 m,) three numbers for each of m constraints: its error divided by its tolerance, times the square
         root of its weight
     slopes : (3 m, W) derivatives of the residuals
@@ -127,7 +128,7 @@ class Objective:
 
         Parameters
         ----------
-        stacked : (W,) float64    latent vectors one after the other, this step's from `first` on
+        stacked : (W,) float64    latent vectors of all steps, one after the other
         first : int    index in `stacked` of the first number of this step
         placement : (3,) float64    heading, x and z in the world at which the motion begins; replaces the placement of
             this objective
@@ -176,7 +177,7 @@ def build_objective(
     constraints : sequence of constraints    m constraints
     standard_joints : mapping of str to int    joint index by standard name, as far as they are known
     placement : Placement    start of the motions in the world of the targets
-    also : sequence of Tracked    further points to track; they come first
+    also : sequence of Tracked    points to track in addition to those of the constraints; they come first
 
     Returns
     -------
@@ -239,7 +240,7 @@ def _row(
 ) -> _ResidualRow:
     """Convert a constraint to numbers, and add the points and times that it needs to `tracked` and `moments`.
 
-    Both contain each point or canonical frame once, with its index.
+    `tracked` maps each point, and `moments` each canonical frame, to its index.
     """
     frame = frame_at(primitive, constraint.at)
 

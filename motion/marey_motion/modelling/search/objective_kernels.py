@@ -115,7 +115,7 @@ def _angle_factors(sine, cosine):  # type: ignore[no-untyped-def]
 def _rotation_error(turn, target, out):  # type: ignore[no-untyped-def]
     """Fill `out` (3,) with the rotation vector from the rotation `target` to the rotation `turn`.
 
-    Its length is the angle between them.
+    The length of the vector is the angle between the two rotations.
     """
     w, x, y, z = product(turn, inverse(target))
     if w < 0.0:
@@ -159,7 +159,8 @@ def _crossed(a, b, out):  # type: ignore[no-untyped-def]
 def _residual(row, rows, points, turns, times, room, out):  # type: ignore[no-untyped-def]
     """Fill `out` (3,) with the error of the constraint with index `row`, in metres, radians or seconds.
 
-    `points` and `turns` are the tracked points and rotations, `times` those of `_times`; `room` (2, 3) is overwritten.
+    `points` and `turns` are the tracked points and rotations, and `times` the times that `_times` computes; `room`
+    (2, 3) is overwritten.
     """
     kind, item, target = rows.kinds[row], rows.items[row], rows.targets[row]
     out[:] = 0.0

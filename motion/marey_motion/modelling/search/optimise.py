@@ -3,8 +3,8 @@
 The cost is ½ Σ w (e / σ)² - λ Σ ln p(s), with errors e, their tolerances σ and weights w, and the likelihood p of each
 latent vector s. To compute a step, the mixture is replaced by its component that is most likely at the current vector
 (max-mixture, Olson and Agarwal 2013). The whitened distance from this component's mean is then a residual like any
-other; the constant term of its logarithm does not change the step and is left out. A step is accepted if it decreases
-the cost under the whole mixture.
+other. The constant term of the component's log-likelihood does not change the step and is left out. A step is accepted
+if it decreases the cost under the whole mixture.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class LeastSquares(Protocol):
 
 
 def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAULT_REFINING) -> Refined:
-    """Improve latent vectors; the cost of the result is never above that of the start.
+    """Improve latent vectors; the cost of the result is never above the cost of the start.
 
     Parameters
     ----------

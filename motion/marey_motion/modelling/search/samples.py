@@ -15,7 +15,7 @@ from marey_motion.modelling.search.tree import SampleTree
 from marey_schemas.options.searching import CANDIDATES, PASSES
 
 NARROWING = 0.25
-"""Factor by which each further pass shrinks the distances between samples."""
+"""Factor by which each pass after the first shrinks the distances between samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +41,8 @@ def search_tree(objective: Objective, tree: SampleTree, *, candidates: int = CAN
 
     All children of all candidates of a level are evaluated at once: a node by the mean of its samples, a leaf by each
     of its samples. The result consists of samples and never of means, because a mean need not be a likely motion. Of
-    samples with equal costs, the first in the tree is preferred. With as many candidates as there are nodes it is an
-    exhaustive search.
+    samples with equal costs, the first in the tree is preferred. If `candidates` is at least the number of nodes, the
+    search is exhaustive.
 
     Parameters
     ----------
@@ -65,8 +65,8 @@ def search_closely(
     """Find the best sample, then better latent vectors close to it, by several runs of `search_tree`.
 
     Each further pass searches the same tree, but with all samples moved towards the best latent vector so far: the
-    distances between them are a quarter of those in the pass before. The resulting motion is about as likely as a
-    sample.
+    distances between the samples are a quarter of the distances in the pass before. The resulting motion is about as
+    likely as a sample.
 
     Parameters
     ----------
@@ -134,16 +134,16 @@ def _best(tree: SampleTree, samples: Indices, costs: Floats, top: int, evaluatio
 
 
 def _smallest(costs: Floats, places: Indices, count: int) -> Indices:
-    """Return the `count` entries of `places`, indices into `costs`, with the smallest costs, in order of their costs.
+    """Return the `count` indices with the smallest costs among `places`, which are indices into `costs`, by cost.
 
-    Of equal costs, the first ones are returned.
+    Of indices with equal costs, the first are returned.
     """
     order: Indices = np.lexsort((places, costs))[:count]
     return order
 
 
 def _ranges(starts: NDArray[np.int32], counts: NDArray[np.int32]) -> Indices:
-    """Concatenate ranges of consecutive integers; each begins at one of `starts` and has one of `counts` numbers."""
+    """Concatenate ranges of consecutive integers; range i has `counts[i]` integers and begins at `starts[i]`."""
     ends = np.cumsum(counts)
     firsts: Indices = np.repeat(starts - (ends - counts), counts)
     return firsts + np.arange(len(firsts), dtype=np.intp)

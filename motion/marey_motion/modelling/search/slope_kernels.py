@@ -1,9 +1,9 @@
 """Compiled derivatives of the constraints' points and times with respect to the latent vectors of one or more steps.
 
 A step's own latent vector moves its joints through spline, quaternion normalisation and forward kinematics; the latent
-vectors of earlier steps move its placement, at which it begins in the world. `moved` (3, W) is the derivative of the
-placement (heading, x, z) with respect to all W numbers of the stacked latent vectors, in which the numbers of the step
-itself begin at `first`.
+vectors of earlier steps move the step's placement, which is its position and heading at its start in the world. `moved`
+(3, W) is the derivative of the placement (heading, x, z) with respect to all W numbers of the stacked latent vectors,
+in which the numbers of the step itself begin at `first`.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ _SMALL_ANGLE = 1e-3
 def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-untyped-def]
     """Fill `shifts` and `spins` (V, 3, k) with the derivatives of V joints' positions and rotations.
 
-    They are derivatives with respect to the k spatial scores, in canonical coordinates. `local` and `rotations` are
-    those that `objective_kernels._pose` computes.
+    They are derivatives with respect to the k spatial scores, in canonical coordinates. `objective_kernels._pose`
+    computes `local` and `rotations`.
     """
     for node in range(chains.parents.shape[0]):
         first, parent = chains.columns[node], chains.parents[node]
@@ -72,9 +72,9 @@ def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-u
 def track(chains, placement, moved, latent, first, points, turns, point_slopes, turn_slopes):  # type: ignore[no-untyped-def]
     """Fill `points` (n, 3) and `turns` (n, 4) with the tracked points and rotations, in the world.
 
-    Fills `point_slopes` and `turn_slopes` (n, 3, W) with their derivatives with respect to the stacked latent vectors
-    `latent` (W,). `placement` is the start of this step in the world; `moved` and `first` are described in the
-    introduction of this module.
+    Fills `point_slopes` and `turn_slopes` (n, 3, W) with the derivatives of the points and of the rotations with
+    respect to the stacked latent vectors `latent` (W,). `placement` is the start of this step in the world; `moved` and
+    `first` are described in the introduction of this module.
     """
     nodes, scores = chains.parents.shape[0], chains.directions.shape[0]
     channels, local = np.empty(chains.mean.shape[0]), np.empty((nodes, 5))
@@ -104,8 +104,8 @@ def track(chains, placement, moved, latent, first, points, turns, point_slopes, 
 def _add_turned(cos, sin, sign, slopes, first, out):  # type: ignore[no-untyped-def]
     """Convert derivatives `slopes` (3, k) from canonical to world coordinates, and add them to `out` (3, W).
 
-    `cos` and `sin` are those of the placement's heading; `sign` is a factor, 1 or -1. The columns of the k scores begin
-    at `first`.
+    `cos` and `sin` are the cosine and sine of the placement's heading; `sign` is a factor, 1 or -1. The columns of the
+    k scores begin at `first`.
     """
     for score in range(slopes.shape[1]):
         x, z = slopes[0, score], slopes[2, score]
@@ -179,11 +179,12 @@ def _orientation_slope(residual, by_turn):  # type: ignore[no-untyped-def]
 
 @compiled
 def _aim_slopes(pointing, wanted, distance, by_point, by_turn):  # type: ignore[no-untyped-def]
-    """Fill the derivatives of the error of an axis, the rotation vector angle / sin(angle) · (pointing × wanted).
+    """Fill `by_point` and `by_turn` (3, 3) with the derivatives of the error of a joint's axis.
 
-    `pointing` and `wanted` are the unit directions of the axis and of the target. `by_turn` and `by_point` (3, 3) are
-    the derivatives with respect to the joint's rotation and position. `distance` is the distance of the point to look
-    at, or 0 for a constraint without such a point.
+    The error is the rotation vector angle / sin(angle) · (pointing × wanted). `pointing` and `wanted` are the unit
+    directions of the axis and of the target. `by_turn` and `by_point` (3, 3) are the derivatives with respect to the
+    joint's rotation and position. `distance` is the distance of the point to look at, or 0 for a constraint without
+    such a point.
     """
     across = np.empty(3)
     sine = _crossed(pointing, wanted, across)
@@ -209,7 +210,7 @@ def _aim_slopes(pointing, wanted, distance, by_point, by_turn):  # type: ignore[
 def _slopes_of(row, rows, points, turns, residual, by_point, by_turn):  # type: ignore[no-untyped-def]
     """Fill `by_point` and `by_turn` (3, 3) with derivatives of the error `residual` of the constraint with index `row`.
 
-    They are derivatives with respect to its tracked point and its tracked rotation.
+    They are derivatives with respect to the tracked point and the tracked rotation of the constraint.
     """
     kind, item = rows.kinds[row], rows.items[row]
     by_point[:], by_turn[:] = 0.0, 0.0

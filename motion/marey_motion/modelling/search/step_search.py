@@ -35,9 +35,9 @@ class Sequel:
     Parameters
     ----------
     latents : one latent vector (L,) per step
-    measured : their placements and errors
-    joints : standard names of the joints whose jumps are measured, that is, their changes of position from the end
-        of one step to the start of the next; `Measured.jumps_m` lists the jump of the pelvis, then those of `joints`
+    measured : placements and errors of the motions
+    joints : standard names of the joints whose jumps are measured; a jump is the change of position from the end of one
+        step to the start of the next. `Measured.jumps_m` lists the jump of the pelvis, then the jumps of `joints`
     searched : result of the search in each tree
     sampled : placements and errors before refining
     refined : result of refining, None if it was not requested
@@ -79,7 +79,7 @@ def search_steps(
     Raises
     ------
     InvalidConstraint    naming step and constraint
-    MotionError    if numbers become too large to compute with
+    MotionError    if the errors or costs become too large to compute with
     """
     problem = SeveralSteps.of(steps, start, transitions)
     searched: list[FoundSamples] = []
@@ -107,7 +107,7 @@ def _require_finite(*found: Floats) -> None:
 def _search_step(
     step: Step, tree: SampleTree, begun: CarriedOn, candidates: int, passes: int, transitions: TransitionOptions
 ) -> FoundSamples:
-    """Find the best motion in the tree of a step; `begun` is its start, at the end of the previous step."""
+    """Find the best motion in the tree of a step that starts at `begun`, where the previous step ended."""
     _require_finite(*begun.joints.values())
     # The end of a motion may lie outside of the range that requests are limited to, so these are not validated.
     going_on = tuple(

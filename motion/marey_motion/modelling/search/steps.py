@@ -1,7 +1,7 @@
 """Sequences of several motions, with constraints on each of them.
 
 Each step is placed in the world so that its pelvis begins above the point of the ground where the pelvis of the
-previous step ended, with the same heading. So ground position and heading are continuous for any latent vectors.
+previous step ended, with the same heading. Ground position and heading are thus continuous for any latent vectors.
 Continuity of the *transition joints* (hands and feet) and of the height of the pelvis is a constraint.
 """
 
@@ -79,9 +79,9 @@ class _Link(NamedTuple):
     Parameters
     ----------
     objective : the step's constraints. If the sequence has several steps, the objective also computes the points that
-        `_ends` lists, before those of the constraints
+        `_ends` lists; they come before the points of the constraints
     beginning : pelvis, and axis of the body from right to left, at the start of the step; they determine how the step
-        is placed at the end of the previous one
+        is placed at the end of the previous step
     first : index of the step's first number in the stacked latent vectors of all steps
     """
 
@@ -177,7 +177,7 @@ class SeveralSteps:
         return tuple(np.split(stacked, [one.first for one in self.links[1:]]))
 
     def linearise(self, stacked: Floats) -> tuple[Floats, Floats]:
-        """Compute the errors of all constraints and all jumps and their derivatives.
+        """Compute the errors of all constraints and all jumps, with their derivatives.
 
         Parameters
         ----------
@@ -255,7 +255,7 @@ class SeveralSteps:
 
 
 def _ends(step: Step, joints: Sequence[str]) -> tuple[Tracked, ...]:
-    """List points of a step whose positions are compared with those of its neighbours. Raises `MappingError`.
+    """List the points of a step that are compared with the same points of adjacent steps. Raises `MappingError`.
 
     The points at the start of the step come first: the pelvis, the axis of the body from right to left, and the
     transition joints `joints`. The same points at the end of the step follow.

@@ -1,7 +1,7 @@
-"""Selection of the joints and moments of a primitive's motions that constraints need.
+"""Selection of the joints and canonical frames of a primitive's motions that constraints need.
 
-A spline at a fixed moment is linear in the scores, so each channel of a joint costs one product with precomputed
-numbers.
+The value of a spline at a fixed time is linear in the scores, so each channel of a joint costs one product with
+precomputed numbers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from marey_motion.errors import MappingError
 from marey_motion.modelling.primitive import MotionPrimitive
 
 LEFTS, RIGHTS = ("left_hip", "left_shoulder"), ("right_hip", "right_shoulder")
-"""Standard joints whose difference gives the direction the body faces."""
+"""Standard joints of both sides; the vectors from right to left joints give the direction that the body faces."""
 
 
 class Tracked(NamedTuple):
@@ -26,7 +26,7 @@ class Tracked(NamedTuple):
     ----------
     frame : canonical frame
     joints : joints whose positions are added; the rotation of the first one is tracked
-    minus : joints whose positions are subtracted, as many as are added; empty for a single joint
+    minus : joints whose positions are subtracted, the same number as in `joints`; empty for a single joint
     """
 
     frame: float
@@ -37,8 +37,8 @@ class Tracked(NamedTuple):
 class Chains(NamedTuple):
     """Arrays from which n tracked points are computed for a latent vector.
 
-    V is the number of joints that the points need, where a joint is counted once for each moment; X is the number of
-    channels of all these joints.
+    V is the number of joints that the points need, where a joint is counted once for each canonical frame; X is the
+    number of channels of all these joints.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class Clocks(NamedTuple):
     weights : (n, N - 1) factors by which the steps are multiplied; their sum is the time, in seconds, at each of the n
         canonical frames
     frame_s : seconds of one frame
-    range_s : (2,) shortest and longest duration of a motion; a longer or shorter one is played faster or slower as a
+    range_s : (2,) shortest and longest duration of a motion; a longer or shorter motion is played faster or slower as a
         whole
     log_slope_bounds : (2,) limits to which logarithms of steps are clipped
     """
@@ -132,7 +132,7 @@ def facing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
 
 
 def track_points(primitive: MotionPrimitive, tracked: Sequence[Tracked]) -> Chains:
-    """Prepare the joints that move tracked points, with their channels at the requested moments.
+    """Prepare the joints that move tracked points, with the channels of these joints at the requested canonical frames.
 
     Parameters
     ----------

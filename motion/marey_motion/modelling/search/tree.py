@@ -38,7 +38,7 @@ class SampleTree:
 
     Parameters
     ----------
-    samples : (n, L) float32 latent vectors; those of a node are contiguous
+    samples : (n, L) float32 latent vectors; the samples of a node are contiguous
     sizes : (M,) number of samples of each node
     children : (M,) number of child nodes of each node
     """
@@ -90,7 +90,7 @@ class SampleTree:
         return means
 
     def most_evaluations(self, candidates: int) -> int:
-        """Bound the number of motions that a search evaluates.
+        """Compute an upper bound of the number of motions that a search evaluates.
 
         Parameters
         ----------

@@ -24,7 +24,7 @@ def _square_distance(a, b):  # type: ignore[no-untyped-def]
 
 @compiled
 def _place_centres(features, members, randoms, nearest, centres):  # type: ignore[no-untyped-def]
-    """Choose centres of clusters among members by k-means++ (Arthur and Vassilvitskii 2007); return their number.
+    """Choose cluster centres among members by k-means++ (Arthur and Vassilvitskii 2007); return the number of centres.
 
     `members` are row numbers of `features`; `randoms` are uniform random numbers, one per centre. `centres` is filled;
     `nearest` has space for one distance per member.
@@ -53,7 +53,7 @@ def _place_centres(features, members, randoms, nearest, centres):  # type: ignor
 
 @compiled
 def _assign(features, members, centres, labels):  # type: ignore[no-untyped-def]
-    """Fill `labels` with the index of each member's nearest centre, the first of equally near ones.
+    """Fill `labels` with the index of each member's nearest centre; of equally near centres, the first is taken.
 
     Returns the number of members whose label has changed.
     """
@@ -71,7 +71,7 @@ def _assign(features, members, centres, labels):  # type: ignore[no-untyped-def]
 
 @compiled
 def _average(features, members, labels, centres, sizes):  # type: ignore[no-untyped-def]
-    """Move each of `centres` to the mean of its members, and fill `sizes` with their numbers.
+    """Move each of `centres` to the mean of its members, and fill `sizes` with the numbers of members.
 
     A centre without members does not move.
     """
@@ -171,7 +171,7 @@ def locate(sizes, children, starts):  # type: ignore[no-untyped-def]
 
 @compiled
 def average(samples, starts, sizes, means):  # type: ignore[no-untyped-def]
-    """Fill `means` (nodes, L) with the mean of each node's samples, which begin at `starts` and number `sizes`."""
+    """Fill `means` (nodes, L) with the means of nodes; node i has `sizes[i]` samples, beginning at `starts[i]`."""
     means[:] = 0.0
     for node in range(sizes.shape[0]):
         for sample in range(starts[node], starts[node] + sizes[node]):

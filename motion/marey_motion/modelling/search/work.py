@@ -1,7 +1,7 @@
 """Estimates of the work of a search, in nanoseconds of one thread.
 
-They are computed from the inputs (samples, moments, joints, nodes of trees, constraints, iterations) with measured
-weights, so that the same request is always accepted or always refused, whatever the load of the machine.
+They are computed from the numbers of samples, canonical frames, joints, nodes of trees, constraints and iterations,
+with measured weights, so that the same request is always accepted or always refused, whatever the load of the machine.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ RADIAL_NAMES = 8  # more names than this are written radially, so that they do n
 
 
 class _Line(NamedTuple):
-    """Jumps from a range of frames to another: uids of both clips, middle frames of both ranges, number of jumps."""
+    """Jumps from one range of frames to another: uids of both clips, middle frames of both ranges, number of jumps."""
 
     source: str
     left: int
@@ -105,10 +105,10 @@ def _links(subjects: Sequence[Subject], switches: Sequence[Ints]) -> dict[tuple[
 
 
 def _lines(subject: Subject, switches: Ints, circles: dict[str, Circle]) -> list[_Line]:
-    """Combine the jumps between clips into lines, the most frequent first.
+    """Combine the jumps between clips into lines, the line with most jumps first.
 
-    All jumps from the same range of frames to the same other range form one line. Each range is one dot of a circle, or
-    several neighbouring dots if there would otherwise be more than `MOST_LINES` lines.
+    All jumps from one range of frames to another range form one line. Each range is one dot of a circle, or several
+    neighbouring dots if there would otherwise be more than `MOST_LINES` lines.
     """
     clips = subject.result.clips
     owners = clips_of_rows(clips, switches[:, :2])

@@ -56,7 +56,7 @@ def arrange(frames: Mapping[str, int], links: Mapping[tuple[str, str], int]) -> 
     Parameters
     ----------
     frames : number of frames by uid, the most used clip first
-    links : number of transitions from clip to clip, by the uids of both
+    links : number of transitions from one clip to another, by the uids of both clips
     """
     order = _neighbours(list(frames), links)
     largest = max(frames.values(), default=1)
@@ -83,7 +83,7 @@ def _neighbours(uids: Sequence[str], links: Mapping[tuple[str, str], int]) -> li
 
 
 def _ring(radii: Floats) -> Floats:
-    """Place centres (n, 2) of circles so that neighbours do not touch; the first at the top, then clockwise."""
+    """Place the centres (n, 2) of circles on a ring, clockwise from the top, so that neighbours do not touch."""
     if len(radii) < 2:
         return np.zeros((len(radii), 2))
     rooms = radii + BETWEEN / 2

@@ -32,7 +32,7 @@ TRANSITIONS = "Transitions"
 
 
 class _Use(NamedTuple):
-    """Use of the clips of a subject: displayed ticks and name by uid, and the number of transitions in total."""
+    """Use of the clips of a subject: ticks of display and name of each clip by uid, and total number of transitions."""
 
     ticks: dict[str, int]
     names: dict[str, str]
@@ -40,7 +40,10 @@ class _Use(NamedTuple):
 
 
 def draw_usage(subjects: Sequence[Subject], trial: str | None, options: FigureOptions) -> Sketch:
-    """Draw bars for the most used clips, one for the others, and one for transitions, for the suite or one trial."""
+    """Draw a bar for each of the most used clips, one bar for all other clips, and one for transitions.
+
+    The bars are for one trial, or for the whole suite if `trial` is None.
+    """
     uses = [_use(subject, trial) for subject in subjects]
     order = _order(uses)
     shown, others = order[: options.most_clips], order[options.most_clips :]
@@ -76,8 +79,8 @@ def _draw_bars(
     """Draw the labelled bars of the subject with index `number`.
 
     There is one bar for each listed clip, one for all remaining clips if `others` is true, and a hatched one for
-    transitions. `values` are the lengths of the bars without the last one, `places` the positions of all bars, and
-    `thick` is their thickness.
+    transitions. `values` are the lengths of all bars except the bar for transitions. `places` are the positions of all
+    bars, and `thick` is their thickness.
     """
     total = sum(use.ticks.values())
     colours = [COLOURS[number]] * (len(values) - others) + [REFERENCE] * others
@@ -102,7 +105,7 @@ def _use(subject: Subject, trial: str | None) -> _Use:
 
 
 def _order(uses: Sequence[_Use]) -> list[str]:
-    """Sort clips by the time that all subjects display them, most first, then by uid; unused clips are left out."""
+    """Sort clips by their total time of display in all subjects, longest first, then by uid; leave out unused clips."""
     totals: dict[str, int] = {}
     for use in uses:
         for uid, ticks in use.ticks.items():

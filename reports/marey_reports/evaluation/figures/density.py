@@ -37,7 +37,7 @@ DIRECTION_CELL_M_S = 0.25
 
 
 class _Plane(NamedTuple):
-    """Axes of a density map: two quantities of windows of clips, their names, and the area that seconds refer to."""
+    """Axes of a density map: two quantities of windows of clips, their names, and the area to which a value refers."""
 
     x: Callable[[Coverage], Floats]
     y: Callable[[Coverage], Floats]
@@ -124,7 +124,7 @@ def _draw(subjects: Sequence[Subject], plane: _Plane) -> Sketch:
 
 
 def _edges(subjects: Sequence[Subject], plane: _Plane) -> tuple[Floats, Floats]:
-    """Compute the edges of the fine cells along both axes; together they contain all trials and nearly all windows."""
+    """Compute the edges of the cells of the map along both axes; the map contains all trials and nearly all windows."""
     spans = []
     for axis, values in enumerate((plane.x, plane.y)):
         found = np.concatenate([values(subject.result.coverage) for subject in subjects])
@@ -147,7 +147,7 @@ def _least_ranges(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float
 
 
 def _seconds(subject: Subject, plane: _Plane, edges: tuple[Floats, Floats], cell: tuple[float, float]) -> Floats:
-    """Compute the smoothed seconds of data (FINE, FINE) in an area of size `cell` around each fine cell."""
+    """Compute the smoothed seconds of data (FINE, FINE) in an area of size `cell` around each cell of the map."""
     from scipy.ndimage import gaussian_filter
 
     coverage = subject.result.coverage

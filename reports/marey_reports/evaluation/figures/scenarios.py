@@ -91,7 +91,7 @@ def _number_sections(
     sections: Sequence[tuple[int, int, float]],
     limits: tuple[tuple[float, float], tuple[float, float]],
 ) -> None:
-    """Write the number of each section on the path, if possible at a distance from the numbers written before."""
+    """Write the number of each section on the path, if possible away from the numbers that were written before."""
     span = limits[0][1] - limits[0][0]
     placed: list[Floats] = []
     for number, (start, stop, _) in enumerate(sections, start=1):

@@ -1,4 +1,4 @@
-"""Subjects of figures: the results of one or two evaluations that a figure shows, and single trials of them."""
+"""Subjects of figures: the one or two evaluation results that a figure shows, and single trials of these results."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from marey_schemas.options.evaluation import Family
 
 @dataclass(frozen=True)
 class FigureOptions:
-    """Options of drawing figures.
+    """Options for drawing figures.
 
     Parameters
     ----------
     negate_errors : draw reference minus recorded, as the paper's figure 8, instead of recorded minus reference
     logarithmic : whether the sizes of dots and the lengths of bars have a logarithmic scale
-    most_clips : number of clips that are drawn one by one; the others are summed up
+    most_clips : number of clips that are drawn one by one; all other clips are summed up
     """
 
     negate_errors: bool = False

@@ -13,7 +13,7 @@ from marey_reports.drawing.paper import COLOURS, REFERENCE, Place, add_keys, add
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject, TrialView, choose_trial, view_trial
 
 LEAST_TOP_M = 0.01
-"""Least upper end of the axis of costs, in metres; far smaller costs are rounding errors of a character at rest."""
+"""Least upper end of the axis of costs, in metres, so that rounding errors of a character at rest look like zero."""
 
 
 def draw_transition_costs(subjects: Sequence[Subject], trial: str | None, _options: FigureOptions) -> Sketch:

@@ -1,4 +1,4 @@
-"""Figure of an alignment's costs: differences between moments of a clip and of the reference, and the path."""
+"""Figure of an alignment's costs: differences between frames of a clip and of the reference, and the warping path."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class CostView(NamedTuple):
 
     @property
     def along_path_cm(self) -> Floats:
-        """Costs (N,) along the path, one at each canonical frame."""
+        """Costs (N,) along the warping path, one for each canonical frame."""
         wanted = (np.arange(len(self.clip.time_function)), np.rint(self.clip.time_function))
         cells = [
             np.abs(frames - each[:, None]).argmin(axis=1) for frames, each in zip(self.frames, wanted, strict=True)

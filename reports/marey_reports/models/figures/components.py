@@ -1,4 +1,4 @@
-"""Figures of the components of a model: motions from two standard deviations below the mean to two above it."""
+"""Figures of the components of a model: motions from two standard deviations below the mean to two above the mean."""
 
 from __future__ import annotations
 

@@ -88,8 +88,8 @@ def _odd_ones(count: int) -> str:
 def _pairs(spatial: int, temporal: int) -> list[tuple[int, int]]:
     """Choose at most three pairs of latent dimensions to draw.
 
-    The first spatial component is paired with the second and third one and with the first temporal component. If this
-    gives no pair, the first two temporal components are drawn.
+    The first spatial component is paired with the second and third one and with the first temporal component. If there
+    is no such pair, the first two temporal components are drawn.
     """
     pairs = [(0, 1)] if spatial > 1 else []
     if spatial > 2:

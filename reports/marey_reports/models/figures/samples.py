@@ -1,4 +1,4 @@
-"""Figure of samples beside the examples: bodies on top of each other, and the paths of hands and feet."""
+"""Figures that compare samples with examples: bodies drawn on top of each other, and paths of hands and feet."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def reach_of(subject: ModelSubject) -> list[Reach]:
 
 
 def draw_samples(subject: ModelSubject) -> Sketch:
-    """Draw examples and samples at the same moments, all examples in one row and all samples in another."""
+    """Draw examples and samples in the same canonical frames: all examples in one row, all samples in another row."""
     frames, moments = subject.moments()
     chosen = evenly(len(subject.poses), len(subject.samples))
     examples = subject.points(subject.poses[chosen][:, frames])

@@ -1,4 +1,4 @@
-"""Figures about numbers of components: explained variance, error of reconstruction, and choice of the mixture."""
+"""Figures about numbers of components: explained variance, reconstruction error, and size of the mixture."""
 
 from __future__ import annotations
 

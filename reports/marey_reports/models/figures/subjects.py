@@ -30,9 +30,9 @@ SAMPLES = 16
 LONGEST_LABEL = 18
 
 FROM_ASIDE_RAD, FROM_AHEAD_RAD = float(np.radians(-50.0)), float(np.radians(-25.0))
-"""Directions, in radians about +Y, from which strips show motions that travel and other motions: from the front right.
+"""Viewing directions of strips, in radians about +Y, for motions that travel and for all other motions.
 
-Motions begin facing +z, so walks go to the right in the picture.
+Both directions are from the front right. Motions begin facing +z, so walks go to the right in the picture.
 """
 
 TRAVELS_M = 0.3
@@ -79,7 +79,7 @@ class ModelSubject:
 
     @cached_property
     def seen_from_rad(self) -> float:
-        """Direction from which strips show the body, in radians; further to the side if the motion travels."""
+        """Direction from which strips show the body, in radians about +Y; more from the side if the motion travels."""
         way = self.mean_poses[[0, -1], :3]
         return FROM_ASIDE_RAD if np.linalg.norm((way[1] - way[0])[[0, 2]]) > TRAVELS_M else FROM_AHEAD_RAD
 
@@ -100,7 +100,7 @@ class ModelSubject:
     def moments(self, count: int = MOMENTS) -> tuple[NDArray[np.int64], StripMoments]:
         """Choose `count` canonical frames as the columns of strips; return these frames, and the columns.
 
-        Each column is centred on the position of the mean motion at its frame.
+        Each column is centred on the position of the mean motion in the column's frame.
         """
         return choose_moments(self, count)
 

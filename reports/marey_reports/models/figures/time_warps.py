@@ -1,4 +1,4 @@
-"""Figure of the time functions of an alignment, with the places where each clip is faster or slower."""
+"""Figure of the time functions (time warps) of an alignment, which shows where each clip is faster or slower."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 NAMED = 4
 POINTS = 12_000
-"""Greatest number of points of all lines in a panel together; more could not be distinguished."""
+"""Greatest total number of points of all lines in a panel; more points could not be distinguished."""
 TABLED = 100
 SPEED_SPAN = (0.1, 10.0)
 
 
 def draw_time_warps(aligned: AlignedSet) -> Sketch:
-    """Draw time functions and speeds; name the reference and the clips whose time differs most from the reference's."""
+    """Draw time functions and speeds; name the reference and the clips that differ most from it in time."""
     times_s = aligned.time_functions / aligned.frame_rate_hz
     speeds = 1.0 / np.diff(aligned.time_functions, axis=1)
     reference = [clip.uid for clip in aligned.clips].index(aligned.reference)
@@ -59,7 +59,7 @@ def draw_time_warps(aligned: AlignedSet) -> Sketch:
 
 
 def _most_unlike(aligned: AlignedSet, reference: int) -> list[int]:
-    """Find the clips whose time functions, scaled to the same duration, differ most from the reference's function."""
+    """Find the clips whose time functions, scaled to equal duration, differ most from that of the reference."""
     paths = aligned.time_functions / aligned.time_functions[:, -1:]
     apart = np.abs(paths - paths[reference]).max(axis=1)
     order = sorted(range(len(paths)), key=lambda place: (-apart[place], aligned.clips[place].uid))

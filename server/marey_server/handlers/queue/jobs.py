@@ -121,8 +121,9 @@ class ProjectJobs(Resource):
     async def post(self, project: str, body: JobCreate) -> Rendered | Reply:
         """Submit a job. Inputs are pinned to their newest revisions; a job with many inputs is divided into tasks.
 
-        An input `{"job": id}` means all outputs of that job that have the input's kind; the new job waits for that job.
-        With `Prefer: wait=n`, the answer is sent when the job has ended, at the latest after n seconds.
+        An input `{"job": id}` stands for outputs of another job: all outputs of the kind that the input takes. The new
+        job waits for the other job. With `Prefer: wait=n`, the answer is sent when the new job has ended, at the latest
+        after n seconds.
         """
         submitted = await self.answer_with(lambda made: _accepted(made[0]), submission.submit, project, (body,))
         wait_s = wait_preferred(self)
@@ -175,7 +176,7 @@ class JobResource(Resource):
 
 
 def wait_preferred(resource: Resource) -> float:
-    """Return the seconds that the caller prefers to wait (RFC 7240), up to the limit of this server."""
+    """Return how many seconds the caller prefers to wait (RFC 7240), at most the limit of this server."""
     found = _WAIT.search(resource.request.headers.get("Prefer", ""))
     return min(float(found[1]), LONGEST_WAIT_S) if found else 0.0
 
@@ -231,7 +232,7 @@ class JobResults(Resource):
 
     @reads(access=Access.READER, query=PageQuery, answer=TaskResult, paged=True, attempts=True)
     async def get(self, job: str, query: PageQuery) -> Rendered:
-        """Return the results of a job's tasks in order. Blobs named in the results are kept until the job ends."""
+        """Return the results of a job's tasks in order. Blobs used in the results are kept until the job ends."""
         return await self.answer(reading.list_results, job, query.cursor, query.limit)
 
 
@@ -270,7 +271,7 @@ class JobLog(Resource):
 
     @reads(access=Access.READER, query=JobLogQuery, answer=Bytes, answer_types=("text/plain",), public=False)
     async def get(self, job: str, query: JobLogQuery) -> Rendered:
-        """Return the output of a job's attempts, one after another, from an offset in bytes.
+        """Return the logs of a job's attempts, joined in order, from an offset in bytes.
 
         The header `Log-Offset` is the offset of the next page; `Log-Sealed: true` means that there is no next page.
         """
@@ -304,8 +305,8 @@ class JobRetry(Resource):
     async def post(self, job: str) -> Rendered:
         """Submit a failed or cancelled job again with the same inputs; the answer is the new job.
 
-        Unsuccessful dependencies of the job are retried, too, and so are jobs that ended only because this job did not
-        succeed. So the rest of a pipeline continues.
+        Unsuccessful jobs on which the job depends are retried, too, and so are jobs that ended only because this job
+        did not succeed. So the rest of a pipeline continues.
         """
         return await self.answer_with(_accepted, retrying.retry_job, job)
 

@@ -44,7 +44,7 @@ class Leases(Resource):
 
     @writes(access=Access.WORKER, scope="work", body=ClaimRequest, answer=LeaseList, reserved=True)
     async def post(self, body: ClaimRequest) -> Reply:
-        """Claim jobs; wait up to `wait_s` seconds until there are jobs. A lease that is not renewed expires."""
+        """Claim jobs; if there are none, wait for jobs up to `wait_s` seconds. A lease that is not renewed expires."""
         loop = asyncio.get_running_loop()
         deadline = loop.time() + body.wait_s
         with wakeups.listen([work_topic(kind) for kind in body.kinds]) as listener:
@@ -75,7 +75,7 @@ class Completions(Resource):
         reserved=True,
     )
     async def post(self, body: BatchCompleteRequest) -> Rendered:
-        """Complete many jobs that the caller claimed, in one transaction; each is accepted or refused separately."""
+        """Complete many jobs that the caller claimed, in one transaction; each job is accepted or refused by itself."""
         return await self.answer_with(
             lambda results: Reply(BatchCompleteAnswer(results=tuple(results))),
             completion.complete_many,
@@ -117,7 +117,7 @@ class AttemptLog(Resource):
     async def post(self, job: str, fence: int, body: bytes | None) -> Rendered:
         """Append to the attempt's log at the offset in the header `Upload-Offset`.
 
-        If this is not the end of the log, the answer is 409 with the right offset in `context.offset`.
+        If this offset is not the end of the stored log, the answer is 409 with the right offset in `context.offset`.
         """
         text = self.request.headers.get("Upload-Offset", "")
         if not (text.isascii() and text.isdigit() and len(text) <= 15):
@@ -144,7 +144,7 @@ class AttemptOutputs(Resource):
     async def post(self, job: str, fence: int, body: StageRequest) -> Rendered:
         """Upload outputs, which become visible when the attempt completes.
 
-        An output replaces an earlier one of the same name.
+        An output replaces an earlier output of the same name.
         """
         prepared = await self.compute(partial(_prepare, body))
         return await self.answer_with(

@@ -1,4 +1,4 @@
-"""Resource of pipelines: jobs submitted together, some of which read outputs of others."""
+"""Resource of pipelines: jobs that are submitted together and may read outputs of each other."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class ProjectPipelines(Resource):
         in_folders=True,
     )
     async def post(self, project: str, body: PipelineCreate) -> Rendered:
-        """Submit several jobs, some of which read outputs of others; if one job is not valid, no job is submitted.
+        """Submit several jobs that may read outputs of each other; if one job is not valid, no job is submitted.
 
-        An input `{"step": name}` means all outputs of that step that have the input's kind, at the revisions that
-        the step creates. Cached results are used: if a pipeline is submitted again, only the jobs that a change affects
-        are computed.
+        An input `{"step": name}` stands for outputs of another step: all outputs of the kind that the input takes, at
+        the revisions that the other step creates. Cached results are used: if a pipeline is submitted again, only the
+        jobs that a change affects are computed.
         """
         return await self.answer_with(
             lambda made: Reply(made, headers={"Retry-After": "1"}), submit_pipeline, project, body

@@ -29,7 +29,7 @@ class ProjectContents(Resource):
 
     @reads(access=Access.READER, body=ContentsRequest, answer=Document)
     async def post(self, project: str, body: ContentsRequest) -> Rendered:
-        """Return the revisions with the given content digests, and documents of such revisions.
+        """Return revisions and documents by their content digests.
 
         The answer is `{"revisions": [...], "documents": [...]}` in the order of the request. A revision has its `kind`
         and the content digests of its `parts`. In documents, references to revisions are replaced by `{"content":
@@ -52,9 +52,9 @@ class ExportChecks(Resource):
         """Check that the consent for the clips of an export has not ended.
 
         A program that writes an archive or other files sends this request before it reads the documents with `POST
-        /projects/{project}/contents`. Aligned clips are checked, too. If the consent for an item has ended, the answer
-        is an error (409, `consent-expired`) that names such items. Maintainers can allow the export with
-        `allow_expired_consent` and a reason; an event then names the items.
+        /projects/{project}/contents`. Aligned clips are checked, too. If the consent for one or more items has ended,
+        the answer is an error (409, `consent-expired`) that names these items. Maintainers can allow the export with
+        `allow_expired_consent` and a reason; an event then records these items.
         """
         run = self.change if body.allow_expired_consent else self.look_up
         return Reply(await run(datasets.check_export, project, dataset, body))
@@ -76,9 +76,9 @@ class ReceivedContents(Resource):
 
         Received revisions refer to other revisions by content digest; the project must have these revisions. The server
         creates an item for each received revision. If the revision is the content of a dataset entry, the item is
-        created as a deleted item, and a checkout of a version with this entry restores the item. The items of other
-        revisions are created in the folder `imported`. Because quotas do not count deleted items, only maintainers may
-        send this request.
+        created as a deleted item; a checkout of a version with this entry restores the item. Otherwise, the item is
+        created in the folder `imported`. Because quotas do not count deleted items, only maintainers may send this
+        request.
         """
         local = await self.look_up(datasets.find_local, project, body.revisions)
         drafts = await self.compute(datasets.prepare_revisions, body.revisions, local)
@@ -100,9 +100,9 @@ class ReceivedCommits(Resource):
     async def post(self, project: str, dataset: str, body: ReceivedCommit) -> Rendered:
         """Record a commit from an archive or another server, with its author and time, so that it keeps its digest.
 
-        The server applies the changes to the first parent, and refuses the commit if its tree differs from the result.
-        A branch without commits can be set to the commit; no other branch moves. To add the commit to another branch,
-        merge it.
+        The server applies the changes of the commit to the tree of its first parent, and refuses the commit if the
+        result differs from the commit's tree. A branch without commits can be set to the commit; no other branch moves.
+        To add the commit to another branch, merge it.
         """
         prepared = await self.look_up(datasets.prepare_receipt, project, dataset, body)
         return await self.answer(datasets.record_receipt, project, dataset, body, prepared)

@@ -129,7 +129,7 @@ class CommitsQuery(PageQuery):
     path: CollectionPath = Field(
         "",
         description="Entry or folder: only commits that changed it or anything below it are listed, each with the "
-        "number of entries by kind of change. A page may then be shorter than its limit although others follow.",
+        "number of entries by kind of change. A page may then be shorter than `limit`, even if more pages follow.",
     )
 
 

@@ -22,8 +22,9 @@ class DifferenceResource(Resource):
     async def get(self, project: str, kind: str, item: str, query: DifferenceRequest) -> Reply:
         """Return how a revision differs from an earlier one, or from a revision of another item of the same kind.
 
-        Frames are matched by content. The answer has the schema `marey/difference@1`: frames removed and inserted,
-        re-timing, changed rotations and paths, segments, joints, examples of models, and changed fields.
+        Frames are matched by content. The answer has the schema `marey/difference@1`. It lists removed and inserted
+        frames, changes of timing, of rotations and of the root's path, changed segments, joints and examples of models,
+        and other changed fields.
         """
         source = await self.look_up(comparing.read_difference, project, kind_of(kind), item, query)
         order = partial(comparing.difference_order, source, query, self.media.encoding)

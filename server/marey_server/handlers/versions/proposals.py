@@ -31,7 +31,7 @@ from marey_server.store.datasets import proposals
 from marey_server.store.datasets.committing import BRANCH_MOVED
 
 TRIES = 3
-"""Greatest number of times that a merge is prepared, if branches move in the meantime."""
+"""Greatest number of times that a merge is prepared, because a branch may move in the meantime."""
 
 
 class ProposalsQuery(PageQuery):
@@ -99,7 +99,7 @@ class ProposalComments(Resource):
 
 
 class WaitingProposal(Resource):
-    """Base of resources that can meet the last requirement of a proposal which waits to be merged."""
+    """Base of resources that may meet the last requirement of a waiting proposal, which is then merged."""
 
     tag = "Proposals"
 

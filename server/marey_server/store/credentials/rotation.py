@@ -17,11 +17,12 @@ from marey_server.store.transaction import Transaction
 
 
 def rotate_token(tx: Transaction, token_id: str, request: TokenRotation) -> NewToken:
-    """Replace the token of this request by a successor; the token ends after `grace_s`, its predecessor at once.
+    """Replace the token of this request by a successor. The replaced token ends after `grace_s` seconds.
 
-    The secret of the successor is derived from the secret of the token and from `rotation_id`. So a repeated request
-    gets the same successor, although no secret is stored. Raises `ForbiddenProblem` if `token_id` is not the token of
-    this request, and `ConflictProblem` if the token was rotated with another `rotation_id`, or if its successor was
+    If the replaced token is itself the successor of another token, that older token ends at once. The secret of the
+    successor is derived from the secret of the replaced token and from `rotation_id`. So a repeated request gets the
+    same successor, although no secret is stored. Raises `ForbiddenProblem` if `token_id` is not the token of this
+    request, and `ConflictProblem` if the token was already rotated with another `rotation_id`, or if the successor was
     revoked.
     """
     principal = tx.principal
@@ -49,7 +50,7 @@ def rotate_token(tx: Transaction, token_id: str, request: TokenRotation) -> NewT
 
 
 def _replace(tx: Transaction, old: Row[Any], request: TokenRotation) -> None:
-    """Store the successor of a token, and shorten the time for which the token and its predecessor are valid."""
+    """Store the successor of a token, and shorten the validity of the token and of the token's predecessor."""
     end_us = tx.now_us + request.grace_s * 1_000_000
     _end_by(tx, old.id, end_us, rotation_hash=hash_secret(request.rotation_id))
     if old.successor_of is not None:

@@ -1,11 +1,11 @@
 """Limits on wrong passwords and invitation codes, shared by all servers; they never lock out the owner of an account.
 
-Every try with a wrong password counts towards two limits: that of this account from this address, and that of this
-address for all accounts. If the address is unknown, which means that nobody has signed in to the account from it, the
-try also counts towards a third limit: that of the account from all unknown addresses together. The third limit does not
-apply to known addresses. So guesses from elsewhere never lock out an owner who signs in from a known address
-(docs/decisions/0020-sign-in-limits.md). For the code of an invitation, the prefix of the code takes the place of the
-account.
+Every try with a wrong password counts towards two limits: one for this account from this address, and one for this
+address with all accounts. If the address is unknown, which means that nobody has signed in to the account from it
+lately, the try also counts towards a third limit: one for this account from all unknown addresses together. The third
+limit does not apply to known addresses. So guesses from elsewhere never lock out an owner who signs in from a known
+address (docs/decisions/0020-sign-in-limits.md). For the code of an invitation, the prefix of the code takes the place
+of the account.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from marey_server.store.tables import sign_in_limit
 from marey_server.store.transaction import Transaction
 
 MORE_FOR_MANY = 10
-"""Factor by which the limit of one address, for all accounts, exceeds `per_minute`.
+"""Limit of one address for all accounts, as a multiple of `per_minute`.
 
-The limit of an account, from all unknown addresses, allows this many times `per_minute` tries at once, but then only
-`per_minute` tries a minute.
+The limit of one account for all unknown addresses allows the same number of tries at once, but then only `per_minute`
+tries a minute.
 """
 KNOWN_FOR_US = 90 * DAY_US
 """Time for which an address is known after a sign-in."""
@@ -68,7 +68,7 @@ def count(tx: Transaction, attempt: SignInTry) -> None:
 
 
 def forgive(tx: Transaction, attempt: SignInTry) -> None:
-    """Remove a try with the right password from the counts, and remember its address as known."""
+    """Remove a try with the right password from the counts, and remember the client's address as known."""
     take_back(tx, attempt)
     row = {"key": _known_key(attempt), "until_us": tx.now_us + KNOWN_FOR_US}
     remembered = tx.insert_into(sign_in_limit, row)
@@ -82,7 +82,7 @@ def take_back(tx: Transaction, attempt: SignInTry) -> None:
 
 
 def _limits(attempt: SignInTry, *, known: bool) -> Iterator[tuple[RateLimit, LimitScope]]:
-    """Yield the limits of a try, in the order in which every transaction locks their rows."""
+    """Yield the limits of a try in a fixed order, in which every transaction locks the rows of the limits."""
     few, many = attempt.per_minute, MORE_FOR_MANY * attempt.per_minute
     pair, address = key_of("pair", attempt.name, attempt.address), key_of("address", attempt.address)
     limits: list[tuple[RateLimit, LimitScope]] = [

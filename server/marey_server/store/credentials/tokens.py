@@ -1,4 +1,4 @@
-"""Bearer tokens: creation, revocation, and the principal that each belongs to."""
+"""Bearer tokens: creation, revocation, and the principal to whom a token belongs."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from marey_server.store.tables import attempt, job, token, user
 from marey_server.store.transaction import Transaction
 
 NOTE_USE_EVERY_S = 3600
-"""Precision of `last_used_at` in seconds; an update at each request would make each read a write."""
+"""Precision of `last_used_at` in seconds; if every request updated the time, every read would become a write."""
 
 KEPT_AFTER_END_US = 30 * DAY_US
 """Time for which an expired token is listed, so that its owner can see why a program stopped."""
@@ -120,8 +120,8 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
     """Return the principal of an attempt's token.
 
     Raises `LeaseLostProblem` if the attempt has lost the job, or if the author of the job has lost the right to run it.
-    The token is valid while the attempt holds its job. After the end of the attempt, for `REPLAY_GRACE_US`, it only
-    allows a repeated `complete` or `fail`, which gets the stored answer.
+    The token is valid while the attempt holds its job. For `REPLAY_GRACE_US` after the end of the attempt, the token
+    only allows a repeated `complete` or `fail`, which gets the stored answer.
     """
     row = tx.first(_ATTEMPT_TOKEN, {"hash": hash_secret(secret)})
     if row is None:
@@ -188,7 +188,7 @@ def _insert(
 
 
 def _labels_of(tx: Transaction, request: TokenCreate) -> Mapping[str, str] | None:
-    """Return the labels to which a new token is bound: those requested, or else those of the caller's token."""
+    """Return the labels to which a new token is bound: the requested ones, or else the labels of the caller's token."""
     claims_jobs = scopes.reaches_somewhere(request.scopes, "work")
     if request.labels is None:
         return tx.principal.labels if claims_jobs else None
@@ -206,7 +206,7 @@ def _labels_of(tx: Transaction, request: TokenCreate) -> Mapping[str, str] | Non
 
 
 def _end_of(tx: Transaction, request: TokenCreate) -> int | None:
-    """Return the time at which a new token expires, None if it never expires.
+    """Return the time at which a new token expires, or None if the token never expires.
 
     By default, the new token expires no later than the caller's own token. Raises `ForbiddenProblem` if the request
     explicitly sets a later time.
@@ -239,7 +239,7 @@ def _in_words(seconds: int) -> str:
 def list_tokens(
     tx: Transaction, wanted: TokenFilter = OWN_TOKENS, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
 ) -> Page:
-    """Return tokens, newest first, without their secrets: by default the caller's; administrators may list anybody's.
+    """Return the caller's tokens, or for an administrator the tokens of any user, newest first and without secrets.
 
     Raises `ForbiddenProblem`, or `NotFoundProblem` for a user whom the caller may not see.
     """
@@ -263,7 +263,7 @@ def list_tokens(
 
 
 def _id_of(tx: Transaction, name: str) -> str:
-    """Return the id of a user. Raises `NotFoundProblem` if there is none, or the caller is not an administrator."""
+    """Return the id of a user. Raises `NotFoundProblem` without such a user, or if the caller is no administrator."""
     unknown = NotFoundProblem(f"There is no user {name!r} that you may see.", code="no-user")
     require_administrator(tx.principal, hidden=unknown)
     found = tx.execute(select(user.c.id).where(user.c.name == name)).scalar()
@@ -278,9 +278,9 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
     With `with_created`, also revoke the successors and predecessors of this token, all tokens that were created with
     any of these, and so on.
 
-    Without `with_created`, only this token is revoked. Tokens that were created with the revoked token are then
-    recorded as created with its parent, the token with which it was itself created. If it was rotated, its successor is
-    recorded as the successor of its predecessor. A token may always revoke itself.
+    Without `with_created`, only this token is revoked, and its links are joined. For example, if A created the revoked
+    token B, and B created C, then C is recorded as created by A. The successor of B is recorded as the successor of B's
+    predecessor. A token may always revoke itself.
     """
     principal = tx.principal
     if principal.kind != "user" or token_id != principal.token_id:

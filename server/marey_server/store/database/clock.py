@@ -13,9 +13,9 @@ from sqlalchemy import Connection, insert, select, text, update
 from marey_server.store.tables import server_state
 
 FAR_AHEAD_DAYS = 366
-"""Days that a clock may be ahead of the stored time; if it is further ahead, somebody must confirm that it is right."""
+"""Days that a clock may be ahead of the stored time; a clock that is further ahead must be confirmed by an operator."""
 NOTABLY_AHEAD_S = 60
-"""Seconds that the stored time may be ahead of the machine's clock without a message in the log."""
+"""Number of seconds by which the stored time may be ahead of the machine's clock without a message in the log."""
 DAY_US = 86400 * 1_000_000
 _HIGH_WATER = "clock_high_water_us"
 _SAVE_EVERY_US = 1_000_000
@@ -40,9 +40,10 @@ class Clock(Protocol):
 class DatabaseClock:
     """Clock of the database: on Postgres the time of the Postgres server, on SQLite a clock that never goes back.
 
-    On SQLite it starts at the wall clock or the stored high-water mark, whichever is later, and is then advanced by the
-    monotonic clock, so that a jump of the wall clock neither extends nor ends a lease. If the wall clock is far ahead
-    of the stored time, the server does not start, because the stored time could not go back afterwards.
+    On SQLite, the clock starts at the wall clock or at the stored high-water mark (the latest time that earlier
+    processes may have used), whichever is later. Then it follows the monotonic clock, so that a jump of the wall clock
+    neither extends nor ends a lease. If the wall clock is far ahead of the stored time, the server does not start,
+    because the stored time could not go back afterwards.
     """
 
     def __init__(self) -> None:
@@ -91,8 +92,8 @@ def stored_high_water_us(connection: Connection) -> int:
 def save_high_water(connection: Connection, now_us: int) -> int:
     """Store a time after `now_us`, so that no restart uses an earlier time, whatever the wall clock says.
 
-    Returns the stored time: a second after `now_us`, or the time that was stored before if that is still later. Until
-    the clock reaches it, no other time needs to be stored.
+    Returns the stored time: a second after `now_us`, or the previously stored time if this is even later. Until the
+    clock reaches the returned time, no other time needs to be stored.
     """
     stored = stored_high_water_us(connection)
     if now_us < stored:

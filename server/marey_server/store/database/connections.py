@@ -1,6 +1,6 @@
 """Connections and transactions for SQLite and Postgres.
 
-Threads run transactions, and clients take turns to use them (see `lanes`). Other threads are reserved for short
+Threads run transactions, and clients take turns to use the threads (see `lanes`). Other threads are reserved for short
 transactions on which the server and its workers depend: heartbeats, claims, completions, readiness, sign-in and
 admission.
 
@@ -45,7 +45,7 @@ WRITE_TRIES = 5
 WRITE_BACKOFF = Backoff(first_s=0.02, longest_s=0.16, jitter=1.0)
 READ_TRIES = 3
 RESERVED_THREADS = 3
-"""Number of threads, and of connections, for short transactions that must not wait behind others."""
+"""Number of threads, and of connections, for short transactions that must not wait for other transactions."""
 
 _POSTGRES_SETTINGS = {
     "statement_timeout": "120s",
@@ -228,7 +228,7 @@ class Database:
         return lane.submit(client, self.write, principal, function)
 
     async def notifications(self, channel: str) -> AsyncGenerator[None]:
-        """Yield once when listening to a channel of Postgres has begun, and then after each notification.
+        """Listen to a channel of Postgres: yield once when this has begun, and then after each notification.
 
         Raises `UnavailableProblem` if the connection, which is outside of the pool, breaks.
         """

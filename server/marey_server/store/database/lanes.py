@@ -1,8 +1,8 @@
 """Lanes: groups of threads with a limited queue, in which clients take turns.
 
-A client that sends many requests delays only its own requests: the queue alternates between known and unknown
-clients, and between the clients within each group. A client is known if the server has accepted its token before. A
-queue is limited in total and for each client.
+A client that sends many requests delays only its own requests: the queue alternates between known and unknown clients,
+and between the clients within each group. A client is known if the server has accepted its token before. The length of
+a queue is limited, for each of the two groups and for each client.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 MOST_WAITING = 512
-"""Greatest number of calls that wait in a line for known clients, and the same for unknown clients."""
+"""Greatest number of waiting calls of known clients in a line; the same limit applies to unknown clients."""
 MOST_WAITING_EACH = 256
-"""Greatest number of calls that wait in a line for one client."""
+"""Greatest number of waiting calls of one client in a line."""
 RETRY_AFTER_S = 2
 
 
@@ -33,13 +33,13 @@ class Client:
 
     key: str
     known: bool = True
-    """Whether the server has accepted the client's token before, and has not often refused its requests lately."""
+    """Whether the server accepted the client's token before, and has not often refused the client's requests lately."""
     is_gone: Callable[[], bool] = bool
-    """Whether nobody waits for the result any more; then the call is not begun."""
+    """Returns whether nobody waits for the result any more; such a call is not begun."""
 
 
 SERVER = Client("server")
-"""Client in whose name the server runs calls of its own, such as housekeeping."""
+"""Client that stands for the server itself, in calls such as housekeeping."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,8 @@ class _QueuedCall:
 def finish(future: Future[Any], function: Callable[[], Any]) -> None:
     """Set a future to the result or the error of a function.
 
-    A `StopIteration` is replaced by a `RuntimeError`: a future cannot hold it, so the waiting request would never end.
+    A `StopIteration` is replaced by a `RuntimeError`: a future cannot hold a `StopIteration`, so the waiting request
+    would never end.
     """
     try:
         result = function()
@@ -111,7 +112,7 @@ class FairLine(Generic[T]):
         self._lengths[client.known] += 1
 
     def take(self, may_run: Callable[[Client], bool] = lambda _client: True) -> T | None:
-        """Remove and return the next element of any client that may run one more; None if there is none."""
+        """Remove and return the next element of a client for whom `may_run` is true; None without such a client."""
         for group in (self._next_group, not self._next_group):
             for key, line in self._groups[group].items():
                 client, one = line[0]

@@ -95,6 +95,6 @@ def _shown(url: str) -> str:
 
 
 def _reason(error: BaseException | None) -> str:
-    """Return the first line of an error's message, if possible of the error that the database driver raised."""
+    """Return the first line of the message of the driver's error, or of `error` if there is no driver's error."""
     text = str(getattr(error, "orig", None) or error).strip()
     return text.splitlines()[0] if text else "no reason is given"

@@ -1,8 +1,8 @@
 """Prepared statements: compiled once by SQLAlchemy, then passed to the driver as text.
 
-SQLAlchemy spends about 55 µs on a statement that SQLite answers in 10 µs: it looks up the compiled form, and builds a
-context and a result with metadata for each execution. A prepared statement stores the text, the order of the parameters
-and the conversions of values at its first run (docs/decisions/0012).
+SQLAlchemy spends about 55 µs on a statement that SQLite answers in 10 µs: for each execution, SQLAlchemy looks up the
+compiled form, and builds a context and a result with metadata. A prepared statement stores the text, the order of the
+parameters and the conversions of values at its first run (docs/decisions/0012).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MOST_FORMS = 64
 class Prepared:
     """Statement of SQLAlchemy Core with `bindparam`s; lists are parameters with `expanding=True`.
 
-    An INSERT without values sets the columns that its parameters name; the others get their defaults.
+    An INSERT without values sets the columns named in the parameters of the run; the other columns get their defaults.
     """
 
     def __init__(self, statement: Statement) -> None:
@@ -72,7 +72,7 @@ class Prepared:
 def padded(values: Iterable[T]) -> list[T]:
     """Extend a list for `IN` to a length that is a power of two, by repeating its last value.
 
-    So statements are compiled for few lengths only.
+    So a statement is compiled only for a few lengths.
     """
     known = list(values)
     return known + known[-1:] * ((1 << max(len(known) - 1, 0).bit_length()) - len(known))
@@ -144,7 +144,7 @@ def _compile(statement: Statement, dialect: Dialect, parameters: Parameters) -> 
 
 
 def _row_maker(statement: Any, dialect: Dialect) -> Convert | None:
-    """Return a function that makes named tuples from the driver's rows; None if there are no rows."""
+    """Return a function that makes named tuples from the driver's rows; None for a statement that returns no rows."""
     columns = statement.exported_columns
     if not columns:
         return None

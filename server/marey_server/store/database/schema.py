@@ -21,7 +21,7 @@ _CHECKOUT = Path(__file__).parents[4] / "migrations"
 
 
 def upgrade_schema(url: str) -> None:
-    """Create or upgrade the tables of the database at `url`, all or nothing; concurrent calls run in turn."""
+    """Create or upgrade the tables of the database at `url`, all or nothing; concurrent calls run one after another."""
     database = Database(url, readers=1)
     try:
         database.write(SYSTEM, _upgrade)

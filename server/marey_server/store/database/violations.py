@@ -22,7 +22,7 @@ def is_unique_violation(error: exc.IntegrityError) -> bool:
 def taken(error: ApiProblem) -> Iterator[None]:
     """Raise `error` if a statement in the `with` block violates a unique index.
 
-    The transaction cannot be used afterwards.
+    After such a violation, the transaction cannot be used any more.
     """
     try:
         yield

@@ -1,11 +1,12 @@
 """Write-ahead log of an SQLite database.
 
 A commit appends pages to the log. From time to time these pages must be copied into the database file, so that the log
-can start again from its beginning. By default, SQLite copies them at the end of a commit, and all other writes wait for
-this. Here a thread copies them while writes go on; when few pages are left, the writing thread restarts the log.
+can start again from its beginning. By default, SQLite copies the pages at the end of a commit, and all other writes
+wait until the copy is complete. Here a thread copies the pages while writes go on. When few pages are left, the thread
+that writes to the database copies them and restarts the log.
 
 After a crash, SQLite reads the log when the database is opened. When the last connection to the database closes, SQLite
-copies the rest.
+copies the rest of the log.
 """
 
 from __future__ import annotations
@@ -27,16 +28,16 @@ FRAME_BYTES = PAGE_BYTES + 24
 SHORT_BYTES = 4 * 2**20
 """Length of the log up to which nothing is copied. SQLite shortens the file to this length after restarting the log."""
 LITTLE_BYTES = 3 * 2**20
-"""Number of bytes that the writing thread may copy when it restarts the log."""
+"""Greatest number of bytes that the writing thread copies before it restarts the log."""
 LONG_BYTES = 16 * 2**20
 """Length of the log above which uploads wait, so that the copying thread can keep pace."""
 TOO_LONG_BYTES = 64 * 2**20
 """Length of the log above which the writing thread waits longer for readers in order to restart the log."""
 PATIENCE_MS = 10
 LONG_PATIENCE_MS = 250
-"""Milliseconds to wait for readers if the log is too long: longer than most reads, shorter than a backup."""
+"""Milliseconds to wait for readers if the log is longer than `TOO_LONG_BYTES`: enough for reads, not for a backup."""
 PAUSES = 20
-"""Pause after readers prevented a restart of the log, as a multiple of the time spent waiting for them."""
+"""Pause after readers prevented a restart of the log, as a multiple of the time spent waiting for the readers."""
 
 
 class WriteAheadLog:
@@ -85,7 +86,7 @@ class WriteAheadLog:
             return 0
 
     def _copy(self) -> None:
-        """Copy the log in passes, until one copies at most `LITTLE_BYTES`."""
+        """Copy the log in passes, until a pass copies at most `LITTLE_BYTES`."""
         try:
             copied_before = self._copied_bytes
             self._copied_bytes = self._copy_once()
@@ -128,7 +129,7 @@ class WriteAheadLog:
             self._copied_bytes = 0
 
     def _note_failure(self, error: sqlite3.Error) -> None:
-        """Log an error, but not its repetitions; the next commit tries again."""
+        """Warn about an error, but not about its repetitions; the next commit tries again to copy the log."""
         if not self._failing:
             log.warning("the log of the database %s cannot be copied, and grows: %s", self._file, error)
         self._failing = True

@@ -1,7 +1,7 @@
-"""Lane of writes to SQLite: they run one after another, and waiting writes share a transaction.
+"""Lane of writes to SQLite: writes run one after another, and waiting writes share a transaction.
 
-A commit waits for the disk, which takes longer than most writes. So waiting writes share one commit: each runs under a
-savepoint, a refused write rolls back only its own part, and each is answered after the commit.
+A commit waits for the disk, which takes longer than most writes. So waiting writes share one commit. Each write runs
+under a savepoint, so a refused write rolls back only its own part. All writes are answered after the commit.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class _Write:
 
 
 class WriteLane:
-    """Thread that runs writes. `write(principal, function)` runs a function in a transaction and commits.
+    """Thread that runs writes; `write(principal, function)` must run a function in a transaction and commit.
 
     Clients take turns, as in every lane; reserved writes, such as heartbeats, come before all others.
     """
@@ -55,7 +55,7 @@ class WriteLane:
     def submit(
         self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False
     ) -> Future[T]:
-        """Queue `function(tx)`; the future holds its return value once the transaction is committed.
+        """Queue `function(tx)`; once the transaction is committed, the future holds what the function returned.
 
         Raises `UnavailableProblem` if too many writes are waiting.
         """
@@ -88,7 +88,7 @@ class WriteLane:
         return taken
 
     def _write_together(self, group: Sequence[_Write]) -> bool:
-        """Run writes in one transaction; return whether it was committed. An unexpected error rolls back all."""
+        """Run writes in one transaction; return whether it was committed. An unexpected error rolls back all writes."""
         completions: list[Callable[[], Any]] = []
 
         def run_all(tx: Transaction) -> None:

@@ -21,7 +21,7 @@ PART = "annotation"
 AT_ONCE = 100
 """Greatest number of annotations that are loaded with one set of SQL statements."""
 MOST_MERGED = 1_000
-"""Greatest number of annotations that one merge combines. It limits how long other writers wait for the commit."""
+"""Greatest number of annotations that one merge combines. This bounds how long other writers wait for the commit."""
 MOST_MERGED_BY_JOB = 50
 """Greatest number of annotations that the commit of a job's outputs merges.
 
@@ -37,7 +37,7 @@ class AnnotationMerger:
     """Merges annotations of one project, and keeps the resulting documents until a commit stores them."""
 
     def __init__(self, tx: Transaction, project_id: str, most: int | None = None) -> None:
-        """Create a merger of at most `most` annotations (by default `MOST_MERGED`); all others become conflicts."""
+        """Create a merger of at most `most` annotations (by default `MOST_MERGED`); further ones become conflicts."""
         self._tx = tx
         self._project_id = project_id
         self._most = MOST_MERGED if most is None else most
@@ -82,9 +82,9 @@ class AnnotationMerger:
         ]
 
     def _find_documents(self, wanted: Iterable[str]) -> dict[str, str]:
-        """Return the digests of the documents of annotations, by the content digests of their revisions.
+        """Return the digests of the documents of annotation revisions, by the content digests of the revisions.
 
-        `wanted` are content digests of revisions; revisions that the project does not have are left out.
+        `wanted` are the content digests; revisions that the project does not have are left out.
         """
         held = revisions_with(self._tx, self._project_id, wanted)
         parts = read_part_digests(self._tx, set(held.values()))
@@ -95,8 +95,8 @@ class AnnotationMerger:
     ) -> AnnotationClash | None:
         """Return the reason why an annotation is not merged, or None if its three versions can be loaded.
 
-        `three` are the content digests of the base, our version and their version; `digests` maps these to the digests
-        of the documents, and `sizes` maps the latter to sizes in bytes.
+        `three` are the content digests of the base, our version and their version. `digests` maps content digests to
+        digests of documents, and `sizes` maps digests of documents to sizes in bytes.
         """
         if not three:
             return ADDED_TWICE
@@ -107,7 +107,7 @@ class AnnotationMerger:
         return self._too_many if self._loaded > self._most or self._loaded_bytes > MOST_BYTES else None
 
     def _merge_versions(self, bodies: Sequence[Mapping[str, Any]], contents: Contents) -> str | AnnotationClash:
-        """Merge the documents of the base, our side and their side; return the content digest of the result."""
+        """Merge the documents of the base, our side and their side; return the result's content digest, or a clash."""
         merged = merge_annotations(*(_version(body, contents) for body in bodies))
         if isinstance(merged, AnnotationClash):
             return merged
@@ -120,9 +120,9 @@ class AnnotationMerger:
 
 
 def _contents_of(one: ChangedPart) -> tuple[str, ...]:
-    """Return the content digests of the revisions with the base, with our version and with their version of a part.
+    """Return the content digests of the entry to which a part belongs: in the base, on our side, on their side.
 
-    If the part has no base, the result is empty.
+    If the part does not exist in the base, the result is empty.
     """
     return () if one.base is None else (one.base.content, one.ours.content, one.theirs.content)
 

@@ -117,8 +117,9 @@ class _Checkout:
     def _documents(self, entries: Iterable[DatasetEntry]) -> dict[str, tuple[str, Mapping[str, str]]]:
         """Find, for the content of each entry, an item with a revision that has this content.
 
-        Returns, by content digest, the id of the item, and the digests of the documents of the revision by name of the
-        part. Raises `InvalidProblem` if the project does not have the content of an entry.
+        Returns a mapping from the content digest to the id of the item and the parts of the revision. The parts map the
+        name of each part to the digest of its document. Raises `InvalidProblem` if the project does not have the
+        content of an entry.
         """
         wanted = {entry.content: entry for entry in entries}
         held = revisions_with(self.tx, self.project.id, wanted)
@@ -183,7 +184,7 @@ class _Checkout:
         )  # fmt: skip
 
     def _can_restore(self, kind: Kind, item_id: str) -> bool:
-        """Return whether an item is deleted, may be restored, and no other item has its former folder and name."""
+        """Return whether an item is deleted and may be restored, and no other item has its former folder and name."""
         former = (
             select(item.c.name, collection.c.path, collection.c.deleted_us)
             .join(collection, collection.c.id == item.c.collection_id)

@@ -1,4 +1,4 @@
-"""Database storage of the chunks of which trees of dataset entries consist."""
+"""Storage, in the database, of the chunks that make up trees of dataset entries."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ class PreparedCommit:
     dataset_id: str
     branch: str
     head: str | None
-    """Commit at which the branch must still be."""
+    """Newest commit that the branch must still have when the move is recorded."""
     parents: tuple[str, ...]
     message: str
     write_id: str | None
@@ -68,10 +68,10 @@ class PreparedCommit:
     combined: Sequence[CombinedEntry] = ()
     """Entries that combine changes of both sides of a merge; the project may not have revisions of them yet."""
     documents: Mapping[str, PreparedDocument] = field(default_factory=dict)
-    """Documents of the entries in `combined` that are not stored yet, by content digest."""
+    """Documents that are not stored yet, of the entries in `combined`, by content digest."""
     of_folder: bool = False
     existing: str | None = None
-    """Existing commit to which the branch moves, in place of a new one."""
+    """Existing commit to which the branch moves; None if the branch moves to a new commit."""
     recorded: str | None = None
     """Commit that an earlier request with the same `write_id` has recorded, so that nothing is left to do."""
     last_purge: int = 0
@@ -169,9 +169,9 @@ def move_branch_to(tx: Transaction, prepared: PreparedCommit, digest: str, mover
 
 
 def recorded_as(tx: Transaction, dataset_id: str, write_id: str | None) -> str | None:
-    """Return the commit that an earlier request with this `write_id` recorded, or to which it moved a branch.
+    """Return the commit that an earlier request with this `write_id` recorded, or to which that request moved a branch.
 
-    Returns None if there is no such request.
+    Returns None if there was no such request.
     """
     if write_id is None:
         return None
@@ -183,7 +183,7 @@ def recorded_as(tx: Transaction, dataset_id: str, write_id: str | None) -> str |
 
 
 def head_of(tx: Transaction, dataset_id: str, branch: str, expected: str | None) -> str | None:
-    """Return the digest of the newest commit of a branch, None if it has none.
+    """Return the digest of the newest commit of a branch, or None if the branch has no commits.
 
     Raises `NotFoundProblem` for an unknown branch, `InvalidProblem` for a tag, and `ConflictProblem` if the branch is
     not at the expected commit.
@@ -202,7 +202,7 @@ def head_of(tx: Transaction, dataset_id: str, branch: str, expected: str | None)
 def branch_moved(branch: str, head: str | None) -> ConflictProblem:
     """Return the error for a branch whose newest commit is not the expected one.
 
-    `head` is the digest of its newest commit; the client finds it in `context.commit`.
+    `head` is the digest of the newest commit; the client finds this digest in `context.commit`.
     """
     return ConflictProblem(
         f"The branch {branch!r} has moved. Read it again, then repeat the commit.",
@@ -227,7 +227,7 @@ def insert_commit(
     write_id: str | None = None,
     job_id: str | None = None,
 ) -> None:
-    """Store a commit whose tree and parents are stored; `entries` is the number of its entries."""
+    """Store a commit whose tree and parents are stored already; `entries` is the number of entries of the tree."""
     above = select(dataset_commit.c.generation).where(
         dataset_commit.c.dataset_id == dataset_id, dataset_commit.c.digest.in_(record.parents)
     )
@@ -268,10 +268,10 @@ def _require_checked_out(found: Row[Any], parent: str | None) -> None:
 def _from_folder(
     tx: Transaction, project_row: ProjectRow, found: Row[Any], store: StoredChunks, before: str | None
 ) -> tuple[str, Contents]:
-    """Store the items in the dataset's folder as a tree of entries.
+    """Store a tree of entries that is made from the items in the dataset's folder.
 
-    If there is an earlier tree `before`, only the differences between this tree and the folder are applied to it.
-    Returns the digest of the root of the tree, and the content digests of the items.
+    If there is an earlier tree `before`, only the entries that differ from it are changed. Returns the digest of the
+    root of the tree, and the content digests of the items.
     """
     state = read_folder(tx, project_row, found)
     if before is None:
@@ -285,7 +285,7 @@ def _from_folder(
 def _from_changes(
     tx: Transaction, project_row: ProjectRow, store: StoredChunks, before: str | None, changes: Sequence[EntryChange]
 ) -> tuple[str, Contents]:
-    """Apply changes, in their order, to the tree `before`, or to an empty tree if it is None.
+    """Apply changes, in their order, to the tree `before`, or to an empty tree if `before` is None.
 
     Returns the digest of the root of the resulting tree, and the content digests of the revisions in the changes.
     """

@@ -1,4 +1,4 @@
-"""Digests of the content of revisions, which are the same on every server.
+"""Content digests of revisions; equal content has the same digest on every server.
 
 A digest is computed when a commit first needs it, and stored with the revision.
 """
@@ -122,8 +122,8 @@ def _among(wanted: Collection[RevisionKey]) -> tuple[ColumnElement[bool], ...]:
     """Return SQL conditions that the parts of all wanted revisions meet.
 
     Ids and numbers are compared separately, because SQLite would scan the whole table to compare pairs. So the parts of
-    a revision that is not wanted meet the conditions, too, if its id and its number each occur in `wanted`. Callers
-    skip such parts.
+    a revision that is not wanted meet the conditions, too, if the id and the number of this revision each occur in
+    `wanted`. Callers skip such parts.
     """
     ids, numbers = {one.item for one in wanted}, {one.revision for one in wanted}
     return revision_part.c.item_id.in_(sorted(ids)), revision_part.c.number.in_(sorted(numbers))

@@ -30,11 +30,11 @@ from marey_versions.tree.chunks import Value
 from marey_versions.tree.reading import ChunkReader, Tree
 
 MOST_EXAMINED = 1000
-"""Greatest number of commits that one request reads to find those that changed a path."""
+"""Greatest number of commits that one request reads to find the commits that changed a path."""
 MOST_DIFFERENCES = 100_000
 """Greatest number of differing entries that are counted in one answer."""
 MOST_QUOTED = 200
-"""Greatest number of characters of the message of a commit that an error quotes."""
+"""Greatest number of characters that an error quotes from the message of a commit."""
 
 
 def read_commit(tx: Transaction, project: str, name: str, version: str) -> Commit:
@@ -122,9 +122,9 @@ def _listed(row: Row[Any], parents: Sequence[str], change: ChangeAtPath | None) 
 def _changing(
     tx: Transaction, commits: Sequence[Row[Any]], path: str, limit: int
 ) -> tuple[list[tuple[Row[Any], ChangeAtPath | None]], Sequence[Row[Any]]]:
-    """Return the commits that changed a path, at most `limit`, and the commit, if any, at which the next page begins.
+    """Return at most `limit` commits that changed a path, and the commit with which the next page begins.
 
-    In `commits`, each commit is followed by its first parent.
+    The second result is empty if there is no next page. In `commits`, each commit is followed by its first parent.
     """
     comparer = PathComparer(ChunkReader(StoredChunks(tx)), path, MOST_DIFFERENCES)
     found: list[tuple[Row[Any], ChangeAtPath | None]] = []
@@ -163,7 +163,7 @@ def read_origins(tx: Transaction, project: str, name: str, version: str, *, path
 def _no_entry(tx: Transaction, dataset_id: str, start: str, path: str, kind: Kind) -> NotFoundProblem:
     """Return the error for an entry that a version does not have; it names the commit that removed or moved the entry.
 
-    The commit is searched along the first parents, through `MOST_EXAMINED` commits.
+    The search for this commit follows first parents, through at most `MOST_EXAMINED` commits.
     """
     reader, missing = ChunkReader(StoredChunks(tx)), f"The version has no {kind.value} at {path!r}"
     commits = _along_first_parents(tx, dataset_id, start, MOST_EXAMINED)
@@ -205,7 +205,7 @@ class _ReadCommit:
 
 
 class CommitReader:
-    """Reads commits of a dataset, and remembers those that were read."""
+    """Reads commits of a dataset, and reads no commit twice."""
 
     def __init__(self, tx: Transaction, dataset_id: str) -> None:
         self._tx = tx
@@ -259,7 +259,7 @@ class VersionEntries(NamedTuple):
 
     commit: str
     folder: str
-    """Path of the dataset's folder, empty if it has none."""
+    """Path of the dataset's folder, empty if the dataset has no folder."""
     found: tuple[EntryRevision, ...]
     missing: tuple[DatasetEntry, ...]
     """Entries whose content is not in any revision of the project."""
@@ -298,7 +298,7 @@ def shown_entry(entry: DatasetEntry, held: Mapping[str, tuple[str, int]]) -> Ent
 def revisions_with(tx: Transaction, project_id: str, contents: Iterable[str]) -> dict[str, tuple[str, int]]:
     """Find, for each content digest, a revision of the project that has this content.
 
-    A revision of a deleted item is used only if no other item has the content.
+    A revision of a deleted item is used only if no item that is not deleted has the content.
     """
     wanted = sorted(set(contents))
     found: dict[str, tuple[str, int]] = {}

@@ -44,7 +44,7 @@ from marey_versions.tree.editing import change
 from marey_versions.tree.reading import Tree
 
 LARGE_MERGE = "large-merge"
-"""Code of the error for a merge with too many changes to be previewed."""
+"""Code of the error for a merge that is not computed, because one side has more changes than the caller allows."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,8 @@ def _start(
 ) -> PreparedMerge:
     """Return a merge of the commit `theirs` into the branch that `request` names; the result is not computed yet.
 
-    `commit.recorded` is set if an earlier request has recorded the merge; `message` is used if the request has none.
+    `commit.recorded` is set if an earlier request has recorded the merge. `message` is the message of the commit if
+    the request contains none.
     """
     recorded = recorded_as(tx, found.id, request.write_id)
     ours = head_of(tx, found.id, request.into, None if recorded else request.expected)
@@ -184,9 +185,9 @@ def record_merge(
     merge: PreparedMerge,
     mover: Mover | None = None,
 ) -> MergeAnswer:
-    """Record the result of a merge, cherry-pick or revert on behalf of `mover`, by default the caller; return it.
+    """Record the result of a merge, cherry-pick or revert on behalf of `mover`, by default the caller.
 
-    A preview is returned without being recorded.
+    Returns the result. If the request asks for a preview, nothing is recorded.
 
     Raises `ConflictProblem` if there are conflicts without a resolution, or if the branch has moved.
     """
@@ -239,7 +240,7 @@ def _shown_segments(clash: LabelClash[LabelledRange]) -> ConflictingSegments:
 
 
 def _common(tx: Transaction, dataset_id: str, ours: str, theirs: str) -> str | None:
-    """Return the merge base of two commits: their nearest common ancestor, or None if they have none.
+    """Return the merge base of two commits: their nearest common ancestor, or None if there is none.
 
     Raises `ConflictProblem` if there are several merge bases, none of which is an ancestor of another.
     """

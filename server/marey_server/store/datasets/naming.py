@@ -297,7 +297,7 @@ def resolve(tx: Transaction, dataset_id: str, version: str) -> str:
 
 
 def first_parents(dataset_id: str, start: str, steps: int) -> CTE:
-    """Return a query for a commit and the commits before it, from each commit to its first parent.
+    """Return a query for a commit and the commits before it, found by following first parents.
 
     The rows have the columns `digest` and `place`. The commit `start` has the place 0, its first parent the place 1,
     and so on, up to the place `steps`.

@@ -1,4 +1,4 @@
-"""Plans of commits of the outputs of jobs: the outputs are merged with what others have committed; nothing is written.
+"""Plans for committing the outputs of jobs. A plan merges the outputs with the commits of others, and writes nothing.
 
 A plan is computed in the transaction that records it, or, for many outputs, in an earlier read transaction. If others
 have moved the branch since then, `follow` adds their changes to the plan, unless they concern the same entries.
@@ -55,7 +55,7 @@ class OutputEntries:
     author_id: str | None
     """Author of the job."""
     replaced: str | None = None
-    """Folder in which all entries of `kinds` that are not outputs of the job are removed; None: nothing is removed."""
+    """Folder from which all entries of `kinds` are removed, except outputs of the job; if None, nothing is removed."""
     kinds: Collection[str] = ()
     """Kinds of the entries that are removed from the folder `replaced`."""
 
@@ -67,11 +67,11 @@ class PlannedCommit:
     head: str | None
     """Newest commit of the branch when the plan was computed."""
     refused: CommitConflict | None = None
-    """Reason why the outputs cannot be committed; then the fields below are empty."""
+    """Reason why the outputs cannot be committed; if there is one, the fields below are empty."""
     head_tree: str = ""
     """Tree of the commit `head`."""
     tree: str = ""
-    """Tree with the outputs; if there are conflicts, it is based on the commit from which the job started."""
+    """Tree of `head` with the outputs; if there are conflicts, the tree of `OutputEntries.base` with the outputs."""
     count: int = 0
     """Number of entries of `tree`."""
     chunks: Mapping[str, bytes] = field(default_factory=dict)
@@ -89,7 +89,7 @@ def plan_outputs(tx: Transaction, wanted: OutputEntries, head: str | None, most:
     """Compute the commit of the outputs of a job to a branch whose newest commit is `head`.
 
     The commit is refused if it would add, change and remove more than `most` entries in total, if a path is too long,
-    or if more than `MOST_COMBINED` entries have changes of the job and of others.
+    or if both the job and others have changed more than `MOST_COMBINED` entries.
     """
     store = StoredChunks(tx)
     reader = ChunkReader(store)
@@ -114,9 +114,9 @@ def plan_outputs(tx: Transaction, wanted: OutputEntries, head: str | None, most:
 def follow(tx: Transaction, wanted: OutputEntries, planned: PlannedCommit, head: str | None) -> PlannedCommit | None:
     """Return a plan for the commit `head`, to which others have moved the branch since the plan was computed.
 
-    The new plan keeps all chunks of `planned`, even those that were stored already, because a purge may have deleted
-    them: it deletes chunks that only a deleted dataset needs. Returns None if the plan must be computed again, because
-    others have changed the same entries as the job, or too many entries.
+    The new plan keeps all chunks of `planned`. Some of them were stored already, but a purge may have deleted these
+    again, because it deletes chunks that only a deleted dataset needs. Returns None if the plan must be computed again,
+    because others have changed the same entries as the job, or too many entries.
     """
     if planned.head == head or planned.merged.conflicts:  # the commit to a branch of its own stays as it is
         return planned
@@ -170,7 +170,7 @@ def _unfit(entries: Mapping[str, DatasetEntry | None], most: int) -> CommitConfl
 def too_many_changes(most: int, verb: str) -> CommitConflict:
     """Return the conflict of a job whose commit would have more than `most` changes.
 
-    `verb` is the verb phrase of the error text, such as `changes`.
+    `verb` is the verb of the error text, such as `changes`.
     """
     return CommitConflict(
         code="too-many-changes",
@@ -211,7 +211,7 @@ def _compared(before: DatasetEntry | None, after: DatasetEntry | None) -> Compar
 def _is_in_folder(
     tx: Transaction, wanted: OutputEntries, head: str | None, changes: Mapping[str, Value | None]
 ) -> bool:
-    """Return whether the dataset's folder contains a commit's changes already, so that it counts as checked out.
+    """Return whether the dataset's folder has all changes of a commit, so that the commit counts as checked out.
 
     For this, the commit `head`, the parent of the new commit, must be checked out in the folder. Also, each entry in
     `changes` must be the newest revision of an item at the entry's path in the folder.
@@ -244,4 +244,4 @@ def _is_in_folder(
 
 
 FOLDER = select(collection.c.path).join(dataset, dataset.c.collection_id == collection.c.id)
-"""Path of the folder of a dataset."""
+"""Query for the path of the folder of a dataset."""

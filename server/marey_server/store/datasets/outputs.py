@@ -1,9 +1,9 @@
 """Commits of the outputs of jobs, made in the transactions that end the jobs.
 
-The row of the branch is locked before its tree is read, so that commits of several jobs to one branch follow each
-other and none is lost. If the branch has moved since the job started, the outputs are merged with the changes of
-others. If others have changed the same part of an entry, the outputs are committed to a new branch, which is named
-after the job.
+The row of the branch is locked before the tree of the branch is read, so that several jobs commit to one branch one
+after another, and no commit is lost. If the branch has moved since the job started, the outputs are merged with the
+changes of others. If others have changed the same part of an entry, the outputs are committed to a new branch, which is
+named after the job.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def _record_plan(tx: Transaction, wanted: OutputEntries, mover: Mover, planned: 
 
 
 def _store_combined(tx: Transaction, wanted: OutputEntries, planned: PlannedCommit) -> None:
-    """Store the revisions of those entries that have changes of the job and of somebody else."""
+    """Store the revisions of the entries that combine changes of the job with changes of others."""
     if planned.merged.combined:
         folder = tx.execute(FOLDER.where(dataset.c.id == wanted.dataset_id)).scalar()
         store_combined(
@@ -140,9 +140,9 @@ def _on_own_branch(tx: Transaction, wanted: OutputEntries, mover: Mover, planned
     """Commit the outputs of a job to a new branch, because they conflict with changes of the intended branch.
 
     The new branch begins at the commit from which the job started. `planned` is the commit that was planned for the
-    intended branch; its conflicts are the paths that changed on this branch while the job ran. Returns the new commit,
-    with a description of the conflict. If the dataset already has `MOST_REFS` branches and tags, no commit is made, and
-    only the description is returned.
+    intended branch; its conflicts are the paths that changed on the intended branch while the job ran. Returns the new
+    commit, with a description of the conflict. If the dataset already has `MOST_REFS` branches and tags, no commit is
+    made, and only the description is returned.
     """
     paths = sorted({path_and_kind(one.key)[0] for one in planned.merged.conflicts})
     changed = f"{counted(len(paths), 'path')} of the outputs changed on {wanted.branch!r} while the job ran"
@@ -168,7 +168,7 @@ def _on_own_branch(tx: Transaction, wanted: OutputEntries, mover: Mover, planned
 
 
 def _create_branch(tx: Transaction, wanted: OutputEntries, digest: str) -> str:
-    """Create a branch named after the id of the job, with a number if that name is taken; return the name."""
+    """Create a branch named after the id of the job, with a number added if this name is taken; return the name."""
     for number in count(1):
         name = wanted.job_id if number == 1 else f"{wanted.job_id}-{number}"
         row = new_ref(tx, wanted.dataset_id, name, RefKind.BRANCH, digest)

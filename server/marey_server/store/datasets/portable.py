@@ -26,8 +26,8 @@ def check_export(tx: Transaction, project: str, name: str, request: ExportCheck)
     """Check that revisions of a dataset may be exported.
 
     Clips whose consent has ended may be exported if the request allows it; an event then names them. Raises
-    `ConflictProblem` if the consent has ended and the request does not allow the export, and `ForbiddenProblem` if it
-    allows the export, but the caller is not a maintainer or an owner, or lacks the scope `write`.
+    `ConflictProblem` if the consent has ended and the request does not allow the export, and `ForbiddenProblem` if
+    the request allows the export, but the caller is not a maintainer or an owner, or lacks the scope `write`.
     """
     role = Role.MAINTAINER if request.allow_expired_consent else Role.READER
     project_row = projects.require(tx, project, at_least=role)
@@ -46,8 +46,8 @@ def check_export(tx: Transaction, project: str, name: str, request: ExportCheck)
 def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> dict[str, Any]:
     """Load the requested revisions of a project by content digest, and the requested documents with encoded arrays.
 
-    A revision or document that the project does not have is None. If the documents together are too large, the last
-    ones are left out; the first document is always loaded.
+    A revision or document that the project does not have is None. If the documents together are too large, the list of
+    documents ends early; it always contains the first one.
     """
     project_row = projects.require(tx, project)
     wanted = {*request.revisions, *(one.content for one in request.documents)}
@@ -62,7 +62,7 @@ def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> di
 def _described(
     tx: Transaction, held: Mapping[str, RevisionKey], contents: Contents, request: ContentsRequest
 ) -> list[dict[str, Any] | None]:
-    """Return the kind and the content digests of the parts of each revision that was requested."""
+    """Return, for each requested revision, its kind and the content digests of its parts, or None if it is missing."""
     keys = {one: held[one] for one in request.revisions if one in held}
     ids = sorted({key.item for key in keys.values()})
     kinds = {row.id: row.kind for row in tx.execute(select(item.c.id, item.c.kind).where(item.c.id.in_(ids)))}
@@ -88,9 +88,9 @@ def _loaded(tx: Transaction, held: Mapping[str, RevisionKey], request: ContentsR
 
 
 def _that_fit(digests: list[str | None], sizes: Mapping[str, int]) -> list[str | None]:
-    """Return as many of the first digests as have documents of at most `MOST_BYTES_AT_ONCE` bytes in total.
+    """Cut the list of digests so that the documents have at most `MOST_BYTES_AT_ONCE` bytes in total.
 
-    The first digest is always returned, even if its document is larger.
+    The first digest is always kept, even if its document is larger than this.
     """
     size_bytes = 0
     for place, digest in enumerate(digests):

@@ -22,7 +22,7 @@ CODE = "branch-protected"
 class Mover:
     """User on whose behalf a branch is moved.
 
-    `by_proposal` is true if the move is the merge of a proposal. `user_id` is needed where items are created.
+    `by_proposal` is true if the move is the merge of a proposal. `user_id` is needed if the move creates items.
     """
 
     name: str

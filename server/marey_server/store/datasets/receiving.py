@@ -1,4 +1,4 @@
-"""Receipt of versions from archives and other servers; their revisions and commits keep their digests.
+"""Receipt of versions from archives and other servers; received revisions and commits keep their digests.
 
 For each received revision that the project lacks, a new item is created. If the revision is the content of a dataset
 entry, the item is hidden, and no folder shows it. Other items, such as the skeletons of clips, are in the folder
@@ -45,7 +45,7 @@ from marey_versions.tree.editing import change
 from marey_versions.tree.reading import Tree
 
 IMPORTED = "imported"
-"""Folder of the items of revisions that are not entries, with one folder for each kind."""
+"""Folder of the items of revisions that are not entries; it has a subfolder for each kind of item."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def _stored(one: ReceivedRevision, part: str, content: str, local: LocalRevision
 def store_revisions(
     tx: Transaction, project: str, name: str, drafts: Mapping[str, Draft], local: LocalRevisions
 ) -> StoredRevisions:
-    """Store received revisions; `drafts` maps the content digest of each to its draft, made with `local`.
+    """Store received revisions; `drafts` maps content digests to drafts that were made with `local`.
 
     If a revision is the content of a dataset entry, its item is hidden. Raises `InvalidProblem` if the content digest
     of a stored revision is not the one that the request gives, and `ConflictProblem` if items were purged since the

@@ -1,4 +1,4 @@
-"""Creation of revisions for entries of a dataset whose content no item of the project has.
+"""Creation of revisions for dataset entries, if no item of the project has the content of the entry.
 
 Such content was sent by another server, or combined by a merge. For each such entry, a new hidden item is created, so
 that no folder changes; a checkout later shows the item at the path of the entry.
@@ -56,8 +56,8 @@ def publish_contents(
 ) -> int:
     """Publish those drafts whose content the project does not have; return their number.
 
-    `drafts` maps the content digest of each revision to its draft. `rights` may be None only if all drafts are hidden,
-    as for `publish`. Raises `InvalidProblem` if the content digest of a published revision is not its key in `drafts`.
+    `drafts` maps the content digest of each revision to its draft. As in `publish`, `rights` may be None only if all
+    drafts are hidden. Raises `InvalidProblem` if the content digest of a published revision is not its key in `drafts`.
     """
     held = revisions_with(tx, project_row.id, drafts)
     lacking = [draft for content, draft in drafts.items() if content not in held]

@@ -21,9 +21,9 @@ from marey_server.store.tables import collection, folder_role, member, user
 from marey_server.store.transaction import Transaction
 
 MOST_FOLDER_ROLES = 1000
-"""Greatest number of roles in the folders of one project that are not deleted. A restoration may exceed it."""
+"""Greatest number of roles in those folders of one project that are not deleted. Restoring a folder may exceed it."""
 MOST_WITH_DELETED = 10_000
-"""Greatest number of roles in all folders of one project, so that a request can read all that concern its caller."""
+"""Greatest number of roles in all folders of one project; it lets a request read all roles that concern its caller."""
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -38,9 +38,10 @@ def list_folder_roles(
     cursor: str | None = None,
     limit: int = listing.DEFAULT_LIMIT,
 ) -> Page:
-    """List the roles in folders at and below `folder`, in the order of their paths; with `user_name`, only of one user.
+    """List the roles in folders at and below `folder`, in the order of the paths of the folders.
 
-    Guests of a public project may not see them. Roles in deleted folders are left out.
+    With `user_name`, only the roles of this user are listed. Guests of a public project may not see any. Roles in
+    deleted folders are left out.
     """
     project_row = projects.require(tx, project)
     statement = _rows(project_row).where(at_or_below(folder))

@@ -33,7 +33,7 @@ _OVERRIDES = Prepared(
     )
     .where(member.c.project_id == bindparam("project_id"), member.c.user_id == bindparam("user_id"))
 )  # fmt: skip
-"""Role of a member in the project, in each row of the result, with the roles in folders that concern the member."""
+"""Query of the roles in folders that concern a member; each row also contains the member's role in the project."""
 _AUTHOR = Prepared(
     select(user.c.administrator, user.c.disabled, member.c.role)
     .select_from(
@@ -52,9 +52,10 @@ def lock_places(tx: Transaction, project: ProjectRow) -> None:
     """Lock the roles in folders and the paths of the folders that have them, until the transaction ends.
 
     Members who write compare the path of a folder with the paths at which they have roles. While another request moves,
-    deletes or restores a folder, one of the two could be out of date. So these requests and changes of roles, in
-    folders or in the project, take this lock, before they lock an item, a folder or a job. It waits for writes that
-    have read roles, and excludes new ones.
+    deletes or restores a folder, one of these paths could be out of date. So a request that moves, deletes or restores
+    a folder, or changes a role in a folder or in the project, calls this function before it locks an item, a folder or
+    a job. The function waits for writes that have read roles. Later writes that read roles wait until the lock is
+    released.
     """
     tx.lock(lock_name(project.id))
     forget_rights(tx)
@@ -63,8 +64,8 @@ def lock_places(tx: Transaction, project: ProjectRow) -> None:
 def rights_of_caller(tx: Transaction, project: ProjectRow) -> FolderRights:
     """Return the caller's rights in the folders of a project, which stay the same until the transaction ends.
 
-    Must be called before the write reads the path of an item or a folder, because the path may change until then. It
-    must also be called before the write locks rows, because changes of roles lock rows after they lock the roles.
+    Must be called before the write reads the path of an item or a folder, because the path may change before this call.
+    It must also be called before the write locks rows, because changes of roles lock rows after they lock the roles.
     """
     return _kept(tx, project, tx.principal.user_id, project.role)
 
@@ -99,7 +100,7 @@ def forget_rights(tx: Transaction) -> None:
 
 
 def _has_overrides(user_id: str | None, role: Role) -> bool:
-    """Return whether overrides may apply to a user: not to an owner, nor to an attempt of a job, which has no user."""
+    """Return whether roles in folders may apply: not to an owner, and not to an attempt of a job, which has no user."""
     return user_id is not None and role is not Role.OWNER
 
 
@@ -118,7 +119,7 @@ def _kept(tx: Transaction, project: ProjectRow, user_id: str | None, role: Role)
 
 
 def _read(tx: Transaction, project: ProjectRow, user_id: str | None) -> FolderRights:
-    """Read the rights of a member; the role in the project, too, because it may have changed before the lock."""
+    """Read a member's rights, including the role in the project, which may have changed before the lock was held."""
     rows = tx.run(_OVERRIDES, {"project_id": project.id, "user_id": user_id, "every_member": EVERY_MEMBER})
     role = Role(rows[0].project_role) if rows else Role.READER  # of a user who is no member any more
     if role is Role.OWNER:

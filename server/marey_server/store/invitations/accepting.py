@@ -1,8 +1,8 @@
 """Acceptance of invitations: by users, who become members of a project, and by people who create an account.
 
-Each acceptance locks the project and the invitation, in this order, before it checks anything. So each of the following
-changes is either complete before the acceptance, or waits until the acceptance has ended: the last use of the
-invitation, another change of the members, and a change that ends the inviter's right and so withdraws the invitation.
+Each acceptance locks the project and the invitation, in this order, before it checks anything. So another change is
+either complete before the acceptance, or waits until the acceptance has ended. Such changes are the last use of the
+invitation, other changes of the members, and a change that ends the inviter's right and so withdraws the invitation.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def invitation_invalid() -> NotFoundProblem:
 
 
 def try_of(code: str, address: str, per_minute: int) -> SignInTry:
-    """Return the try to be counted before the invitation code is checked."""
+    """Return the try that is to be counted before the invitation code is checked."""
     prefix, _ = split_invitation(code) or ("", "")
     return SignInTry(f"invitation {prefix}", address, per_minute)
 
@@ -108,7 +108,7 @@ def _require_user(tx: Transaction) -> tuple[str, str]:
 
 
 def _use(tx: Transaction, row: Row[Any], user_id: str, user_name: str) -> None:
-    """Count one use of a locked invitation by a user, and give the user its role."""
+    """Count one use of a locked invitation by a user, and give the user the role that the invitation offers."""
     tx.execute(update(invitation).where(invitation.c.id == row.id).values(used=invitation.c.used + 1))
     tx.execute(insert(invitation_use).values(invitation_id=row.id, user_id=user_id))
     if row.project_id is not None:
@@ -124,8 +124,8 @@ def _use(tx: Transaction, row: Row[Any], user_id: str, user_name: str) -> None:
 def needs_password_check(tx: Transaction, code: str, name: str) -> bool:
     """Return whether to check the password and call `sign_up_again`, instead of `sign_up`, for the user `name`.
 
-    This is so if the user has used the code. It is also so if the code is not valid for an account: otherwise the
-    answer to a used code would show who has used it. Raises `NotFoundProblem` if the secret of the code is wrong.
+    The result is true if the user has used the code, or if the code cannot create an account: otherwise the answer to a
+    used code would show who has used it. Raises `NotFoundProblem` if the secret of the code is wrong.
     """
     row = _find(tx, code)
     user_id = tx.execute(select(user.c.id).where(user.c.name == name)).scalar()
@@ -141,7 +141,7 @@ def _require_open_for_accounts(row: Row[Any]) -> None:
 def sign_up(tx: Transaction, request: SignUp, password_hash: str, attempt: SignInTry) -> SignedUp:
     """Create an account with the invitation of an administrator, join its project, and return the token of a sign-in.
 
-    Raises `NotFoundProblem` if the code is not valid for this, and `ConflictProblem` if the name is taken.
+    Raises `NotFoundProblem` if the code cannot create an account, and `ConflictProblem` if the name is taken.
     """
     row = _lock(tx, request.code.get_secret_value())
     _require_open_for_accounts(row)

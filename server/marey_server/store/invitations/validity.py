@@ -21,7 +21,7 @@ DELETED_AT_ONCE = 500
 
 
 def _exists(*which: ColumnElement[bool]) -> ColumnElement[bool]:
-    """Return the condition that a row exists for the invitation in the surrounding query."""
+    """Return the condition that a row meeting `which` exists for the invitation in the surrounding query."""
     return exists().where(*which).correlate(invitation)
 
 
@@ -72,7 +72,7 @@ def delete_expired(tx: Transaction) -> int:
 
 
 def _locked(*which: ColumnElement[bool]) -> Any:
-    """Select invitations in the order in which every transaction locks them."""
+    """Return a query that selects and locks invitations, in the order in which every transaction locks them."""
     statement = select(invitation.c.id, invitation.c.project_id, invitation.c.prefix).where(*which)
     return statement.order_by(invitation.c.id).with_for_update(of=invitation)
 

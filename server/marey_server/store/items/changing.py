@@ -158,7 +158,7 @@ def revert_item(
 def change_item(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: ItemChange, *, expected_rev: ExpectedRev
 ) -> Item:
-    """Rename, move or tag an item. Raises `ConflictProblem` if the name is taken at its new place."""
+    """Rename, move or tag an item. Raises `ConflictProblem` if another item at the new place has the name."""
     project_row = projects.require(tx, project)
     rights = rights_of_caller(tx, project_row)
     found = _find_to_change(tx, project_row, kind, item_id)
@@ -219,8 +219,8 @@ def _find_to_change(
 ) -> Any:
     """Return the row of an item whose folder the caller may write to.
 
-    Raises `NotFoundProblem` if there is no such item, and `ForbiddenProblem` if the caller's role in its folder is
-    lower than `needed`.
+    Raises `NotFoundProblem` if there is no such item, and `ForbiddenProblem` if the caller's role in the folder of the
+    item is lower than `needed`.
     """
     rights = rights_of_caller(tx, project_row)
     found = find_item(tx, project_row, kind, item_id)

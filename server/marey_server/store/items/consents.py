@@ -1,7 +1,7 @@
 """Consent of performers: clips whose consent has ended, and permissions to export them nevertheless.
 
 The take record of the newest revision counts for every revision of a clip, because a consent concerns the recording. An
-aligned clip has no take record of its own; that of its source clip counts.
+aligned clip has no take record of its own; the take record of its source clip counts.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def find_ended_consents(tx: Transaction, item_ids: Iterable[str]) -> dict[str, E
 
 
 def find_ended_with(tx: Transaction, project_id: str, contents: Sequence[str]) -> list[EndedConsent]:
-    """Return the items of a project whose consent has ended and that have a revision with a wanted content.
+    """Return those items of a project that have a revision with a wanted content, and whose consent has ended.
 
     `contents` are the content digests of the wanted revisions.
     """
@@ -121,7 +121,7 @@ def record_override(
 ) -> None:
     """Record in the audit log that the caller allows the export of clips whose consent has `ended`.
 
-    `subject` is the id of what exports them: a job, a dataset, or the item itself.
+    `subject` is the id of the job that exports the clips, or of the dataset or item that is exported.
     """
     names = [one.path.rpartition("/")[2] for one in ended] or [subject]  # a job may not know its clips yet
     details = {"reason": override.consent_reason, **_named(ended)}

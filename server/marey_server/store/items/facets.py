@@ -47,7 +47,7 @@ def stored_facets(tx: Transaction, job_row: Any, facets: Sequence[ItemFacets]) -
 
 
 def _measured(tx: Transaction, job_row: Any) -> set[tuple[str, int]]:
-    """Return the inputs of a job, and the clips of the evaluations among them, as ids and numbers of revisions."""
+    """Return the inputs of a job, and the clips of evaluations among these inputs, as pairs of item and revision."""
     pins = [pin for many in job_row.inputs.values() for pin in many]
     found = {(pin["item"], pin["revision"]) for pin in pins}
     evaluations = sorted({pin["item"] for pin in pins if pin["kind"] == Kind.EVALUATION})
@@ -126,7 +126,8 @@ def _not_purged(tx: Transaction, project_id: str, items: Sequence[str]) -> Seque
     """Return those items of a project that are not purged, sorted by id.
 
     So the facets of one job are written in the order of item ids. A transaction that publishes the facets of several
-    jobs begins this order again for each job, so two such transactions can deadlock; `Database.write` then repeats one.
+    jobs begins this order again for each job, so two such transactions can deadlock; `Database.write` then repeats one
+    of the two.
     """
     statement = select(item.c.id).where(
         item.c.id.in_(items), item.c.project_id == project_id, item.c.purged_us.is_(None)

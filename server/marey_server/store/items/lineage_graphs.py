@@ -54,10 +54,10 @@ _AT_ONCE = 500
 def read_lineage_graph(
     tx: Transaction, project_name: str, kind: Kind, item_id: str, request: LineageRequest
 ) -> LineageGraph:
-    """Return the graph of the revisions that a revision was made from, and of those that were made from it.
+    """Return the graph of the revisions from which a revision was made, and of the revisions made from this revision.
 
-    Revisions that the caller may not read are left out; so are the revisions that are linked only through them. The
-    graph holds at most `MOST_REVISIONS` revisions and `MOST_LINKS` links in each direction.
+    Revisions that the caller may not read are left out, and with them the revisions that are linked only through them.
+    The graph holds at most `MOST_REVISIONS` revisions and `MOST_LINKS` links in each direction.
     """
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
     start = (item_id, request.revision or found.head)
@@ -191,7 +191,7 @@ class _LineageWalk:
     def _commits(self, ids: Collection[str]) -> dict[str, set[str]]:
         """Return, for each job, the commits of datasets from which the job or its tasks took inputs.
 
-        The database selects them, because a job may have 100,000 inputs.
+        The database selects the commits, because a job may have 100,000 inputs.
         """
         if self._tx.connection.dialect.name == "postgresql":
             value = column("value", JSONB)

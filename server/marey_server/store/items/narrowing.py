@@ -1,9 +1,9 @@
 """Choice of the index by which a list finds the items that a query selects.
 
-An index helps if few items have the wanted value, and costs time if most of them have it. Databases estimate which is
-the case: Postgres from statistics that may be old, SQLite from none at all. So this module counts the items that
-conditions of a query select, up to a limit. For each condition, the database reads at most that many entries of an
-index, and one more, which takes less than a millisecond.
+An index helps if few items have the wanted value, and costs time if most items have it. Databases estimate which is the
+case: Postgres from statistics that may be old, SQLite without statistics. So this module counts the items that each
+condition of a query selects, up to a limit. To do so, the database reads at most one more index entry than the limit,
+which takes less than a millisecond.
 """
 
 from __future__ import annotations
@@ -21,37 +21,38 @@ from marey_server.store.tables import INDEXED_CHARACTERS, INDEXED_FACTS, MemberS
 from marey_server.store.transaction import Transaction
 
 MOST_ITEMS = 1000
-"""Greatest number of items that may meet a condition for it to be used as `Narrowing.few`."""
+"""Greatest number of items that may meet a condition that is used as `Narrowing.few`."""
 
 Candidates = Callable[[Condition, str, Kind], Select[Any]]
-"""Function that returns the ids of all items of a project and kind that may meet a condition, found by an index.
+"""Function that returns a query for the items of a project and kind that may meet a condition; the query uses an index.
 
-The second column is the time of creation, and the newest items are first; or it is null for all items, and their order
-is arbitrary. Items that the condition does not select, and items of other projects, may be among them.
+The columns of the query are the id of the item and the time of its creation, and the newest items come first. If the
+order is arbitrary instead, the second column is null for all items. The result may contain items that do not meet the
+condition, and items of other projects.
 """
 
 
 class Narrowing(NamedTuple):
     """Condition that all items selected by a query meet, and for which the database has an index.
 
-    At most one of the two fields is set.
+    At most one of the two fields is set; if neither is set, no index helps.
     """
 
     few: ColumnElement[bool] | None = None
     """Condition that at most `MOST_ITEMS` items meet."""
     ordered: ColumnElement[bool] | None = None
-    """Condition on a single value that more than `MOST_ITEMS` items have, found by an index in the order of creation.
+    """Condition that a fact has a certain value. More than `MOST_ITEMS` items have this value.
 
-    A list in this order then reads only the items with the wanted value, however many have this value.
+    An index finds these items in the order of their creation, so a list in this order reads no other items.
     """
 
 
 def narrow(tx: Transaction, project_id: str, kind: Kind, query: Query) -> Narrowing:
     """Return the condition by which the fewest items have to be read for a query.
 
-    Of all operands of the outermost `and`, the one for which an index finds the fewest items is chosen. If each operand
-    has more than `MOST_ITEMS` items, the choice is among the comparisons of a fact with a single value: the one whose
-    newest `MOST_ITEMS` items go back furthest in time is chosen, since it is the rarest.
+    It is one of the operands of the outermost `and`: the operand for which an index finds the fewest items. If an index
+    finds more than `MOST_ITEMS` items for each operand, only comparisons of a fact with a single value remain. Of
+    these, the rarest is chosen: the comparison whose newest `MOST_ITEMS` items reach furthest back in time.
     """
     fewest, few = MOST_ITEMS + 1, None
     oldest_us, ordered = None, None
@@ -81,7 +82,7 @@ def _indexed(query: Query) -> Iterator[Condition]:
 
 
 def _start(condition: Condition) -> ColumnElement[bool]:
-    """Return the condition that a text in the summary begins like one of the values.
+    """Return the SQL condition that a fact in the summary begins with the same characters as one of the values.
 
     Only the first `INDEXED_CHARACTERS` characters are compared, because the index contains no more.
     """
@@ -91,10 +92,10 @@ def _start(condition: Condition) -> ColumnElement[bool]:
 
 
 def _with_fact(condition: Condition, project_id: str, kind: Kind) -> Select[Any]:
-    """Return the items with one of the values.
+    """Return a query for the items whose fact has one of the values of the condition.
 
-    Only for a single value does the index of the fact return the newest items first. For several values, SQLite would
-    read all items in the order of creation instead, so the order and the times are left out.
+    For a single value, the index of the fact returns the newest items first. For several values, it does not, and
+    SQLite would read all items in the order of creation instead, so the query has no order and no times.
     """
     present = (item.c.project_id == project_id, item.c.kind == kind.value, item.c.deleted_us.is_(None))
     if len(condition.values) > 1:

@@ -37,7 +37,7 @@ DRAFTS_TOGETHER = 256
 """Greatest number of drafts that are published with the same statements."""
 
 _RACES = 20
-"""Maximum number of tries to publish a draft if concurrent writes interfere."""
+"""Greatest number of tries to publish a draft if concurrent writes interfere."""
 
 
 def publish(
@@ -55,11 +55,11 @@ def publish(
     In a document, `{"output": name}` refers to another draft and is replaced by the item and revision published from
     it. If the draft of a model has a sample tree, the tree's `model_digest` may be a reference, too, and is replaced by
     the digest of the draft's model. With `refer_to_deleted`, documents may refer to items that are deleted. If an item
-    already has the content of a draft, no new revision is created. `rights` are those of the user who publishes; they
-    may be None only if all drafts are hidden.
+    already has the content of a draft, no new revision is created. `rights` are the rights of the user who publishes;
+    they may be None only if all drafts are hidden.
 
     Raises `InvalidProblem` for a draft that is not valid, `ConflictProblem` for a name that is taken, and
-    `ForbiddenProblem` if `rights` do not allow to write to the folder of a new item or revision.
+    `ForbiddenProblem` if `rights` do not allow writing to the folder of a new item or revision.
     """
     by_name = {draft.name_in_batch: draft for draft in drafts}
     if len(by_name) != len(drafts):
@@ -77,7 +77,7 @@ def publish(
 
 
 def require_places(drafts: Iterable[Draft], rights: FolderRights | None) -> None:
-    """Raise `ForbiddenProblem` unless `rights` allow to write to the folders of all drafts that are not hidden."""
+    """Raise `ForbiddenProblem` unless `rights` allow writing to the folder of each draft that is not hidden."""
     for folder in sorted({draft.collection for draft in drafts if not draft.hidden}):
         if rights is None:
             raise TypeError("drafts that are not hidden are published with the rights of a user")
@@ -155,7 +155,7 @@ class _Ready:
     digests: Mapping[str, str]
     bodies: Mapping[str, Tree]
     stored_bytes: Mapping[str, int]
-    """Number of bytes for which each part counts in quotas."""
+    """Number of bytes that each part uses of a quota."""
 
     @property
     def required(self) -> tuple[str | None, ...]:

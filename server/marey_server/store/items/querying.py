@@ -80,7 +80,7 @@ def _lower_on_postgres(element: _LowerAscii, compiler: SQLCompiler, **options: A
 class _NumberIn(FunctionElement[float]):
     """SQL expression for a number in the summary of an item.
 
-    It is null if the summary has another value there; a plain cast to a number would fail.
+    It is null if the summary has no number there; a plain cast to a number would fail.
     """
 
     type = Float()
@@ -144,9 +144,9 @@ def _number_of(name: str) -> Comparison:
 
 
 def stored_text(value: object) -> str:
-    """Return the text that a summary stores for a value of a query: a text unchanged, a day such as `2026-11-23`.
+    """Return the text with which a summary stores a value: a text unchanged, a day in the form `2026-11-23`.
 
-    Of a time, only the day is compared, because summaries store no times.
+    A time is converted to its day, because summaries store no times.
     """
     return value.isoformat()[: len("2026-11-23")] if isinstance(value, date) else str(value)
 

@@ -48,7 +48,7 @@ def read_item(tx: Transaction, project: str, kind: Kind, item_id: str) -> Item:
 
 
 def item_rows() -> Select[Any]:
-    """Return the rows of items with the path of their collection."""
+    """Return a query for the rows of items, each with the path of its collection."""
     return select(item, collection.c.path).join(collection, collection.c.id == item.c.collection_id)
 
 
@@ -164,7 +164,7 @@ def read_tags(tx: Transaction, item_ids: Collection[str]) -> dict[str, tuple[str
 
 
 def _read_facets(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, dict[str, float]]:
-    """Return the facets of the newest revisions of items, sorted by name, by item."""
+    """Return, by item id, the facets of the newest revision of each item, sorted by name."""
     found: dict[str, dict[str, float]] = {}
     for row in tx.run(_FACETS, {"items": [row.id for row in rows]}):
         found.setdefault(row.item_id, {})[row.name] = row.value
@@ -190,7 +190,7 @@ class FoundPart:
     digest: str
     revision: int
     rev: int
-    """The item's `rev`, which a change of its newest revision must name."""
+    """The `rev` of the item; a request that changes the newest revision must name this `rev`."""
     size_bytes: int
     """Size of the stored document."""
 
@@ -198,7 +198,7 @@ class FoundPart:
 def find_part(
     tx: Transaction, project: str, kind: Kind, item_id: str, part: str, *, revision: int | None = None
 ) -> FoundPart:
-    """Return a part of the newest revision, or of `revision`. Raises `NotFoundProblem` if it does not exist."""
+    """Return a part of the newest revision, or of `revision`. Raises `NotFoundProblem` if there is no such part."""
     project_row = projects.require(tx, project)
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value, "part": part}
     if revision is None:

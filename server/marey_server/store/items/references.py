@@ -20,7 +20,7 @@ Tree = dict[str, Any]
 
 
 def outputs_in(tree: Any) -> Iterator[str]:
-    """Return the names of the drafts that a document refers to as `{"output": name}`."""
+    """Yield the names of the drafts that a document refers to as `{"output": name}`."""
     if isinstance(tree, Mapping):
         if tree.keys() == {"output"} and isinstance(tree["output"], str):
             yield tree["output"]
@@ -33,7 +33,7 @@ def outputs_in(tree: Any) -> Iterator[str]:
 
 
 def with_model_digest(tree: Tree, digest: str | None) -> Tree:
-    """Return the tree with `digest` as its `model_digest`, if it referred to the model of its own draft."""
+    """Return the tree with `digest` as its `model_digest`, if this member refers to the model of the same draft."""
     if digest is None or isinstance(tree["model_digest"], str):
         return tree
     return {**tree, "model_digest": digest}
@@ -86,7 +86,7 @@ class ReferenceCheck:
         self._seen: dict[tuple[str, int, Kind, str], Tree] = {}
 
     def know(self, published: Published, bodies: Mapping[str, Tree]) -> None:
-        """Remember the parts of a revision that this write has stored or found, so that they are not read again."""
+        """Remember the parts of a revision that this write has stored or found, so that no part is read twice."""
         for part, body in bodies.items():
             self._seen[published.item, published.revision, published.kind, part] = body
 

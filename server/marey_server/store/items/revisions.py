@@ -40,8 +40,8 @@ def write_head(
 ) -> bool:
     """Increase the number of the item's newest revision by one; return false if the item does not meet `conditions`.
 
-    `parts` are the digests of the new revision's parts. `bodies` are their documents; those of unchanged parts may be
-    omitted. `added_bytes` is the size of the changed parts, which counts towards quotas.
+    `parts` are the digests of the new revision's parts. `bodies` are the documents of these parts; documents of
+    unchanged parts may be omitted. `added_bytes` is the size of the changed parts, which counts towards quotas.
     """
     known = dict(bodies)
     for part, digest in parts.items():

@@ -11,7 +11,7 @@ from marey_schemas.documents.clips import TakeRecord
 from marey_schemas.kinds import Kind
 
 LABELS_SHOWN = 32
-"""Greatest number of labels in the summary of an annotation; those with the most segments are kept."""
+"""Greatest number of labels in the summary of an annotation; the labels with the most segments are kept."""
 
 
 @dataclass(frozen=True, slots=True)

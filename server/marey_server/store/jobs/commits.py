@@ -1,8 +1,8 @@
 """Commits of the outputs of jobs: checks at submission, and the commit in the transaction that ends the job.
 
-A job commits once: tasks of a fan-out publish their outputs, and their parent job commits these when it ends. If the
-commit is not allowed any more, the job fails and publishes nothing. The same happens if the author of the job may not
-write to the folders of its outputs any more.
+A job commits once: tasks of a fan-out publish their outputs, and the parent job commits these outputs when it ends. If
+the commit is not allowed any more, the job fails and publishes nothing. The same happens if the author of the job may
+not write to the folders of its outputs any more.
 """
 
 from __future__ import annotations
@@ -116,10 +116,10 @@ def check_again(
 
 
 def with_new_base(tx: Transaction, target: Target | None) -> Target | None:
-    """Return the commit that a job is to make, with the present head of its branch as the base.
+    """Return the commit that a job is to make, with the present head of the branch as the base.
 
-    Called when inputs of the job that are outputs of other jobs are pinned. `target` is returned unchanged if the
-    branch does not exist.
+    Called when outputs of other jobs are pinned as inputs of the job. `target` is returned unchanged if the branch does
+    not exist.
     """
     ref = None if target is None else find_ref(tx, target["dataset_id"], target["branch"])
     return target if target is None or ref is None else {**target, "base": ref.digest}
@@ -162,7 +162,7 @@ def _joined(*names: str) -> str:
 
 @dataclass(frozen=True)
 class PublishedOutputs:
-    """Published outputs of a job, and the values of the columns that its commit determines.
+    """Published outputs of a job, and the values of the job's columns that the commit determines.
 
     If `failure` is set, nothing was published, because the author may not write to a folder of the outputs any more, or
     the commit is not allowed.
@@ -277,7 +277,7 @@ def refused_commit(target: Target, code: str, reason: str) -> dict[str, Any]:
 def _publish_entries(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> list[dict[str, Any]]:
     """Publish the drafts of a job, and return its outputs with the paths of their entries.
 
-    Also stores the digests of their content, so that a parent job need not compute them.
+    Also stores the content digests of the outputs, so that a parent job need not compute them.
     """
     outputs = staging.publish_drafts(tx, row, drafts)
     store_contents(tx, find_contents_of(tx, map(_revision, outputs)))
@@ -328,7 +328,7 @@ def _entries_of(tx: Transaction, row: Any, outputs: Iterable[Mapping[str, Any]])
 
 
 def _free_path(output: Mapping[str, Any], taken: Mapping[str, RevisionKey]) -> str:
-    """Return the path of an output, with a number if another item of the same job has the path.
+    """Return the path of an output, with a number added if another item of the same job has this path.
 
     Two outputs may have the same name if items with equal content are reused.
     """

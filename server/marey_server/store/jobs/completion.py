@@ -51,7 +51,7 @@ def complete(tx: Transaction, job_id: str, fence: int, request: CompleteRequest)
     """End the job with success and publish its staged outputs; a repeated `write_id` gets the same answer.
 
     If its cancellation was requested, the job is cancelled instead, and nothing is published. Raises `LeaseLostProblem`
-    if the attempt does not hold the job, or has ended it with another `write_id`.
+    if the attempt does not hold the job, or has ended the job with another `write_id`.
     """
     require_attempt(tx.principal, job_id, fence)
     hold_off_purges_of_jobs(tx, [job_id])
@@ -309,8 +309,8 @@ def fail(
 def _is_poisoned(tx: Transaction, job_id: str, signature: str | None) -> bool:
     """Return whether an earlier attempt of the job ended with the same failure signature.
 
-    The signature identifies the error and the place in the code where it occurred. A retry would then fail in the same
-    way, and perhaps stop another worker.
+    The signature identifies the error and the place in the code where the error occurred. If it is the same, a retry
+    would fail in the same way, and perhaps stop another worker.
     """
     if signature is None:
         return False

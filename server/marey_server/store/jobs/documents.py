@@ -38,7 +38,7 @@ def job_documents(tx: Transaction, ids: Sequence[str]) -> list[Job]:
 
 
 _UNSAID = {column.key: None if column.default is None else column.default.arg for column in job.c}  # type: ignore[attr-defined]
-"""Initial values of the columns that `new_row` omits."""
+"""Initial values of columns, for those columns that `new_row` omits."""
 
 
 def document_of_new(tx: Transaction, project_name: str, row: Mapping[str, Any], after: Collection[str]) -> Job:

@@ -19,14 +19,14 @@ def emit_job_events(tx: Transaction, kind: OrdinaryEventKind, events: Sequence[E
 
 
 def wake_workers(tx: Transaction, kinds: Iterable[str]) -> None:
-    """Wake requests that wait for work of these kinds, after the commit."""
+    """After the commit, wake the requests that wait for work of these kinds."""
     topics = {work_topic(kind) for kind in kinds}
     if topics:
         tx.after_commit(lambda: wakeups.announce(topics))
 
 
 def wake_watchers(tx: Transaction, job_ids: Iterable[str]) -> None:
-    """Wake requests that wait for the end of these jobs, after the commit."""
+    """After the commit, wake the requests that wait for the end of these jobs."""
     topics = {job_topic(job_id) for job_id in job_ids}
     if topics:
         tx.after_commit(lambda: wakeups.announce(topics))

@@ -23,7 +23,7 @@ from marey_server.store.wakeups import OUTPUTS_TO_COMMIT, wakeups
 MOST_GATHERED = 1000
 """Greatest number of entries in a list of a combined result, such as its refusals."""
 MOST_AT_END = 1_000
-"""Greatest number of entries that the transaction that ends the last task commits itself."""
+"""Greatest number of entries that are committed in the transaction that ends the last task."""
 
 DEFERRED: ColumnElement[bool] = and_(
     job.c.state == RUNNING,
@@ -43,8 +43,9 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
     not end yet, and the list is empty: if a worker must combine the results of the tasks, the parent job is queued; if
     the outputs are too many to be committed in this transaction, the module `finishing` commits them later.
 
-    If a task failed, the parent job fails. If cancellation was requested before, the parent job is cancelled if a task
-    did not succeed, or if a worker must still combine the results.
+    If a task failed, the parent job fails, unless the cancellation of the parent job was requested before. In all other
+    cases, the parent job is cancelled: if a task did not succeed, or if a worker would have to combine the results
+    after a request for cancellation.
     """
     columns = (*commits.JOB_COLUMNS, job.c.gathers, job.c.cancel_requested_us)
     head = tx.execute(select(*columns).where(job.c.id == parent_id)).one()
@@ -103,9 +104,10 @@ def _defer(tx: Transaction, running: ColumnElement[bool], result: Mapping[str, A
 
 
 def release_tasks(tx: Transaction, gathered: Collection[str]) -> None:
-    """Delete the results of the tasks of these parent jobs; the combined results of the parent jobs replace them.
+    """Delete the staged outputs of the tasks of the parent jobs `gathered`, and release the blobs that tasks name.
 
-    Blobs named by the tasks may then be collected as garbage, and the tasks no longer serve as cached results.
+    The combined results of the parent jobs replace them. Garbage collection may then delete the blobs, and the results
+    of the tasks are no longer cached.
     """
     tasks = select(job.c.id).where(job.c.parent_id.in_(gathered))
     tx.execute(delete(job_blob).where(job_blob.c.job_id.in_(tasks)))
@@ -128,7 +130,7 @@ def combine_results(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
 def _combine(known: Any, value: Any) -> Any:
     """Return `known` combined with `value`: numbers are added, lists joined and objects merged.
 
-    A value of another type is ignored, and so is a `known` that has another type than `value`.
+    If `value` has another type, `known` is returned. If `known` has another type than `value`, `known` is ignored.
     """
     if isinstance(value, int | float) and not isinstance(value, bool):
         return value + (known if isinstance(known, int | float) else 0)

@@ -1,8 +1,8 @@
 """Fencing: the condition under which writes of an attempt are accepted.
 
 Every job has a number, its fence, which each claim increases. A worker with an older fence has lost the job, perhaps
-without having noticed. Every write of an attempt includes this condition in its own transaction: after a separate
-check, another worker could claim the job before the write.
+without having noticed. Every write of an attempt includes the condition that the fence is unchanged. A separate check
+would not suffice, because another worker could claim the job between the check and the write.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ WAITING: ColumnElement[str] = literal_column("'waiting'")
 
 
 def same_fence(fence: int) -> ColumnElement[bool]:
-    """Return the condition that no other attempt has claimed the job since this one."""
+    """Return the SQL condition that no later attempt has claimed the job."""
     return job.c.fence == fence
 
 
 def held(job_id: str, fence: int) -> ColumnElement[bool]:
-    """Return the condition that the attempt still holds its job; every write of a worker includes it."""
+    """Return the SQL condition that the attempt still holds its job; every write of a worker includes this."""
     return and_(job.c.id == job_id, job.c.state == RUNNING, same_fence(fence))
 
 
@@ -61,7 +61,7 @@ def held_parameters(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
 
 
 UNCOUNTED: ColumnElement[int] = case((job.c.counted_fence < job.c.fence, 1), else_=0)
-"""1 while the attempt that holds the job has written nothing, so that it is not counted yet; else 0."""
+"""SQL expression: 1 while the attempt that holds the job has written nothing and is not counted yet; else 0."""
 
 COUNT_ATTEMPT: dict[str, Any] = {"attempt": job.c.attempt + UNCOUNTED, "counted_fence": job.c.fence}
 """Values that every write of an attempt sets in its job: an attempt counts from its first write, not from its claim,
@@ -80,14 +80,15 @@ AUTHOR_MAY_RUN: ColumnElement[bool] = or_(
 )
 """The condition that the author of a job still has a role that may submit jobs, or that the job has no author.
 
-The role in one folder suffices; the transaction that publishes results checks the role in the folders of the results.
+A role in one folder suffices; the transaction that publishes results checks the role in the folders of the results.
 """
 
 
 def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
     """Check that the caller's credential belongs to this attempt.
 
-    Raises `LeaseLostProblem` if it belongs to another attempt of the job, and `NotFoundProblem` if it belongs to none.
+    Raises `LeaseLostProblem` if the credential belongs to another attempt of the job, and `NotFoundProblem` if it
+    belongs to no attempt of the job.
     """
     if principal.kind == "system":
         return

@@ -2,9 +2,8 @@
 
 A read transaction plans the commit. Several short writes store the chunks of its tree. A last write ends the job and
 moves the branch. If others have committed since the plan was computed, the last write adds their changes to the plan.
-If their changes concern the same entries, the commit is planned again. It is planned again, too, if items of the
-project were purged meanwhile. If the server stops in between, nothing but chunks has been stored, and the next server
-begins again.
+If their changes concern the same entries, the commit is planned again. The same happens if items of the project were
+purged meanwhile. If the server stops in between, nothing but chunks has been stored, and the next server begins again.
 """
 
 from __future__ import annotations
@@ -34,9 +33,9 @@ from marey_server.store.transaction import Transaction
 from marey_versions.tree.chunks import DamagedChunk
 
 CHUNKS_AT_ONCE = 500
-"""Number of chunks that one write stores, so that it is short."""
+"""Greatest number of chunks that one write stores, so that the write is short."""
 MOST_PLANS = 5
-"""Number of times that a commit is planned before the next jobs have their turn."""
+"""Greatest number of times that a commit is planned in a row, before the next job has its turn."""
 
 DATASET_DAMAGED = "dataset-damaged"
 """Code of the failure of a job whose commit cannot be computed, because chunks of the dataset are damaged."""
@@ -48,7 +47,7 @@ def commit_deferred(database: Database) -> int:
     """Commit the outputs of jobs whose tasks have all ended, and end these jobs; return how many have ended.
 
     A job fails if its commit is refused, or cannot be computed because chunks of the dataset are damaged. After any
-    other error, the job stays as it is, and does not keep the others from ending.
+    other error, the job stays as it is; the other jobs are ended nevertheless.
     """
     return sum(_commit_one(database, one) for one in database.read(SYSTEM, _deferred_jobs))
 

@@ -56,7 +56,7 @@ _ITEMS_BY_ID = Prepared(_ITEMS.where(item.c.id.in_(bindparam("ids", expanding=Tr
 
 
 def find_items(tx: Transaction, project: ProjectRow, requests: Iterable[JobCreate]) -> dict[str, FoundItem]:
-    """Return, by id, the items that the requests name by their ids, and not through a collection or a dataset."""
+    """Return, by id, the items that the requests name by id, without those named through a collection or a dataset."""
     choices = (choice for request in requests for many in request.inputs.values() for choice in _as_many(many))
     return items_by_id(tx, project.id, (choice.item for choice in choices if isinstance(choice, ItemInput)))
 
@@ -173,7 +173,7 @@ def _pin_input(
 
 
 def late_inputs(request: JobCreate, at: str = "") -> Iterator[tuple[str, str, str]]:
-    """Return the inputs that other jobs produce: position in the request, name of the input, and id of the job."""
+    """Yield the inputs that other jobs produce: position in the request, name of the input, and id of the other job."""
     for name, choices in request.inputs.items():
         for index, choice in enumerate(_as_many(choices)):
             if isinstance(choice, JobOutputsInput):

@@ -1,7 +1,8 @@
 """Late inputs: inputs of a job that are outputs of other jobs, pinned when those jobs have succeeded.
 
-They are pinned in the transaction that makes the job ready, with its row locked. The job is then processed like a
-submission with existing inputs: it is split into tasks, gets its cache key, and is queued or shares a result.
+They are pinned in the transaction that makes the job ready, while the row of the job is locked. The job is then
+processed like a submission with existing inputs: it is split into tasks, gets its cache key, and is queued or shares a
+result.
 """
 
 from __future__ import annotations

@@ -102,9 +102,9 @@ def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dic
 
 
 def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_cache.SharedResult]:
-    """Set the cache keys of jobs, and find jobs with the same results, finished or in progress.
+    """Set the cache keys of jobs, and find other jobs that have computed, or are computing, the same results.
 
-    Each job for which such a job is found changes to the state `waiting`.
+    Each job for which another job is found changes to the state `waiting`.
     """
     _set_cache_keys(tx, jobs)
     sources = result_cache.decide(tx, [one for one in jobs if one.state == "queued"])
@@ -115,7 +115,7 @@ def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_c
 
 
 def _spread(head: NewJob) -> list[NewJob]:
-    """Make a job with several tasks a parent job, and return its tasks, which start when it starts.
+    """Make a job with several tasks a parent job, and return its tasks, which start together with it.
 
     A job with one task is unchanged, and the result is empty.
     """
@@ -171,7 +171,7 @@ def _has_key(submission: Submission) -> bool:
 
 
 def _newest_revisions(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, int]:
-    """Return the newest revisions of the items that parameters of jobs name.
+    """Return, by item id, the number of the newest revision of each item that parameters of jobs name.
 
     Items that are not in the project are omitted.
     """

@@ -15,7 +15,7 @@ SECOND_US = 1_000_000
 class QueuePolicy:
     """Durations of leases and waits, and limits of retries.
 
-    `random_unit` draws from [0, 1); a test replaces it to make the backoff predictable.
+    `random_unit` draws from [0, 1); tests replace this function to make the backoff predictable.
     """
 
     lease_ttl_s: float = 60.0
@@ -25,8 +25,11 @@ class QueuePolicy:
     longest_backoff_s: float = 15 * 60.0
     max_interruptions: int = 20
     max_unstarted: int = 10
-    """Limit of claims that are lost before the first write of the attempt. They do not count as attempts, because the
-    answer to the claim may have been lost; the limit ends a job that kills each worker at once."""
+    """Greatest number of claims of a job that are lost before the first write of the attempt.
+
+    Such claims do not count as attempts, because the answer to the claim may have been lost. Without this limit, a job
+    that kills each worker at once would never end.
+    """
     log_limit_bytes: int = 10 * 2**20
     random_unit: Callable[[], float] = random.random
 
@@ -41,7 +44,7 @@ class QueuePolicy:
         return round(self.end_grace_s * SECOND_US)
 
     def backoff_us(self, failures: int) -> int:
-        """Return the wait in microseconds before a retry; each failure makes it four times as long."""
+        """Return the wait in microseconds before a retry; each failure makes it four times as long, up to a limit."""
         backoff = Backoff(
             self.first_backoff_s, self.longest_backoff_s, factor=4.0, jitter=0.25, random_unit=self.random_unit
         )

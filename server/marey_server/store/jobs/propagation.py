@@ -110,10 +110,10 @@ def _waiting(tx: Transaction, ids: Sequence[str]) -> Sequence[Row[Any]]:
 
 
 def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[Ended]]) -> list[Ended]:
-    """Update waiting jobs after ends of jobs on which they depend.
+    """Update waiting jobs after jobs on which they depend have ended.
 
-    `upstream` lists these ends by the id of the waiting job. Jobs whose dependencies have all succeeded are made ready;
-    jobs that can no longer run are ended. Returns the jobs that have ended.
+    `upstream` lists the ended jobs by the id of the waiting job. Jobs whose dependencies have all succeeded are made
+    ready; jobs that can no longer run are ended. Returns the jobs that have ended.
     """
     following: list[Ended] = []
     left: dict[str, int] = {}
@@ -221,7 +221,7 @@ def _admit(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
 def _stop_sharing(tx: Transaction, rows: Sequence[Row[Any]]) -> None:
     """Remove the link from waiting jobs to an unsuccessful job whose result they would have shared.
 
-    `make_ready` then queues one of them, and the others wait for its result.
+    `make_ready` then queues one of the waiting jobs, and the others wait for its result.
     """
     if rows:
         ids = [row.id for row in rows]

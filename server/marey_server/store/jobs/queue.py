@@ -63,7 +63,7 @@ from marey_server.store.transaction import Transaction
 def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_POLICY) -> list[Lease]:
     """Claim up to `request.max` queued jobs for the caller, in order of priority, each under a new fence.
 
-    A repeated `claim_id` gets the leases of the earlier claim that are still held. Raises `ForbiddenProblem` if the
+    A repeated `claim_id` gets those leases of the earlier claim that are still held. Raises `ForbiddenProblem` if the
     caller may not claim jobs or may not announce these labels, `InvalidProblem` if the worker uses another version of
     the protocol, and `LeaseLostProblem` if no lease of the earlier claim is held any more.
     """
@@ -142,8 +142,8 @@ def heartbeat(
 ) -> HeartbeatAnswer:
     """Extend the lease of an attempt, and store the progress that the worker reports.
 
-    After a cancellation, or at the time limit of the job, the lease is extended only to the end of the grace period.
-    An expired lease is extended, too, unless the job was reclaimed. Raises `LeaseLostProblem` if the attempt no longer
+    After a cancellation, or at the time limit of the job, the lease is extended only to the end of a grace period. An
+    expired lease is extended, too, unless the job was reclaimed. Raises `LeaseLostProblem` if the attempt no longer
     holds the job.
     """
     require_attempt(tx.principal, job_id, fence)
@@ -213,7 +213,7 @@ def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
 def _pick(restriction: _Restriction) -> CTE:
     """Return the query for the ids of the jobs to claim.
 
-    Of the jobs with the same concurrency key, it selects at most one, and none while one of them is running.
+    Of the jobs with the same concurrency key, the query selects at most one, and none while a job with this key runs.
     """
 
     def claimable(candidate: FromClause) -> ColumnElement[bool]:
@@ -335,7 +335,7 @@ def _leases(
 
 
 def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
-    """Return the number of tasks of each parent job of the given tasks, by the id of the parent job."""
+    """Return, by id, the number of tasks of each job that is the parent job of a given task."""
     parents = {row.parent_id for row in rows if row.parent_id is not None}
     if not parents:
         return {}

@@ -34,7 +34,7 @@ _named: LruCache[str, frozenset[str]] = LruCache(
 )
 """Results of `_named_items`, by the id of the job.
 
-They never become outdated, because neither the inputs and parameters of a job nor revisions change.
+The results never become outdated, because neither the inputs and parameters of a job nor revisions change.
 """
 
 

@@ -155,7 +155,7 @@ def _conditions(project_id: str, filters: JobFilters) -> list[ColumnElement[bool
 
 
 def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLICY) -> Job:
-    """Cancel a job: at once if it is not running, else when its worker stops or the grace period ends.
+    """Cancel a job: at once if it is not running, else when its worker stops or a grace period ends.
 
     A parent job is cancelled with its tasks. A repeated cancellation has no effect. Raises `ConflictProblem` for a
     job that has succeeded or failed, and `ForbiddenProblem` for a job of another user.
@@ -181,7 +181,7 @@ def _cancel(tx: Transaction, which: ColumnElement[bool], policy: QueuePolicy) ->
     """Cancel the jobs that have not ended, in one statement, and return them in their new states.
 
     The time limit of a running job is set to now, so that its lease cannot be extended beyond the grace period. A
-    parent job has no lease while its tasks are running, and ends when they have ended.
+    parent job has no lease while its tasks are running, and ends when all its tasks have ended.
     """
     running = job.c.state == RUNNING
     leased = and_(running, job.c.lease_expires_us.is_not(None))

@@ -27,10 +27,11 @@ PAGE = 256
 
 
 class StartGrace:
-    """Delay of the reaper by the time of one lease, after this process has started or the database was unreachable.
+    """Delay before leases may be reclaimed, after this process has started or the database was unreachable.
 
-    Leases expire while nobody can renew them; during the delay, live workers renew theirs. The delay also starts after
-    a jump of the clock, and after a long write that blocked all other writes, and therefore heartbeats.
+    Leases expire while no worker can renew them. The delay is as long as a lease; in this time, live workers renew
+    their leases. The delay also starts after a jump of the clock, and after a long write that blocked all other writes,
+    and therefore heartbeats.
     """
 
     def __init__(self, policy: QueuePolicy = DEFAULT_POLICY) -> None:

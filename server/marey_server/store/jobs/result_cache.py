@@ -2,10 +2,10 @@
 
 Jobs are identical if kind, version of the kind, parameters, seed and inputs are equal. Inputs are equal if the item,
 its name, its path, and the content of the documents that the kind reads are equal, because results are named after
-inputs and refer to them. A kind can require more to be equal: the collection of the results, or the newest revision of
+inputs and refer to them. A kind can also require that the collection of the results is equal, or the newest revision of
 an item that the parameters name. Jobs whose result depends on data that is read while they run have no cache key. For
-each job, shared results are published again, into the job's own collection. The cache is limited to one project. An
-exported archive is not shared after the consent for one of its clips has ended.
+each job, shared results are published again, into the job's own collection. Jobs of different projects share no
+results. An exported archive is not shared after the consent for one of its clips has ended.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MOST_SHARED_OUTPUTS = 256
 """Greatest number of outputs published from the cache in one transaction; a single job may exceed it."""
 
 MEASURED_PER_OUTPUT = 5
-"""Number of revisions with facets that count as one output, because publishing their facets takes about as long."""
+"""Number of revisions whose facets count as one output, because publishing these facets takes about as long."""
 
 
 class SharedResult(NamedTuple):
@@ -124,8 +124,8 @@ def _content(pin: Pin, read: Collection[str], parts: Mapping[str, str]) -> list[
 def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult]:
     """Find, for each of `candidates`, the job whose result it can share.
 
-    A candidate is a row with `id`, `project_id`, `cache_key` and `cache_mode`. Candidates without such a job are
-    omitted. Of several identical candidates, the first computes the result and the others share it. In each
+    A candidate is a row with `id`, `project_id`, `cache_key` and `cache_mode`. Candidates that cannot share a result
+    are omitted. Of several identical candidates, the first computes the result and the others share it. In each
     project, this function runs for one transaction at a time. It locks the jobs that it finds, so that none of them
     ends before the transaction has recorded who shares its result.
     """
@@ -147,7 +147,7 @@ def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult
 
 
 def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, str], SharedResult]:
-    """Return, for each cache key, the newest succeeded job, or else the oldest one that has not ended."""
+    """Return, for each project and cache key, the newest succeeded job, or else the oldest queued or running job."""
     keys = sorted({one.cache_key for one in asking if one.cache_mode == "use"})
     projects = sorted({one.project_id for one in asking})
     active = or_(job.c.state == QUEUED, job.c.state == RUNNING)
@@ -178,7 +178,7 @@ def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, st
 
 
 def join(tx: Transaction, joining: Sequence[tuple[Any, SharedResult]]) -> list[Ended]:
-    """Let waiting jobs share the results of other jobs, now or as soon as those finish; return the jobs that ended.
+    """Let waiting jobs share the results of other jobs, now or as soon as these have finished; return the ended jobs.
 
     `joining` pairs the row of each waiting job, of which only `id` is read, with the job that has the result.
     """
@@ -247,8 +247,8 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
 def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     """Publish the shared result as the result of a waiting job; return the jobs that ended as a result.
 
-    No job ends if the shared result is no longer stored. No job ends either if the jobs export clips, and the clips
-    whose consent has ended are not the same for both jobs. Raises the errors of `publish`.
+    The waiting job does not end if the shared result is no longer stored. It does not end either if the two jobs export
+    clips, and the clips whose consent has ended are not the same for both jobs. Raises the errors of `publish`.
     """
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")

@@ -1,4 +1,4 @@
-"""Retries of failed or cancelled jobs, of unsuccessful dependencies, and of dependants that ended because of them."""
+"""Retries of failed or cancelled jobs, of their unsuccessful dependencies, and of dependants that could not run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ UNSUCCESSFUL = ("failed", "cancelled")
 
 
 def retry_job(tx: Transaction, job_id: str) -> Job:
-    """Submit a failed or cancelled job again, and return the new job; results of its tasks are used again.
+    """Submit a failed or cancelled job again, and return the new job; results of the old job's tasks are used again.
 
     The new job has the same inputs; inputs that were never available are late inputs again. Unsuccessful dependencies
     are retried before it, and dependants that ended only because of this job are retried after it, so that the rest of
@@ -142,7 +142,7 @@ class _Family:
 def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_ins: Mapping[str, str]) -> Submission:
     """Return the submission that retries a job under the id `new`.
 
-    `stand_ins` maps its dependencies to their retries, on which the new job depends instead.
+    `stand_ins` maps each dependency of the job to the retry of this dependency, on which the new job depends instead.
     """
     try:
         kind = find_kind(row.kind)
@@ -218,9 +218,9 @@ def _states(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
 
 
 def _needs(tx: Transaction, rows: Mapping[str, Row[Any]]) -> dict[str, dict[str, str]]:
-    """Return the dependencies of each job, each with its newest retry.
+    """Return, for each job, its dependencies, each mapped to its newest retry.
 
-    The job whose result a job shares is left out.
+    A job on which another depends only to share its result is left out.
     """
     needs: dict[str, dict[str, str]] = {one: {} for one in rows}
     statement = select(job_dependency).order_by(job_dependency.c.on_job_id)
@@ -232,7 +232,7 @@ def _needs(tx: Transaction, rows: Mapping[str, Row[Any]]) -> dict[str, dict[str,
 
 
 def _latest_tries(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
-    """Return the newest retry of each job, or the job itself if it has none."""
+    """Return the newest retry of each job, or the job itself if it was not retried."""
     latest = {one: one for one in ids}
     looking: Collection[str] = set(ids)
     while looking:

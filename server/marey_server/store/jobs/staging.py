@@ -136,7 +136,7 @@ def _staged_draft(prepared: PreparedOutput, pins: PinnedInputs) -> StagedDraft:
 
 
 def _pinned_sources(output: StagedOutput, pins: PinnedInputs) -> dict[str, list[list[Any]]]:
-    """Return the inputs that an output names as sources, as pairs of item and revision; all inputs if it names none."""
+    """Return the inputs that an output names as sources, as pairs of item and revision; by default, all inputs."""
     if not output.sources:
         return {role: [[pin["item"], pin["revision"]] for pin in many] for role, many in pins.items()}
     return {role: [_pinned_source(role, source, pins) for source in named] for role, named in output.sources.items()}
@@ -213,8 +213,8 @@ def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: P
     """Return drafts that an identical job has staged, rewritten as drafts of this job.
 
     The two jobs may have read different revisions with the same content. In the sources and facets of each draft, the
-    revision that the other job read (from `theirs`) is replaced by the one at the same position in the inputs of this
-    job (`ours`).
+    revision that the other job read (from `theirs`) is replaced by the revision at the same position in the inputs of
+    this job (`ours`).
     """
     revisions = {
         (role, their["item"], their["revision"]): our["revision"]

@@ -49,7 +49,7 @@ _INSERT_JOB = Prepared(insert(job))
 
 
 class Upstream(NamedTuple):
-    """Job that others depend on."""
+    """Job on which other jobs depend."""
 
     kind: str
     state: JobState
@@ -94,9 +94,10 @@ def submit_checked(
 ) -> list[Job]:
     """Insert the rows of checked jobs and queue those without unfinished dependencies.
 
-    `upstream` maps the jobs on which they depend to the states of these jobs, which must be locked. If a job depends on
-    another of the submitted jobs, this dependency counts as unfinished. Raises `ForbiddenProblem` for an export for
-    which the role of the caller is too low, and for results in a folder to which the caller may not write.
+    `upstream` maps the ids of existing jobs, on which the new jobs depend, to their states; these existing jobs must be
+    locked. If a new job depends on another new job, this dependency counts as unfinished. Raises `ForbiddenProblem` for
+    an export for which the role of the caller is too low, and for results in a folder to which the caller may not
+    write.
     """
     rights = rights_of_caller(tx, project)
     for submitted in submissions:
@@ -293,8 +294,8 @@ def submit_pipeline(tx: Transaction, project: str, pipeline: PipelineCreate) -> 
 def _placed(request: JobCreate, step: PipelineStep) -> JobCreate:
     """Return the job request of a step, without those settings of the pipeline that do not apply to the step.
 
-    The field `into` is left out if the results have a fixed place, such as a tree in its model. The field `commit` is
-    left out if the step creates no items.
+    The field `into` is left out if the place of the results is fixed; for example, a tree is stored in its model. The
+    field `commit` is left out if the step creates no items.
     """
     try:
         kind = find_kind(request.kind)

@@ -29,7 +29,8 @@ _ORDER = (
 )  # fmt: skip
 """Kinds in the order of a purge.
 
-Documents refer to items of later kinds. So they are purged before these items, and do not hold them.
+Documents of an item refer to items of later kinds in this order. So an item is purged before the items to which its
+documents refer, and does not hold them.
 """
 assert set(_ORDER) == set(Kind), "every kind needs a place in the order of a purge"
 
@@ -98,9 +99,9 @@ def _kind_of(last: str) -> Kind:
 
 
 def contents_of(tx: Transaction, ids: Sequence[str]) -> tuple[dict[str, frozenset[str]], dict[str, frozenset[str]]]:
-    """Return the content digests of the revisions of each item, and those of the parts of each such content.
+    """Return the content digests of the revisions of each item, and, by these, the content digests of their parts.
 
-    Content digests are computed when a commit first needs them; revisions without one are left out.
+    Content digests are computed when a commit first needs them; revisions that have none yet are left out.
     """
     of_revision = and_(revision_part.c.item_id == revision.c.item_id, revision_part.c.number == revision.c.number)
     statement = (

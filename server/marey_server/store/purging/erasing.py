@@ -1,7 +1,7 @@
 """Erasure of items: their content, names and tags, and the traces of these in jobs and events.
 
 What remains of an item is a row with its id, its kind, the times of its creation, deletion and purge, and one row for
-each revision, with its number, its time and the job that made it. Rows of `lineage` refer to these.
+each revision, with its number, its time and the job that made it. Rows of `lineage` refer to the rows that remain.
 """
 
 from __future__ import annotations

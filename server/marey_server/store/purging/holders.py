@@ -37,8 +37,9 @@ def find_holders(
 ) -> dict[str, FoundHolders]:
     """Return what holds each item, by its id; `rows` are the items that are to be purged together.
 
-    Items that nothing holds are left out. If a document of one of these items refers to another of them, it holds this
-    other item only if its own item is held, too. `versions` are the holders that a `VersionSearch` has found.
+    Items that nothing holds are left out. If a document of one item in `rows` refers to another item in `rows`, the
+    first item holds the other one only if the first item is itself held. `versions` are the holders that a
+    `VersionSearch` has found.
     """
     held: dict[str, FoundHolders] = {}
     for item_id, found in versions.items():

@@ -22,7 +22,7 @@ class JobNaming:
     state: str
     """State of the job, or of its parent job if it is a task."""
     named: set[str] = field(default_factory=set)
-    """Ids of items in its inputs, parameters and results."""
+    """Ids of items in the inputs, parameters and results of the job."""
 
 
 def jobs_naming(
@@ -30,7 +30,7 @@ def jobs_naming(
 ) -> list[JobNaming]:
     """Return the jobs of a project that name one of `items`, by id.
 
-    With `unfinished`, only those are returned that have not ended, or whose parent job has not ended.
+    With `unfinished`, only jobs are returned that have not ended, or whose parent job has not ended.
     """
     parent = job.alias("parent")
     columns = (job_item.c.item_id, job.c.id, job.c.project_id, job.c.parent_id, job.c.kind)

@@ -29,9 +29,10 @@ STILL_HELD = "still-held"
 
 
 def preview_purge(tx: Transaction, project: str, request: PurgeRequest) -> PurgeAnswer:
-    """Return what a purge would delete and what it would refuse; this reads, and changes nothing.
+    """Return what a purge would delete and what it would refuse to delete; a preview only reads.
 
-    Raises the errors of `prepare_purge`, and those of `record_purge` for a single item, except if something holds it.
+    Raises the errors of `prepare_purge`. For a single item, also raises the errors of `record_purge`, except the error
+    for an item that something holds.
     """
     prepared = prepare_purge(tx, project, request)
     project_row = projects.require(tx, project)
@@ -42,9 +43,9 @@ def preview_purge(tx: Transaction, project: str, request: PurgeRequest) -> Purge
 def record_purge(tx: Transaction, project: str, request: PurgeRequest, prepared: PreparedPurge) -> PurgeAnswer:
     """Purge the prepared items that nothing holds, all in this transaction.
 
-    Items that were restored since they were chosen are left out. If the request names a single item, raises
-    `ConflictProblem` if something holds it or it is not deleted, `GoneProblem` if it was purged already, and
-    `NotFoundProblem` if it does not exist.
+    Items that were restored since they were chosen are left out. For a request that names a single item, raises
+    `ConflictProblem` if something holds the item or the item is not deleted, `GoneProblem` if it was purged already,
+    and `NotFoundProblem` if it does not exist.
     """
     assert not request.preview, "a preview is a read"
     project_row = projects.require(tx, project)
@@ -67,7 +68,7 @@ class _Examined:
     free: Sequence[Row[Any]]
     refused: tuple[HeldItem, ...]
     jobs: Sequence[str]
-    """Ids of the jobs that name an item that can be purged, all of which have ended, and of their parent jobs."""
+    """Ids of all jobs that name an item that can be purged, and of their parent jobs. All these jobs have ended."""
 
 
 def _examine(tx: Transaction, project_row: ProjectRow, request: PurgeRequest, prepared: PreparedPurge) -> _Examined:

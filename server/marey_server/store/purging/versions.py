@@ -111,7 +111,7 @@ class _Names:
         self._proposals = tx.execute(_PROPOSALS.where(proposal.c.dataset_id.in_(chosen))).all() if ids else []
 
     def holder(self, dataset_id: str, commits: Collection[str]) -> DatasetHolder:
-        """Return a dataset of which some commits contain an item."""
+        """Return the dataset as a holder of an item; `commits` are the commits of the dataset that contain the item."""
         refs = [row for row in self._refs if row.dataset_id == dataset_id and row.digest in commits]
         proposals = [row for row in self._proposals if row.dataset_id == dataset_id and row.head_now in commits]
         return DatasetHolder(

@@ -59,7 +59,7 @@ class PreparedDatasetPurge:
     commits: frozenset[str]
     """Commits that no other dataset of the project has."""
     citing: frozenset[str]
-    """Jobs that read one of these commits; while the dataset is deleted, no new jobs can read them, except retries."""
+    """Jobs that read one of `commits`; while the dataset is deleted, no new jobs can read these, except retries."""
     chunks: Mapping[str, int]
     """Digests of the chunks that are only in trees of this dataset, with the times at which they were stored last."""
     freed_bytes: int
@@ -102,7 +102,10 @@ def prepare_dataset_purge(tx: Transaction, project: str, request: DatasetPurgeRe
 def record_dataset_purge(
     tx: Transaction, project: str, request: DatasetPurgeRequest, prepared: PreparedDatasetPurge
 ) -> DatasetPurgeAnswer:
-    """Delete a deleted dataset for good. Raises `ConflictProblem` if something holds it, and `NotFoundProblem`."""
+    """Delete a deleted dataset for good.
+
+    Raises `ConflictProblem` if something holds the dataset, and `NotFoundProblem` if there is no such dataset.
+    """
     assert not request.preview, "a preview is a read"
     project_row = projects.require(tx, project)
     begin_purge(tx, project_row.id)
@@ -251,8 +254,9 @@ def _below(store: StoredChunks, roots: Collection[str], known: Collection[str]) 
 def _delete_chunks(tx: Transaction, chunks: Mapping[str, int]) -> None:
     """Delete chunks, apart from those that another write has stored again since the purge was prepared.
 
-    A write that makes a tree stores its new chunks, even those that are stored already; this changes their times, so
-    they are not deleted. The other chunks of the new tree belong to an older tree, too, and so they are not deleted.
+    A write that makes a tree stores its new chunks, even those that are stored already; this changes the times of these
+    chunks, so they are not deleted. All other chunks of the new tree belong to an older tree, too, and so they are not
+    deleted either.
     """
     digests = sorted(chunks)
     for some in in_lists(digests):

@@ -35,7 +35,7 @@ def unique_alive(table: str, *columns: str) -> Index:
 
 
 INDEXED_CHARACTERS = 100
-"""Greatest number of characters of a text that an index stores: Postgres refuses rows with much longer ones."""
+"""Greatest number of characters of a text that an index stores: Postgres refuses much longer index entries."""
 
 
 class MemberStart(FunctionElement[str]):

@@ -19,7 +19,7 @@ from marey_server.store.webhooks.managing import find_webhook, no_webhook
 
 TEST_KIND = "webhook.test"
 MOST_WAITING = 1000
-"""Greatest number of requested deliveries of a webhook that wait."""
+"""Greatest number of deliveries of a webhook that were requested and are not sent yet."""
 
 
 def list_deliveries(

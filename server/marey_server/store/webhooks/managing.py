@@ -1,4 +1,4 @@
-"""Webhooks as resources of a project: created, listed, changed, rotated and deleted by its owners."""
+"""Webhooks as resources of a project: its owners create, list, change and delete them, and replace their secrets."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ def change_webhook(
 
 
 def give_up_retries(tx: Transaction, webhook_id: str) -> None:
-    """Give up the delivery of a webhook that failed and would be sent again."""
+    """Give up the failed delivery that the server would send to a webhook again."""
     which = (webhook_delivery.c.webhook_id == webhook_id, webhook_delivery.c.state == "retrying")
     tx.execute(update(webhook_delivery).where(*which).values(state="dead", updated_us=tx.now_us))
 

@@ -3,7 +3,7 @@
 The position of a webhook is the number of the last event that was delivered or given up, so events are sent in their
 order. The transaction that records an outcome also moves the position. So a process that dies loses no delivery, and
 its successor repeats at most the deliveries whose outcome was not recorded. Only the leading process sends deliveries;
-if it has lost the lead in the meantime, it does not record the outcome.
+if it loses the lead before it records an outcome, it does not record the outcome.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ RETRY = Backoff(first_s=5.0, longest_s=1800.0)
 BATCH = 100
 """Greatest number of deliveries that are read at once."""
 SKIPPED_MOST = 10_000
-"""Number of events without a delivery to a webhook after which its stored position is moved past them."""
+"""Number of events, none of which concerns a webhook, after which the stored position of the webhook is moved on."""
 MISSED_KIND = "webhook.events_missed"
 
 Outcome = Literal["delivered", "retry", "dead"]
@@ -285,7 +285,8 @@ def _note(tx: Transaction, delivery: Delivery, result: DeliveryResult, outcome: 
 def count_missed(tx: Transaction, last: int) -> None:
     """Count, for each webhook, the undelivered events up to the one numbered `last`, which are about to leave the feed.
 
-    If a webhook has missed events, its position moves to `last`, and a later delivery reports their number.
+    If a webhook has missed events, its position moves to `last`, and a later delivery reports the number of missed
+    events.
     """
     for row in tx.execute(select(webhook).where(webhook.c.position < last).with_for_update()).all():
         number = events.number_of(tx)

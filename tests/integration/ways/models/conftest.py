@@ -1,4 +1,4 @@
-"""A project that all tests of a module share, because its contents take long to create."""
+"""A project that all tests of a module share, because the contents of the project take long to create."""
 
 from collections.abc import Iterator
 from math import radians
@@ -19,7 +19,7 @@ EXAMPLES = 12
 
 @pytest.fixture(scope="module")
 def lab(marey: Marey, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProjectHandle]:
-    """A project with twelve aligned walks of two steps, and two walks of another alignment."""
+    """A project with twelve aligned walks of two steps each, and two more walks that were aligned separately."""
     project = marey.create_project(ProjectCreate(name="lab"))
     folder = tmp_path_factory.mktemp("takes")
     write_steps(folder)

@@ -1,4 +1,4 @@
-"""Job kinds of another distribution, as a worker finds them: one that works, and one that fails in every way."""
+"""Job kinds of another Python package, as a worker finds them: kinds that work, and one that fails in many ways."""
 
 import ctypes
 import os
@@ -65,7 +65,7 @@ def _eat() -> dict[str, int]:
 
 
 def _hoard(folder: Path) -> None:
-    """Allocate memory in small pieces, in a forked process that removes its limit; write its id to a file."""
+    """Fork a process that writes its id to a file, removes its memory limit, and allocates more and more memory."""
     if os.fork() == 0:
         (folder / "hoarder").write_text(str(os.getpid()))
         resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
@@ -98,7 +98,7 @@ def _sleep(seconds: float) -> dict[str, bool]:
 
 
 def _give_up_early(context: Context) -> None:
-    """Raise an error while requested documents are still being sent."""
+    """Raise an error while documents that were requested are still arriving."""
     pin = PinnedInput(item="clip_1", revision=1, kind="clip", name="walk", collection="")
     reading = context.documents([pin] * 20, "motion")
     next(reading)

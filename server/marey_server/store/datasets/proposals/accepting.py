@@ -47,7 +47,7 @@ MOST_PREVIEWED = 10_000
 MOST_SHOWN_CONFLICTS = 100
 
 WAITING_MERGE = ProposalMerge()
-"""Request with default options, used to preview a merge, and to merge a waiting proposal."""
+"""Request with default options; it is used to preview a merge, and to merge a waiting proposal."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,11 @@ class WaitingOutcome(Enum):
     NOT_READY = auto()
     """No merge is requested, or approvals, checks or rights are missing."""
     OBSTRUCTED = auto()
-    """The merge has conflicts or another obstacle, until a branch moves or the rule of the target changes."""
+    """A conflict or another obstacle prevents the merge until a branch moves or the rule of the target changes."""
 
 
 class MergeBasis(NamedTuple):
-    """Basis of the result of a merge: the newest commits of source and target, and the rule of the target."""
+    """What the result of a merge depends on: the newest commits of source and target, and the rule of the target."""
 
     head: str
     target: str | None
@@ -132,7 +132,7 @@ def _target(tx: Transaction, row: Row[Any], *, lock: bool = False) -> Row[Any]:
 
 
 def _obstacles(prepared: PreparedAcceptance, rule: Protection | None) -> Iterator[Missing]:
-    """Yield what prevents a merge of the two versions: an error, conflicts, or a source that is not up to date."""
+    """Yield why the two versions cannot be merged: an error, conflicts, or a source that is not up to date."""
     if prepared.refusal is not None and prepared.refusal.error_code != LARGE_MERGE:
         yield Missing(code=prepared.refusal.error_code, detail=prepared.refusal.detail)
     if prepared.merge is None:
@@ -188,8 +188,8 @@ def merge_proposal(
 ) -> Proposal:
     """Merge a proposal. With `when_green`, merge it later if approvals, checks or other requirements are missing.
 
-    Raises `ConflictProblem` if the proposal has ended, if a requirement is missing without `when_green`, or if a branch
-    has moved since the merge was prepared, and the errors of `require_move`.
+    Raises `ConflictProblem` if the proposal has ended, if a requirement is missing and `when_green` is not set, or if a
+    branch has moved since the merge was prepared. Raises the errors of `require_move`, too.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
@@ -266,8 +266,8 @@ def merge_if_green(
 ) -> WaitingOutcome:
     """Merge a locked proposal if its automatic merge (`when_green`) was requested and all requirements are met.
 
-    It is not merged if the user who requested the merge may no longer move the branch. Raises `ConflictProblem` if a
-    branch has moved since the merge was prepared.
+    The proposal is not merged if the user who requested the merge may no longer move the branch. Raises
+    `ConflictProblem` if a branch has moved since the merge was prepared.
     """
     if not is_waiting(row):
         return WaitingOutcome.NOT_READY
@@ -285,10 +285,10 @@ def merge_if_green(
 def merge_if_possible(
     tx: Transaction, project: str, name: str, row: Row[Any], prepared: PreparedAcceptance | None
 ) -> None:
-    """Call `merge_if_green`, and leave a merge that is refused, for example because of a quota, to housekeeping.
+    """Call `merge_if_green`; if it refuses the merge, for example because of a quota, housekeeping tries again later.
 
-    The merge is not the caller's, so its refusal must not undo what the caller has stored in this transaction. Raises
-    `ConflictProblem` if a branch has moved since the merge was prepared.
+    The merge is only a side effect of the caller's request, so a refusal must not undo what the request has stored in
+    this transaction. Raises `ConflictProblem` if a branch has moved since the merge was prepared.
     """
     try:
         with tx.connection.begin_nested():
@@ -314,9 +314,10 @@ def merge_basis(tx: Transaction, project_row: ProjectRow, row: Row[Any]) -> Merg
 
 
 def _ready_mover(tx: Transaction, project_row: ProjectRow, row: Row[Any], target: Row[Any]) -> Mover | None:
-    """Return the user who requested the merge, if the approvals and checks that the target requires are present.
+    """Return the user who requested the merge, if the proposal has all required approvals and checks.
 
-    Returns None if they are missing, if a reviewer has requested changes, or if the user may no longer move the branch.
+    Returns None if one of them is missing, if a reviewer has requested changes, or if the user who requested the merge
+    may no longer move the branch.
     """
     if any(find_missing(tx, project_row.id, row, rule_of(target))):
         return None

@@ -23,14 +23,14 @@ from marey_versions.records import key_of
 from marey_versions.tree.reading import Tree
 
 MOST_OF_EACH = 1000
-"""Greatest number of comments, of reviews and of checks of a proposal."""
+"""Greatest number of comments on a proposal. Its reviews have the same limit, and so have its checks."""
 
 
 def add_comment(tx: Transaction, project: str, name: str, number: int, request: CommentCreate) -> Comment:
     """Comment on an open proposal.
 
-    Raises `NotFoundProblem` if neither the proposed version nor the target has the entry, and `ConflictProblem` if the
-    proposal has ended or has too many comments.
+    Raises `NotFoundProblem` if the request names an entry that neither the proposed version nor the target has, and
+    `ConflictProblem` if the proposal has ended or has too many comments.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
@@ -53,7 +53,10 @@ def add_comment(tx: Transaction, project: str, name: str, number: int, request: 
 
 
 def next_number(tx: Transaction, table: Table, row: Row[Any], things: str) -> int:
-    """Return the number of the next comment or review of a locked proposal. Raises `ConflictProblem` at the limit."""
+    """Return the number of the next comment or review of a locked proposal.
+
+    `things` is the plural noun in the error text. Raises `ConflictProblem` if there are already `MOST_OF_EACH`.
+    """
     held = select(func.count()).where(table.c.dataset_id == row.dataset_id, table.c.proposal == row.number)
     count: int = tx.execute(held).scalar_one()
     if count >= MOST_OF_EACH:

@@ -32,7 +32,7 @@ _AUTHOR, _WAITING, _ENDING = user.alias("author"), user.alias("waiting"), user.a
 
 
 def find_proposal(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
-    """Return the row of a proposal, with the names of the users in it.
+    """Return the row of a proposal, with the names of the users to whom the row refers.
 
     The columns `head_now` and `target_now` are the newest commits of the proposal's source and of its target.
     """
@@ -160,7 +160,7 @@ def _require_room(tx: Transaction, dataset_id: str) -> None:
 def close_proposal(tx: Transaction, project: str, name: str, number: int) -> Proposal:
     """Close a proposal without merging it; its author and maintainers may do this.
 
-    Raises `ForbiddenProblem` for others, and `ConflictProblem` if the proposal is merged or closed already.
+    Raises `ForbiddenProblem` for other callers, and `ConflictProblem` if the proposal is merged or closed already.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)

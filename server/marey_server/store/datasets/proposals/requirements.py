@@ -35,7 +35,7 @@ def shown_review(one: Row[Any], head: str) -> Review:
 
 
 def verdicts_of(tx: Transaction, project_id: str, row: Row[Any]) -> list[Row[Any]]:
-    """Return the newest approval or request for changes of each reviewer.
+    """Return, for each reviewer, the newest review that approves the proposal or requests changes.
 
     The column `counts` is true if the reviewer may still write in the project.
     """
@@ -55,7 +55,7 @@ def verdicts_of(tx: Transaction, project_id: str, row: Row[Any]) -> list[Row[Any
 
 
 def checks_of(tx: Transaction, row: Row[Any]) -> dict[str, ProposalCheck]:
-    """Return the checks of the newest commit of a proposal as a mapping from their names, sorted by name."""
+    """Return the checks of the newest commit of a proposal by name, sorted by name."""
     statement = (
         select(proposal_check, user.c.name.label("reporter"))
         .join(user, user.c.id == proposal_check.c.reporter_id)
@@ -73,7 +73,7 @@ def checks_of(tx: Transaction, row: Row[Any]) -> dict[str, ProposalCheck]:
 
 
 def find_missing(tx: Transaction, project_id: str, row: Row[Any], rule: Protection | None) -> Iterator[Missing]:
-    """Return the approvals and checks that a proposal still needs, and the requests for changes that block it."""
+    """Yield the approvals and checks that a proposal still needs, and the requests for changes that block it."""
     verdicts = [one for one in verdicts_of(tx, project_id, row) if one.counts]
     for one in verdicts:
         if one.verdict == Verdict.REQUEST_CHANGES:

@@ -25,7 +25,7 @@ from marey_server.store.transaction import Transaction
 def add_review(
     tx: Transaction, project: str, name: str, number: int, request: ReviewCreate, waiting: PreparedAcceptance | None
 ) -> Review:
-    """Review the newest commit of an open proposal, and merge the proposal if it waits for nothing else.
+    """Review the newest commit of an open proposal; then merge the proposal if it only waited for this review.
 
     Raises `ConflictProblem` if the proposal has ended, or if its newest commit is not the one that the request names.
     """
@@ -62,7 +62,7 @@ def list_reviews(tx: Transaction, project: str, name: str, number: int, *, curso
 def report_check(
     tx: Transaction, project: str, name: str, number: int, request: CheckReport, waiting: PreparedAcceptance | None
 ) -> ProposalCheck:
-    """Record the state of a check of the newest commit, and merge the proposal if it waits for nothing else.
+    """Record the state of a check of the newest commit; then merge the proposal if it only waited for this check.
 
     Raises `ConflictProblem` if the proposal has ended, or if its newest commit is not the commit of the report. A
     report of success may name a job; `ConflictProblem` is also raised if this job has not succeeded, or has read only

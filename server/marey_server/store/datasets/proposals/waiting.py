@@ -1,8 +1,8 @@
 """Automatic merges of proposals (`when_green`): each proposal is merged as soon as it meets all requirements.
 
-A review or a report of a check tries the merge at once. Other changes can meet the last requirement, too: a changed
-rule, a moved target, a new role of the user who requested the merge. So the server examines all waiting proposals
-regularly.
+When a review or a report of a check arrives, the server tries the merge at once. The last requirement can also be met
+by other changes: a changed rule, a moved target, a new role of the user who requested the merge. So the server examines
+all waiting proposals regularly.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from marey_server.store.transaction import Transaction
 EXAMINED_AT_ONCE = 100
 """Greatest number of proposals that one call of `WaitingMerges.attempt` examines."""
 IN_VAIN_KEPT = 10_000
-"""Greatest number of proposals whose merges in vain are remembered."""
+"""Greatest number of proposals for which the last failed merge is remembered."""
 REFUSED_PAUSE_S = 60.0
 """Seconds until a merge that was refused, for example because of a quota, is computed again on the same basis."""
 
@@ -53,14 +53,14 @@ class _PendingMerge(NamedTuple):
 
 
 class _InVain(NamedTuple):
-    """Merge that was computed in vain: its basis, and the monotonic time in seconds when the basis is tried again."""
+    """Merge computed in vain: its basis, and the monotonic time in seconds before which it is not tried again."""
 
     basis: MergeBasis
     again_s: float
 
 
 class WaitingMerges:
-    """Attempts to merge waiting proposals, in repeated rounds; each round is in the order of datasets and numbers."""
+    """Merges waiting proposals in repeated rounds; a round takes the proposals in the order of dataset and number."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
