@@ -70,7 +70,7 @@ class WaitingOutcome(Enum):
 
 
 class MergeBasis(NamedTuple):
-    """What the result of a merge depends on: the newest commits of source and target, and the rule of the target."""
+    """Newest commits of source and target, and rule of the target; the result of a merge depends on nothing else."""
 
     head: str
     target: str | None
