@@ -11,8 +11,9 @@ ARGS   ?=
 # Tests start hundreds of processes, each of which would compile the sources again.
 unexport PYTHONDONTWRITEBYTECODE
 EFFORT ?= 4
-# Twice as many processes as two processors: tests of faults mostly wait, for leases to end or processes to start.
-PYTEST := $(BIN)/python -m pytest -q -n 4 --dist loadgroup $(ARGS)
+PYTEST := $(BIN)/python -m pytest -q --dist loadgroup $(ARGS)
+# One process more than two processors: tests of faults wait, for leases to end or processes to start. All others compute.
+PROCESSES ?= 3
 
 .DEFAULT_GOAL := help
 .PHONY: help installed demo check test soak lint format dev bench docs pins audit bom clean
@@ -45,13 +46,13 @@ dev: $(VENV)/.installed-dev ## A server and a worker on this machine, with data 
 	$(BIN)/marey serve
 
 check: $(VENV)/.installed-dev lint ## In 4 minutes: lint, types, units, REST on SQLite, one whole way
-	$(PYTEST) --tier check tests
+	$(PYTEST) -n auto --tier check tests
 
 test: $(VENV)/.installed-dev lint ## In 15 minutes: everything a change can break, on SQLite and on Postgres
-	$(PYTEST) --tier test tests
+	$(PYTEST) -n $(PROCESSES) --tier test tests
 
 soak: $(VENV)/.installed-dev lint ## Long forms of all tests, on both databases; EFFORT=20 for more examples, in hours
-	$(PYTEST) --tier soak --effort $(EFFORT) -o timeout=7200 --durations=25 tests
+	$(PYTEST) -n $(PROCESSES) --tier soak --effort $(EFFORT) -o timeout=7200 --durations=25 tests
 	$(BIN)/python -m tests.support.motion_fuzz $$((300 * $(EFFORT)))
 	$(BIN)/python -m tests.support.hostile_figures
 

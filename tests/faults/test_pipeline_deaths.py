@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
+from tests.support.tiers import is_soak
 
 from marey_client.handles.pipelines import PipelineRun
 from marey_client.imports import LocalFile, find_files
@@ -24,15 +25,14 @@ from marey_schemas.queue.pipelines import PipelineCreate
 
 pytestmark = pytest.mark.timeout(900)
 
-TAKES = 40
 StartWorker = Callable[..., WorkerProcess]
 
 
 @pytest.fixture(scope="module")
 def takes(tmp_path_factory: pytest.TempPathFactory) -> list[LocalFile]:
-    """Different short walks as BVH files."""
+    """Different short walks as BVH files; in the tier `soak`, more of them."""
     folder = tmp_path_factory.mktemp("takes")
-    for number in range(TAKES):
+    for number in range(40 if is_soak() else 12):
         clip = generate_gait(1.0 + number / 100, 0.0, 0.5, 30)
         (folder / f"walk-{number:02d}.bvh").write_bytes(write_motion(clip, "bvh"))
     return list(find_files([folder]).files)
@@ -70,7 +70,7 @@ def game_rig(lab: ProjectHandle, folder: Path) -> str:
     return entry.skeleton
 
 
-def to_game_and_back(lab: ProjectHandle, takes: list[LocalFile], folder: Path) -> PipelineCreate:
+def game_twice(lab: ProjectHandle, takes: list[LocalFile], folder: Path) -> PipelineCreate:
     """Return a pipeline that imports the takes, retargets them to another skeleton, and retargets the results again."""
     files = [file.model_dump() for file in lab.imports.send(takes)]
     skeleton = {"item": game_rig(lab, folder)}
@@ -82,13 +82,13 @@ def to_game_and_back(lab: ProjectHandle, takes: list[LocalFile], folder: Path) -
     return PipelineCreate.model_validate({"steps": steps})
 
 
-def assert_made_once(lab: ProjectHandle, run: PipelineRun) -> None:
+def assert_made_once(lab: ProjectHandle, run: PipelineRun, takes: list[LocalFile]) -> None:
     """Check that every step has succeeded, and that every clip exists once, at its first revision, with its sources."""
     assert {job.state for job in run.refresh().values()} == {JobState.SUCCEEDED}, run
     for folder, inputs in (("raw", 0), ("game", 2), ("again", 2)):
         clips = list(lab.clips.list(collection=folder))
-        assert [clip.item.revision for clip in clips] == [1] * TAKES, folder
-        assert len({clip.path for clip in clips}) == TAKES, folder
+        assert [clip.item.revision for clip in clips] == [1] * len(takes), folder
+        assert len({clip.path for clip in clips}) == len(takes), folder
         assert len(clips[0].lineage().inputs) >= inputs
     assert all(not clip.staleness().stale for clip in lab.clips.list(collection="again"))
 
@@ -105,7 +105,7 @@ def test_a_server_killed_where_a_job_gets_its_inputs_goes_on_with_all_of_them_or
 ) -> None:
     server.start()
     with server.client() as marey:
-        wanted = to_game_and_back(marey.create_project(ProjectCreate(name="lab")), takes, tmp_path)
+        wanted = game_twice(marey.create_project(ProjectCreate(name="lab")), takes, tmp_path)
     server.stop()
     server.start(fault=f"{place}{nth}:kill")
     with server.client() as marey:
@@ -114,7 +114,7 @@ def test_a_server_killed_where_a_job_gets_its_inputs_goes_on_with_all_of_them_or
         assert server.wait_until_dead() == -signal.SIGKILL
         server.start()
         run.wait(timeout_s=120)
-        assert_made_once(marey.project("lab"), run)
+        assert_made_once(marey.project("lab"), run, takes)
     server.check_database()
 
 
@@ -128,7 +128,7 @@ def test_a_server_killed_where_a_pipeline_is_handed_in_has_all_of_it_or_nothing(
 ) -> None:
     server.start()
     with server.client() as marey:
-        wanted = to_game_and_back(marey.create_project(ProjectCreate(name="lab")), takes, tmp_path)
+        wanted = game_twice(marey.create_project(ProjectCreate(name="lab")), takes, tmp_path)
     server.stop()
     server.start(fault=f"{place}:kill")
     with server.client() as marey, ThreadPoolExecutor(1) as pool:
@@ -140,7 +140,7 @@ def test_a_server_killed_where_a_pipeline_is_handed_in_has_all_of_it_or_nothing(
         assert len(list(marey.project("lab").jobs())) == 3
         start_worker("steady")
         run.wait(timeout_s=120)
-        assert_made_once(marey.project("lab"), run)
+        assert_made_once(marey.project("lab"), run, takes)
     server.check_database()
 
 
@@ -155,12 +155,12 @@ def test_a_worker_killed_under_a_pipeline_is_replaced_and_nothing_is_there_twice
     server.start()
     with server.client() as marey:
         lab = marey.create_project(ProjectCreate(name="lab"))
-        wanted = to_game_and_back(lab, takes, tmp_path)
+        wanted = game_twice(lab, takes, tmp_path)
         dying = [start_worker(f"dying-{n}", fault=f"worker.{place}@{n}:kill") for n in (1, 3)]
         run = lab.pipeline(wanted)
         for worker in dying:
             assert worker.wait_until_dead() == -signal.SIGKILL
         start_worker("healthy")
         run.wait(timeout_s=120)
-        assert_made_once(lab, run)
+        assert_made_once(lab, run, takes)
     server.check_database()

@@ -11,8 +11,8 @@ from tests.support.tiers import examples
 from marey_server.store.database.connections import Database
 from marey_server.store.database.schema import upgrade_schema
 
-FEW = 2
-"""Requests for each probe in the tier `test`."""
+FEW = 1
+"""Requests for each probe in the tier `test`. In the tier `soak`, `test_generated_requests.py` sends many more."""
 SEED = 20261121
 CALLERS = ("anonymous", "reader", "owner")
 

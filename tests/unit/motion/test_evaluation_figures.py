@@ -59,7 +59,10 @@ def other() -> EvaluationResult:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_figure_has_the_same_bytes_each_time(name: str, result: EvaluationResult) -> None:
-    assert draw_figure(name, result).files() == is_sound(figure_of(name)).files()
+    first, second = is_sound_svg(figure_of(name)), draw_figure(name, result)
+    assert (first.svg, first.data) == (second.svg, second.data)
+    if is_soak():
+        assert is_sound(first).files() == second.files()
 
 
 @pytest.mark.slow
