@@ -208,6 +208,13 @@ class ClientGoneProblem(ApiProblem):
 # 5xx: ours
 
 
+class DamagedProblem(ApiProblem):
+    """Stored data are missing or damaged; the administrator of the server can check them with `marey db fsck`."""
+
+    status = 500
+    code = "dataset-damaged"
+
+
 class UnavailableProblem(ApiProblem):
     """The server cannot answer just now; try again."""
 

@@ -609,6 +609,11 @@ def test_damaged_versions_are_found(owner: httpx.Client, gaits: Callable[..., An
     assert not list(check_store(database))
     database.write(SYSTEM, damage)
     assert {one.code for one in check_store(database)} == {"chunk-corrupt", "commit-corrupt"}
+    before = ok(owner.get(f"{GAITS}/refs/main"))
+    refused(owner.get(f"{GAITS}/entries"), 500, "dataset-damaged")
+    change = {"change": "put", "path": "c", "item": item_at(owner, "gaits/a")["id"]}
+    refused(owner.post(f"{GAITS}/commits", json={"message": "m", "changes": [change]}), 500, "dataset-damaged")
+    assert ok(owner.get(f"{GAITS}/refs/main")) == before
 
 
 def test_the_numbers_of_datasets_and_of_tags_are_limited(

@@ -16,13 +16,20 @@ from tornado.web import HTTPError, RequestHandler
 from marey_schemas.address import API
 from marey_schemas.problems import MEDIA_TYPE, Problem
 from marey_schemas.sizes import KIB, MIB
-from marey_server.errors import ApiProblem, MethodNotAllowedProblem, UnauthenticatedProblem, forget_origin
+from marey_server.errors import (
+    ApiProblem,
+    DamagedProblem,
+    MethodNotAllowedProblem,
+    UnauthenticatedProblem,
+    forget_origin,
+)
 from marey_server.http.caching import NOT_STORED
 from marey_server.http.declarations import Declared, Operation
 from marey_server.http.etags import entity_tag
 from marey_server.http.reply import Rendered
 from marey_server.process.observe import request_id
 from marey_server.process.services import Services
+from marey_versions.tree.chunks import DamagedChunk
 
 LINGER_BYTES = 64 * 2**20
 """Number of bytes of a refused body that are read and discarded, so that its sender receives the answer."""
@@ -203,6 +210,8 @@ class Exchange(RequestHandler):
         error = exc_info[1] if exc_info else HTTPError(status_code)
         if isinstance(error, HTTPError) and error.status_code == 405:  # a method that Tornado itself does not know
             error = self.method_not_allowed()
+        if isinstance(error, DamagedChunk):
+            error = DamagedProblem("Stored data of the dataset are missing or damaged on the server.")
         self.set_header("X-Request-Id", self.request_id)
         self._write_problem(error)
         forget_origin(error)

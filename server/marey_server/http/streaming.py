@@ -10,7 +10,7 @@ from types import MappingProxyType
 from urllib.parse import quote
 
 from marey_schemas.sizes import MIB
-from marey_server.errors import RangeNotSatisfiableProblem, UnavailableProblem
+from marey_server.errors import DamagedProblem, RangeNotSatisfiableProblem
 from marey_server.http.caching import IMMUTABLE
 from marey_server.http.etags import entity_tag, matches
 from marey_server.http.reply import Rendered
@@ -137,10 +137,6 @@ class BlobSender(Resource):
             stop = min(opened.stop, position + PIECE_BYTES)
             piece = await self.look_up(blobs.read_range, digest, position, stop)
             if len(piece) != stop - position:
-                raise UnavailableProblem(
-                    f"Bytes of the blob {digest} are missing on the server; its administrator can check the "
-                    "stored data with `marey db fsck`.",
-                    code="blob-damaged",
-                )
+                raise DamagedProblem(f"Bytes of the blob {digest} are missing on the server.", code="blob-damaged")
             self.write(piece)
             position = stop

@@ -18,7 +18,7 @@ from sqlalchemy import select
 from marey_schemas.queue.commits import MOST_COMMITTED
 from marey_server import faults
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import ApiProblem, UnavailableProblem
+from marey_server.errors import ApiProblem, DamagedProblem, UnavailableProblem
 from marey_server.store.database.connections import Database
 from marey_server.store.datasets.chunks import store_chunks
 from marey_server.store.datasets.naming import find_ref
@@ -37,8 +37,6 @@ CHUNKS_AT_ONCE = 500
 MOST_PLANS = 5
 """Greatest number of times that a commit is planned in a row, before the next job has its turn."""
 
-DATASET_DAMAGED = "dataset-damaged"
-"""Code of the failure of a job whose commit cannot be computed, because chunks of the dataset are damaged."""
 
 log = logging.getLogger(__name__)
 
@@ -123,7 +121,7 @@ def _plan(tx: Transaction, job_id: str) -> _JobPlan | None:
     except DamagedChunk as error:
         log.exception("the outputs of %s cannot be committed", job_id)
         detail = f"The stored data of the dataset are damaged: {error}."
-        return replace(plan, failure=commits.refused_commit(row.commit_to, DATASET_DAMAGED, detail))
+        return replace(plan, failure=commits.refused_commit(row.commit_to, DamagedProblem.code, detail))
 
 
 def _with_commit(tx: Transaction, row: Any, plan: _JobPlan) -> _JobPlan:
