@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+from sqlalchemy import select
 
+from marey_schemas.datasets.naming import MAIN
 from marey_schemas.encoding.canonical import document_digest
+from marey_server.access.principal import SYSTEM
 from marey_server.store import datasets
 from marey_server.store.database.connections import Database
+from marey_server.store.datasets import receiving
+from marey_server.store.datasets.chunks import store_chunks
 from marey_server.store.fsck import check_store
+from marey_server.store.tables import dataset_ref
+from marey_server.store.transaction import Transaction
 from marey_versions.records import CommitRecord, key_of, revision_content
 from marey_versions.tree.building import build
 from marey_versions.tree.chunks import ChunksInMemory
@@ -132,6 +140,25 @@ def test_a_commit_is_not_recorded_in_another_dataset_of_the_same_name(
         refused(client.post(f"{GAITS}/received-commits", json=body), 409, "branch-moved")
     refused(client.get(f"{GAITS}/commits/{digest}"), 404, "no-version")
     assert (receive(client, body)["digest"], receive(client, body)["entries"]) == (digest, 1)
+
+
+@pytest.mark.parametrize("database_url", ["postgres"], indirect=True)
+def test_a_received_commit_locks_its_branch_before_it_stores_chunks(
+    client: httpx.Client, open_database: Callable[[], Database], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other commits do the same, so that the two never wait for each other."""
+    one, other = skeleton("Hips"), open_database()
+    send(client, one)
+    free: list[list[str]] = []
+
+    def store(tx: Transaction, chunks: Mapping[str, bytes]) -> None:
+        branch = select(dataset_ref.c.name).where(dataset_ref.c.name == MAIN).with_for_update(skip_locked=True)
+        free.append(other.write(SYSTEM, lambda tx: list(tx.execute(branch).scalars())))
+        store_chunks(tx, chunks)
+
+    monkeypatch.setattr(receiving, "store_chunks", store)
+    receive(client, commit({"rig": one})[0], begins=MAIN)
+    assert free == [[]]
 
 
 def test_a_revision_that_is_no_entry_gets_an_item_that_stays(client: httpx.Client) -> None:

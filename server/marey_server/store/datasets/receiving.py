@@ -27,7 +27,7 @@ from marey_server.store.datasets.committing import (
     move_branch_to,
 )
 from marey_server.store.datasets.history import read_commit, revisions_with, tree_of
-from marey_server.store.datasets.naming import find_dataset
+from marey_server.store.datasets.naming import find_dataset, find_ref
 from marey_server.store.datasets.protection import Mover
 from marey_server.store.datasets.revisions import item_name, publish_contents, require_contents
 from marey_server.store.documents import PreparedDocument
@@ -187,6 +187,8 @@ def record_receipt(
     if not _is_known(tx, found, digest):
         _require_parents(tx, found, prepared.record)
         require_no_purge_since(tx, project_row.id, prepared.last_purge)
+        if request.begins is not None:
+            find_ref(tx, found.id, request.begins, lock=True)  # in the order of other commits: branch, chunks
         store_chunks(tx, prepared.chunks)
         insert_commit(tx, found.id, prepared.record, entries=prepared.entries)
         tx.emit("commit.received", found.id, project_id=project_row.id, commit=digest)
