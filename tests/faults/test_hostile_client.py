@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sqlalchemy import select
+from tests.support import hostile_client
 from tests.support.furnished_house import House, build_house
 from tests.support.hostile_client import ATTACKED, Outcome, fire_all, shots, some
 from tests.support.process_cost import ProcessCost
-from tests.support.rest_server import People
+from tests.support.rest_server import People, running
 from tests.support.server_process import ServerProcess
 from tests.support.tiers import is_soak
 from tests.support.who_may import PEOPLE
 
+from marey_schemas.encoding import codecs
+from marey_server.access import roles
 from marey_server.store.database.connections import Database
 from marey_server.store.tables import metadata
 
@@ -97,3 +102,37 @@ def test_two_hundred_hostile_connections_leave_no_fault(attacked: Attacked) -> N
     outcomes = asyncio.run(fire_all(attacked.process.url, some(outsiders, SHOTS, SEED), 200))
     assert attacked.faults(outcomes) == []
     assert attacked.cost.peak_mb() < MOST_MB
+
+
+def _every_role_is_enough(_role: Any, _required: Any) -> bool:
+    return True
+
+
+def _no_body_can_be_read(*_body: Any, **_limits: Any) -> Any:
+    raise KeyError("a mistake in a decoder")
+
+
+def _bodies_take_long(*_body: Any, **_limits: Any) -> Any:
+    time.sleep(1.0)
+    return {}
+
+
+HOLES: dict[str, tuple[Any, str, Callable[..., Any]]] = {
+    "every member may do everything": (roles, "includes", _every_role_is_enough),
+    "a decoder fails": (codecs, "decode_tree", _no_body_can_be_read),
+    "a decoder takes long": (codecs, "decode_tree", _bodies_take_long),
+}
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("hole", HOLES)
+def test_a_planted_hole_is_found(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hole: str
+) -> None:
+    monkeypatch.setattr(hostile_client, "HANGS_S", 0.5 if hole == "a decoder takes long" else hostile_client.HANGS_S)
+    with running(database, tmp_path, body_timeout_s=5.0, header_timeout_s=5.0) as server:
+        every = some(shots(build_house(server), ("reader",)), 1_000, SEED)
+        monkeypatch.setattr(*HOLES[hole])
+        outcomes = asyncio.run(fire_all(server.address, every, 8))
+    assert any(one.fault for one in outcomes)
