@@ -22,10 +22,14 @@ MOST_UNPACKED_BYTES = 1 << 29
 Content = Literal["motion", "skeleton", "model", "tree", "graph", "annotation", "alignment", "item"]
 
 AnnotationForm = Literal["labels", "list", "frames"]
-"""Forms of annotations of Marey's predecessor: sections by label, a list of sections, or frames by label."""
+"""Layouts of annotation files of Marey's predecessor.
+
+`labels`: the segments of each label; `list`: one list of all segments, without labels; `frames`: the frames of each
+label.
+"""
 DEFAULT_FORM: AnnotationForm = "labels"
 EndIndex = Literal["inclusive", "exclusive"]
-"""Meaning of the last index of a section in the format of Marey's predecessor: inside the section, or just after it."""
+"""Meaning of the last index of a segment in the format of Marey's predecessor: inside the segment, or just after it."""
 DEFAULT_END_INDEX: EndIndex = "inclusive"
 
 UNITS_M = {

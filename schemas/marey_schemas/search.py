@@ -23,7 +23,7 @@ MOST_CONSTRAINTS = 64
 MOST_STEPS = 16
 MOST_CANDIDATES = 256
 MOST_CANDIDATE_CONSTRAINTS = 4096
-"""Greatest product of the numbers of candidates and constraints; a search at this limit takes some seconds."""
+"""Greatest product of the numbers of candidates and constraints; a search at this limit takes a few seconds."""
 
 SearchConstraints = Annotated[tuple[SearchConstraint, ...], Field(max_length=MOST_CONSTRAINTS)]
 

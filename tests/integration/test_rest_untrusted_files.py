@@ -54,7 +54,7 @@ def small(database: Database, tmp_path: Path) -> Iterator[Server]:
 
 
 def until(condition: Callable[[], Any]) -> None:
-    """Wait until a condition is true; fail after some seconds."""
+    """Wait until a condition is true; fail after `PATIENCE_S` seconds."""
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline

@@ -74,7 +74,11 @@ class ItemsMachine(RuleBasedStateMachine):
         return self.lab.write(function, self.lab.name, Kind.STUDY, item_id, *args, **kwargs)
 
     def attempt(self, item_id: str, expected: str, change: Callable[..., Any], *, blocked: bool = False) -> bool:
-        """Run `change(expected_rev)`; return whether the change succeeded. The model states the expected error."""
+        """Run `change(expected_rev)`, and return whether it succeeds; the test fails if the model says otherwise.
+
+        `expected` selects the `rev` of the item that the change expects: "any", "right" or "wrong". `blocked` is
+        whether the change conflicts with another item.
+        """
         model = self.world.items[item_id]
         expected_rev = {"any": None, "right": model.rev, "wrong": model.rev + 7}[expected]
         error: type[Exception] | None = None

@@ -47,7 +47,7 @@ class AdjustableClock:
         return time.time_ns() // 1000 + self._ahead_us
 
     def advance(self, seconds: float) -> None:
-        """Set the clock forward by some seconds."""
+        """Set the clock forward by this number of seconds."""
         self._ahead_us += round(seconds * 1_000_000)
 
 

@@ -48,7 +48,7 @@ def figure_of(name: str, trial: str | None = None) -> DrawnFigure:
 
 @functools.cache
 def drawn_both() -> Mapping[str, DrawnFigure]:
-    """Return figures that compare the usual evaluation with the changed one."""
+    """Return the figures that compare the evaluations `usual()` and `changed()`, by name."""
     return MappingProxyType(draw_figures(usual(), other=changed(), labels=("old", "new")))
 
 

@@ -61,7 +61,8 @@ def main() -> None:
 class Garbage:
     """Collector of cyclic garbage, called after each job; it skips the objects of loaded modules.
 
-    Modules own nearly all objects and live as long as the process; searching these would take 0.1 s after every job.
+    Modules own nearly all objects and live as long as the process; searching these objects would take 0.1 s
+    after every job.
     """
 
     def __init__(self) -> None:

@@ -344,8 +344,9 @@ def _place(entry: Entry) -> tuple[str, str]:
 def _line(place: tuple[str, str], entry: Entry | None, unchanged: Mapping[str, str] | None = None) -> dict[str, Any]:
     """Return the JSON object that describes a changed entry in the archive's list of changes.
 
-    `entry` is the entry after the change; None if it was removed. `unchanged` maps the parts that did not change to the
-    content digest of the earlier revision.
+    `place` is the path and the kind of the entry. `entry` is the entry after the change; None if it was removed.
+    `unchanged` contains the names of the parts that did not change, and maps each name to the content digest of the
+    entry's revision before the change.
     """
     path, kind = place
     if entry is None:

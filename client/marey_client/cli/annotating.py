@@ -233,8 +233,8 @@ def import_annotation(
     end_index: Annotated[
         EndIndex,
         typer.Option(
-            help="Meaning of end_idx in the file. inclusive: the last frame of a section, as in the predecessor's "
-            "editor. exclusive: the frame after the last frame."
+            help="Meaning of end_idx in the file. inclusive: the last frame of a segment, as in the editor of Marey's "
+            "predecessor. exclusive: the frame after the last frame."
         ),
     ] = DEFAULT_END_INDEX,
     label: Annotated[list[str] | None, typer.Option(help="Import only this label; may be repeated.")] = None,
@@ -261,15 +261,15 @@ def export_annotation(
     form: Annotated[
         AnnotationForm,
         typer.Option(
-            help="Content of the file: sections by label (labels), a list of sections (list), or frames by label "
-            "(frames)."
+            help="Layout of the file. labels: the segments of each label. list: one list of all segments, without "
+            "labels. frames: the frames of each label."
         ),
     ] = DEFAULT_FORM,
     end_index: Annotated[
         EndIndex,
         typer.Option(
-            help="Meaning of end_idx in the file. inclusive: the last frame of a section. exclusive: the frame after "
-            "the last frame."
+            help="Meaning of end_idx in the file. inclusive: the last frame of a segment, as in the editor of Marey's "
+            "predecessor. exclusive: the frame after the last frame."
         ),
     ] = DEFAULT_END_INDEX,
 ) -> None:

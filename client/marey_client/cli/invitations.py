@@ -145,7 +145,10 @@ def _lifetime(days: int, uses: int) -> timedelta:
 
 
 def _named(text: str) -> str:
-    """Return the prefix or id of an invitation. Raises `WrongUsage` for a code, which would become part of a URL."""
+    """Return `text`, which is the prefix or id of an invitation and becomes part of a URL.
+
+    Raises `WrongUsage` if `text` is the code of an invitation: a code is a secret and must not become part of a URL.
+    """
     from marey_schemas.invitations import CODE_PREFIX
 
     if text.startswith(CODE_PREFIX):

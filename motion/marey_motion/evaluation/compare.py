@@ -87,14 +87,14 @@ class TrialChange:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Differences between two evaluations of the same trials.
+    """Differences between two evaluations of sets of clips by the same trials.
 
     Parameters
     ----------
     metrics : changes of the metrics that exist in both evaluations, in alphabetical order
     changed : the trials whose records differ, in the suite's order
-    removed, added : uids of the clips that are only in the first data set, or only in the second
-    newly_unused : uids of clips that are in both data sets, but were used only in the first evaluation
+    removed, added : uids of the clips that are only in the first set, or only in the second
+    newly_unused : uids of clips that are in both sets, but were used only in the first evaluation
     coverage_change_s : (V, O) float64    seconds of data gained per cell of the coverage map
     """
 

@@ -1,4 +1,4 @@
-"""Verdict on a data set by simple rules.
+"""Verdict on a set of clips by simple rules.
 
 A trial counts as followed if the character keeps within three limits, on average over the trial:
 
@@ -41,7 +41,7 @@ class Strain(NamedTuple):
 
 @dataclass(frozen=True)
 class Judgement:
-    """Grade of a data set, and the numbers on which the grade is based.
+    """Grade of a set of clips, and the numbers on which the grade is based.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Clips and data sets of generated gaits."""
+"""Clips, and sets of clips, of generated gaits."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BEHIND_ANKLE = 0.64  # of the ankle's height: how far the heel is behind the ank
 
 
 class GeneratedTake(NamedTuple):
-    """One clip of a generated data set, with a name and tags to store it under."""
+    """One clip of a generated set, with a name and tags to store it under."""
 
     name: str
     clip: Clip
@@ -182,7 +182,7 @@ def generate_dataset(seed: int = 0, frame_rate_hz: float = 60.0) -> list[Generat
 
 
 def _programme() -> list[tuple[str, RootPath, tuple[str, ...]]]:
-    """List names, paths and tags of the generated data set."""
+    """List names, paths and tags of the clips of the generated set."""
 
     def arc(speed: float, turn_deg: float = 0.0, travel_deg: float = 0.0, seconds: float = 6.0) -> RootPath:
         return straight_or_arc(speed, radians(turn_deg), seconds, travel_angle_rad=radians(travel_deg))

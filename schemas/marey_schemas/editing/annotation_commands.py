@@ -132,8 +132,8 @@ class AnnotationImport(Request):
     )
     end_index: EndIndex = Field(
         DEFAULT_END_INDEX,
-        description="Whether a section includes its frame `end_idx`, as in the predecessor's editor, or ends before "
-        "this frame, as in the predecessor's time warping.",
+        description="Whether a segment includes its frame `end_idx`, as in the editor of Marey's predecessor, or ends "
+        "before this frame, as in the predecessor's time warping.",
     )
     labels: tuple[Label, ...] | None = Field(
         None,

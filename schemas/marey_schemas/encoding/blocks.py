@@ -217,8 +217,9 @@ def _require_sane_tiles(layout: _Layout) -> None:
     if layout.block_frames < 1 or layout.group_columns < 1:
         raise BlockError("the header declares tiles without frames or without columns")
     largest = min(layout.block_frames, layout.frames) * min(layout.group_columns, layout.columns)
-    if largest * np.dtype(layout.spec.dtype).itemsize > MAX_TILE_BYTES:
-        raise BlockError(f"a tile of {largest} elements is larger than {MAX_TILE_BYTES} bytes")
+    largest_bytes = largest * np.dtype(layout.spec.dtype).itemsize
+    if largest_bytes > MAX_TILE_BYTES:
+        raise BlockError(f"the largest tile has {largest_bytes} bytes; at most {MAX_TILE_BYTES} are allowed")
 
 
 def _unpack(packed: bytes, layout: _Layout, block: int, group: int) -> NDArray[Any]:

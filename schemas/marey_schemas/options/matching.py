@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import pairwise
 from typing import Annotated, Literal, Self
 
@@ -88,8 +89,9 @@ class DatabaseOptions(Options):
     @field_validator("extra_joints")
     @classmethod
     def _check_names(cls, extra_joints: tuple[str, ...]) -> tuple[str, ...]:
-        if len(set(extra_joints)) < len(extra_joints):
-            raise ValueError("the list contains a joint twice; remove one")
+        repeated = next((name for name, count in Counter(extra_joints).items() if count > 1), None)
+        if repeated is not None:
+            raise ValueError(f"the list contains the joint {repeated!r} more than once; remove the repetitions")
         return extra_joints
 
     @model_validator(mode="after")

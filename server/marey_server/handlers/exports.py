@@ -41,12 +41,12 @@ class ExportQuery(ConsentOverride):
     unit: WrittenUnit = Field(DEFAULT_UNIT, description="Unit of length of a BVH file.")
     end_index: EndIndex = Field(
         DEFAULT_END_INDEX,
-        description="For annotations in the predecessor's format: whether a section includes its frame `end_idx`.",
+        description="For annotations in the predecessor's format: whether a segment includes its frame `end_idx`.",
     )
     form: AnnotationForm = Field(
         DEFAULT_FORM,
-        description="For annotations in the predecessor's format: sections by label, a list of sections, or "
-        "frames by label.",
+        description="For annotations in the predecessor's format: layout of the file. `labels`: the segments of each "
+        "label. `list`: one list of all segments, without labels. `frames`: the frames of each label.",
     )
     part: Literal["model", "tree", "alignment"] | None = Field(
         None,

@@ -94,8 +94,7 @@ def write_precondition(if_match: str | None, if_none_match: str | None, *, may_c
     revs = sorted({int(rev) for tag in tags if _REV.fullmatch(rev := tag.partition(".")[0])})
     if not revs:
         raise PreconditionFailedProblem(
-            f"If-Match contains no version of this resource ({if_match[:200]}); read the resource "
-            "again, and send its ETag."
+            f"If-Match contains no ETag of this resource: {if_match[:200]}. Read the resource again, and send its ETag."
         )
     if len(revs) > MOST_STATES:
         raise BadRequestProblem(f"If-Match names {len(revs)} versions; at most {MOST_STATES} are allowed.")

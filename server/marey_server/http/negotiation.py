@@ -76,7 +76,7 @@ def choose(accept: str | None, offers: tuple[MediaType, ...]) -> MediaType:
     if chosen is None:
         names = ", ".join(map(str, offers))
         raise NotAcceptableProblem(
-            f"The Accept header allows no media type of this resource, which is available as {names}.",
+            f"The Accept header allows no media type of this resource; this resource has only: {names}.",
             context={"offered": [str(offer) for offer in offers]},
         )
     return chosen
@@ -127,7 +127,7 @@ def body_type(content_type: str | None, known: tuple[str, ...] = codecs.MEDIA_TY
     name, params = _split_parameters(content_type)
     if name not in known:
         raise UnsupportedMediaTypeProblem(
-            f"The body of this request must have the media type {', '.join(known)}, not {name}.",
+            f"The media type of the body is {name}; this request accepts only: {', '.join(known)}.",
             context={"understood": list(known)},
         )
     if params.get("charset", "utf-8") not in ("utf-8", "utf8", "us-ascii"):

@@ -17,7 +17,7 @@ from marey_server.store.items.annotating import AnnotatedClip, ChangedAnnotation
 from marey_server.store.revs import ExpectedRev, is_expected, moved_on
 
 MOST_WORK = 30_000_000
-"""Greatest amount of work in a request; this amount takes some seconds.
+"""Greatest amount of work in a request; this amount takes a few seconds.
 
 The work of a command is the number of segments and keyframes of the annotation; the work of a request is the sum over
 its commands.

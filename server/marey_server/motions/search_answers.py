@@ -126,7 +126,7 @@ def search(searchables: Sequence[Searchable], request: SearchRequest, most_work:
     """Find the motions that a request describes.
 
     Raises `InvalidProblem` with a pointer to the faulty constraint, and `TooLargeProblem` for searches that would take
-    more than some seconds.
+    more than a few seconds.
     """
     from marey_motion.errors import MotionError
     from marey_motion.modelling.search import work as search_work

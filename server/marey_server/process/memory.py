@@ -19,9 +19,10 @@ UNKNOWN_CLIENTS = "unknown-clients"
 
 
 class RequestMemory:
-    """Count of the bytes that requests hold. It is thread-safe.
+    """Count of the bytes that all requests hold, limited to `total_bytes`. It is thread-safe.
 
-    If only one request holds bytes, this request may exceed the total; the limits of a single request still apply.
+    While no other request holds bytes, a request may exceed `total_bytes`; the limits on the size of a single request
+    still apply.
     """
 
     def __init__(self, total_bytes: int) -> None:
@@ -33,8 +34,8 @@ class RequestMemory:
     def take(self, owner: str, bytes_now: int, more: int, *, reserved: bool) -> None:
         """Count `more` bytes for `owner`, whose request already holds `bytes_now` bytes.
 
-        Reserved operations are limited only by the total, which is higher for them by the fraction `RESERVED_SHARE`.
-        Raises `UnavailableProblem` if a limit would be exceeded.
+        Reserved operations have no limit for their owner, and the limit on all requests together is higher for them:
+        `total_bytes * (1 + RESERVED_SHARE)`. Raises `UnavailableProblem` if a limit would be exceeded.
         """
         with self._lock:
             others = self.held_bytes > bytes_now

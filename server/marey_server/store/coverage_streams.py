@@ -36,7 +36,7 @@ class CoverageOffset(ConflictProblem):
 class NewStream:
     """Initial state of a stream.
 
-    `settings` are the members of `CoverageStream` that never change; `rig` is the skeleton of the stream's poses.
+    `settings` are the fields of `CoverageStream` that never change; `rig` is the skeleton of the stream's poses.
     """
 
     settings: Tree
@@ -60,7 +60,7 @@ class Stream:
     rev: int
 
     def shown(self) -> Tree:
-        """Return the members of `CoverageStream` that describe the stream."""
+        """Return the stream as the fields of a `CoverageStream`."""
         return {
             **self.settings,
             "id": self.id,

@@ -122,7 +122,7 @@ class Model:
         return {} if digest is None else self.commits[digest].state
 
     def in_order(self, commits: Iterable[str]) -> list[str]:
-        """Return `commits` in the order of their creation, so that equal programs make equal choices."""
+        """Return `commits` in the order of their creation, so that random choices depend only on the seed."""
         wanted = set(commits)
         return [one for one in self.commits if one in wanted]
 

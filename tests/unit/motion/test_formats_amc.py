@@ -1,4 +1,4 @@
-"""ASF/AMC reader, compared with the definition of the format, computed with matrices joint by joint."""
+"""ASF/AMC reader, compared with joint positions that the test computes, with matrices, as the format defines them."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ def test_many_joints_are_warned_of() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"extra_joints": ("head", "head")}, "extra_joints\n.*a joint twice"),
+        ({"extra_joints": ("head", "head")}, "extra_joints\n.*the joint 'head' more than once"),
         ({"horizons_s": ()}, "horizons_s"),
         ({"horizons_s": (0.5, 0.25)}, "horizons_s"),
         ({"horizons_s": (0.0, 0.25)}, "horizons_s"),

@@ -43,7 +43,7 @@ def start(pool: Children, function: str, payload: bytes = b"", *, caller: str = 
 
 
 def until(condition: Callable[[], Any]) -> None:
-    """Wait until a condition is true; fail after some seconds."""
+    """Wait until a condition is true; fail after `PATIENCE_S` seconds."""
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline

@@ -1,4 +1,4 @@
-"""Cache keys of jobs: effect of the results' folder and of newest revisions, and job kinds without a cache key."""
+"""Which jobs get the result of an earlier job, and which jobs are refused because of where their results would go."""
 
 from typing import Any
 

@@ -54,10 +54,11 @@ def parse(text: str, *, version: bool = False) -> NamedVersion:
 
 
 def imported(at: NamedVersion, made: ImportedVersion, *, server: str | None = None) -> str:
-    """Return a sentence for the user about an import; it ends with the command to run next.
+    """Return a sentence for the user that reports an import and ends with the command to run next.
 
-    If the branch moved to the imported version, this next command checks out the branch; otherwise, it merges the
-    version into the branch. `server` is the address of the server with the dataset if another server was named for it.
+    If the branch moved to the imported version, the next command checks out the branch; otherwise, the next command
+    merges the version into the branch. `server` is the address of the server that has received the version; None for
+    the default server, which the next command need not name.
     """
     name, digits = f"{at.project}/{at.dataset}", short(made.commit.digest)
     there = f" --server {server}" if server else ""

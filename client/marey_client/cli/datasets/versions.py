@@ -95,9 +95,8 @@ def log(
     path: Annotated[
         str,
         typer.Option(
-            help="Entry or folder. List only versions that changed this entry or an entry below this folder. Each is "
-            "listed with the numbers of entries at this path that were added, removed, moved or changed since "
-            "its first parent."
+            help="Entry or folder. List only versions that changed the entry, or entries below the folder, and show "
+            "how many of these entries were added, removed, moved or changed."
         ),
     ] = "",
     most: Annotated[int, typer.Option("--limit", "-n", min=1, help="Greatest number of versions to list.")] = 20,

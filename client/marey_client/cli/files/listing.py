@@ -180,7 +180,7 @@ def _sorted(items: Sequence[ItemHandle], column: str, *, reverse: bool) -> list[
 
 
 def _stale(items: Sequence[ItemHandle]) -> list[ItemHandle]:
-    """Return the stale items: an input has got a newer revision since the item was made."""
+    """Return the stale items, each made from at least one item that has a newer revision now."""
     with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
         answers = pool.map(lambda one: one.staleness().stale, items)
         return [one for one, stale in zip(items, answers, strict=True) if stale]

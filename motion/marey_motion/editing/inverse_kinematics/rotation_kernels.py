@@ -125,7 +125,7 @@ def between(a, b):  # type: ignore[no-untyped-def]
 def twist_angle(q, axis):  # type: ignore[no-untyped-def]
     """Compute the angle, in radians from -π to π, by which the rotation `q` turns about the unit vector `axis`.
 
-    `q` is divided into swing · twist, where the twist is a rotation about the axis.
+    `q` is decomposed into swing · twist, where the twist is a rotation about the axis.
     """
     angle = 2.0 * math.atan2(dot((q[1], q[2], q[3]), axis), q[0])
     if angle > math.pi:

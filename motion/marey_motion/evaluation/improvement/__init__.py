@@ -1,1 +1,1 @@
-"""Improvements of a data set: clips to remove, clips that fill holes in its coverage, and better feature weights."""
+"""Improvements of a set of clips: clips to remove, clips that fill holes in the coverage, better feature weights."""

@@ -1,4 +1,4 @@
-"""Clips of other collections that would fill the holes of a data set."""
+"""Clips of other collections that would fill the holes of a set of clips."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The objective of an optimisation: one number that rates a data set; lower is better."""
+"""The objective of an optimisation: one number that rates a set of clips; lower is better."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from marey_motion.evaluation.result import TrialResult
 from marey_schemas.options.improvement import ObjectiveOptions
 
 HEADLINES = ("offset_mean", "abs_se_v", "abs_se_omega_deg", "pose_cost_mean", "transitions_per_s")
-"""Headline metrics: the metrics that are reported for a changed data set."""
+"""Headline metrics: the metrics that are reported for a changed set of clips."""
 
 
 def objective_value(weights: ObjectiveOptions, results: Sequence[TrialResult], seconds: float) -> float:
-    """Compute the objective, in metres, of a data set of `seconds` seconds from its trials.
+    """Compute the objective, in metres, of a set of clips of `seconds` seconds from its trials.
 
     Parameters
     ----------

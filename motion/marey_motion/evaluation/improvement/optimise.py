@@ -1,4 +1,4 @@
-"""Optimisation of a data set: clips are removed or added one by one, as long as this lowers an objective.
+"""Optimisation of a set of clips: clips are removed or added one by one, as long as this lowers an objective.
 
 Every step tries all candidates, each by simulating the trials that it can change, and applies the best one. The
 objective decreases with every step, so no set is visited twice and the loop ends. An optimisation can be continued

@@ -1,4 +1,4 @@
-"""Redundancy of clips in a data set: the effect of leaving out each used clip, and a plan for several removals."""
+"""Redundancy of clips in a set: the effect of leaving out each used clip, and a plan for several removals."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Removal:
 
 @dataclass(frozen=True)
 class PlannedRemoval:
-    """One step of a plan: the removal of one more source of clips from the data set, and its result.
+    """One step of a plan: the removal of one more source of clips from the set, and the result.
 
     Parameters
     ----------

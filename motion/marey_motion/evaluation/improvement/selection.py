@@ -180,7 +180,7 @@ def require_same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> 
     """
     if not same_skeleton(first, second):
         raise MotionError(
-            "the clips to add and the database have different skeletons; retarget the clips to add first",
+            "the clips to add have another skeleton than the database; retarget them to the database's skeleton first",
             code="skeleton-mismatch",
             where="skeleton",
         )

@@ -1,6 +1,6 @@
 """Suggestions after an evaluation: unused and redundant clips, duplicates, and clips that fill holes.
 
-Each suggestion is a proposal with its predicted effect; the data set is not changed.
+Each suggestion is a proposal with its predicted effect; the set of clips is not changed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ The distance is a pose cost, in metres, summed over seven joints.
 
 @dataclass(frozen=True, eq=False)
 class Suggestions:
-    """Proposals for one data set, each list with the best first.
+    """Proposals for one set of clips, each list with the best first.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def suggest(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> Suggestions:
-    """Collect everything that an evaluation suggests about its data set.
+    """Collect everything that an evaluation suggests about its set of clips.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def _require_same(database: MatchingDatabase, result: EvaluationResult) -> None:
     different = [name for name in ("dataset", "normaliser") if getattr(own, name) != getattr(result.provenance, name)]
     if different:
         raise MotionError(
-            f"the evaluation was made from other data ({', '.join(different)}); evaluate this data set first",
+            f"the evaluation was made from other data ({', '.join(different)}); evaluate this set of clips first",
             code="not-comparable",
             where=", ".join(different),
         )

@@ -23,7 +23,7 @@ Tree = dict[str, Any]
 
 
 def comparison_to_tree(comparison: Comparison) -> Tree:
-    """Convert a comparison of two evaluations; the document identifies the evaluations by their data sets.
+    """Convert a comparison of two evaluations; the document identifies each evaluation by its set of clips.
 
     Parameters
     ----------

@@ -8,6 +8,7 @@ hierarchy, so reading a clip needs its skeleton document, too.
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any, Literal
 
 import numpy as np
@@ -151,8 +152,9 @@ def _clip_fields(document: dict[str, Any], file: str) -> tuple[list[str], NDArra
         names = text_list(document, "jointSequence", file)
         poses = _engine_rows(field_of(document, "frames", list, file), file)
         frame_time_s = field_of(document, "frameTime", (int, float), file)
-    if len(set(names)) != len(names):
-        raise FormatError("the joint sequence contains a joint twice", file=file)
+    repeated = next((name for name, count in Counter(names).items() if count > 1), None)
+    if repeated is not None:
+        raise FormatError("the joint sequence contains the joint twice", file=file, joint=repeated)
     width = 3 + 4 * len(names)
     if poses.ndim != 2 or len(poses) == 0 or poses.shape[1] < width:
         raise FormatError(

@@ -6,6 +6,7 @@ to the root's offset. Arrays of coefficients have the shape (coefficient, channe
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -246,8 +247,9 @@ def _animated(parts: ModelParts, basis: SplineBasis, mean: Floats, skeleton: Ske
     if mean.shape[1] != 3 + 4 * len(animated):
         message = f"the mean has {mean.shape[1]} channels, but {len(animated)} joints need {3 + 4 * len(animated)}"
         raise FormatError(message, code="joints-mismatch", file=file)
-    if len(set(animated)) != len(animated):
-        raise FormatError("field 'animated_joints' contains a joint twice", file=file)
+    repeated = next((name for name, count in Counter(animated).items() if count > 1), None)
+    if repeated is not None:
+        raise FormatError("field 'animated_joints' contains the joint twice", file=file, joint=repeated)
     unknown = next((name for name in animated if name not in skeleton), None)
     if unknown is not None:
         raise FormatError("the skeleton has no joint of this name", code="joints-mismatch", file=file, joint=unknown)

@@ -60,7 +60,7 @@ def read_skeleton_document(document: Document, file: str) -> SourceMotion:
 
 
 def skeleton_document(skeleton: Skeleton, *, form: SkeletonForm = "database") -> Document:
-    """Convert a skeleton to the form of the predecessor's data base or files.
+    """Convert a skeleton to the form of the predecessor's database or files.
 
     Every leaf joint gets a tip as child, since a leaf of the document would be read as a tip.
 

@@ -151,7 +151,10 @@ class _Prior:
         self.scales = np.concatenate([_precisions(mixture) for mixture in mixtures])
 
     def cost(self, stacked: Floats) -> float:
-        """Compute -λ ln p with all components of the mixtures."""
+        """Compute -λ Σ ln p(s), with the weight λ of the prior and the density p of each latent vector s.
+
+        The density is that of the whole mixture; `quadratic` uses only the most likely component of each mixture.
+        """
         pairs = zip(self._mixtures, self._parts, strict=True)
         return -self._weight * sum(float(mixture.log_density(stacked[None, part])[0]) for mixture, part in pairs)
 

@@ -70,11 +70,11 @@ def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-u
 
 @compiled
 def track(chains, placement, moved, latent, first, points, turns, point_slopes, turn_slopes):  # type: ignore[no-untyped-def]
-    """Fill `points` (n, 3) and `turns` (n, 4) with the tracked points and rotations, in the world.
+    """Fill `points` (n, 3) and `turns` (n, 4) with the tracked points and rotations of one step, in the world.
 
     Fills `point_slopes` and `turn_slopes` (n, 3, W) with the derivatives of the points and of the rotations with
-    respect to the stacked latent vectors `latent` (W,). `placement` is the start of this step in the world; `moved` and
-    `first` are described in the introduction of this module.
+    respect to `latent` (W,), the stacked latent vectors of all steps. `placement`, `moved` and `first` belong to the
+    same step as `chains`; the introduction of this module describes them.
     """
     nodes, scores = chains.parents.shape[0], chains.directions.shape[0]
     channels, local = np.empty(chains.mean.shape[0]), np.empty((nodes, 5))

@@ -32,14 +32,19 @@ def stored_facets(tx: Transaction, job_row: Any, facets: Sequence[ItemFacets]) -
     for a name that the kind of the job does not declare.
     """
     declared, given = find_kind(job_row.kind).facets, _measured(tx, job_row)
+    stated: set[tuple[str, int]] = set()
     for one in facets:
+        if (one.item, one.revision) in stated:
+            raise InvalidProblem(
+                f"The job states facets of {one.item} at revision {one.revision} twice.", code="no-facet-input"
+            )
         if (one.item, one.revision) not in given:
             raise InvalidProblem(
-                f"The job states facets of {one.item} at revision {one.revision}, which is not among its inputs; or it "
-                "states them twice.",
+                f"The job states facets of {one.item} at revision {one.revision}, which is neither an input of the job "
+                "nor a clip of an evaluation among its inputs.",
                 code="no-facet-input",
             )
-        given.discard((one.item, one.revision))
+        stated.add((one.item, one.revision))
         if unknown := sorted(one.values.keys() - declared.keys()):
             name = unknown[0]
             raise InvalidProblem(f"The job kind {job_row.kind} does not declare the facet {name!r}.", code="no-facet")

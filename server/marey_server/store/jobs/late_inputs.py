@@ -128,7 +128,7 @@ class _Made(NamedTuple):
     pins: list[Pin]
 
     def below(self, one: Pin) -> str:
-        """Return the collection of an output, relative to `into` if it is below `into`, otherwise in full."""
+        """Return the collection of the output `one`: relative to `self.into` if possible, otherwise the full path."""
         path: str = one["collection"]
         return f"{path}/".removeprefix(f"{self.into}/").rstrip("/") if self.into else path
 

@@ -89,7 +89,11 @@ def reap_page(
 
 
 def _take_back(tx: Transaction, row: Row[Any], policy: QueuePolicy) -> bool:
-    """End the attempt of one overdue job and propagate the end; return whether that succeeded."""
+    """Reclaim a job whose lease has expired, and return whether this succeeded.
+
+    Reclaiming ends the attempt and the lease. The job is queued again, or it ends, and then the jobs that depend on it
+    are updated. Raises `OperationalError`; any other error is logged, and the result is False.
+    """
     try:
         with tx.connection.begin_nested():
             outcome = decide_expired_outcome(row, policy)

@@ -183,7 +183,7 @@ def _citing(tx: Transaction, project_row: ProjectRow, commits: frozenset[str]) -
 
 
 def _with_retries(tx: Transaction, citing: Iterable[str]) -> set[str]:
-    """Return jobs, their retries, and the tasks of both."""
+    """Return the ids of the jobs `citing`, of all their retries, and of the tasks of all these jobs."""
     found = set(citing)
     ahead = found
     while ahead:

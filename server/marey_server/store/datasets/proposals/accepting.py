@@ -300,10 +300,11 @@ def merge_if_possible(
 
 
 def merge_basis(tx: Transaction, project_row: ProjectRow, row: Row[Any]) -> MergeBasis | None:
-    """Return the commits and the protection rule on which the result of a waiting merge depends.
+    """Return the commits and the protection rule on which the result of a proposal's automatic merge depends.
 
-    Returns None if the proposal does not wait, if approvals, checks or rights are missing, or if a reviewer has
-    requested changes.
+    An automatic merge (`when_green`) is a merge that a user has requested to happen as soon as it is allowed. Returns
+    None if no automatic merge is requested, or if it is not allowed yet: approvals or checks are missing, a reviewer
+    has requested changes, or the user may no longer move the branch.
     """
     if not is_waiting(row):
         return None
