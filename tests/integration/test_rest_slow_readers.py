@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import socket
@@ -16,6 +17,7 @@ import pytest
 from tests.support.rest_server import PATIENCE_S, Server, running
 
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
+from marey_server.http.streaming import HELD_BYTES
 from marey_server.motions import exporting
 from marey_server.process.computing import RENDERING_THREADS
 from marey_server.store.database.connections import Database
@@ -127,3 +129,20 @@ def test_the_documents_of_an_export_count_as_memory_before_they_are_packed(
         server.app.services.memory.take("somebody else", 0, DOCUMENT_BYTES // 2, reserved=False)
         refused = server.client(token).get(path)
         assert (refused.status_code, refused.json()["code"]) == (503, "memory")
+
+
+def test_blobs_that_are_being_sent_count_as_memory(database: Database, tmp_path: Path) -> None:
+    with running(database, tmp_path, request_memory_bytes=3 * MIB) as server:
+        client, memory = server.client(token := server.make_project()), server.app.services.memory
+        data = np.random.default_rng(2).bytes(8 * MIB)
+        path = f"/blobs/sha256:{hashlib.sha256(data).hexdigest()}"
+        assert client.put(path, content=data).is_success
+        with reading(server, path, token):
+            wait_until(lambda: memory.held_bytes == HELD_BYTES)
+            refused = client.get(path)
+            assert (refused.status_code, refused.json()["code"]) == (503, "memory")
+            short = client.get(path, headers={"Range": "bytes=5-9"})
+            assert (short.status_code, short.content) == (206, data[5:10])
+        wait_until(lambda: memory.held_bytes == 0)
+        assert client.get(path).content == data
+        wait_until(lambda: memory.held_bytes == 0)
