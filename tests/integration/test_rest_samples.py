@@ -4,6 +4,8 @@ import hashlib
 from typing import Any
 
 import httpx
+import pytest
+from tests.support.rest_server import Server
 from tests.support.search_primitives import walking
 
 from marey_motion.documents import skeleton_to_document
@@ -19,13 +21,27 @@ def created(owner: httpx.Client, kind: str, name: str, **parts: object) -> dict[
     return made.json()
 
 
-def test_samples_change_their_tag_with_the_revision_they_name(owner: httpx.Client) -> None:
+@pytest.fixture
+def place(owner: httpx.Client) -> str:
+    """The path of a model."""
     primitive, _ = walking()
     rig = created(
         owner, "skeletons", "rig", hierarchy=skeleton_to_document(primitive.skeleton).model_dump(by_alias=True)
     )
     model = created(owner, "models", "walk", model=primitive_to_tree(primitive, {"item": rig["id"], "revision": 1}))
-    place = f"/projects/lab/models/{model['id']}"
+    return f"/projects/lab/models/{model['id']}"
+
+
+def test_the_documents_of_a_model_count_as_memory_before_they_are_packed(
+    server: Server, owner: httpx.Client, place: str
+) -> None:
+    services = server.app.services
+    services.memory.take("somebody else", 0, services.memory.total_bytes, reserved=False)
+    refused = owner.get(f"{place}/samples")
+    assert (refused.status_code, refused.json()["code"], len(services.models)) == (503, "memory", 0)
+
+
+def test_samples_change_their_tag_with_the_revision_they_name(owner: httpx.Client, place: str) -> None:
     first = owner.get(f"{place}/samples")
     held = {"If-None-Match": first.headers["ETag"]}
     assert owner.get(f"{place}/samples", headers=held).status_code == 304

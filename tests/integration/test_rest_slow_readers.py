@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
 import socket
 import time
@@ -15,6 +17,8 @@ import pytest
 from tests.support.rest_server import PATIENCE_S, Server, running
 
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
+from marey_server.http.streaming import HELD_BYTES
+from marey_server.motions import exporting
 from marey_server.process.computing import RENDERING_THREADS
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import Client
@@ -24,15 +28,16 @@ DOCUMENT_BYTES = 6 * MIB
 
 
 @contextmanager
-def reading(server: Server, path: str, token: str) -> Iterator[socket.socket]:
-    """Send a request and read nothing of the answer; yield the socket."""
+def reading(server: Server, path: str, token: str, body: bytes = b"") -> Iterator[socket.socket]:
+    """Send a request, a POST if it has a body, and read nothing of the answer; yield the socket."""
     host, port = server.address.removeprefix("http://").split(":")
-    head = f"GET /api/v1{path} HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n"
+    head = f"{'POST' if body else 'GET'} /api/v1{path} HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n"
     with socket.socket() as client:
         client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         client.settimeout(PATIENCE_S)
         client.connect((host, int(port)))
-        client.sendall(f"{head}Accept: application/msgpack\r\n\r\n".encode())
+        head += f"Accept: application/msgpack\r\nContent-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
+        client.sendall(head.encode() + body)
         yield client
 
 
@@ -93,7 +98,10 @@ def test_a_reader_that_leaves_early_is_no_error_in_the_log(
     assert [record.message for record in caplog.records if record.levelno >= logging.ERROR] == []
 
 
-def test_documents_that_wait_for_a_thread_that_renders_them_count_as_memory(database: Database, tmp_path: Path) -> None:
+@pytest.mark.parametrize("several", [False, True])
+def test_documents_that_wait_for_a_thread_that_renders_them_count_as_memory(
+    database: Database, tmp_path: Path, *, several: bool
+) -> None:
     with running(database, tmp_path, request_memory_bytes=3 * DOCUMENT_BYTES) as server, ExitStack() as open_until:
         token = server.make_project()
         path, services = add_long_document(server, token), server.app.services
@@ -101,9 +109,40 @@ def test_documents_that_wait_for_a_thread_that_renders_them_count_as_memory(data
         open_until.callback(go_on.set)
         for number in range(RENDERING_THREADS):
             services.compute_threads.rendering.submit(Client(f"busy-{number}"), go_on.wait)
+        place = {"kind": "study", "item": path.split("/")[4], "revision": 1, "part": "study"}
+        body = json.dumps({"parts": [place]}).encode() if several else b""
         for _ in range(2):
-            open_until.enter_context(reading(server, path, token))
+            open_until.enter_context(reading(server, "/projects/lab/parts" if several else path, token, body))
         wait_until(lambda: services.memory.held_bytes > 1.5 * DOCUMENT_BYTES)  # stored documents are compressed
         refused = server.client(token).get(path, headers={"Accept": MSGPACK})
         assert (refused.status_code, refused.json()["code"]) == (503, "memory")
         go_on.set()
+
+
+def test_the_documents_of_an_export_count_as_memory_before_they_are_packed(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exporting, "export_order", lambda *_: b"an order, which counts as memory itself")
+    with running(database, tmp_path, request_memory_bytes=DOCUMENT_BYTES) as server:
+        token = server.make_project()
+        path = add_long_document(server, token).replace("parts/study", "export?format=json")
+        server.app.services.memory.take("somebody else", 0, DOCUMENT_BYTES // 2, reserved=False)
+        refused = server.client(token).get(path)
+        assert (refused.status_code, refused.json()["code"]) == (503, "memory")
+
+
+def test_blobs_that_are_being_sent_count_as_memory(database: Database, tmp_path: Path) -> None:
+    with running(database, tmp_path, request_memory_bytes=3 * MIB) as server:
+        client, memory = server.client(token := server.make_project()), server.app.services.memory
+        data = np.random.default_rng(2).bytes(8 * MIB)
+        path = f"/blobs/sha256:{hashlib.sha256(data).hexdigest()}"
+        assert client.put(path, content=data).is_success
+        with reading(server, path, token):
+            wait_until(lambda: memory.held_bytes == HELD_BYTES)
+            refused = client.get(path)
+            assert (refused.status_code, refused.json()["code"]) == (503, "memory")
+            short = client.get(path, headers={"Range": "bytes=5-9"})
+            assert (short.status_code, short.content) == (206, data[5:10])
+        wait_until(lambda: memory.held_bytes == 0)
+        assert client.get(path).content == data
+        wait_until(lambda: memory.held_bytes == 0)

@@ -8,7 +8,7 @@ from marey_schemas.sizes import MIB
 from marey_server.errors import NotFoundProblem
 from marey_server.handlers.uploads import store_in_pieces
 from marey_server.http.declarations import Access, Bytes, RequestBody, reads, writes
-from marey_server.http.receiving import Receiver
+from marey_server.http.receiving import BATCH_BYTES, Receiver
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.http.streaming import BlobSender
@@ -36,6 +36,7 @@ class Blob(BlobSender):
     async def begin(self, digest: str) -> None:
         """Check that the address contains a valid digest before the bytes are received."""
         require_digest(digest)
+        self.hold_body(BATCH_BYTES)
         self.receiver = Receiver(self.services)
 
     async def receive(self, chunk: bytes) -> None:

@@ -108,7 +108,8 @@ class Export(BlobSender):
                     unchanged.digest, disposition=attachment(unchanged.name), cache_control=REVALIDATED
                 )
         source = await self.look_up(exporting.read_source, *place, permitted=permitted)
-        order = partial(exporting.export_order, source, query.format, query.unit, query.time, options)
+        self.holding.grow(source.size_bytes)
+        order = partial(exporting.export_order, source.item, query.format, query.unit, query.time, options)
         file = await self.compute_apart(exporting.EXPORT_ITEM, order, ComputedFile.unpack)
         headers = {"Content-Disposition": attachment(file.name), "Cache-Control": REVALIDATED}
         return Reply(file.data, media_type=file.media_type, headers=headers)

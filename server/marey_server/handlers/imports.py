@@ -20,7 +20,7 @@ from marey_server.handlers.uploads import store_in_pieces
 from marey_server.http.declarations import Access, Files, RequestBody, writes
 from marey_server.http.multipart import MultipartReader, PartHead, Piece, boundary_of
 from marey_server.http.negotiation import body_type
-from marey_server.http.receiving import Receiver
+from marey_server.http.receiving import BATCH_BYTES, Receiver
 from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
 from marey_server.http.validation import decode_body, validate_body
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 MAX_FILES = 1000
 MAX_UPLOAD_BYTES = 2048 * MIB
 MAX_FORM_BYTES = 256 * KIB
+MAX_LIST_BYTES = MIB
+"""Greatest size of a list of files that are named by their digests."""
 FILES_AHEAD = 2
 """Greatest number of files that are read in advance, while the file before them is still being read."""
 FILES_PER_WRITE = 16
@@ -57,8 +59,12 @@ class ProjectImports(Resource):
         self.parts: MultipartReader | None = None
         if content_type.lower().startswith("multipart/"):
             self.parts = MultipartReader(boundary_of(content_type), max_parts=MAX_FILES + 32)
+            settings = self.services.settings
+            spooled_bytes = min(settings.import_files_now * blobs.SPOOLED_BYTES, settings.import_bytes_now)
+            self.hold_body(BATCH_BYTES + MAX_FORM_BYTES + spooled_bytes)
         else:
             body_type(content_type)
+            self.hold_body(MAX_LIST_BYTES)
         self.body = bytearray()
         self._file: tuple[str, Receiver] | None = None
         self._field: bytearray | None = None
@@ -67,8 +73,8 @@ class ProjectImports(Resource):
         """Receive the next bytes of the files."""
         if self.parts is None:
             self.body += chunk
-            if len(self.body) > MIB:
-                raise TooLargeProblem(f"The JSON list of files to import may have at most {MIB} bytes.")
+            if len(self.body) > MAX_LIST_BYTES:
+                raise TooLargeProblem(f"The JSON list of files to import may have at most {MAX_LIST_BYTES} bytes.")
             return
         for piece in self.parts.feed(chunk):
             await self._take(piece)

@@ -123,8 +123,8 @@ class Parts(Resource):
         The answer is `{"documents": [...]}` in the order of the request, with null for a document that does not exist.
         If the documents together are too large, the last ones are missing from the list: request them again.
         """
-        documents = await self.look_up(items.load_parts, project, body.parts)
-        return await self.render_document(Reply({"documents": documents}))
+        loaded = await self.look_up(items.load_parts, project, body.parts)
+        return await self.render_document(Reply(Loaded(lambda: {"documents": loaded.documents}, loaded.size_bytes)))
 
 
 RESOURCES: tuple[type[Resource], ...] = (PartResource, Parts)

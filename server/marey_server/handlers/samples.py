@@ -52,6 +52,7 @@ class ModelUser(Resource):
         known = self.services.models.get(found.key)
         if known is None:
             loaded = await self.look_up(searching.load_searchable, project, found)
+            self.holding.grow(found.size_bytes)
             known = await self.compute(loaded.pack)
             self.services.models.put(found.key, known)
         return known

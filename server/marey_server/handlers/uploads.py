@@ -115,6 +115,7 @@ class UploadResource(Resource):
                 "The header Upload-Offset must be the offset of this piece in the file, in bytes.",
                 code="bad-offset",
             )
+        self.hold_body(PIECE_BYTES)
         self.upload_id, self.offset, self.piece = upload, int(text), bytearray()
         await self._append()
 

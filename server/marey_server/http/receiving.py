@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from marey_schemas.sizes import KIB, MIB
 from marey_server.errors import StorageFullProblem
@@ -12,6 +14,42 @@ from marey_server.store.blobs import Spool
 BATCH_BYTES = MIB
 WRITTEN_AT_ONCE_BYTES = 64 * KIB
 """Size up to which the rest of a body is written on the event loop; a longer rest is written in a thread."""
+
+
+class PauseLimit:
+    """Time limit for pauses in a body that a client is sending.
+
+    Parameters
+    ----------
+    limit_s : longest pause in seconds
+    close : called when the client has sent nothing for longer
+    """
+
+    def __init__(self, limit_s: float, close: Callable[[], None]) -> None:
+        self._limit_s = limit_s
+        self._close = close
+        self._timer: asyncio.TimerHandle | None = None
+
+    def start(self) -> None:
+        """Start to wait for the next bytes."""
+        self._timer = asyncio.get_running_loop().call_later(self._limit_s, self._close)
+
+    def stop(self) -> None:
+        """Wait for no more bytes."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    @contextmanager
+    def suspended(self) -> Iterator[None]:
+        """Do not count the time in which the server processes bytes, because the client may have to wait for it."""
+        started = self._timer is not None
+        self.stop()
+        try:
+            yield
+        finally:
+            if started:
+                self.start()
 
 
 class Receiver:

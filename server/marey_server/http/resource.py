@@ -57,6 +57,7 @@ from marey_server.http.calls import (
 from marey_server.http.declarations import Access, Bytes, Declared, Document, Operation, RequestBody
 from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.http.exchange import JOINED_BYTES
+from marey_server.http.receiving import PauseLimit
 from marey_server.http.reply import AnswerForm, Loaded, Rendered, Reply, render
 from marey_server.http.validation import decode_body, parse_query, validate_body
 from marey_server.store.transaction import Transaction
@@ -95,6 +96,7 @@ class Resource(CallingExchange):
         """Set up the state of one request."""
         super().initialize()
         self._received: bytearray | bytes = bytearray()
+        self._pauses = PauseLimit(self.services.settings.body_timeout_s, self.request.connection.stream.close)  # type: ignore[union-attr]
 
     # -- for the methods of resources ---------------------------------------------------------------------------------
 
@@ -169,6 +171,14 @@ class Resource(CallingExchange):
     async def receive(self, chunk: bytes) -> None:
         """Process the next piece of a streamed body."""
 
+    def hold_body(self, most_bytes: int) -> None:
+        """Count the memory that a streamed body needs while it is received: its size, or `most_bytes` if it is longer.
+
+        `begin` calls this, so that a request without memory is refused before the client has sent a long body.
+        """
+        if self.expects_body():
+            self.holding.grow(min(self.declared_length() or most_bytes, most_bytes))
+
     def _declared_reply(self, outcome: Any) -> Reply:
         if self.operation.answer is None:
             return Reply()
@@ -197,8 +207,9 @@ class Resource(CallingExchange):
                 if self.operation.stores:
                     self.services.disk.require()
             if body is not None and body.streamed:
-                self.request.connection.set_body_timeout(self.services.settings.upload_timeout_s)  # type: ignore[union-attr]
                 await self.begin(**self.path_variables)
+                self.request.connection.set_body_timeout(self.services.settings.upload_timeout_s)  # type: ignore[union-attr]
+                self._pauses.start()
         except ApiProblem as error:
             await self._wait_for_refusal()
             await self.refuse(error)
@@ -294,6 +305,10 @@ class Resource(CallingExchange):
 
     async def data_received(self, chunk: bytes) -> None:
         """Process the next piece of the body, or discard it if the request was refused already."""
+        with self._pauses.suspended():
+            await self._process(chunk)
+
+    async def _process(self, chunk: bytes) -> None:
         self.received_bytes += len(chunk)
         if self.refused:
             self.drop()
@@ -315,6 +330,7 @@ class Resource(CallingExchange):
 
     async def perform(self, method: Callable[..., Awaitable[Reply | Rendered | None]]) -> None:
         """Run a declared method and send its answer."""
+        self._pauses.stop()
         if self.refused:
             return
         self.performing = True
@@ -349,6 +365,7 @@ class Resource(CallingExchange):
     def on_connection_close(self) -> None:
         """Release the body and stop child processes, because the client has closed the connection."""
         super().on_connection_close()
+        self._pauses.stop()
         if not self.performing and hasattr(self, "operation"):
             self.holding.release()
 

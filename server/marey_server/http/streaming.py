@@ -13,6 +13,7 @@ from marey_schemas.sizes import MIB
 from marey_server.errors import DamagedProblem, RangeNotSatisfiableProblem
 from marey_server.http.caching import IMMUTABLE
 from marey_server.http.etags import entity_tag, matches
+from marey_server.http.exchange import JOINED_BYTES
 from marey_server.http.reply import Rendered
 from marey_server.http.resource import Resource
 from marey_server.store import blobs
@@ -20,6 +21,8 @@ from marey_server.store.transaction import Transaction
 
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 PIECE_BYTES = MIB
+HELD_BYTES = 2 * PIECE_BYTES
+"""Memory that a long blob needs while it is sent: one piece is being sent, and the next one is being read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,20 +126,25 @@ class BlobSender(Resource):
         if wanted is not None:
             fields["Content-Range"] = f"bytes {opened.start}-{opened.stop - 1}/{opened.size}"
         fields |= {"Content-Type": media_type, "Content-Disposition": disposition, **headers}
-        await self._send_pieces(digest, opened, Rendered(200 if wanted is None else 206, fields, opened.first))
+        whole_bytes = opened.stop - opened.start
+        sends_pieces = whole_bytes > JOINED_BYTES and self.request.method != "HEAD"
+        if sends_pieces:
+            self.holding.grow(min(whole_bytes, HELD_BYTES))  # before the first byte, because it may refuse the request
+        self.send(Rendered(200 if wanted is None else 206, fields, opened.first), whole_bytes=whole_bytes)
+        position, stop = opened.start + len(opened.first), opened.stop
+        del opened  # otherwise the first piece would stay in memory until a slow client has received the last one
+        if sends_pieces:
+            await self._send_rest(digest, position, stop)
         return None
 
-    async def _send_pieces(self, digest: str, opened: _Opened, first: Rendered) -> None:
-        """Send the pieces of a blob; each is read after the previous one was sent."""
-        self.send(first, whole_bytes=opened.stop - opened.start)
-        if self.request.method == "HEAD":
-            return
-        position = opened.start + len(first.body)
-        while position < opened.stop:
+    async def _send_rest(self, digest: str, position: int, end: int) -> None:
+        """Send the pieces after the first one, each when the one before was sent, and wait until all are sent."""
+        while position < end:
             await self.flush()
-            stop = min(opened.stop, position + PIECE_BYTES)
+            stop = min(end, position + PIECE_BYTES)
             piece = await self.look_up(blobs.read_range, digest, position, stop)
             if len(piece) != stop - position:
                 raise DamagedProblem(f"Bytes of the blob {digest} are missing on the server.", code="blob-damaged")
             self.write(piece)
             position = stop
+        await self.flush()

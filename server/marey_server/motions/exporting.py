@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 from marey_schemas.encoding import codecs
@@ -48,9 +49,17 @@ class ExportOrder(Message):
         )  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True)
+class ExportSource:
+    """Item with the documents that an export needs, and their size in bytes."""
+
+    item: ItemToExport
+    size_bytes: int
+
+
 def read_source(
     tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None, *, permitted: bool
-) -> ItemToExport:
+) -> ExportSource:
     """Return an item with all documents that a file format may need.
 
     `permitted` says that the export is allowed even if the consent for the clip has ended. Raises `NotFoundProblem`,
@@ -61,12 +70,16 @@ def read_source(
         items.require_consent(items.find_ended_consents(tx, [item_id]).values())
     number = found.revision if revision is None else revision
     held = items.read_revision(tx, project, kind, item_id, number).parts
-    parts = {part: items.read_part(tx, project, kind, item_id, part, revision=number).tree for part in sorted(held)}
+    loaded = {part: items.read_part(tx, project, kind, item_id, part, revision=number) for part in sorted(held)}
+    parts = {name: part.tree for name, part in loaded.items()}
+    size_bytes = sum(part.size_bytes for part in loaded.values())
     hierarchy = None
     if kind in WITH_MOTION or kind is Kind.MODEL:
         ref = parts["model" if kind is Kind.MODEL else "motion"]["skeleton"]
-        hierarchy = items.read_part(tx, project, Kind.SKELETON, ref["item"], "hierarchy", revision=ref["revision"]).tree
-    return ItemToExport(item_id, kind, found.name, found.collection, number, parts, hierarchy, found.tags)
+        skeleton = items.read_part(tx, project, Kind.SKELETON, ref["item"], "hierarchy", revision=ref["revision"])
+        hierarchy, size_bytes = skeleton.tree, size_bytes + skeleton.size_bytes
+    item = ItemToExport(item_id, kind, found.name, found.collection, number, parts, hierarchy, found.tags)
+    return ExportSource(item, size_bytes)
 
 
 def find_unchanged_original(

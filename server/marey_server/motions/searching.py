@@ -49,6 +49,11 @@ class FoundSearchable:
         tree, mapping = ("" if part is None else part.digest for part in (self.tree, self.mapping))
         return self.model.part.digest, tree, mapping
 
+    @property
+    def size_bytes(self) -> int:
+        """The size in bytes of the documents of the model, its tree and its mapping."""
+        return sum(part.size_bytes for part in (self.model.part, self.tree, self.mapping) if part is not None)
+
 
 class SearchedModels(Message):
     """Models of the steps of a search; `packed` contains a `PackedModel` for each item."""

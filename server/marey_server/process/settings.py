@@ -79,7 +79,10 @@ class Settings(BaseSettings):
         description="Seconds after which an idle connection, or one that sends its headers too slowly, is closed.",
     )
     body_timeout_s: float = Field(
-        60.0, gt=0, description="Greatest number of seconds to receive an ordinary request body."
+        60.0,
+        gt=0,
+        description="Greatest number of seconds to receive an ordinary request body; also the longest pause in seconds "
+        "in a streamed request body, such as an upload.",
     )
     upload_timeout_s: float = Field(
         6 * 3600.0, gt=0, description="Greatest number of seconds to receive a streamed request body."

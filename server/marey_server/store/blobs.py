@@ -13,6 +13,7 @@ from sqlalchemy import ColumnElement, Select, Table, and_, or_, select, update
 
 from marey_schemas.access import Scope
 from marey_schemas.problems import FieldError
+from marey_schemas.sizes import KIB
 from marey_server import faults
 from marey_server.access import scopes
 from marey_server.access.principal import Principal
@@ -46,15 +47,18 @@ GRACE_US = 24 * 3600 * 1_000_000
 RENEW_US = GRACE_US // 2
 """Age after which an unreferenced blob must be sent again, so that it is not deleted while a client relies on it."""
 
+SPOOLED_BYTES = 64 * KIB
+"""Greatest number of bytes that a spool keeps in memory."""
+
 
 class Spool:
     """Temporary storage of bytes that are being received, with their running hash.
 
-    The first 1 MiB is kept in memory; a longer body is written to an unnamed file.
+    Up to `SPOOLED_BYTES` are kept in memory; a longer body is written to an unnamed file.
     """
 
     def __init__(self, directory: str | None = None) -> None:
-        self._file = tempfile.SpooledTemporaryFile(max_size=CHUNK_BYTES, dir=directory)  # noqa: SIM115
+        self._file = tempfile.SpooledTemporaryFile(max_size=SPOOLED_BYTES, dir=directory)  # noqa: SIM115
         self._hash = hashlib.sha256()
         self.size_bytes = 0
 

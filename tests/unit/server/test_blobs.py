@@ -1,5 +1,6 @@
 """Access to the bytes of blobs, and rights to refer to blobs."""
 
+import tracemalloc
 from dataclasses import replace
 from typing import Any
 
@@ -10,10 +11,11 @@ from tests.support.store_fixtures import Lab
 from marey_schemas.access import ProjectCreate
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
+from marey_schemas.sizes import MIB
 from marey_server.access.principal import Principal
 from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem, UnauthenticatedProblem
 from marey_server.store import blobs, items, projects
-from marey_server.store.blobs import GRACE_US, digest_of
+from marey_server.store.blobs import GRACE_US, SPOOLED_BYTES, Spool, digest_of
 
 FILE = b"HIERARCHY ROOT hips"
 DIGEST = digest_of(FILE)
@@ -138,3 +140,14 @@ def test_bytes_sent_for_a_project_are_used_by_tokens_that_reach_it(lab: Lab) -> 
     assert seen("read!project=lab", "jobs!project=other") == {"lab", "other"}
     assert seen("read!project=lab", "write") == {"lab", ""}
     assert seen("work", "admin") == seen("read!project=nowhere") == set()
+
+
+def test_a_spool_keeps_few_bytes_in_memory() -> None:
+    tracemalloc.start()
+    try:
+        with Spool() as spool:
+            spool.write(bytes(MIB))
+            assert tracemalloc.get_traced_memory()[0] < 2 * SPOOLED_BYTES
+            assert b"".join(spool.chunks()) == bytes(MIB)
+    finally:
+        tracemalloc.stop()

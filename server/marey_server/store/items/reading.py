@@ -259,7 +259,15 @@ def read_part(
 MOST_BYTES_AT_ONCE = 32 << 20
 
 
-def load_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace]) -> list[dict[str, Any] | None]:
+@dataclass(frozen=True, slots=True)
+class LoadedParts:
+    """Documents of several parts, in the order of a request, and their size in bytes; None for a missing part."""
+
+    documents: list[dict[str, Any] | None]
+    size_bytes: int
+
+
+def load_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace]) -> LoadedParts:
     """Load the documents of parts with encoded arrays, in the order of the request; None for a missing part.
 
     The parts of deleted items count as missing. Only an attempt of a job can load them, if they are inputs of the job,
@@ -281,9 +289,10 @@ def load_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace]) -> li
     size_bytes = 0
     for place in wanted:
         row = found.get((place.kind.value, place.item, place.revision, place.part))
-        size_bytes += row.size_bytes if row is not None else 0
-        if chosen and size_bytes > MOST_BYTES_AT_ONCE:
+        more_bytes = row.size_bytes if row is not None else 0
+        if chosen and size_bytes + more_bytes > MOST_BYTES_AT_ONCE:
             break
+        size_bytes += more_bytes
         chosen.append(None if row is None else row.digest)
     loaded = documents.load_documents(tx, {digest for digest in chosen if digest is not None})
-    return [None if digest is None else loaded[digest] for digest in chosen]
+    return LoadedParts([None if digest is None else loaded[digest] for digest in chosen], size_bytes)

@@ -1,0 +1,103 @@
+"""Clients that send streamed bodies slowly: memory counts for them, and only those who send nothing are cut off."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from tests.support.rest_server import PATIENCE_S, Server, running
+
+from marey_schemas.sizes import KIB, MIB
+from marey_server.handlers.blobs import Blob
+from marey_server.handlers.imports import MAX_FORM_BYTES
+from marey_server.store.blobs import SPOOLED_BYTES, digest_of
+from marey_server.store.database.connections import Database
+
+BODY = b"HIERARCHY"
+BLOB = f"/blobs/{digest_of(BODY)}"
+IMPORTS = "/projects/lab/imports"
+MULTIPART = "multipart/form-data; boundary=b"
+IMPORT_BYTES = MIB + MAX_FORM_BYTES + 64 * SPOOLED_BYTES
+
+
+@contextmanager
+def sending(
+    server: Server, token: str, method: str, path: str, length: int | None, content_type: str = "application/json"
+) -> Iterator[socket.socket]:
+    """Send the head of a request with a body of `length` bytes, or of unknown length; yield the socket."""
+    host, port = server.address.removeprefix("http://").split(":")
+    size = "Transfer-Encoding: chunked" if length is None else f"Content-Length: {length}"
+    head = f"{method} /api/v1{path} HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\nUpload-Offset: 0\r\n"
+    with socket.create_connection((host, int(port)), PATIENCE_S) as client:
+        client.sendall(f"{head}Content-Type: {content_type}\r\n{size}\r\n\r\n".encode())
+        yield client
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "length", "content_type", "held_bytes"),
+    [
+        ("PUT", BLOB, 700 * MIB, "", MIB),
+        ("PUT", BLOB, 10 * KIB, "", 10 * KIB),
+        ("PUT", BLOB, None, "", MIB),
+        ("PATCH", "/uploads/{upload}", 700 * MIB, "", MIB),
+        ("POST", IMPORTS, 700 * MIB, MULTIPART, IMPORT_BYTES),
+        ("POST", IMPORTS, None, "application/json", MIB),
+    ],
+    ids=["blob", "short", "chunked", "upload", "files", "list"],
+)
+def test_the_memory_of_a_streamed_body_counts_before_the_body_comes(
+    server: Server, method: str, path: str, length: int | None, content_type: str, held_bytes: int
+) -> None:
+    token, memory = server.make_project(), server.app.services.memory
+    upload = server.client(token).post("/uploads", json={"length": 700 * MIB}).json()["id"]
+    wait_until(lambda: memory.held_bytes == 0)
+    with sending(server, token, method, path.format(upload=upload), length, content_type):
+        wait_until(lambda: memory.held_bytes == held_bytes)
+        memory.take("somebody else", 0, memory.total_bytes - held_bytes, reserved=True)
+        with sending(server, token, method, path.format(upload=upload), length, content_type) as second:
+            assert second.recv(12) == b"HTTP/1.1 503"
+        memory.give_back("somebody else", memory.total_bytes - held_bytes)
+    wait_until(lambda: memory.held_bytes == 0)
+
+
+def test_who_sends_nothing_for_a_while_is_cut_off(database: Database, tmp_path: Path) -> None:
+    with running(database, tmp_path, body_timeout_s=0.5) as server:
+        token, memory = server.make_project(), server.app.services.memory
+        with sending(server, token, "PUT", BLOB, len(BODY)) as client:
+            client.sendall(BODY[:-1])
+            assert client.recv(1) == b""
+        wait_until(lambda: memory.held_bytes == 0)
+        assert server.client(token).put(BLOB, content=BODY).status_code == 204
+
+
+def test_who_sends_slowly_or_waits_for_the_server_is_not_cut_off(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    receive = Blob.receive
+
+    async def late(self: Blob, chunk: bytes) -> None:
+        await asyncio.sleep(1.5 if chunk == BODY[:1] else 0)
+        await receive(self, chunk)
+
+    monkeypatch.setattr(Blob, "receive", late)
+    with running(database, tmp_path, body_timeout_s=1.0) as server:
+        token = server.make_project()
+        with sending(server, token, "PUT", BLOB, len(BODY)) as client:
+            client.sendall(BODY[:1])
+            time.sleep(0.3)
+            for at in range(1, len(BODY)):
+                client.sendall(BODY[at : at + 1])
+                time.sleep(0.3)
+            assert client.recv(12) == b"HTTP/1.1 204"
