@@ -147,6 +147,11 @@ class Resource(CallingExchange):
         if self.principal is not None and self.caller.token is not None:
             self.services.note_use(self.caller.token, self.principal)
 
+    @property
+    def awaits_guest(self) -> bool:
+        """Whether the request waits for a body from a caller without a token, who may never send it."""
+        return not self.performing and hasattr(self, "caller") and self.caller.token is None and self.expects_body()
+
     async def _wait_for_refusal(self) -> None:
         """Delay the answer to a refused request if the event loop is late and this client was refused several times."""
         if hasattr(self, "caller") and (delay_s := self.services.refusal_brake.delay_s(self.client.key)):
