@@ -9,7 +9,6 @@ from functools import cached_property, partial
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from marey_server.access.principal import ANONYMOUS, Principal
-from marey_server.access.secret_tokens import hash_secret
 from marey_server.errors import ClientGoneProblem
 from marey_server.http.calls import Caller, run_plain
 from marey_server.http.declarations import Operation
@@ -66,12 +65,11 @@ class CallingExchange(Exchange):
 
     @cached_property
     def client(self) -> Client:
-        """Client to which queues attribute this request: a token that was accepted before, or else an address."""
+        """Client to which queues attribute this request: owner of a token that was accepted before, or an address."""
         return self._client_with(self.caller.token)
 
     def _client_with(self, token: str | None) -> Client:
-        if token is not None and self.services.knows(token):
-            key = hash_secret(token)
+        if token is not None and (key := self.services.client_key(token)) is not None:
             return Client(key, known=not self.services.refusal_brake.is_often_refused(key), is_gone=self.departure)
         return Client(limited_address(self.client_address), known=False, is_gone=self.departure)
 

@@ -29,7 +29,7 @@ RETRY_AFTER_S = 2
 
 @dataclass(frozen=True, slots=True)
 class Client:
-    """Owner of a call: a token that the server has accepted before, or the address of an unknown client."""
+    """Owner of a call: a user, worker or attempt whose token was accepted before, or an unknown client's address."""
 
     key: str
     known: bool = True
