@@ -24,7 +24,7 @@ STUDY = {"schema": "marey/document@1", "answer": 42}
 def busy(server: Server) -> Iterator[None]:
     """During the `with` block, occupy all threads for ordinary reads, and fill the queue for these threads."""
     done = threading.Event()
-    clients = [Client(f"192.0.2.{number}", known=False) for number in range(40)]
+    clients = [Client(f"user-{number}") for number in range(40)]
     reads = [server.database.queue_read(one, SYSTEM, lambda _tx: done.wait(PATIENCE_S)) for one in clients]
     try:
         yield
@@ -61,6 +61,17 @@ def test_heartbeats_claims_readiness_and_callers_do_not_wait_behind_reads(server
     assert {name: answer.status_code for name, answer in answers.items()} == {
         "ready": 200, "me": 200, "claim": 200, "sign-in": 401, "heartbeat": 403
     }  # fmt: skip
+
+
+def test_reads_of_one_client_leave_a_thread_to_others(server: Server) -> None:
+    done = threading.Event()
+    queue = server.database.queue_read
+    held = [queue(Client("anna"), SYSTEM, lambda _tx: done.wait(PATIENCE_S)) for _ in range(40)]
+    try:
+        assert queue(Client("ben"), SYSTEM, lambda _tx: "read").result(PATIENCE_S) == "read"
+        assert not any(read.done() for read in held)
+    finally:
+        done.set()
 
 
 def test_a_token_that_is_refused_often_takes_its_turns_among_strangers(
