@@ -87,6 +87,31 @@ def test_a_token_that_is_refused_often_takes_its_turns_among_strangers(
     assert [client.known for client in clients] == [False, True]
 
 
+def test_refusals_of_unknown_addresses_methods_and_headers_are_counted(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    token = server.make_user("anna")
+    user, user_id = server.client(token), server.database.read(SYSTEM, tokens.resolve_token, token).user_id
+    assert user.get("/me").status_code == 200
+    counted: list[str] = []
+
+    def note(client: str) -> float:
+        counted.append(client)
+        return 1e-3
+
+    monkeypatch.setattr(server.app.services.refusal_brake, "delay_s", note)
+    guest = server.client()
+    answers = [
+        guest.get("/nowhere"),
+        guest.delete("/login"),
+        guest.get("/projects", headers={"Accept": "image/png"}),
+        guest.get("/me", headers={"Authorization": "Basic x"}),
+        user.get("/nowhere"),
+    ]
+    assert [answer.status_code for answer in answers] == [404, 405, 406, 401, 404]
+    assert counted == ["127.0.0.1"] * 4 + [user_id]
+
+
 def test_all_tokens_of_a_user_are_one_client_except_those_of_workers(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,7 +22,6 @@ import asyncio
 import re
 import time
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
 from functools import partial
 from typing import Any, ClassVar, Concatenate, ParamSpec, TypeVar
 from urllib.parse import urlencode
@@ -38,7 +37,6 @@ from marey_server.errors import (
     AuthorLostProblem,
     BadRequestProblem,
     TooLargeProblem,
-    UnauthenticatedProblem,
 )
 from marey_server.http import negotiation
 from marey_server.http.calling import CallingExchange
@@ -154,9 +152,13 @@ class Resource(CallingExchange):
 
     async def _wait_for_refusal(self) -> None:
         """Delay the answer to a refused request if the event loop is late and this client was refused several times."""
-        if hasattr(self, "caller") and (delay_s := self.services.refusal_brake.delay_s(self.client.key)):
-            self.holding.release()
+        if delay_s := self.services.refusal_brake.delay_s(self.client.key):
+            self._release_memory()
             await self.pause(delay_s)
+
+    def _release_memory(self) -> None:
+        if hasattr(self, "operation"):  # otherwise the path or the method is unknown, and nothing was received
+            self.holding.release()
 
     @property
     def answer_form(self) -> AnswerForm:
@@ -211,11 +213,8 @@ class Resource(CallingExchange):
     def _turn(self) -> asyncio.Future[None] | None:
         """Return a future that ends when it is the turn of this request, or None if the request may begin at once."""
         operation = self._declared()
-        token = None
-        with suppress(UnauthenticatedProblem):
-            token = negotiation.bearer_token(self.request.headers.get("Authorization"))
         reserved = operation is not None and operation.reserved
-        return self.services.turns.take(self._client_with(token), reserved=reserved)
+        return self.services.turns.take(self.client, reserved=reserved)
 
     async def _admit(self) -> None:
         """Refuse callers who may not send a body, before any of the body is received or decoded.
@@ -354,8 +353,8 @@ class Resource(CallingExchange):
     def on_connection_close(self) -> None:
         """Release the body and stop child processes, because the client has closed the connection."""
         super().on_connection_close()
-        if not self.performing and hasattr(self, "operation"):
-            self.holding.release()
+        if not self.performing:
+            self._release_memory()
 
     async def _read_body(self) -> Any:
         body = self.operation.body
