@@ -87,7 +87,8 @@ class CallingExchange(Exchange):
         """
         if self.principal is None:  # children are shared among users, not among their tokens
             await self.look_up(_identify)
-        with self.services.children.request(self._child_user):
+        guest = self.client.key if self._child_user == UNKNOWN_CLIENTS else ""
+        with self.services.children.request(self._child_user, guest):
             yield
 
     async def compute_in_child(self, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> T:
