@@ -115,9 +115,9 @@ class Resource(CallingExchange):
         """Run `function(tx, ...)` and `to_reply` on its result in one transaction; return the rendered answer."""
         key = idempotency_key(self.request.headers) if self.operation.idempotency == "key" else None
         fingerprint = fingerprint_of(self.request, self._received) if key else ""
+        place = {name: self.path_kwargs.get(name) for name in ("project", "job")}
         answers = self.services.answers
-        project = self.path_kwargs.get("project")
-        call = Call(self.caller, self.answer_form, answers, to_reply, function, args, kwargs, key, fingerprint, project)
+        call = Call(self.caller, self.answer_form, answers, to_reply, function, args, kwargs, key, fingerprint, **place)
         run = self._read if self.operation.method == "GET" else self._write
         outcome = await run(partial(run_call, call))
         return outcome if isinstance(outcome, Rendered) else await self.render_document(outcome)
