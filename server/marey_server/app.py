@@ -176,7 +176,7 @@ def accept_connections(app: Application, server: HTTPServer, sockets: list[socke
         most=most,
         most_each=most if settings.trust_proxy else int(most * ADDRESS_SHARE),
         write_timeout_s=settings.write_timeout_s,
-        busy=lambda: {request.stream for request in in_flight},
+        busy=lambda: {request.stream for request in in_flight if not request.awaits_guest},
         count_closed=lambda reason: app.services.metrics.closed.labels(reason).inc(),
     )
     app.services.metrics.connections.set_function(lambda: len(connections))

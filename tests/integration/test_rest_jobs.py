@@ -278,6 +278,21 @@ def test_contributors_cancel_and_retry_their_own_jobs_only(
     assert ok(owner.post(f"/jobs/{theirs['id']}/retry"), 202)["retry_of"] == theirs["id"]
 
 
+def test_who_has_left_a_project_does_not_hear_of_a_retry_again(server: Server, owner: httpx.Client) -> None:
+    sam = server.client(server.make_user("sam"))
+    ok(owner.put("/projects/lab/members/sam", json={"role": "contributor"}))
+    job = submit(sam)["id"]
+    ok(sam.post(f"/jobs/{job}/cancel"))
+
+    def retry() -> httpx.Response:
+        return sam.post(f"/jobs/{job}/retry", headers={"Idempotency-Key": "again"})
+
+    first = ok(retry(), 202)
+    assert ok(retry(), 202) == first
+    owner.delete("/projects/lab/members/sam", headers={"If-Match": "*"}).raise_for_status()
+    assert (retry().status_code, retry().json()["code"]) == (404, "no-job")
+
+
 def test_a_job_whose_failed_dependency_belongs_to_another_is_retried_by_those_who_may_retry_both(
     server: Server, owner: httpx.Client
 ) -> None:

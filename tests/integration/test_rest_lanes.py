@@ -14,6 +14,7 @@ from tests.support.rest_server import PATIENCE_S, Server
 from marey_schemas.encoding.codecs import encode_tree
 from marey_server.access.principal import SYSTEM
 from marey_server.process.refusal_brake import FREE_REFUSALS
+from marey_server.store.credentials import tokens
 from marey_server.store.database.lanes import Client
 
 STUDY = {"schema": "marey/document@1", "answer": 42}
@@ -23,13 +24,26 @@ STUDY = {"schema": "marey/document@1", "answer": 42}
 def busy(server: Server) -> Iterator[None]:
     """During the `with` block, occupy all threads for ordinary reads, and fill the queue for these threads."""
     done = threading.Event()
-    clients = [Client(f"192.0.2.{number}", known=False) for number in range(40)]
+    clients = [Client(f"user-{number}") for number in range(40)]
     reads = [server.database.queue_read(one, SYSTEM, lambda _tx: done.wait(PATIENCE_S)) for one in clients]
     try:
         yield
         assert not any(read.done() for read in reads)
     finally:
         done.set()
+
+
+def noted_clients(server: Server, monkeypatch: pytest.MonkeyPatch) -> list[Client]:
+    """Return a list to which the client of every further request is added."""
+    clients: list[Client] = []
+    take = server.app.services.turns.take
+
+    def note(client: Client, *, reserved: bool) -> Any:
+        clients.append(client)
+        return take(client, reserved=reserved)
+
+    monkeypatch.setattr(server.app.services.turns, "take", note)
+    return clients
 
 
 def test_heartbeats_claims_readiness_and_callers_do_not_wait_behind_reads(server: Server) -> None:
@@ -49,24 +63,79 @@ def test_heartbeats_claims_readiness_and_callers_do_not_wait_behind_reads(server
     }  # fmt: skip
 
 
+def test_reads_of_one_client_leave_a_thread_to_others(server: Server) -> None:
+    done = threading.Event()
+    queue = server.database.queue_read
+    held = [queue(Client("anna"), SYSTEM, lambda _tx: done.wait(PATIENCE_S)) for _ in range(40)]
+    try:
+        assert queue(Client("ben"), SYSTEM, lambda _tx: "read").result(PATIENCE_S) == "read"
+        assert not any(read.done() for read in held)
+    finally:
+        done.set()
+
+
 def test_a_token_that_is_refused_often_takes_its_turns_among_strangers(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clients: list[Client] = []
-    take = server.app.services.turns.take
-
-    def note(client: Client, *, reserved: bool) -> Any:
-        clients.append(client)
-        return take(client, reserved=reserved)
-
     prober, reader = (server.client(server.make_user(name)) for name in ("prober", "reader"))
     for one in (prober, reader):
         assert one.get("/me").status_code == 200
     for _ in range(FREE_REFUSALS + 1):
         assert prober.get("/projects/none").status_code == 404
-    monkeypatch.setattr(server.app.services.turns, "take", note)
+    clients = noted_clients(server, monkeypatch)
     assert [one.get("/me").status_code for one in (prober, reader)] == [200, 200]
     assert [client.known for client in clients] == [False, True]
+
+
+def test_refusals_of_unknown_addresses_methods_and_headers_are_counted(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    token = server.make_user("anna")
+    user, user_id = server.client(token), server.database.read(SYSTEM, tokens.resolve_token, token).user_id
+    assert user.get("/me").status_code == 200
+    counted: list[str] = []
+
+    def note(client: str) -> float:
+        counted.append(client)
+        return 1e-3
+
+    monkeypatch.setattr(server.app.services.refusal_brake, "delay_s", note)
+    guest = server.client()
+    answers = [
+        guest.get("/nowhere"),
+        guest.delete("/login"),
+        guest.get("/projects", headers={"Accept": "image/png"}),
+        guest.get("/me", headers={"Authorization": "Basic x"}),
+        user.get("/nowhere"),
+    ]
+    assert [answer.status_code for answer in answers] == [404, 405, 406, 401, 404]
+    assert counted == ["127.0.0.1"] * 4 + [user_id]
+
+
+def test_all_tokens_of_a_user_are_one_client_except_those_of_workers(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = server.make_user("anna", administrator=True)
+    user_id = server.database.read(SYSTEM, tokens.resolve_token, first).user_id
+    assert user_id is not None
+
+    def more(*scopes: str) -> httpx.Client:
+        return server.client(server.make_token(user_id, "anna", administrator=True, scopes=scopes))
+
+    people = [server.client(first), more("read"), more("read", "work"), server.client(server.make_user("ben"))]
+    workers = [more("work"), more("work")]
+    claim = {"worker": "w", "kinds": ["export"]}
+
+    def ask() -> None:
+        assert [one.get("/me").status_code for one in people] == [200] * 4
+        assert [one.post("/leases", json=claim).status_code for one in workers] == [200] * 2
+
+    ask()
+    clients = noted_clients(server, monkeypatch)
+    ask()
+    assert all(client.known for client in clients)
+    assert {client.key for client in clients[:3]} == {user_id}
+    assert len({client.key for client in clients}) == 4, "of Anna, of Ben and of two workers"
 
 
 @pytest.mark.parametrize("method", ["GET", "HEAD"])

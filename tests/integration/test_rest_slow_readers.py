@@ -1,4 +1,4 @@
-"""Clients that do not read answers: the memory and the time that such clients cost the server are limited."""
+"""Clients that do not read answers or do not send bodies: the memory and the time that they cost are limited."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import Event
 
+import httpx
 import numpy as np
 import pytest
 from tests.support.rest_server import PATIENCE_S, Server, running
 
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
+from marey_server.http.accepting import ADDRESS_SHARE
 from marey_server.http.streaming import HELD_BYTES
 from marey_server.motions import exporting
 from marey_server.process.computing import RENDERING_THREADS
@@ -25,6 +27,8 @@ from marey_server.store.database.lanes import Client
 
 MIB = 2**20
 DOCUMENT_BYTES = 6 * MIB
+MOST_CONNECTIONS = 16
+MOST_EACH = int(MOST_CONNECTIONS * ADDRESS_SHARE)
 
 
 @contextmanager
@@ -146,3 +150,22 @@ def test_blobs_that_are_being_sent_count_as_memory(database: Database, tmp_path:
         wait_until(lambda: memory.held_bytes == 0)
         assert client.get(path).content == data
         wait_until(lambda: memory.held_bytes == 0)
+
+
+@pytest.mark.parametrize(
+    ("path", "answer"), [("projects", b"HTTP/1.1 401"), ("login", b"")], ids=["refused", "allowed"]
+)
+def test_guests_whose_bodies_do_not_come_do_not_keep_others_out(
+    database: Database, tmp_path: Path, path: str, answer: bytes
+) -> None:
+    head = f"POST /api/v1/{path} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n"
+    with running(database, tmp_path, max_connections=MOST_CONNECTIONS) as server, ExitStack() as open_until:
+        host, port = server.address.removeprefix("http://").split(":")
+        requests = server.app.services.in_flight
+        for _ in range(MOST_EACH):
+            client = open_until.enter_context(socket.create_connection((host, int(port)), timeout=PATIENCE_S))
+            client.sendall(head.encode())
+            if answer:
+                assert client.recv(MIB).startswith(answer)
+        wait_until(lambda: sum(one.awaits_guest for one in list(requests)) == (0 if answer else MOST_EACH))
+        assert httpx.get(f"{server.address}/healthz", timeout=PATIENCE_S).status_code == 200

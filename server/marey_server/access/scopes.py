@@ -19,6 +19,11 @@ def reaches_somewhere(scopes: Iterable[str], need: str) -> bool:
     return any(scope.partition("!")[0] == need for scope in scopes)
 
 
+def only_work(scopes: Iterable[str]) -> bool:
+    """Return whether `scopes` allow nothing but to claim jobs, as those of a worker's token should."""
+    return all(scope.partition("!")[0] == "work" for scope in scopes)
+
+
 def exceeding(wanted: Iterable[str], held: Iterable[str]) -> list[str]:
     """Return the scopes in `wanted` that `held` does not include."""
     held = set(held)

@@ -19,6 +19,7 @@ from tornado.httpserver import HTTPServer
 from tornado.iostream import IOStream
 
 from marey_schemas.sizes import KIB
+from marey_server.process.password_lanes import limited_address
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +27,7 @@ RESERVED_DESCRIPTORS = 256
 """Number of file descriptors that are kept for the database, files and child processes."""
 MOST_CONNECTIONS = 10_000
 ADDRESS_SHARE = 0.75
-"""Largest share of all connections that one address may have; trusted proxies may have more."""
+"""Largest share of all connections that one address (IPv6: one /64 network) may have; trusted proxies may have more."""
 EVICTED_SHARE = 1 / 16
 """Greatest number of idle connections that are closed when a limit is reached.
 
@@ -110,7 +111,7 @@ class Connections:
     ----------
     server : server that handles the connections
     most : greatest number of connections
-    most_each : greatest number of connections of one address
+    most_each : greatest number of connections of one address, as `limited_address` returns it
     write_timeout_s : time in seconds in which a client must receive `LEAST_TAKEN_BYTES`, or all bytes that wait for it
     busy : returns the streams on which a request is being answered; all other streams are idle
     count_closed : counts a refused or closed connection by its reason
@@ -177,7 +178,7 @@ class Connections:
 
     def _begin(self, accepted: socket.socket, address: Any) -> None:
         """Serve a connection, or close it if there are too many."""
-        host = str(address[0]) if isinstance(address, tuple) else ""
+        host = limited_address(str(address[0])) if isinstance(address, tuple) else ""
         if self._by_address[host] >= self._most_each:
             self._evict(host)
         elif len(self._open) >= self._most:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from functools import cached_property, partial
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from marey_server.access.principal import ANONYMOUS, Principal
-from marey_server.access.secret_tokens import hash_secret
-from marey_server.errors import ClientGoneProblem
+from marey_server.errors import ClientGoneProblem, UnauthenticatedProblem
 from marey_server.http.calls import Caller, run_plain
 from marey_server.http.declarations import Operation
 from marey_server.http.exchange import Exchange
+from marey_server.http.negotiation import bearer_token
 from marey_server.process.children import ChildTask
 from marey_server.process.memory import UNKNOWN_CLIENTS, Holding
 from marey_server.process.password_lanes import limited_address
@@ -66,12 +66,11 @@ class CallingExchange(Exchange):
 
     @cached_property
     def client(self) -> Client:
-        """Client to which queues attribute this request: a token that was accepted before, or else an address."""
-        return self._client_with(self.caller.token)
-
-    def _client_with(self, token: str | None) -> Client:
-        if token is not None and self.services.knows(token):
-            key = hash_secret(token)
+        """Client to which queues attribute this request: owner of a token that was accepted before, or an address."""
+        token = None
+        with suppress(UnauthenticatedProblem):
+            token = bearer_token(self.request.headers.get("Authorization"))
+        if token is not None and (key := self.services.client_key(token)) is not None:
             return Client(key, known=not self.services.refusal_brake.is_often_refused(key), is_gone=self.departure)
         return Client(limited_address(self.client_address), known=False, is_gone=self.departure)
 
@@ -88,7 +87,8 @@ class CallingExchange(Exchange):
         """
         if self.principal is None:  # children are shared among users, not among their tokens
             await self.look_up(_identify)
-        with self.services.children.request(self._child_user):
+        guest = self.client.key if self._child_user == UNKNOWN_CLIENTS else ""
+        with self.services.children.request(self._child_user, guest):
             yield
 
     async def compute_in_child(self, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> T:

@@ -23,6 +23,7 @@ from marey_server.http.reply import AnswerCache, AnswerForm, Loaded, Rendered, R
 from marey_server.store import idempotency, projects
 from marey_server.store.credentials import tokens
 from marey_server.store.jobs.fencing import lease_lost, require_attempt
+from marey_server.store.jobs.reading import find_job
 from marey_server.store.transaction import Transaction
 
 T = TypeVar("T")
@@ -143,6 +144,8 @@ class Call:
     fingerprint: str = ""
     project: str | None = None
     """Name of the project in the address, if any."""
+    job: str | None = None
+    """Id of the job in the address, if any."""
 
 
 def run_call(call: Call, tx: Transaction) -> Rendered | Reply:
@@ -154,8 +157,7 @@ def run_call(call: Call, tx: Transaction) -> Rendered | Reply:
     if call.idempotency_key is not None:
         stored = idempotency.begin(tx, call.idempotency_key, call.fingerprint)
         if stored is not None:
-            if call.project is not None and call.caller.operation.access.role is not None:
-                projects.require(tx, call.project)  # the caller's role may have ended since the first request
+            _require_role_again(call, tx)
             headers = {**stored.headers, "Idempotent-Replayed": "true"}
             return Rendered(stored.status, headers, stored.body)
     reply = settle(call.to_reply(call.function(tx, *call.args, **call.kwargs)), call.form, call.answers)
@@ -165,6 +167,16 @@ def run_call(call: Call, tx: Transaction) -> Rendered | Reply:
     if call.idempotency_key is not None:
         idempotency.finish(tx, call.idempotency_key, rendered.status, dict(rendered.headers), rendered.body)
     return rendered
+
+
+def _require_role_again(call: Call, tx: Transaction) -> None:
+    """Refuse a caller whose role in the project of the address, or of its job, has ended since the first request."""
+    if call.caller.operation.access.role is None:
+        return
+    if call.project is not None:
+        projects.require(tx, call.project)
+    if call.job is not None:
+        find_job(tx, call.job)
 
 
 def admit(tx: Transaction, target: BodyTarget) -> None:

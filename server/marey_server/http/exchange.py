@@ -138,7 +138,10 @@ class Exchange(RequestHandler):
         await self.flush()
 
     async def refuse(self, error: ApiProblem) -> None:
-        """Answer before the body is read, then discard the body (closing the connection could lose the answer)."""
+        """Answer before the body is read, then discard the body (closing the connection could lose the answer).
+
+        From then on, the connection is idle: it is closed if there are too many connections.
+        """
         self.refused = True
         self._write_problem(error)
         forget_origin(error)
@@ -146,6 +149,7 @@ class Exchange(RequestHandler):
             self.finish()
         elif self.expects_body():
             await self.flush()
+            self.services.in_flight.discard(self)  # the rest of the body may never come
 
     def method_not_allowed(self) -> MethodNotAllowedProblem:
         """Return the error for a method that the resource does not declare."""

@@ -22,7 +22,6 @@ import asyncio
 import re
 import time
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
 from functools import partial
 from typing import Any, ClassVar, Concatenate, ParamSpec, TypeVar
 from urllib.parse import urlencode
@@ -38,7 +37,6 @@ from marey_server.errors import (
     AuthorLostProblem,
     BadRequestProblem,
     TooLargeProblem,
-    UnauthenticatedProblem,
 )
 from marey_server.http import negotiation
 from marey_server.http.calling import CallingExchange
@@ -119,9 +117,9 @@ class Resource(CallingExchange):
         """Run `function(tx, ...)` and `to_reply` on its result in one transaction; return the rendered answer."""
         key = idempotency_key(self.request.headers) if self.operation.idempotency == "key" else None
         fingerprint = fingerprint_of(self.request, self._received) if key else ""
+        place = {name: self.path_kwargs.get(name) for name in ("project", "job")}
         answers = self.services.answers
-        project = self.path_kwargs.get("project")
-        call = Call(self.caller, self.answer_form, answers, to_reply, function, args, kwargs, key, fingerprint, project)
+        call = Call(self.caller, self.answer_form, answers, to_reply, function, args, kwargs, key, fingerprint, **place)
         run = self._read if self.operation.method == "GET" else self._write
         outcome = await run(partial(run_call, call))
         return outcome if isinstance(outcome, Rendered) else await self.render_document(outcome)
@@ -149,11 +147,20 @@ class Resource(CallingExchange):
         if self.principal is not None and self.caller.token is not None:
             self.services.note_use(self.caller.token, self.principal)
 
+    @property
+    def awaits_guest(self) -> bool:
+        """Whether the request waits for a body from a caller without a token, who may never send it."""
+        return not self.performing and hasattr(self, "caller") and self.caller.token is None and self.expects_body()
+
     async def _wait_for_refusal(self) -> None:
         """Delay the answer to a refused request if the event loop is late and this client was refused several times."""
-        if hasattr(self, "caller") and (delay_s := self.services.refusal_brake.delay_s(self.client.key)):
-            self.holding.release()
+        if delay_s := self.services.refusal_brake.delay_s(self.client.key):
+            self._release_memory()
             await self.pause(delay_s)
+
+    def _release_memory(self) -> None:
+        if hasattr(self, "operation"):  # otherwise the path or the method is unknown, and nothing was received
+            self.holding.release()
 
     @property
     def answer_form(self) -> AnswerForm:
@@ -217,11 +224,8 @@ class Resource(CallingExchange):
     def _turn(self) -> asyncio.Future[None] | None:
         """Return a future that ends when it is the turn of this request, or None if the request may begin at once."""
         operation = self._declared()
-        token = None
-        with suppress(UnauthenticatedProblem):
-            token = negotiation.bearer_token(self.request.headers.get("Authorization"))
         reserved = operation is not None and operation.reserved
-        return self.services.turns.take(self._client_with(token), reserved=reserved)
+        return self.services.turns.take(self.client, reserved=reserved)
 
     async def _admit(self) -> None:
         """Refuse callers who may not send a body, before any of the body is received or decoded.
@@ -366,8 +370,8 @@ class Resource(CallingExchange):
         """Release the body and stop child processes, because the client has closed the connection."""
         super().on_connection_close()
         self._pauses.stop()
-        if not self.performing and hasattr(self, "operation"):
-            self.holding.release()
+        if not self.performing:
+            self._release_memory()
 
     async def _read_body(self) -> Any:
         body = self.operation.body

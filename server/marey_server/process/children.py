@@ -59,6 +59,11 @@ class ChildLimits:
         """Greatest number of requests of one caller that use children or wait for one."""
         return max(1, self.requests // 2)
 
+    @property
+    def requests_of_guest(self) -> int:
+        """Greatest number of these requests from one guest, if all guests together are one caller."""
+        return max(1, self.requests_each // 2)
+
 
 @dataclass(eq=False)
 class ChildTask(Generic[T]):
@@ -130,6 +135,7 @@ class Children:
         self._waiting: list[ChildTask[Any]] = []
         self._running: list[ChildTask[Any]] = []
         self._requests: Counter[str] = Counter()
+        self._guests: Counter[str] = Counter()
         self._turns: dict[str, int] = {}
         """Number of the turn in which each caller last got a child.
 
@@ -147,21 +153,26 @@ class Children:
         return len(self._running), len(self._waiting)
 
     @contextmanager
-    def request(self, caller: str) -> Iterator[None]:
-        """Count a request of a caller until the `with` statement ends.
+    def request(self, caller: str, guest: str = "") -> Iterator[None]:
+        """Count a request of a caller, and of a guest if one is given, until the `with` statement ends.
 
         Raises `UnavailableProblem` if too many requests already use a child process or wait for one.
         """
         with self._changed:
             if self._requests[caller] >= self.limits.requests_each:
                 raise _busy(f"{self._requests[caller]} of your requests")
+            if guest and self._guests[guest] >= self.limits.requests_of_guest:
+                raise _busy(f"{self._guests[guest]} of your requests")
             if self._requests.total() >= self.limits.requests:
                 raise _busy(f"{self._requests.total()} requests")
             self._requests[caller] += 1
+            self._guests[guest] += 1
         try:
             yield
         finally:
             with self._changed:
+                self._guests[guest] -= 1
+                self._guests += Counter()  # drops guests without a request
                 self._requests[caller] -= 1
                 if not self._requests[caller]:
                     del self._requests[caller]

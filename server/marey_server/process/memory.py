@@ -12,6 +12,8 @@ CLIENT_SHARE = 0.75
 """Largest fraction of the memory that one client may hold."""
 UNKNOWN_SHARE = 0.25
 """Largest fraction of the memory that all clients without a known token together may hold."""
+UNKNOWN_SHARE_EACH = UNKNOWN_SHARE / 2
+"""Largest fraction of the memory that one of these clients, who is known by its address only, may hold."""
 RESERVED_SHARE = 0.125
 """Additional memory for reserved operations, such as heartbeats, as a fraction of the memory for other requests."""
 UNKNOWN_CLIENTS = "unknown-clients"
@@ -31,16 +33,17 @@ class RequestMemory:
         self._by_owner: Counter[str] = Counter()
         self._lock = threading.Lock()
 
-    def take(self, owner: str, bytes_now: int, more: int, *, reserved: bool) -> None:
-        """Count `more` bytes for `owner`, whose request already holds `bytes_now` bytes.
+    def take(self, client: Client, bytes_now: int, more: int, *, reserved: bool) -> None:
+        """Count `more` bytes for `client`, whose request already holds `bytes_now` bytes.
 
         Reserved operations have no limit for their owner, and the limit on all requests together is higher for them:
         `total_bytes * (1 + RESERVED_SHARE)`. Raises `UnavailableProblem` if a limit would be exceeded.
         """
         with self._lock:
             others = self.held_bytes > bytes_now
-            share = UNKNOWN_SHARE if owner == UNKNOWN_CLIENTS else CLIENT_SHARE
-            exceeds_share = not reserved and self._by_owner[owner] + more > share * self.total_bytes
+            exceeds_share = not reserved and any(
+                self._by_owner[owner] + more > share * self.total_bytes for owner, share in _shares(client).items()
+            )
             total = self.total_bytes * (1 + RESERVED_SHARE * reserved)
             if others and (exceeds_share or self.held_bytes + more > total):
                 whose = "your requests" if exceeds_share else "all requests together"
@@ -50,16 +53,26 @@ class RequestMemory:
                     code="memory",
                     headers={"Retry-After": str(RETRY_AFTER_S)},
                 )
-            self.held_bytes += more
-            self._by_owner[owner] += more
+            self._count(client, more)
 
-    def give_back(self, owner: str, held: int) -> None:
-        """Subtract `held` bytes, which a request no longer holds, from the memory counted for its owner."""
+    def give_back(self, client: Client, held: int) -> None:
+        """Subtract `held` bytes, which a request no longer holds, from the memory counted for its client."""
         with self._lock:
-            self.held_bytes -= held
-            self._by_owner[owner] -= held
+            self._count(client, -held)
+
+    def _count(self, client: Client, more: int) -> None:
+        self.held_bytes += more
+        for owner in _shares(client):
+            self._by_owner[owner] += more
             if not self._by_owner[owner]:
                 del self._by_owner[owner]
+
+
+def _shares(client: Client) -> dict[str, float]:
+    """Return for whom the bytes of a client are counted, each with the largest fraction of the memory it may hold."""
+    if client.known:
+        return {client.key: CLIENT_SHARE}
+    return {client.key: UNKNOWN_SHARE_EACH, UNKNOWN_CLIENTS: UNKNOWN_SHARE}
 
 
 class Holding:
@@ -67,7 +80,7 @@ class Holding:
 
     def __init__(self, memory: RequestMemory, client: Client, *, reserved: bool) -> None:
         self._memory = memory
-        self._owner = client.key if client.known else UNKNOWN_CLIENTS
+        self._client = client
         self._reserved = reserved
         self._bytes = 0
 
@@ -76,17 +89,17 @@ class Holding:
 
         Raises `UnavailableProblem` if all requests together, or all requests of the client, would hold too many bytes.
         """
-        self._memory.take(self._owner, self._bytes, more, reserved=self._reserved)
+        self._memory.take(self._client, self._bytes, more, reserved=self._reserved)
         self._bytes += more
 
     def shrink(self, less: int) -> None:
         """Reduce the memory that this request holds by `less` bytes."""
         if less:
             self._bytes -= less
-            self._memory.give_back(self._owner, less)
+            self._memory.give_back(self._client, less)
 
     def release(self) -> None:
         """Release all held bytes; may be called more than once."""
         held, self._bytes = self._bytes, 0
         if held:
-            self._memory.give_back(self._owner, held)
+            self._memory.give_back(self._client, held)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from marey_schemas.lru import LruCache
+from marey_server.access import scopes
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.access.secret_tokens import hash_secret
 from marey_server.errors import AuthorLostProblem, UnavailableProblem
@@ -95,7 +96,8 @@ class Services:
         self.upload_hashes = UploadHashes(database)
         self._faults: list[str] = []
         self._tokens_noted: LruCache[str, float] = LruCache(max_entries=TOKENS_REMEMBERED)
-        self._tokens_known: LruCache[str, bool] = LruCache(max_entries=TOKENS_REMEMBERED)
+        self._client_keys: LruCache[str, str] = LruCache(max_entries=TOKENS_REMEMBERED)
+        """Keys that `client_key` returns, by the hash of the token."""
         self.queue_policy = QueuePolicy(settings.lease_ttl_s, settings.heartbeat_s, settings.cancel_grace_s)
         self.start_grace = StartGrace(self.queue_policy)
         self._watch()
@@ -119,13 +121,19 @@ class Services:
             else:
                 log.info("ready again")
 
-    def knows(self, token: str) -> bool:
-        """Return whether a request with this token was accepted before; then the caller counts as a known client."""
-        return self._tokens_known.get(hash_secret(token)) is not None
+    def client_key(self, token: str) -> str | None:
+        """Return the key of the client that has a token, or None if no request with this token was accepted before.
+
+        All tokens of a user belong to one client, so that nobody gets more than one share by creating tokens. Each
+        worker and each attempt is a client of its own.
+        """
+        return self._client_keys.get(hash_secret(token))
 
     def note_use(self, token: str, principal: Principal) -> None:
         """Record the use of a token; each token is updated in the database at most once per `NOTE_USE_EVERY_S`."""
-        self._tokens_known.put(hash_secret(token), True)
+        token_hash = hash_secret(token)
+        user_id = None if scopes.only_work(principal.scopes) else principal.user_id
+        self._client_keys.put(token_hash, user_id or token_hash)
         token_id, now = principal.token_id, time.monotonic()
         if token_id is None:
             return

@@ -44,6 +44,17 @@ class Exhausted(socket.socket):
         return super().accept()
 
 
+class OfOneNetwork(socket.socket):
+    """Listening socket whose clients seem to have different addresses of one IPv6 network of 64 bits."""
+
+    accepted = 0
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        client, _ = super().accept()
+        self.accepted += 1
+        return client, (f"2001:db8::{self.accepted}", 1, 0, 0)
+
+
 Work = Callable[[Connections, Kept, Callable[[], Awaitable[socket.socket]]], Awaitable[None]]
 
 
@@ -52,6 +63,7 @@ def serve(
     *,
     listening: type[socket.socket] = socket.socket,
     most: int = 4,
+    most_each: int = 4,
     busy: Callable[[Kept], Collection[object]] = lambda _: (),
 ) -> None:
     """Call `work` with a function that connects a client, while an event loop accepts connections."""
@@ -62,7 +74,7 @@ def serve(
         connections = Connections(
             server,
             most=most,
-            most_each=most,
+            most_each=most_each,
             write_timeout_s=TIMEOUT_S,
             busy=lambda: busy(server),
             count_closed=lambda _reason: None,
@@ -145,6 +157,17 @@ def test_a_connection_that_is_busy_is_kept_and_the_new_one_is_closed() -> None:
         assert not any(stream.closed() for stream in server.streams)
 
     serve(work, busy=lambda server: server.streams)
+
+
+def test_addresses_of_one_network_share_the_connections_of_one_address() -> None:
+    async def work(connections: Connections, server: Kept, connect: Callable[[], Awaitable[socket.socket]]) -> None:
+        for number in range(3):
+            await connect()
+            await until(lambda number=number: len(server.streams) > number)  # type: ignore[misc]
+        assert [stream.closed() for stream in server.streams] == [True, False, False]
+        assert len(connections) == 2
+
+    serve(work, listening=OfOneNetwork, most_each=2)
 
 
 def test_connections_wait_while_there_are_no_descriptors_and_the_log_says_so_once(

@@ -171,6 +171,14 @@ def test_work_for_a_client_that_left_is_stopped(children: Children, tmp_path: Pa
     assert not (tmp_path / "never").exists()
 
 
+def test_one_guest_leaves_requests_to_other_guests(children: Children) -> None:
+    one = children.request("guests", "192.0.2.1")
+    with one, pytest.raises(UnavailableProblem, match=r"^1 of your requests"), children.request("guests", "192.0.2.1"):
+        pass
+    with children.request("guests", "192.0.2.1"), children.request("guests", "192.0.2.2"):
+        pass
+
+
 def test_requests_are_bounded_together_and_for_each_caller(children: Children) -> None:
     with children.request("mallory"), children.request("mallory"):
         with pytest.raises(UnavailableProblem, match=r"^2 of your requests") as caught, children.request("mallory"):

@@ -5,10 +5,15 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 
+from marey_server.process.computing import ComputeThreads
+from marey_server.store.database.lanes import Client
+
+PATIENCE_S = 30
 ENDLESS = """
 import sys, time
 from marey_server import app, commands
@@ -33,3 +38,12 @@ def test_a_server_that_is_told_to_stop_does_not_wait_for_computations(tmp_path: 
             assert process.wait(120) == 0
         finally:
             process.kill()
+
+
+def test_bodies_of_one_client_leave_a_thread_to_others() -> None:
+    threads, release = ComputeThreads(2), threading.Event()
+    held = [threads.submit_for(Client("anna"), release.wait, PATIENCE_S) for _ in range(2)]
+    assert threads.submit_for(Client("ben"), lambda: "decoded").result(PATIENCE_S) == "decoded"
+    release.set()
+    assert all(call.result(PATIENCE_S) for call in held)
+    threads.close()

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from marey_server.errors import ClientGoneProblem, UnavailableProblem
-from marey_server.store.database.lanes import Client, FairLine, Lane
+from marey_server.store.database.lanes import SERVER, Client, FairLine, Lane
 
 PATIENCE_S = 30
 ANNA, BEN = Client("anna"), Client("ben")
@@ -61,6 +61,13 @@ def test_one_client_and_all_strangers_leave_a_thread_to_others(release: threadin
     assert lane.submit(ANNA, lambda: "quick").result(PATIENCE_S) == "quick"
     release.set()
     assert all(future.result(PATIENCE_S) for future in held)
+    lane.close()
+
+
+def test_calls_of_the_server_itself_may_use_all_threads() -> None:
+    lane, both = Lane("test", 2, most_each=1), threading.Barrier(2)
+    calls = [lane.submit(SERVER, both.wait, PATIENCE_S) for _ in range(2)]
+    assert {call.result(PATIENCE_S) for call in calls} == {0, 1}
     lane.close()
 
 

@@ -46,6 +46,8 @@ WRITE_BACKOFF = Backoff(first_s=0.02, longest_s=0.16, jitter=1.0)
 READ_TRIES = 3
 RESERVED_THREADS = 3
 """Number of threads, and of connections, for short transactions that must not wait for other transactions."""
+SHARED_BY_ALL = 2
+"""Greatest number of ordinary threads of which one client may use all; half of two would make a lone client slow."""
 
 _POSTGRES_SETTINGS = {
     "statement_timeout": "120s",
@@ -88,7 +90,7 @@ class Database:
         self._lane: AbstractContextManager[Any] = threading.Lock() if self.is_sqlite else nullcontext()
         file = sqlite_file(self.url)
         self._log = WriteAheadLog(file) if file else None
-        self._ordinary = Lane("marey-database", readers)
+        self._ordinary = Lane("marey-database", readers, most_each=readers if readers <= SHARED_BY_ALL else readers - 1)
         self._reserved = Lane("marey-reserved", RESERVED_THREADS, most_each=RESERVED_THREADS - 1)
         self._write_lane = WriteLane(self.write) if self.is_sqlite else None
 

@@ -29,7 +29,7 @@ RETRY_AFTER_S = 2
 
 @dataclass(frozen=True, slots=True)
 class Client:
-    """Owner of a call: a token that the server has accepted before, or the address of an unknown client."""
+    """Owner of a call: a user, worker or attempt whose token was accepted before, or an unknown client's address."""
 
     key: str
     known: bool = True
@@ -130,7 +130,8 @@ class FairLine(Generic[T]):
 class Lane:
     """Threads that run the calls of a `FairLine`.
 
-    `most_each` limits how many calls run at the same time for one client, and for all unknown clients together.
+    `most_each` limits how many calls run at the same time for one client, and for all unknown clients together. Calls
+    of the server itself are not limited.
     """
 
     def __init__(self, name: str, threads: int, *, most_each: int | None = None) -> None:
@@ -186,6 +187,8 @@ class Lane:
             return call
 
     def _may_run(self, client: Client) -> bool:
+        if client.key == SERVER.key:
+            return True
         if not client.known and self._running_unknown >= self._most_each:
             return False
         return self._running[client.key] < self._most_each
