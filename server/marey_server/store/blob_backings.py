@@ -225,7 +225,7 @@ class DirectoryBlobs:
     def new_copy(self) -> Path:
         """Create an empty file for the copy of an upload, and return its path.
 
-        Garbage collection removes the file if `adopt` is not called.
+        If a process dies before it adopts or removes the file, garbage collection removes the file after a day.
         """
         handle, name = tempfile.mkstemp(dir=self._incoming)
         os.close(handle)
