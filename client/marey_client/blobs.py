@@ -11,7 +11,7 @@ from typing import BinaryIO
 import httpx
 
 from marey_client.downloads import saved_atomically
-from marey_client.errors import Conflict, DigestMismatch, FileChanged, Unreachable
+from marey_client.errors import BlobTooLarge, Conflict, DigestMismatch, FileChanged, Unreachable
 from marey_client.one_or_several import several
 from marey_client.transport import Transport, as_json, read_model
 from marey_schemas.formats import OCTETS
@@ -76,9 +76,20 @@ class Blobs:
         )
         return name
 
-    def fetch(self, digest: str) -> bytes:
-        """Return the bytes of a blob. Raises `DigestMismatch` if the received bytes have another digest."""
-        data: bytes = self.transport.send("GET", f"/blobs/{digest}", headers={"Accept": "*/*"}).content
+    def fetch(self, digest: str, *, most_bytes: int | None = None) -> bytes:
+        """Return the bytes of a blob. Raises `DigestMismatch` if the received bytes have another digest.
+
+        Raises `BlobTooLarge` before the download if the blob has more than `most_bytes`.
+        """
+
+        def once() -> bytes:
+            with self.transport.stream(f"/blobs/{digest}", headers={"Accept-Encoding": "identity"}) as response:
+                size_bytes = int(response.headers.get("Content-Length", 0))
+                if most_bytes is not None and size_bytes > most_bytes:
+                    raise BlobTooLarge(digest, size_bytes, most_bytes)
+                return response.read()
+
+        data = self.transport.repeat(once, repeatable=True, what=f"GET /blobs/{digest}")
         if digest_of(data) != digest:
             raise DigestMismatch(
                 f"the downloaded blob has the digest {digest_of(data)} instead of {digest}: it was "

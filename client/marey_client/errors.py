@@ -45,6 +45,15 @@ class DigestMismatch(MareyError):
     """The received bytes do not have the requested digest."""
 
 
+class BlobTooLarge(MareyError):
+    """A blob is larger than the caller allows; it was not downloaded."""
+
+    def __init__(self, digest: str, size_bytes: int, most_bytes: int) -> None:
+        super().__init__(f"the file {digest} has {size_bytes} bytes, but at most {most_bytes} are allowed here")
+        self.digest = digest
+        self.size_bytes = size_bytes
+
+
 class ArchiveInUse(MareyError):
     """Another process is writing the archive."""
 

@@ -210,6 +210,11 @@ class TestDirectoryBlobs(BlobBackingContract):
         assert set(backing.stray_digests(older_than_s=-10)) == {kept}
         assert store.read(blobs.read_blob, kept) == b"kept"
 
+    def test_other_users_may_not_look_into_its_folders(self, store: Lab, backing: DirectoryBlobs) -> None:
+        store.write(blobs.put_blob, b"private")
+        folders = [backing.root, *(path for path in backing.root.iterdir() if path.is_dir())]
+        assert [folder.stat().st_mode & 0o777 for folder in folders] == [0o700] * 3
+
     def test_an_interrupted_write_leaves_no_file_under_the_name(self, store: Lab, backing: DirectoryBlobs) -> None:
         def broken() -> Iterator[bytes]:
             yield b"half"

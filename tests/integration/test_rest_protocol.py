@@ -9,6 +9,7 @@ import logging
 import socket
 import time
 from asyncio import Future
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -23,16 +24,20 @@ from tornado.iostream import IOStream
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree
 from marey_server.access.principal import SYSTEM
+from marey_server.errors import UnavailableProblem
+from marey_server.handlers.uploads import LONG_BODY_BYTES
 from marey_server.http import reply
 from marey_server.http.exchange import JOINED_BYTES
 from marey_server.http.negotiation import MediaType
 from marey_server.process.observe import without_received_text
-from marey_server.store import projects
+from marey_server.store import projects, uploads
+from marey_server.store.blob_backings import DirectoryBlobs
 from marey_server.store.blobs import Spool
 from marey_server.store.database.connections import Database
 from marey_server.store.items.facets import publish_facets
 from marey_server.store.transaction import Transaction
 
+OCTETS = {"Content-Type": "application/octet-stream"}
 JOINTS = ("hips", "knee", "foot")
 HIERARCHY = {
     "schema": "marey/skeleton@1",
@@ -572,6 +577,27 @@ def test_an_upload_goes_on_where_it_broke_off(owner: httpx.Client, server: Serve
     done = answer.json()
     assert done["offset"] == len(data)
     assert owner.get(f"/blobs/{done['digest']}").content == data
+
+
+def test_the_copy_of_an_upload_that_ends_without_a_blob_is_removed_at_once(
+    server: Server, owner: httpx.Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server.database.blobs = DirectoryBlobs(tmp_path / "blobs")
+    incoming = tmp_path / "blobs" / "incoming"
+    path = owner.post("/uploads", json={"length": 10}).headers["Location"].removeprefix("/api/v1")
+    assert owner.patch(path, content=b"12345", headers={"Upload-Offset": "0", **OCTETS}).status_code == 200
+    assert [copy.read_bytes() for copy in incoming.iterdir()] == [b"12345"]
+    assert owner.delete(path).status_code == 204
+    assert list(incoming.iterdir()) == []
+
+    def fail(*_: object) -> None:
+        raise UnavailableProblem("The storage is away.")
+
+    data = bytes(LONG_BODY_BYTES + 1)
+    monkeypatch.setattr(uploads, "finish", fail)
+    digest = f"sha256:{hashlib.sha256(data).hexdigest()}"
+    assert owner.put(f"/blobs/{digest}", content=data, headers=OCTETS).status_code == 503
+    assert list(incoming.iterdir()) == []
 
 
 def test_an_upload_waits_for_a_database_that_is_behind_but_not_for_ever(

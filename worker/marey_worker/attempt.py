@@ -22,7 +22,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from marey_client.errors import Conflict, LeaseLost, MareyError, NotFound
+from marey_client.errors import BlobTooLarge, Conflict, LeaseLost, MareyError, NotFound
 from marey_schemas.items import PartPlace
 from marey_schemas.processes.child_process import BadMessage, ChildProcess
 from marey_schemas.queue.job_kinds import find_kind
@@ -58,6 +58,10 @@ WEIGH_EVERY_S = 0.5
 LOG_EVERY_S = 2.0
 LOG_LIMIT_BYTES = 64 * MIB
 ANSWER_LIMIT_BYTES = 32 * MIB
+MOST_BLOB_BYTES = 1 << 30
+"""Greatest size of a blob that a job may read, because this process, whose memory has no limit, holds it in memory."""
+MEMORY_PER_BLOB = 4
+"""Least ratio of a job's memory limit to the size of a blob; the child needs several times the size of a file."""
 TRANSFERS_AT_ONCE = 4
 
 
@@ -281,7 +285,8 @@ class RunningAttempt:
             self._keeper.lost.set()
             return None
         except Exception as error:  # noqa: BLE001 - whatever happened, the child waits for an answer
-            return ChildReply(request.request, refusal=str(error), missing=isinstance(error, NotFound))
+            missing, too_large = isinstance(error, NotFound), isinstance(error, BlobTooLarge)
+            return ChildReply(request.request, refusal=str(error), missing=missing, too_large=too_large)
 
     def _carried_out(self, request: Request) -> Any:
         match request:
@@ -292,7 +297,7 @@ class RunningAttempt:
             case FindItems(_, kind, name, collection):
                 return self._api.find_items(kind, name, collection)
             case ReadBlob(_, digest):
-                return self._cache.get(self._cache_key(digest), lambda: self._api.read_blob(digest))
+                return self._read_blob(digest)
             case ReadResults():
                 return self._api.read_results()
             case PutFile(_, path):
@@ -303,6 +308,11 @@ class RunningAttempt:
                 self._api.stage(body)
                 faults.point("worker.after_blob")
                 return None
+
+    def _read_blob(self, digest: str) -> bytes:
+        """Return a blob from the cache or the server. Raises `BlobTooLarge` if the job's memory is too small for it."""
+        most_bytes = min(MOST_BLOB_BYTES, self._lease.resources.memory_limit_mb * MIB // MEMORY_PER_BLOB)
+        return self._cache.get(self._cache_key(digest), lambda: self._api.read_blob(digest, most_bytes))
 
     def _read_parts(self, places: Sequence[PartPlace]) -> list[bytes | None]:
         """Return encoded documents from the cache or the server, and None for a document that does not exist.

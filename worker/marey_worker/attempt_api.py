@@ -114,10 +114,10 @@ class AttemptApi:
         with _dead_token_is_lost_lease():
             return [one.result or {} for one in pages(self._transport, TaskResult, f"/jobs/{self._job}/results")]
 
-    def read_blob(self, digest: str) -> bytes:
-        """Return a blob's bytes by its digest."""
+    def read_blob(self, digest: str, most_bytes: int) -> bytes:
+        """Return a blob's bytes by its digest. Raises `BlobTooLarge` before the download of more than `most_bytes`."""
         with _dead_token_is_lost_lease():
-            return Blobs(self._transport).fetch(digest)
+            return Blobs(self._transport).fetch(digest, most_bytes=most_bytes)
 
     def put_file(self, path: Path) -> str:
         """Send a file to the server, which stores it as a blob, and return its digest."""

@@ -21,7 +21,7 @@ from marey_schemas.processes.child_process import READY, connect_to_parent
 from marey_schemas.processes.limits import allow_memory
 from marey_schemas.queue.job_kinds import KindDeclaration, find_kind
 from marey_worker import signatures
-from marey_worker.context import Context, JobRefused, NoSuchThing
+from marey_worker.context import Context, JobRefused, Unreadable
 from marey_worker.messages import Done, End, Failed, Run, pack, unpack
 
 DETAIL_CHARACTERS = 1000
@@ -95,7 +95,7 @@ def run_job(run: Run, pipe: Connection) -> End:
         result = to_jsonable_python(_perform(find_kind(run.kind), context, run))
     except JobRefused as error:
         return Failed(error.code, error.detail, None, retryable=False)
-    except NoSuchThing as error:  # inputs are pinned: what is not there now will not be there at the next try
+    except Unreadable as error:  # inputs are pinned: what is not there now will not be there at the next try
         return Failed(error.code, str(error), None, retryable=False)
     except ValidationError as error:
         return Failed("invalid-params", str(error), None, retryable=False)

@@ -55,12 +55,30 @@ class RequestRefused(Exception):
     """The supervisor could not carry out a request of the job."""
 
 
-class NoSuchThing(RequestRefused):
+class Unreadable(RequestRefused):
+    """A requested object cannot be read, even if the job is retried. `code` is a stable identifier of the reason."""
+
+    def __init__(self, detail: str, code: str) -> None:
+        super().__init__(detail)
+        self.code = code
+
+
+class NoSuchThing(Unreadable):
     """A requested object does not exist, or the job may not read it; `code` names its kind, as in `no-skeleton`."""
 
     def __init__(self, detail: str, code: str = "not-found") -> None:
-        super().__init__(detail)
-        self.code = code
+        super().__init__(detail, code)
+
+
+class FileTooLarge(Unreadable):
+    """A stored file is too large for the memory limit of the job."""
+
+    def __init__(self, detail: str) -> None:
+        super().__init__(
+            f"{detail}: a job can read files of up to a quarter of its memory limit, and of up to 1 GiB; submit it "
+            "with a greater memory_limit_mb, or split the file",
+            "file-too-large",
+        )
 
 
 class Task(NamedTuple):
@@ -142,7 +160,7 @@ class Context:
         return results
 
     def blob(self, digest: str) -> bytes:
-        """Return the bytes of a blob. Raises `NoSuchThing` if the blob does not exist."""
+        """Return the bytes of a blob. Raises `NoSuchThing` if it does not exist, `FileTooLarge` if it is too large."""
         data: bytes = self._value(self._send(lambda request: ReadBlob(request, digest)), "no-blob")
         return data
 
@@ -224,14 +242,16 @@ class Context:
     def _value(self, request: int, missing: str = "not-found") -> Any:
         """Wait for the answer to a request, and return its value.
 
-        If the requested object does not exist, raises `NoSuchThing` with the code `missing`; if the request failed for
-        another reason, raises `RequestRefused`.
+        If the requested object does not exist, raises `NoSuchThing` with the code `missing`; if it is too large for the
+        job, raises `FileTooLarge`; if the request failed for another reason, raises `RequestRefused`.
         """
         while request not in self._replies:
             reply: ChildReply = unpack(self._pipe.recv_bytes())
             self._replies[reply.request] = reply
         reply = self._replies.pop(request)
         if reply.refusal is not None:
+            if reply.too_large:
+                raise FileTooLarge(reply.refusal)
             raise NoSuchThing(reply.refusal, missing) if reply.missing else RequestRefused(reply.refusal)
         return reply.value
 

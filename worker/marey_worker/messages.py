@@ -47,13 +47,15 @@ class Run:
 class ChildReply:
     """Answer to a request: the requested value, or the reason why the request failed.
 
-    `missing` is true if the reason is that the requested object does not exist.
+    `missing` is true if the reason is that the requested object does not exist, and `too_large` if it is too large for
+    the job's memory limit.
     """
 
     request: int
     value: Any = None
     refusal: str | None = None
     missing: bool = False
+    too_large: bool = False
 
 
 # From the child

@@ -48,6 +48,7 @@ async def store_in_pieces(resource: Resource, spool: blobs.Spool) -> None:
         await finish_upload(resource, upload)
     except BaseException:
         await resource.change(uploads.abandon, upload.id)
+        resource.services.upload_hashes.forget(upload.id)
         raise
 
 
@@ -166,7 +167,9 @@ class UploadResource(Resource):
     @writes(access=Access.SIGNED_IN, attempts=True)
     async def delete(self, upload: str) -> Rendered:
         """Cancel an upload."""
-        return await self.answer(uploads.abandon, upload)
+        cancelled = await self.answer(uploads.abandon, upload)
+        self.services.upload_hashes.forget(upload)
+        return cancelled
 
 
 RESOURCES: tuple[type[Resource], ...] = (Uploads, UploadResource)

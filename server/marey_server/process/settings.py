@@ -187,6 +187,12 @@ class Settings(BaseSettings):
         ge=0,
         description="Greatest total size, in bytes, of the unfinished uploads of a user.",
     )
+    user_daily_bytes: int = Field(
+        Quotas.user_daily_bytes,
+        ge=0,
+        description="Number of bytes that a user may send at once, and then per day; bytes that the server has already "
+        "do not count.",
+    )
     user_tokens: int = Field(
         Quotas.user_tokens, ge=0, description="Greatest number of valid tokens of a user, not counting sign-ins."
     )

@@ -160,11 +160,18 @@ class DirectoryBlobs:
     def __init__(self, root: Path) -> None:
         self.root = root
         self._incoming = root / "incoming"
-        self._incoming.mkdir(parents=True, exist_ok=True)
+        root.mkdir(parents=True, exist_ok=True, mode=0o700)
+        self._incoming.mkdir(exist_ok=True, mode=0o700)
 
     def _path(self, digest: str) -> Path:
         digits = digest.removeprefix("sha256:")
         return self.root / digits[:2] / digits[2:]
+
+    def _new_path(self, digest: str) -> Path:
+        """Return the path of a blob's file, and create its folder if necessary."""
+        path = self._path(digest)
+        path.parent.mkdir(exist_ok=True, mode=0o700)
+        return path
 
     def write(self, connection: Connection, contents: Mapping[str, Iterable[bytes]]) -> None:  # noqa: ARG002
         """Write the file of each blob, replacing a file that a rolled-back transaction may have left under its name."""
@@ -172,8 +179,7 @@ class DirectoryBlobs:
             self._write(digest, chunks)
 
     def _write(self, digest: str, chunks: Iterable[bytes]) -> None:
-        path = self._path(digest)
-        path.parent.mkdir(exist_ok=True)
+        path = self._new_path(digest)
         handle, name = tempfile.mkstemp(dir=self._incoming)
         try:
             with os.fdopen(handle, "wb") as file:
@@ -219,7 +225,7 @@ class DirectoryBlobs:
     def new_copy(self) -> Path:
         """Create an empty file for the copy of an upload, and return its path.
 
-        Garbage collection removes the file if `adopt` is not called.
+        If a process dies before it adopts or removes the file, garbage collection removes the file after a day.
         """
         handle, name = tempfile.mkstemp(dir=self._incoming)
         os.close(handle)
@@ -230,8 +236,7 @@ class DirectoryBlobs:
 
         Does nothing if an earlier try of the same transaction has renamed the copy already.
         """
-        path = self._path(digest)
-        path.parent.mkdir(exist_ok=True)
+        path = self._new_path(digest)
         try:
             os.replace(copy, path)
         except FileNotFoundError:

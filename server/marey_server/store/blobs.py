@@ -27,6 +27,7 @@ from marey_server.errors import (
 from marey_server.store.blob_backings import CHUNK_BYTES
 from marey_server.store.jobs import reach
 from marey_server.store.projects import is_visible, writable_projects
+from marey_server.store.quotas import count_sent
 from marey_server.store.tables import (
     attempt_blob,
     blob,
@@ -103,7 +104,8 @@ def put_blob(
     """Store bytes that the caller uploaded, and allow the caller to refer to them by their digest.
 
     The bytes can be used in the project `project_id`, or if this is None, in all projects that the caller's token
-    allows. Raises `InvalidProblem` if the digest of the bytes is not `expected`.
+    allows. Raises `InvalidProblem` if the digest of the bytes is not `expected`, and `QuotaExceededProblem` if the
+    caller has sent too many bytes.
     """
     require_sender(tx.principal)
     places = places_of_sender(tx) if project_id is None else (project_id,)
@@ -113,8 +115,10 @@ def put_blob(
             f"The bytes have the digest {digest}, not {expected}: they were changed in transit; send them again.",
             code="digest-mismatch",
         )
-    store_blobs(tx, {digest: content})
+    new = store_blobs(tx, {digest: content})
     add_holder(tx, digest, places)
+    if new:
+        count_sent(tx, _size_bytes(content))
     faults.point("blob.put.before_commit")
     tx.after_commit(lambda: faults.point("blob.put.after_commit"))
     return digest
@@ -151,14 +155,18 @@ def places_of_sender(tx: Transaction) -> tuple[str, ...]:
     return tuple(found)
 
 
-def store_blobs(tx: Transaction, contents: Mapping[str, bytes | Spool]) -> None:
-    """Store bytes under their digests; for blobs that are stored already, reset the age to zero."""
+def store_blobs(tx: Transaction, contents: Mapping[str, bytes | Spool]) -> set[str]:
+    """Store bytes under their digests; for blobs that are stored already, reset the age to zero.
+
+    Returns the digests of the blobs that were not stored before.
+    """
     rows = [
         {"digest": digest, "size_bytes": _size_bytes(content), "created_us": tx.now_us}
         for digest, content in contents.items()
     ]
     new = insert_new(tx, blob, rows)
     tx.blobs.write(tx.connection, {digest: _chunks(contents[digest]) for digest in contents if digest in new})
+    return new
 
 
 def _size_bytes(content: bytes | Spool) -> int:

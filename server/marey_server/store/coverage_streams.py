@@ -86,7 +86,7 @@ def create_stream(tx: Transaction, project: str, new: NewStream) -> Stream:
     """Create a stream. Raises `ConflictProblem` if the project has too many streams."""
     project_row = projects.require(tx, project)
     tx.lock(f"coverage:{project_row.id}")
-    count = select(func.count()).where(coverage_stream.c.project_id == project_row.id, ~_is_old(tx))
+    count = select(func.count()).where(coverage_stream.c.project_id == project_row.id, ~is_old(tx))
     if tx.execute(count).scalar_one() >= MOST_STREAMS:
         raise ConflictProblem(
             f"The project already has {MOST_STREAMS} coverage streams, the most that are allowed; delete "
@@ -104,7 +104,7 @@ def list_streams(
 ) -> Page:
     """List the streams of a project, newest first."""
     project_row = projects.require(tx, project)
-    statement = select(*_LISTED).where(coverage_stream.c.project_id == project_row.id, ~_is_old(tx))
+    statement = select(*_LISTED).where(coverage_stream.c.project_id == project_row.id, ~is_old(tx))
     order = listing.parse_order("-id", {"id": coverage_stream.c.id})
     rows, next_cursor = listing.read_page(tx, statement, order, ["coverage", project_row.id], cursor, limit)
     return Page(items=tuple(CoverageStream(**_listed(row)) for row in rows), next_cursor=next_cursor)
@@ -162,11 +162,6 @@ def delete_stream(tx: Transaction, project: str, stream_id: str) -> None:
     tx.execute(delete(coverage_stream).where(coverage_stream.c.id == found.id))
 
 
-def drop_old_streams(tx: Transaction) -> int:
-    """Delete the streams that have received no frames for a day; return their number."""
-    return tx.execute(delete(coverage_stream).where(_is_old(tx))).rowcount
-
-
 _LISTED = [coverage_stream.c[name] for name in ("id", "settings", "offset", "created_us", "updated_us", "rev")]
 
 
@@ -175,13 +170,13 @@ def _listed(row: Row[Any]) -> Tree:
     return Stream(**row._mapping, **no_state).shown()
 
 
-def _is_old(tx: Transaction) -> ColumnElement[bool]:
+def is_old(tx: Transaction) -> ColumnElement[bool]:
     return coverage_stream.c.updated_us < tx.now_us - LIFETIME_US
 
 
 def _find(tx: Transaction, project_id: str, stream_id: str) -> Stream:
     statement = select(coverage_stream).where(
-        coverage_stream.c.id == stream_id, coverage_stream.c.project_id == project_id, ~_is_old(tx)
+        coverage_stream.c.id == stream_id, coverage_stream.c.project_id == project_id, ~is_old(tx)
     )
     row = tx.execute(statement).first()
     if row is None:

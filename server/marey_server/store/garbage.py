@@ -11,8 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from sqlalchemy import ColumnElement, Table, delete, exists, select
+from sqlalchemy import ColumnElement, Table, delete, exists, literal, select, tuple_
 
 from marey_schemas.queue.jobs import JobState
 from marey_schemas.sizes import MIB
@@ -20,8 +21,8 @@ from marey_server import faults
 from marey_server.access.principal import SYSTEM
 from marey_server.store import uploads
 from marey_server.store.blobs import GRACE_US
-from marey_server.store.coverage_streams import drop_old_streams
-from marey_server.store.credentials.tokens import forget_ended
+from marey_server.store.coverage_streams import is_old
+from marey_server.store.credentials.tokens import expired_long_ago
 from marey_server.store.database.connections import Database
 from marey_server.store.idempotency import LIFETIME_US as KEY_LIFETIME_US
 from marey_server.store.invitations import validity
@@ -30,6 +31,7 @@ from marey_server.store.tables import (
     attempt_blob,
     blob,
     blob_holder,
+    coverage_stream,
     document,
     document_blob,
     document_item,
@@ -38,6 +40,7 @@ from marey_server.store.tables import (
     job_blob,
     revision_part,
     staged_output,
+    token,
 )
 from marey_server.store.transaction import Transaction
 
@@ -74,10 +77,10 @@ def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collecte
         blobs=_collect(database, blob, delete_blobs, grace_us),
         stray_files=_sweep_strays(database, grace_us),
         uploads=_delete_uploads(database),
-        keys=database.write(SYSTEM, _drop_old_keys),
-        coverage_streams=database.write(SYSTEM, drop_old_streams),
-        tokens=database.write(SYSTEM, forget_ended),
-        ended_holdings=database.write(SYSTEM, _drop_ended_holdings),
+        keys=_delete_expired(database, idempotency_key, _is_old_key),
+        coverage_streams=_delete_expired(database, coverage_stream, is_old),
+        tokens=_delete_expired(database, token, expired_long_ago),
+        ended_holdings=_delete_expired(database, attempt_blob, _attempt_has_ended),
         invitations=database.write(SYSTEM, validity.delete_expired),
     )
 
@@ -191,13 +194,41 @@ def _delete_uploads(database: Database) -> int:
     return dropped
 
 
-def _drop_old_keys(tx: Transaction) -> int:
-    old = idempotency_key.c.created_us < tx.now_us - KEY_LIFETIME_US
-    return tx.execute(delete(idempotency_key).where(old)).rowcount
+Condition = Callable[[Transaction], ColumnElement[bool]]
+"""Function that returns the SQL condition for rows that may be deleted."""
 
 
-def _drop_ended_holdings(tx: Transaction) -> int:
-    """Delete the records of blobs uploaded by attempts that have ended or lost their jobs; return their number."""
+def _delete_expired(database: Database, table: Table, condition: Condition) -> int:
+    """Delete the rows that meet a condition, `BATCH` rows in each transaction; return their number."""
+    deleted, behind = 0, None
+    while found := database.read(SYSTEM, _expired_keys, table, condition, behind):
+        deleted += database.write(SYSTEM, _delete_rows, table, condition, found)
+        behind = found[-1]
+    return deleted
+
+
+def _expired_keys(
+    tx: Transaction, table: Table, condition: Condition, behind: tuple[Any, ...] | None
+) -> list[tuple[Any, ...]]:
+    """Return at most `BATCH` primary keys, the next after `behind`, of rows that meet a condition."""
+    key = list(table.primary_key.columns)
+    rows = select(*key).where(condition(tx)).order_by(*key).limit(BATCH)
+    if behind is not None:
+        rows = rows.where(tuple_(*key) > tuple_(*map(literal, behind)))
+    return [tuple(row) for row in tx.execute(rows)]
+
+
+def _delete_rows(tx: Transaction, table: Table, condition: Condition, keys: Sequence[tuple[Any, ...]]) -> int:
+    """Delete those of the rows with the given primary keys that still meet a condition; return their number."""
+    chosen = tuple_(*table.primary_key.columns).in_(keys)
+    return tx.execute(delete(table).where(chosen, condition(tx))).rowcount
+
+
+def _is_old_key(tx: Transaction) -> ColumnElement[bool]:
+    return idempotency_key.c.created_us < tx.now_us - KEY_LIFETIME_US
+
+
+def _attempt_has_ended(_tx: Transaction) -> ColumnElement[bool]:
+    """Return the SQL condition for records of blobs uploaded by attempts that have ended or lost their jobs."""
     same_attempt = (job.c.id == attempt_blob.c.job_id, job.c.fence == attempt_blob.c.fence)
-    held = exists().where(*same_attempt, job.c.state == RUNNING)
-    return tx.execute(delete(attempt_blob).where(~held)).rowcount
+    return ~exists().where(*same_attempt, job.c.state == RUNNING)

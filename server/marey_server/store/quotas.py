@@ -15,8 +15,10 @@ from sqlalchemy import Column, Row, Select, bindparam, exists, func, or_, select
 
 from marey_schemas.access import QuotaChange, QuotasInUse, QuotaUse, Role
 from marey_server.errors import QuotaExceededProblem
+from marey_server.store import rate_limits
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.invitations.validity import is_unspent
+from marey_server.store.rate_limits import DailyAmount, key_of
 from marey_server.store.tables import (
     UNFINISHED,
     document,
@@ -105,6 +107,42 @@ def _used(tx: Transaction, quota: str, user_id: str) -> Select[Any]:
 
 def _open(user_id: str) -> tuple[Any, ...]:
     return upload.c.user_id == user_id, upload.c.finished_digest.is_(None), upload.c.dropped.is_(False)
+
+
+# -- bytes that users send --------------------------------------------------------------------------------------------
+
+
+def count_sent(tx: Transaction, size_bytes: int) -> None:
+    """Count new bytes that the caller sends; they take space for a day, even if no item ever uses them.
+
+    The server and attempts of jobs have no quotas. Raises `QuotaExceededProblem` if the caller has sent too many bytes.
+    """
+    if (limit := _part_of_day(tx, size_bytes)) is None:
+        return
+    most = tx.quotas.user_daily_bytes
+    wait_s = None if size_bytes > most else rate_limits.count(tx, limit)
+    if wait_s == 0:
+        return
+    remedy = "The operator can raise the setting `user_daily_bytes`."
+    raise QuotaExceededProblem(
+        f"You may send {most:,} new bytes per day, and this needs {size_bytes:,} more. "
+        + (remedy if wait_s is None else f"Send it in {wait_s} s. {remedy}"),
+        context={"quota": "user_daily_bytes", "limit": most, "wait_s": wait_s},
+    )
+
+
+def take_back_sent(tx: Transaction, size_bytes: int) -> None:
+    """Undo the count of bytes that were announced, but never received."""
+    if (limit := _part_of_day(tx, size_bytes)) is not None:
+        rate_limits.take_back(tx, limit)
+
+
+def _part_of_day(tx: Transaction, size_bytes: int) -> DailyAmount | None:
+    """Return the limit that an amount of bytes uses up, or None if it is not limited."""
+    if tx.principal.user_id is None or tx.principal.kind != "user" or size_bytes == 0:
+        return None
+    key = key_of("sent-bytes", tx.principal.user_id)
+    return DailyAmount.part(key, size_bytes, max(1, tx.quotas.user_daily_bytes))
 
 
 # -- items and their bytes --------------------------------------------------------------------------------------------

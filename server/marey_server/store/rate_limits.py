@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from sqlalchemy import case, delete, select, update
 
 from marey_schemas.encoding.canonical import canonical_json
+from marey_server.store.database.clock import DAY_US
 from marey_server.store.tables import sign_in_limit
 from marey_server.store.transaction import Transaction
 
@@ -33,6 +34,20 @@ class RateLimit:
     def latest_us(self, now_us: int) -> int:
         """Return the latest time that the row may contain if another event is to be allowed now."""
         return now_us + (self.burst - 1) * self.interval_us
+
+
+@dataclass(frozen=True, slots=True)
+class DailyAmount(RateLimit):
+    """Limit on an amount per day, such as bytes: an event uses up an amount that is free again after `interval_us`."""
+
+    @classmethod
+    def part(cls, key: str, amount: int, most: int) -> DailyAmount:
+        """Return the limit for an event that uses up `amount` of `most`; `most` is free at first, and again per day."""
+        return cls(key, burst=1, interval_us=max(1, amount * DAY_US // most))
+
+    def latest_us(self, now_us: int) -> int:
+        """Return the latest time that the row may contain if the event is to be allowed now."""
+        return now_us + DAY_US - self.interval_us
 
 
 def key_of(*parts: str) -> str:

@@ -26,7 +26,7 @@ from marey_server.store import blob_backings, blobs
 from marey_server.store.blob_backings import CHUNK_BYTES
 from marey_server.store.database.clock import DAY_US
 from marey_server.store.ids import new_id
-from marey_server.store.quotas import require_room
+from marey_server.store.quotas import count_sent, require_room, take_back_sent
 from marey_server.store.tables import blob, job, upload, upload_chunk
 from marey_server.store.transaction import Transaction
 
@@ -66,6 +66,7 @@ def create_upload(tx: Transaction, length: int, *, digest: str | None = None) ->
         raise TooLargeProblem(f"The size of an upload must be 1 to {MAX_UPLOAD_BYTES} bytes.")
     require_room(tx, "user_uploads")
     require_room(tx, "user_upload_bytes", length)
+    count_sent(tx, length)
     upload_id = new_id("upload")
     row = {
         "id": upload_id, **sender, "length": length, "offset": 0, "digest": digest,
@@ -156,7 +157,9 @@ def require_intact(found: StoredUpload) -> None:
 def abandon(tx: Transaction, upload_id: str) -> None:
     """Mark an upload as dropped, so that it is deleted later; a blob made from it is kept."""
     found = _find(tx, upload_id)
-    tx.execute(update(upload).where(upload.c.id == found.id).values(dropped=True))
+    dropped = update(upload).where(upload.c.id == found.id, upload.c.dropped.is_(False)).values(dropped=True)
+    for row in tx.execute(dropped.returning(upload.c.length, upload.c.offset)).all():
+        take_back_sent(tx, row.length - row.offset)
 
 
 # -- garbage ----------------------------------------------------------------------------------------------------------

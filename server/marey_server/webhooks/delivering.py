@@ -13,6 +13,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any, Concatenate, ParamSpec, TypeVar
+from weakref import WeakValueDictionary
 
 from marey_server import faults
 from marey_server.access.principal import SYSTEM
@@ -25,7 +26,7 @@ from marey_server.store.transaction import Transaction
 from marey_server.store.wakeups import NUMBERED_EVENTS, wakeups
 from marey_server.store.webhooks import outbox
 from marey_server.store.webhooks.outbox import Batch, Delivery, DeliveryResult, Outcome
-from marey_server.webhooks.sending import MOST_AT_ONCE, Sender
+from marey_server.webhooks.sending import MOST_AT_ONCE, MOST_OF_ONE_USER, Sender
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -61,6 +62,8 @@ class Deliverer:
         self._services = services
         self._sender = Sender(services.settings.webhook_networks)
         self._places = asyncio.Semaphore(MOST_AT_ONCE)
+        self._shares: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
+        """By user, the places for requests to the webhooks that this user created, while any request needs a place."""
         self._holder = secrets.token_hex(8)
         self._lead: Lead | None = None
         self._renew_at_s = 0.0
@@ -209,7 +212,9 @@ class Deliverer:
 
     async def _send(self, batch: Batch, delivery: Delivery, before: tuple[int, int]) -> Outcome | None:
         """Send a delivery, record the result, and return the outcome; None if this process is no longer the leader."""
-        async with self._places:
+        share = self._shares.get(batch.sharer) or asyncio.Semaphore(MOST_OF_ONE_USER)
+        self._shares[batch.sharer] = share
+        async with share, self._places:
             lead = self._lead
             if lead is None or not self._leads():
                 return None

@@ -30,6 +30,8 @@ TIMEOUT_S = 10.0
 MOST_ANSWER_BYTES = 64 * KIB
 MOST_AT_ONCE = 64
 """Greatest number of requests under way."""
+MOST_OF_ONE_USER = 4
+"""Greatest number of requests under way to webhooks of one user, so that no user can occupy all places."""
 RESOLVERS = 16
 """Number of threads that resolve host names, because a slow name server blocks a thread."""
 _FIRST_FAILURE = 300

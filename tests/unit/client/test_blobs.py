@@ -79,6 +79,14 @@ def test_other_bytes_than_those_asked_for_are_never_kept(script: ScriptedServer,
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_blob_is_not_downloaded_if_it_is_larger_than_allowed(script: ScriptedServer) -> None:
+    endless = httpx.Response(200, headers={"Content-Length": str(1 << 40)}, stream=Torn(b""))
+    script.answers = [endless, httpx.Response(200, content=DATA)]
+    with pytest.raises(errors.BlobTooLarge, match=f"has {1 << 40} bytes"):
+        script.marey().blobs.fetch(digest_of(DATA), most_bytes=len(DATA))
+    assert script.marey().blobs.fetch(digest_of(DATA), most_bytes=len(DATA)) == DATA
+
+
 def test_thousands_of_digests_are_asked_for_in_few_questions(script: ScriptedServer) -> None:
     digests = [f"sha256:{number:064x}" for number in range(12_000)]
 

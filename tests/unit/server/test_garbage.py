@@ -1,7 +1,7 @@
 """Garbage collection while other transactions run: nothing that has a reference is deleted."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
@@ -16,7 +16,17 @@ from marey_server.access.principal import SYSTEM
 from marey_server.errors import ConflictProblem
 from marey_server.store import blobs, documents, fsck, garbage, items
 from marey_server.store.blobs import GRACE_US, digest_of
-from marey_server.store.tables import attempt, blob, document, job, staged_output
+from marey_server.store.tables import (
+    attempt,
+    attempt_blob,
+    blob,
+    coverage_stream,
+    document,
+    idempotency_key,
+    job,
+    staged_output,
+    token,
+)
 from marey_server.store.transaction import Transaction
 
 LONG_S = GRACE_US / 1e6 + 1
@@ -172,6 +182,48 @@ def test_nothing_is_lost_while_everybody_is_busy(lab: Lab, clock: AdjustableCloc
         thread.join(120)
     assert errors == []
     assert list(fsck.check_store(lab.database)) == []
+
+
+@pytest.mark.parametrize("table", [idempotency_key, token, attempt_blob, coverage_stream], ids=lambda one: one.name)
+def test_expired_rows_go_a_few_at_a_time_and_others_stay(
+    lab: Lab, clock: AdjustableClock, monkeypatch: pytest.MonkeyPatch, table: Table[Any]
+) -> None:
+    monkeypatch.setattr(garbage, "BATCH", 2)
+
+    def add_rows(tx: Transaction, names: Sequence[str]) -> None:
+        for name in names:
+            hour_us = tx.now_us + 3600 * 10**6
+            project_id = tx.execute(sqlalchemy.text("SELECT id FROM project")).scalar_one()
+            rows_of = {
+                "idempotency_key": {"principal": "user", "key": name, "fingerprint": "f"},
+                "token": {"id": name, "user_id": lab.owner.user_id, "name": name, "prefix": name, "secret_hash": "h",
+                          "scopes": [], "expires_us": hour_us},
+                "attempt_blob": {"digest": digest_of(FILE), "job_id": name, "fence": 1},
+                "coverage_stream": {"id": name, "project_id": project_id, "settings": {}, "state": b"",
+                                    "updated_us": tx.now_us},
+            }  # fmt: skip
+            tx.execute(sqlalchemy.insert(table).values(**rows_of[table.name], created_us=tx.now_us))
+
+    key = list(table.primary_key.columns)[-1 if table is idempotency_key else 1 if table is attempt_blob else 0]
+    lab.write(blobs.put_blob, FILE)
+    lab.write(add_rows, [f"old{number}" for number in range(5)])
+    clock.advance(100 * 86400)
+    if table is not attempt_blob:
+        lab.write(add_rows, ["new"])
+    counts: list[int] = []
+    delete_rows = garbage._delete_rows
+
+    def delete_and_count(*args: Any) -> int:
+        counts.append(delete_rows(*args))
+        return counts[-1]
+
+    monkeypatch.setattr(garbage, "_delete_rows", delete_and_count)
+    garbage.collect_garbage(lab.database, grace_us=200 * 86400 * 10**6)
+    left = lab.database.read(SYSTEM, lambda tx: set(tx.execute(sqlalchemy.select(key)).scalars()))
+    assert not {name for name in left if name.startswith("old")}
+    assert ("new" in left) == (table is not attempt_blob)
+    assert sum(counts) == 5
+    assert max(counts) == 2
 
 
 def test_expired_keys_go(lab: Lab, clock: AdjustableClock) -> None:

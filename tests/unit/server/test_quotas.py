@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 import pytest
+from tests.support.database_fixtures import AdjustableClock
 from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import Lab
 
@@ -14,7 +15,7 @@ from marey_schemas.access import ProjectCreate, TokenCreate
 from marey_schemas.queue.jobs import ItemInput, JobCreate
 from marey_server.errors import QuotaExceededProblem
 from marey_server.process.settings import Settings
-from marey_server.store import projects, uploads
+from marey_server.store import blobs, projects, uploads
 from marey_server.store.blobs import digest_of
 from marey_server.store.credentials import tokens
 from marey_server.store.jobs import reading
@@ -115,6 +116,34 @@ def test_unfinished_jobs_and_their_tasks_count_until_they_end(desk: Desk) -> Non
     later = desk.submit()
     desk.cancel(later)
     desk.submit()
+
+
+def test_new_bytes_are_limited_per_day_and_become_free_with_time(lab: Lab, clock: AdjustableClock) -> None:
+    lab.database.quotas = Quotas(user_daily_bytes=1000)
+    lab.write(blobs.put_blob, b"a" * 600)
+    lab.write(blobs.put_blob, b"a" * 600)  # which the server has already
+    with pytest.raises(QuotaExceededProblem, match="1,000 new bytes per day") as refused:
+        lab.write(blobs.put_blob, b"b" * 600)
+    assert refused.value.context["wait_s"] == pytest.approx(0.2 * 86400, abs=60)
+    assert lab.read(blobs.readable, [digest_of(b"b" * 600)]) == set()
+    with pytest.raises(QuotaExceededProblem):
+        lab.write(uploads.create_upload, 401)
+    lab.write(blobs.put_blob, b"c" * 600, who=lab.contributor)  # the quota of somebody else
+    clock.advance(0.21 * 86400)
+    lab.write(blobs.put_blob, b"b" * 600)
+    clock.advance(10 * 86400)
+    with pytest.raises(QuotaExceededProblem):
+        lab.write(blobs.put_blob, b"d" * 1001)
+
+
+def test_bytes_of_a_cancelled_upload_count_if_they_were_received(lab: Lab) -> None:
+    lab.database.quotas = Quotas(user_daily_bytes=1000)
+    upload = lab.write(uploads.create_upload, 1000)
+    lab.write(uploads.append, upload.id, 0, b"a" * 300)
+    lab.write(uploads.abandon, upload.id)
+    with pytest.raises(QuotaExceededProblem):
+        lab.write(uploads.create_upload, 701)
+    lab.write(uploads.create_upload, 699)
 
 
 def test_every_quota_is_a_setting_with_the_same_default() -> None:

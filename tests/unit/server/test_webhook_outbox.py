@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,6 +23,8 @@ from marey_server.store.tables import webhook, webhook_delivery
 from marey_server.store.transaction import Transaction
 from marey_server.store.webhooks import deliveries, managing, outbox
 from marey_server.store.webhooks.outbox import Batch, DeliveryResult, Outcome, Recorded
+from marey_server.webhooks import delivering
+from marey_server.webhooks.sending import MOST_OF_ONE_USER
 
 OWNER = declared("POST", "/projects/{project}/webhooks")
 ADDED = DeliveryResult(204)
@@ -271,3 +275,48 @@ def test_a_position_moves_past_events_that_do_not_concern_the_webhook(desk: Desk
     moved = desk.batch()
     assert moved is not None
     assert moved.position == newest
+
+
+class Silence:
+    """Sender whose receivers do not answer; it records the webhooks to which requests are under way."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    async def send(self, _batch: Batch, delivery: outbox.Delivery) -> DeliveryResult:
+        self.asked.append(delivery.webhook_id)
+        await asyncio.Event().wait()
+        return FAILED
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def test_a_user_whose_receivers_do_not_answer_does_not_delay_others(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(delivering, "MOST_AT_ONCE", MOST_OF_ONE_USER + 1)
+    monkeypatch.setattr(delivering, "STOP_S", 0.0)
+    mine, other = [Desk(lab) for _ in range(2 * MOST_OF_ONE_USER)], Desk(lab, "item.created").hook.id
+    created = update(webhook).where(webhook.c.id == other).values(creator_id=lab.stranger.user_id)
+    lab.database.write(SYSTEM, lambda tx: tx.execute(created))
+    lab.database.write(SYSTEM, leader.give_up_lead, "webhooks", "a")
+    mine[0].add_folders("one")
+    sender = Silence()
+
+    async def deliver() -> None:
+        services = SimpleNamespace(settings=SimpleNamespace(webhook_networks=()), database=lab.database)
+        deliverer = delivering.Deliverer(services)
+        deliverer._sender.close()
+        deliverer._sender = sender
+        running = asyncio.create_task(deliverer.run())
+        async with asyncio.timeout(30):
+            while len(sender.asked) < MOST_OF_ONE_USER:
+                await asyncio.sleep(0.01)
+            await asyncio.to_thread(lab.add_skeleton)
+            await asyncio.to_thread(lab.database.write, SYSTEM, events.number_events)
+            while other not in sender.asked:
+                await asyncio.sleep(0.01)
+        running.cancel()
+        await deliverer.close()
+
+    asyncio.run(deliver())
+    assert len(sender.asked) == MOST_OF_ONE_USER + 1

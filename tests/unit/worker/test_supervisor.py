@@ -10,6 +10,7 @@ import pytest
 from tests.support.attached_worker import StartWorker
 from tests.support.fake_server import FakeServer
 
+from marey_client.blobs import digest_of
 from marey_client.credentials import write_private
 
 
@@ -322,6 +323,20 @@ def test_slots_run_jobs_at_the_same_time(server: FakeServer, start_worker: Start
 def test_a_file_that_a_job_made_is_sent_and_named_by_its_digest(shared_server: FakeServer) -> None:
     end = shared_server.ended(shared_server.submit("misbehave", {"how": "put"}))
     assert shared_server.blobs[end["result"]["digest"]] == b"bytes that a job made"
+
+
+def test_a_file_that_is_too_large_for_the_memory_limit_is_not_downloaded(shared_server: FakeServer) -> None:
+    small, large = b"small", bytes((128 << 20) + 1)
+    shared_server.blobs |= {digest_of(data): data for data in (small, large)}
+    failed, read = (
+        shared_server.ended(
+            shared_server.submit("misbehave", {"how": "read-blob", "blob": digest}, memory_limit_mb=512)
+        )
+        for digest in (digest_of(large), digest_of(small))
+    )
+    assert (failed["code"], failed["retryable"]) == ("file-too-large", False)
+    assert all(told in failed["detail"] for told in (digest_of(large), str(len(large)), "memory_limit_mb"))
+    assert read["result"] == {"bytes": len(small)}
 
 
 @pytest.mark.slow

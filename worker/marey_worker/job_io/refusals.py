@@ -8,9 +8,9 @@ from pydantic import ValidationError
 
 from marey_motion.errors import MotionError
 from marey_schemas.queue.worker_protocol import PinnedInput
-from marey_worker.context import Context, NoSuchThing
+from marey_worker.context import Context, NoSuchThing, Unreadable
 
-UNUSABLE = (MotionError, ValidationError, NoSuchThing)
+UNUSABLE = (MotionError, ValidationError, Unreadable)
 """Errors that concern a single input; the job processes its other inputs."""
 
 
@@ -29,7 +29,7 @@ class Refusals:
         self._context = context
 
     def add(
-        self, pin: PinnedInput, error: MotionError | ValidationError | NoSuchThing, *, name: str | None = None
+        self, pin: PinnedInput, error: MotionError | ValidationError | Unreadable, *, name: str | None = None
     ) -> None:
         """Add a refused input. `name` identifies the refusal to users; by default, the path of the input does."""
         shown = name or pin.path

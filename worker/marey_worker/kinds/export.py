@@ -20,7 +20,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.queue.job_params import ExportParams
 from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_schemas.wording import counted
-from marey_worker.context import Context, JobRefused, NoSuchThing
+from marey_worker.context import Context, JobRefused, Unreadable
 from marey_worker.job_io.refusals import present
 
 READABLE_BY_ALL = 0o644 << 16
@@ -51,7 +51,7 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
             context.progress(done, len(pins), f"writing {pin.name}")
             try:
                 file = exporting.file_of(pin, info or {}, *motion)
-            except (MotionError, NoSuchThing) as error:
+            except (MotionError, Unreadable) as error:
                 refused.append(_refusal(pin, error.code, str(error)))
                 continue
             name = _free_name(pin, file.name, written)
@@ -82,7 +82,7 @@ class _Exporting:
         """Return a clip as a file in the requested format.
 
         `info` and `tree` are the parts `info` and `motion` of the clip; the format "original" does not need `tree`.
-        Raises `MotionError` or `NoSuchThing` if the clip has no file in this format.
+        Raises `MotionError` or `Unreadable` if the clip has no file in this format.
         """
         if self._params.format == "original":
             return self._original(pin, info)

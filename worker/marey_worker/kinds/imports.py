@@ -16,7 +16,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
 from marey_schemas.queue.job_params import ImportParams
 from marey_schemas.queue.worker_protocol import StagedOutput
-from marey_worker.context import Context, JobRefused, NoSuchThing
+from marey_worker.context import Context, FileTooLarge, JobRefused, NoSuchThing
 from marey_worker.job_io.staged_results import StagedResults
 
 
@@ -64,6 +64,8 @@ class _Importing:
             items = found.items if found.graph is None else (self._graph_item(found.graph),)
         except NoSuchThing as error:
             return refused_entry(planned.name, Refusal(code="blob-missing", detail=str(error)))
+        except FileTooLarge as error:
+            return refused_entry(planned.name, Refusal(code=error.code, detail=str(error)))
         except MotionError as error:
             return refused_entry(planned.name, refusal_of(error))
         if found.refusal is not None:

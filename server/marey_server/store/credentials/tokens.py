@@ -354,9 +354,9 @@ def _revoke(tx: Transaction, which: ColumnElement[bool]) -> None:
         tx.audit("token.revoked", row.id, about=names[row.user_id], name=row.name)
 
 
-def forget_ended(tx: Transaction) -> int:
-    """Delete tokens that expired more than `KEPT_AFTER_END_US` ago; return their number."""
-    return tx.execute(delete(token).where(token.c.expires_us < tx.now_us - KEPT_AFTER_END_US)).rowcount
+def expired_long_ago(tx: Transaction) -> ColumnElement[bool]:
+    """Return the SQL condition for tokens that expired more than `KEPT_AFTER_END_US` ago, and may be deleted."""
+    return token.c.expires_us < tx.now_us - KEPT_AFTER_END_US
 
 
 def note_use(tx: Transaction, token_id: str) -> None:

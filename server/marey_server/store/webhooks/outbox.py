@@ -94,6 +94,8 @@ class Delivery:
 class Batch:
     """Next deliveries of a webhook in order, with the URL and the secrets for sending them."""
 
+    sharer: str
+    """Id of the user who created the webhook, or of the webhook if the user is unknown."""
     url: str = field(repr=False)
     secrets: tuple[str, ...] = field(repr=False)
     position: int
@@ -128,7 +130,8 @@ def next_batch(tx: Transaction, webhook_id: str, scanned: int) -> Batch | None:
 
 
 def _batch(tx: Transaction, row: Row[Any], found: list[Delivery], *, complete: bool, waits: bool) -> Batch:
-    return Batch(row.url, _secrets(row, tx.now_us), row.position, row.attempts, tuple(found), complete, waits)
+    sharer = row.creator_id or row.id
+    return Batch(sharer, row.url, _secrets(row, tx.now_us), row.position, row.attempts, tuple(found), complete, waits)
 
 
 def _secrets(row: Row[Any], now_us: int) -> tuple[str, ...]:

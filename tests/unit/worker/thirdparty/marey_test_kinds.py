@@ -24,6 +24,7 @@ class MisbehaveParams(Request):
     how: str
     seconds: float = 0.0
     folder: str = ""
+    blob: str = ""
 
 
 def add(context: Context, params: AddParams) -> dict[str, int]:
@@ -39,6 +40,7 @@ def misbehave(context: Context, params: MisbehaveParams) -> dict[str, Any]:
         "fork-and-raise": _fork_and_raise,
         "sleep": lambda: _sleep(params.seconds),
         "give-up-early": lambda: _give_up_early(context), "put": lambda: _put(context),
+        "read-blob": lambda: {"bytes": len(context.blob(params.blob))},
         "read-late": lambda: _read_late(context, Path(params.folder)),
         "miss": lambda: context.document(Kind.SKELETON, "skeleton_gone", 1, "hierarchy"),
     }[params.how]()  # fmt: skip
