@@ -124,6 +124,8 @@ def record_commit(
     found = find_dataset(tx, project_row, name)
     if found.id != prepared.dataset_id:
         raise branch_moved(prepared.branch, None)
+    if prepared.write_id is not None:  # so that a repeated request waits for the first one, and finds its commit
+        tx.lock(f"commit {found.id} {prepared.write_id}")
     recorded = prepared.recorded or recorded_as(tx, found.id, prepared.write_id)
     if recorded is not None:
         return read_commit(tx, project, name, recorded)
