@@ -125,6 +125,20 @@ def test_commits_record_the_folder_and_name_its_items(owner: httpx.Client, gaits
     assert ([one["message"] for one in rest["items"]], rest["next_cursor"]) == (["first"], None)
 
 
+def test_a_list_of_entries_ends_in_the_version_in_which_it_began(
+    owner: httpx.Client, gaits: Callable[..., Any]
+) -> None:
+    page = ok(owner.get(f"{GAITS}/entries", params={"limit": 1}))
+    delete(owner, "gaits/b")
+    ok(owner.post(f"{LAB}/skeletons", json=skeleton("c")), 201)
+    gaits("second")
+    query = {"limit": 1, "cursor": page["next_cursor"]}
+    rest = ok(owner.get(f"{GAITS}/entries", params=query))
+    assert ([one["path"] for one in rest["items"]], rest["next_cursor"]) == (["b"], None)
+    refused(owner.get(f"{GAITS}/entries", params={**query, "version": "main~1"}), 400, "bad-cursor")
+    refused(owner.get(f"{GAITS}/entries", params={**query, "path": "b"}), 400, "bad-cursor")
+
+
 def test_equal_content_has_the_same_tree_whatever_the_ids(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
     for name in ("a", "b"):
         ok(owner.post(f"{LAB}/skeletons", json=skeleton(name, f"Joint {name}", folder="copy")), 201)

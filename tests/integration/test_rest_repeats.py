@@ -10,6 +10,7 @@ import pytest
 from tests.support.store_fixtures import skeleton_tree
 
 LAB = "/projects/lab"
+GAITS = f"{LAB}/datasets/gaits"
 ANY = {"If-Match": "*"}
 KEY = {"Idempotency-Key": "restoration-1"}
 
@@ -55,3 +56,39 @@ def test_a_repeated_return_to_an_earlier_revision_has_the_same_answer(owner: htt
     first, second = send_twice(owner, f"{item}/revert", json={"revision": 1}, headers=KEY | state)
     assert first == second
     assert (first[0], owner.get(item).json()["revision"]) == (200, 3)
+
+
+def commit(client: httpx.Client, branch: str, path: str) -> None:
+    """Commit a new skeleton to a branch of the dataset `gaits`."""
+    made = client.post(f"{LAB}/skeletons", json={"name": path, "parts": {"hierarchy": skeleton_tree(2)}}).json()
+    put = {"change": "put", "path": path, "item": made["id"]}
+    sent = client.post(f"{GAITS}/commits", json={"branch": branch, "message": "m", "changes": [put]})
+    assert sent.status_code == 201, sent.text
+
+
+@pytest.fixture
+def head(owner: httpx.Client) -> str:
+    """Newest commit of `main` in the dataset `gaits`; this branch and `trial` have one commit since a common one."""
+    assert owner.post(f"{LAB}/datasets", json={"name": "gaits"}).status_code == 201
+    commit(owner, "main", "a")
+    assert owner.post(f"{GAITS}/refs", json={"name": "trial", "kind": "branch"}).status_code == 201
+    commit(owner, "main", "b")
+    commit(owner, "trial", "c")
+    return str(owner.get(f"{GAITS}/commits/main").json()["digest"])
+
+
+@pytest.mark.parametrize("kind", ["commits", "merges", "cherry-picks", "reverts"])
+def test_a_repeated_change_of_a_branch_has_the_same_answer(owner: httpx.Client, head: str, kind: str) -> None:
+    """The preparation refuses the repeated request, because the first one has changed the branch."""
+    removal = {"change": "remove", "path": "a", "kind": "skeleton"}
+    bodies: dict[str, dict[str, Any]] = {
+        "commits": {"message": "m", "expected": head, "changes": [removal]}, "merges": {"version": "trial"},
+        "cherry-picks": {"version": "trial"}, "reverts": {"version": head},
+    }  # fmt: skip
+    url, body = f"{GAITS}/{kind}", bodies[kind]
+    first, second = send_twice(owner, url, json=body, headers=KEY)
+    assert first == second
+    assert first[0] in (200, 201)
+    assert owner.post(url, json=body).status_code in (409, 422)
+    other = owner.post(url, json={**body, "message": "other"}, headers=KEY)
+    assert other.json()["code"] == "idempotency-key-reused"

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from tornado.httputil import HTTPHeaders, HTTPServerRequest
+from tornado.httputil import HTTPServerRequest
 
 from marey_server.access import scopes
 from marey_server.access.principal import ANONYMOUS, Principal
@@ -22,6 +22,7 @@ from marey_server.http.declarations import Access, Operation
 from marey_server.http.reply import AnswerCache, AnswerForm, Loaded, Rendered, Reply, render, settle
 from marey_server.store import idempotency, projects
 from marey_server.store.credentials import tokens
+from marey_server.store.idempotency import StoredAnswer
 from marey_server.store.jobs.fencing import lease_lost, require_attempt
 from marey_server.store.jobs.reading import find_job
 from marey_server.store.transaction import Transaction
@@ -129,6 +130,18 @@ def _require_attempt_access(operation: Operation, principal: Principal) -> None:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class IdempotentRequest:
+    """Request with an idempotency key."""
+
+    key: str
+    fingerprint: str
+    project: str | None
+    """Name of the project in the address, if any."""
+    job: str | None
+    """Id of the job in the address, if any."""
+
+
 @dataclass(frozen=True)
 class Call:
     """Function that a request runs in a transaction, and the form of its answer."""
@@ -140,12 +153,8 @@ class Call:
     function: Callable[..., Any]
     args: tuple[Any, ...] = ()
     kwargs: Mapping[str, Any] = field(default_factory=dict)
-    idempotency_key: str | None = None
-    fingerprint: str = ""
-    project: str | None = None
-    """Name of the project in the address, if any."""
-    job: str | None = None
-    """Id of the job in the address, if any."""
+    idempotent: IdempotentRequest | None = None
+    """The request, if it has an idempotency key."""
 
 
 def run_call(call: Call, tx: Transaction) -> Rendered | Reply:
@@ -154,29 +163,39 @@ def run_call(call: Call, tx: Transaction) -> Rendered | Reply:
     If the answer is a loaded document, it is returned without being encoded.
     """
     call.caller.identify(tx)
-    if call.idempotency_key is not None:
-        stored = idempotency.begin(tx, call.idempotency_key, call.fingerprint)
+    idempotent = call.idempotent
+    if idempotent is not None:
+        stored = idempotency.begin(tx, idempotent.key, idempotent.fingerprint)
         if stored is not None:
-            _require_role_again(call, tx)
-            headers = {**stored.headers, "Idempotent-Replayed": "true"}
-            return Rendered(stored.status, headers, stored.body)
+            return _repeated(tx, call.caller, idempotent, stored)
     reply = settle(call.to_reply(call.function(tx, *call.args, **call.kwargs)), call.form, call.answers)
     if isinstance(reply.content, Loaded):
         return reply
     rendered = render(reply, call.form, call.answers)
-    if call.idempotency_key is not None:
-        idempotency.finish(tx, call.idempotency_key, rendered.status, dict(rendered.headers), rendered.body)
+    if idempotent is not None:
+        idempotency.finish(tx, idempotent.key, rendered.status, dict(rendered.headers), rendered.body)
     return rendered
 
 
-def _require_role_again(call: Call, tx: Transaction) -> None:
+def find_first_answer(caller: Caller, idempotent: IdempotentRequest, tx: Transaction) -> Rendered | None:
+    """Return the answer to an earlier, equal request with the same idempotency key, or None if there is none."""
+    caller.identify(tx)
+    stored = idempotency.find(tx, idempotent.key, idempotent.fingerprint)
+    return None if stored is None else _repeated(tx, caller, idempotent, stored)
+
+
+def _repeated(tx: Transaction, caller: Caller, idempotent: IdempotentRequest, stored: StoredAnswer) -> Rendered:
+    if caller.operation.access.role is not None:
+        _require_role_again(idempotent, tx)
+    return Rendered(stored.status, {**stored.headers, "Idempotent-Replayed": "true"}, stored.body)
+
+
+def _require_role_again(idempotent: IdempotentRequest, tx: Transaction) -> None:
     """Refuse a caller whose role in the project of the address, or of its job, has ended since the first request."""
-    if call.caller.operation.access.role is None:
-        return
-    if call.project is not None:
-        projects.require(tx, call.project)
-    if call.job is not None:
-        find_job(tx, call.job)
+    if idempotent.project is not None:
+        projects.require(tx, idempotent.project)
+    if idempotent.job is not None:
+        find_job(tx, idempotent.job)
 
 
 def admit(tx: Transaction, target: BodyTarget) -> None:
@@ -200,17 +219,25 @@ def run_plain(caller: Caller, function: Callable[[Transaction], T], tx: Transact
 # -- idempotency -------------------------------------------------------------------------------------------------------
 
 
-def idempotency_key(headers: HTTPHeaders) -> str | None:
-    """Return the header Idempotency-Key, or None if it is missing. Raises `BadRequestProblem` if it is malformed."""
-    key = headers.get("Idempotency-Key")
-    if key is not None and not _KEY.fullmatch(key):
+def idempotent_request(
+    request: HTTPServerRequest, body: bytes | bytearray, project: str | None, job: str | None
+) -> IdempotentRequest | None:
+    """Return a request with its header Idempotency-Key, or None if it has no such header.
+
+    `project` and `job` are the name of the project and the id of the job in the address, if any. Raises
+    `BadRequestProblem` if the header is malformed.
+    """
+    key = request.headers.get("Idempotency-Key")
+    if key is None:
+        return None
+    if not _KEY.fullmatch(key):
         raise BadRequestProblem(
             "The header Idempotency-Key must have 1 to 255 visible ASCII characters.", code="bad-idempotency-key"
         )
-    return key
+    return IdempotentRequest(key, _fingerprint_of(request, body), project, job)
 
 
-def fingerprint_of(request: HTTPServerRequest, body: bytes | bytearray) -> str:
+def _fingerprint_of(request: HTTPServerRequest, body: bytes | bytearray) -> str:
     """Return a digest of a request, to refuse a different request with the same idempotency key."""
     digest = hashlib.sha256(f"{request.method} {request.uri}\n".encode())
     digest.update(request.headers.get("Content-Type", "").encode() + b"\n")

@@ -44,10 +44,11 @@ from marey_server.http.calls import (
     BodyTarget,
     Call,
     Caller,
+    IdempotentRequest,
     admission_of,
     admit,
-    fingerprint_of,
-    idempotency_key,
+    find_first_answer,
+    idempotent_request,
     require_access,
     run_call,
     run_plain,
@@ -115,14 +116,23 @@ class Resource(CallingExchange):
         **kwargs: P.kwargs,
     ) -> Rendered:
         """Run `function(tx, ...)` and `to_reply` on its result in one transaction; return the rendered answer."""
-        key = idempotency_key(self.request.headers) if self.operation.idempotency == "key" else None
-        fingerprint = fingerprint_of(self.request, self._received) if key else ""
-        place = {name: self.path_kwargs.get(name) for name in ("project", "job")}
         answers = self.services.answers
-        call = Call(self.caller, self.answer_form, answers, to_reply, function, args, kwargs, key, fingerprint, **place)
+        call = Call(self.caller, self.answer_form, answers, to_reply, function, args, kwargs, self._idempotent())
         run = self._read if self.operation.method == "GET" else self._write
         outcome = await run(partial(run_call, call))
         return outcome if isinstance(outcome, Rendered) else await self.render_document(outcome)
+
+    def _idempotent(self) -> IdempotentRequest | None:
+        """Return the request with its idempotency key, or None if it has none or the operation accepts none."""
+        if self.operation.idempotency != "key":
+            return None
+        place = {name: self.path_kwargs.get(name) for name in ("project", "job")}
+        return idempotent_request(self.request, self._received, **place)
+
+    async def _first_answer(self) -> Rendered | None:
+        """Return the answer to an earlier, equal request with the same idempotency key, or None if there is none."""
+        idempotent = self._idempotent()
+        return None if idempotent is None else await self._read(partial(find_first_answer, self.caller, idempotent))
 
     async def render_document(self, reply: Reply) -> Rendered:
         """Render a loaded document in a rendering thread.
@@ -353,7 +363,12 @@ class Resource(CallingExchange):
         body = self.operation.body
         if body is not None and not body.streamed:
             arguments["body"] = await self._read_body()
-        outcome = await method(self, **arguments)
+        try:
+            outcome = await method(self, **arguments)
+        except ApiProblem as refusal:  # perhaps by a preparation that has seen the effects of the first, equal request
+            outcome = await self._first_answer() if refusal.status < 500 else None
+            if outcome is None:
+                raise
         if isinstance(outcome, Reply):
             outcome = render(outcome, self.answer_form, self.services.answers)
         if outcome is None:

@@ -2,6 +2,9 @@
 
 Key, answer and effects are written in one transaction, so that all exist or none. A concurrent request with the same
 key waits for that transaction.
+
+A request may be refused before its transaction begins, because the first request with the key has had its effects. So
+the server looks up the key of a refused request, too, before it answers.
 """
 
 from __future__ import annotations
@@ -9,8 +12,9 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
-from sqlalchemy import ColumnElement, delete, select, update
+from sqlalchemy import ColumnElement, Row, delete, select, update
 
 from marey_schemas.encoding.canonical import canonical_json
 from marey_server.access.principal import Principal
@@ -47,7 +51,20 @@ def begin(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
     claimed = tx.insert_or_ignore(idempotency_key, row).returning(idempotency_key.c.key)
     if tx.execute(claimed).first() is not None:
         return None
-    stored = tx.execute(select(idempotency_key).where(*mine)).one()
+    return _answer(tx.execute(select(idempotency_key).where(*mine)).one(), fingerprint)
+
+
+def find(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
+    """Return the stored answer to an earlier, equal request with this key, or None; unlike `begin`, reserve nothing.
+
+    Raises `InvalidProblem` if the key was used for another request.
+    """
+    kept = idempotency_key.c.created_us >= tx.now_us - LIFETIME_US
+    stored = tx.execute(select(idempotency_key).where(*_mine(tx.principal, key), kept)).first()
+    return None if stored is None else _answer(stored, _with_reach(fingerprint, tx.principal))
+
+
+def _answer(stored: Row[Any], fingerprint: str) -> StoredAnswer:
     if stored.fingerprint != fingerprint:
         detail = "This Idempotency-Key was used for another request, or with a token of other scopes."
         raise InvalidProblem(detail, code="idempotency-key-reused")

@@ -23,8 +23,9 @@ from marey_schemas.datasets.merges import (
 from marey_schemas.datasets.naming import RefCreate, RefKind
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.worker_protocol import StagedOutput
-from marey_server.errors import ConflictProblem
+from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import datasets, fsck, items
+from marey_server.store.datasets import merging
 from marey_server.store.documents import load_body
 from marey_server.store.items.drafts import Draft
 from marey_server.store.items.revisions import read_part_digests
@@ -132,6 +133,19 @@ def test_a_preview_stores_nothing_and_a_repeated_merge_makes_one_commit(labellin
     assert labelling.rows() == tuple(count + 1 for count in before)
     assert labelling.merge(write_id="12345678").commit == first.commit
     assert labelling.rows() == tuple(count + 1 for count in before)
+
+
+@pytest.mark.parametrize("preview", [True, False])
+def test_a_merge_that_combines_too_many_entries_is_refused(
+    labelling: LabellingDesk, monkeypatch: pytest.MonkeyPatch, preview: bool
+) -> None:
+    monkeypatch.setattr(merging, "MOST_COMBINED", 0)
+    labelling.label(OURS)
+    labelling.label(THEIRS, "trial")
+    head = labelling.head()
+    with pytest.raises(InvalidProblem) as refused:
+        labelling.merge(preview=preview)
+    assert (refused.value.error_code, labelling.head()) == ("too-many-combined", head)
 
 
 def test_a_merge_that_gives_the_labels_of_one_side_stores_no_further_revision(labelling: LabellingDesk) -> None:

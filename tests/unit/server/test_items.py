@@ -5,6 +5,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from typing import Any
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from marey_server.errors import (
 from marey_server.store import collections, items, projects
 from marey_server.store.database.connections import Database
 from marey_server.store.fsck import check_store
+from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.transaction import Transaction
 
 
@@ -171,6 +173,14 @@ def test_the_same_content_again_makes_no_revision(lab: Lab, rig: Item) -> None:
     motion = motion_tree(rig)
     same = lab.write(items.put_part, "lab", Kind.CLIP, clip.id, "motion", motion, expected_rev=None)
     assert same.revision == 1
+
+
+def test_the_parts_of_any_number_of_revisions_are_read(lab: Lab, rig: Item) -> None:
+    """A database limits the parameters of one statement: SQLite by default to 32,766, Postgres to 65,535."""
+    wanted = {(f"item-{number}", 1) for number in range(66_000)} | {(rig.id, 1)}
+    found = lab.read(read_part_digests, wanted)
+    assert found.keys() == wanted
+    assert {one: parts for one, parts in found.items() if parts} == {(rig.id, 1): {"hierarchy": ANY}}
 
 
 def test_old_revisions_stay_readable(lab: Lab, rig: Item) -> None:

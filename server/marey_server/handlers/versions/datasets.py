@@ -272,7 +272,7 @@ class DatasetEntries(Resource):
 
     @reads(access=Access.READER, query=EntriesQuery, answer=Entry, paged=True)
     async def get(self, project: str, dataset: str, query: EntriesQuery) -> Rendered:
-        """List the entries of a version in the order of their paths."""
+        """List the entries of a version in the order of their paths; all pages are from the same commit."""
         return await self.answer(
             datasets.list_entries,
             project,

@@ -67,7 +67,9 @@ def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest
         )
     compared = compare_entries(changes)
     _Checkout(tx, project_row, found, state).apply(compared)
-    tx.execute(update(dataset).where(dataset.c.id == found.id).values(folder_commit=digest))
+    # A commit of the folder that is being recorded sees by `rev` that the folder has other content now.
+    values = {"folder_commit": digest, "updated_us": tx.now_us, "rev": dataset.c.rev + 1}
+    tx.execute(update(dataset).where(dataset.c.id == found.id).values(**values))
     counts = Counter(one.change for one in compared)
     return CheckoutAnswer(
         commit=digest, added=counts["added"], removed=counts["removed"], moved=counts["moved"],

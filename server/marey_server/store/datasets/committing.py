@@ -69,7 +69,8 @@ class PreparedCommit:
     """Entries that combine changes of both sides of a merge; the project may not have revisions of them yet."""
     documents: Mapping[str, PreparedDocument] = field(default_factory=dict)
     """Documents that are not stored yet, of the entries in `combined`, by content digest."""
-    of_folder: bool = False
+    folder_rev: int | None = None
+    """`rev` of the dataset when its folder was read; None if the entries are not from the folder."""
     existing: str | None = None
     """Existing commit to which the branch moves; None if the branch moves to a new commit."""
     recorded: str | None = None
@@ -106,7 +107,7 @@ def prepare_commit(tx: Transaction, project: str, name: str, request: CommitCrea
         raise InvalidProblem(f"Nothing has changed since the newest commit of {request.branch!r}.", code="no-changes")
     return replace(
         prepared, tree=tree, entries=len(Tree(store, tree)), chunks=store.new, contents=contents,
-        of_folder=request.changes is None,
+        folder_rev=found.rev if request.changes is None else None,
     )  # fmt: skip
 
 
@@ -123,6 +124,8 @@ def record_commit(
     found = find_dataset(tx, project_row, name)
     if found.id != prepared.dataset_id:
         raise branch_moved(prepared.branch, None)
+    if prepared.write_id is not None:  # so that a repeated request waits for the first one, and finds its commit
+        tx.lock(f"commit {found.id} {prepared.write_id}")
     recorded = prepared.recorded or recorded_as(tx, found.id, prepared.write_id)
     if recorded is not None:
         return read_commit(tx, project, name, recorded)
@@ -138,8 +141,8 @@ def record_commit(
     if prepared.existing is not None and prepared.write_id is not None:
         tx.execute(insert(fast_forward).values(dataset_id=found.id, write_id=prepared.write_id, digest=digest))
     move_branch_to(tx, prepared, digest, mover)
-    if prepared.of_folder:  # after the branch, as jobs do that commit, so that the two never wait for each other
-        tx.execute(update(dataset).where(dataset.c.id == found.id).values(folder_commit=digest))
+    if prepared.folder_rev is not None:  # after the branch, as in commits of jobs, so that the two never deadlock
+        _follow_with_folder(tx, prepared, digest)
     tx.emit("branch.moved", found.id, project_id=project_row.id, branch=prepared.branch, commit=digest)
     faults.point("dataset_commit.before_commit")
     tx.after_commit(lambda: faults.point("dataset_commit.after_commit"))
@@ -277,6 +280,20 @@ def _from_folder(
     if before is None:
         return build(store, sorted(state.entries.items())), state.contents
     return change(store, before, state.changes_since(Tree(store, before))), state.contents
+
+
+def _follow_with_folder(tx: Transaction, prepared: PreparedCommit, digest: str) -> None:
+    """Note that a commit is checked out in the folder from which it was made.
+
+    If somebody has checked out a version since the folder was read, the folder no longer has the entries of the commit,
+    and nothing is noted. Otherwise, the next commit of the folder would undo this one.
+    """
+    unchanged = (
+        dataset.c.id == prepared.dataset_id,
+        dataset.c.rev == prepared.folder_rev,  # a checkout of the version that is checked out already increases it, too
+        dataset.c.folder_commit.is_not_distinct_from(prepared.head),
+    )
+    tx.execute(update(dataset).where(*unchanged).values(folder_commit=digest))
 
 
 # -- explicit changes -------------------------------------------------------------------------------------------------

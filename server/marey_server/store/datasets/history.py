@@ -228,16 +228,21 @@ class CommitReader:
 def list_entries(
     tx: Transaction, project: str, name: str, version: str, *, path: str, cursor: str | None, limit: int
 ) -> Page:
-    """List the entries of a version in the order of their paths; with `path`, only those at this path and below it."""
+    """List the entries of a version in the order of their paths; with `path`, only those at this path and below it.
+
+    All pages of a list are from the commit that the version names when the list begins.
+    """
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)
-    commit = _commit(tx, row.id, resolve(tx, row.id, version))
     order = listing.parse_order("key", {"key": literal("")}, unique="key")
-    identity = ["entries", row.id, commit.digest, path]
-    after = "" if cursor is None else listing.read_cursor(tx, cursor, order, identity)[0]
-    found = list(islice(_entries_at(tx, commit.tree, path, after=after), limit + 1))
+    identity = ["entries", row.id, version, path]
+    if cursor is None:
+        digest, after = resolve(tx, row.id, version), ""
+    else:  # from the same commit as the page before, even if the branch has moved
+        digest, after = listing.read_cursor(tx, cursor, order, identity)
+    found = list(islice(_entries_at(tx, tree_of(tx, row.id, digest), path, after=after), limit + 1))
     entries = [entry_of(*one) for one in found[:limit]]
-    following = listing.make_cursor(tx, order, identity, [entries[-1].key]) if len(found) > limit else None
+    following = listing.make_cursor(tx, order, identity, [digest, entries[-1].key]) if len(found) > limit else None
     return Page(items=_shown_entries(tx, project_row.id, entries), next_cursor=following)
 
 

@@ -31,6 +31,7 @@ from marey_server.store.datasets.committing import PreparedCommit, head_of, reco
 from marey_server.store.datasets.history import CommitReader, read_commit, revisions_with, shown_entry, tree_of
 from marey_server.store.datasets.naming import find_dataset, resolve
 from marey_server.store.datasets.protection import Mover
+from marey_server.store.datasets.revisions import MOST_COMBINED
 from marey_server.store.purge_lock import last_purge
 from marey_server.store.transaction import Transaction
 from marey_versions.ancestry import nearest_common
@@ -159,6 +160,12 @@ def _combine(
         path, kind = path_and_kind(unknown[0])
         raise InvalidProblem(
             f"The {kind} at {path!r} is not in conflict; remove its resolution from the request.", code="no-conflict"
+        )
+    if len(merged.combined) > MOST_COMBINED:
+        raise InvalidProblem(
+            f"A merge combines the changes of both sides in at most {MOST_COMBINED:,} entries, but both sides have "
+            f"changed {len(merged.combined):,}. Merge in several steps, first an earlier version.",
+            code="too-many-combined",
         )
     tree = change(store, ours, merged.changes)
     held = revisions_with(tx, project_id, _contents(merged.conflicts))

@@ -17,6 +17,7 @@ from marey_schemas.wording import counted
 from marey_server.store.datasets.annotations import MOST_MERGED_BY_JOB, AnnotationMerger
 from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.history import tree_of
+from marey_server.store.datasets.revisions import MOST_COMBINED
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.tables import collection, dataset, item
 from marey_server.store.transaction import Transaction, in_lists
@@ -31,8 +32,6 @@ from marey_versions.tree.reading import ChunkReader, Tree
 
 LONGEST_PATH = 1280
 """Greatest number of characters in the path of an entry."""
-MOST_COMBINED = 10_000
-"""Greatest number of entries that both the job and others have changed; the commit stores new revisions of them."""
 MOST_FOLLOWED = 1_000
 """Greatest number of changes of others that are added to a plan while the branch is locked."""
 

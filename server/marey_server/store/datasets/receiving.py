@@ -115,6 +115,9 @@ def store_revisions(
     """
     project_row = projects.require(tx, project)
     require_no_purge_since(tx, project_row.id, local.last_purge)
+    tx.lock(
+        f"received revisions {project_row.id}"
+    )  # so that another sender of the same revisions waits, and finds them
     folder = find_dataset(tx, project_row, name).path or ""
     placed = {
         content: replace(draft, collection=folder) if draft.hidden else draft for content, draft in drafts.items()
@@ -184,6 +187,7 @@ def record_receipt(
             code=BRANCH_MOVED,
         )
     digest = prepared.record.digest
+    tx.lock(f"commit {found.id} {digest}")  # so that another sender of the same commit waits, and finds it
     if not _is_known(tx, found, digest):
         _require_parents(tx, found, prepared.record)
         require_no_purge_since(tx, project_row.id, prepared.last_purge)

@@ -14,18 +14,19 @@ from marey_server.store.documents import load_body
 from marey_server.store.items.summaries import summarise
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import item, revision, revision_part
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import Transaction, in_lists
 
 
 def read_part_digests(tx: Transaction, revisions: Collection[tuple[str, int]]) -> dict[tuple[str, int], dict[str, str]]:
     """Return the digest of each part of the given revisions (pairs of item id and number)."""
     found: dict[tuple[str, int], dict[str, str]] = {one: {} for one in revisions}
-    ids, numbers = {item_id for item_id, _ in found}, {number for _, number in found}
-    # Not pairs: SQLite would scan the table for them. What this finds beyond them is one row here and there.
-    chosen = (revision_part.c.item_id.in_(sorted(ids)), revision_part.c.number.in_(sorted(numbers)))
-    for row in tx.execute(select(revision_part).where(*chosen)) if found else ():
-        if (row.item_id, row.number) in found:
-            found[row.item_id, row.number][row.part] = row.document_digest
+    for some in in_lists(sorted(found)):
+        ids, numbers = {item_id for item_id, _ in some}, {number for _, number in some}
+        # Not pairs: SQLite would scan the table for them. What this finds beyond them is one row here and there.
+        chosen = (revision_part.c.item_id.in_(sorted(ids)), revision_part.c.number.in_(sorted(numbers)))
+        for row in tx.execute(select(revision_part).where(*chosen)):
+            if (row.item_id, row.number) in found:
+                found[row.item_id, row.number][row.part] = row.document_digest
     return found
 
 
