@@ -56,7 +56,7 @@ def fetched_versions(
     interrupted while it writes the file, the next call continues writing. Consents are not checked here: take records
     are copied with their clips, so that the other server checks them.
     """
-    path = transfers_folder() / f"{short_name([head.digest, *bases])}.tar"
+    path = transfers_folder() / f"{short_name(head.digest, bases)}.tar"
     if not path.exists():
         write_archive(source, head.digest, path, on_progress, since=bases, check=_accept)
     with path.open("rb") as file:

@@ -93,7 +93,7 @@ def write_archive(
     """
     head = dataset.at(version)
     bases = [dataset.at(one) for one in since]
-    part = path.with_name(f"{path.name}.{short_name(one.digest for one in (head, *bases))}.part")
+    part = path.with_name(f"{path.name}.{short_name(head.digest, [one.digest for one in bases])}.part")
     part.parent.mkdir(parents=True, exist_ok=True)
     with (
         os.fdopen(os.open(part, os.O_RDWR | os.O_CREAT, 0o666), "r+b") as file,
@@ -128,9 +128,12 @@ def check_consents(dataset: DatasetReader, reason: str | None, contents: Sequenc
     return frozenset(ended)
 
 
-def short_name(commits: Iterable[str]) -> str:
-    """Return a short text that identifies commits, for file names."""
-    return "-".join(digest.removeprefix("sha256:")[:12] for digest in commits)
+def short_name(head: str, bases: Iterable[str]) -> str:
+    """Return a text of 32 characters, for file names, that identifies the content of an archive.
+
+    `head` is the digest of the archive's newest commit, and `bases` are those of the commits that it leaves out.
+    """
+    return digest_of("\n".join([head, *sorted(set(bases))]).encode()).removeprefix("sha256:")[:32]
 
 
 def _lock(file: BinaryIO, path: Path) -> None:
