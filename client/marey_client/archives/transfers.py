@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import shutil
+import stat
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -69,11 +71,17 @@ def _accept(_contents: Sequence[str]) -> None:
 
 
 def transfers_folder() -> Path:
-    """Return the folder for archives of running copies, below `XDG_CACHE_HOME` or `~/.cache`; delete its old files."""
+    """Return the folder for archives of running copies, below `XDG_CACHE_HOME` or `~/.cache`; delete its old content.
+
+    A copy that was killed leaves its archive, and also the folder of its downloaded files.
+    """
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "marey" / "transfers"
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     oldest = time.time() - MOST_DAYS_KEPT * 86_400
     for path in folder.iterdir():
-        if path.stat().st_mtime < oldest:
-            path.unlink(missing_ok=True)
+        with suppress(FileNotFoundError):  # another copy may delete the same files
+            found = path.lstat()
+            if found.st_mtime < oldest:
+                delete = shutil.rmtree if stat.S_ISDIR(found.st_mode) else os.unlink
+                delete(path)
     return folder
