@@ -6,6 +6,7 @@ import fcntl
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
@@ -95,11 +96,7 @@ def write_archive(
     bases = [dataset.at(one) for one in since]
     part = path.with_name(f"{path.name}.{short_name(head.digest, [one.digest for one in bases])}.part")
     part.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        os.fdopen(os.open(part, os.O_RDWR | os.O_CREAT, 0o666), "r+b") as file,
-        tempfile.TemporaryDirectory(dir=part.parent) as folder,
-    ):
-        _lock(file, part)
+    with _opened(part) as file, tempfile.TemporaryDirectory(dir=part.parent) as folder:
         _Making(dataset, ArchiveWriter(file), Path(folder), on_progress, check).run(head, bases)
         try:
             check_archive(Archive(file), lambda done, of: on_progress("checking", done, of))
@@ -110,7 +107,7 @@ def write_archive(
             ) from error
         file.flush()
         os.fsync(file.fileno())
-    part.replace(path)
+        part.replace(path)  # before the file is unlocked, so that no other process changes the finished archive
     return head
 
 
@@ -136,12 +133,27 @@ def short_name(head: str, bases: Iterable[str]) -> str:
     return digest_of("\n".join([head, *sorted(set(bases))]).encode()).removeprefix("sha256:")[:32]
 
 
-def _lock(file: BinaryIO, path: Path) -> None:
-    """Keep other processes from writing the file until it is closed."""
+@contextmanager
+def _opened(part: Path) -> Iterator[BinaryIO]:
+    """Open an unfinished archive, and keep other processes from writing it until it is closed."""
+    while True:
+        with os.fdopen(os.open(part, os.O_RDWR | os.O_CREAT, 0o666), "r+b") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise ArchiveInUse(f"another process is writing {part}; wait until that process has ended") from error
+            if _is_at(part, file):
+                yield file
+                return
+            # Another process finished the archive between the two steps, so this file is no longer the unfinished one.
+
+
+def _is_at(path: Path, file: BinaryIO) -> bool:
+    """Return whether the path leads to this opened file, and not to another file or to none."""
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise ArchiveInUse(f"another process is writing {path}; wait until that process has ended") from error
+        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False
 
 
 @dataclass

@@ -2,17 +2,66 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import time
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
 from marey_client.archives.transfers import MOST_DAYS_KEPT, transfers_folder
-from marey_client.archives.writing import short_name
+from marey_client.archives.writing import short_name, write_archive
+from marey_client.errors import ArchiveInUse
+from marey_client.progress import ignore_progress
+from marey_client.transport import Transport
+from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
+from marey_schemas.datasets.differences import DatasetDifference
+from marey_versions.archive.checking import check_archive
+from marey_versions.archive.reading import Archive
+from marey_versions.records import CommitRecord, key_of
+from marey_versions.tree.building import build
+from marey_versions.tree.chunks import ChunksInMemory
 
 MOST_CHARACTERS = 255
 """Greatest length of a file name in usual file systems."""
+
+
+class ListedDataset:
+    """Dataset with a line of versions, each given as the list of its entries; the newest version is the last."""
+
+    transport = cast(Transport, None)
+    project_url = "/projects/lab"
+    name = "gaits"
+
+    def __init__(self, *versions: Sequence[Entry]) -> None:
+        self.listed: dict[str, Sequence[Entry]] = {}
+        self.commits: list[Commit] = []
+        at = datetime(2026, 1, 1, tzinfo=UTC)
+        for entries in versions:
+            pairs = {key_of(one.path, one.kind): {"parts": one.parts, "tags": list(one.tags)} for one in entries}
+            tree = build(ChunksInMemory(), sorted(pairs.items()))
+            parents = tuple(one.digest for one in self.commits[-1:])
+            digest = CommitRecord(tree, parents, "ada", "", at.strftime(TIME_OF_COMMIT)).digest
+            count = len(entries)
+            self.commits.append(
+                Commit(digest=digest, tree=tree, parents=parents, author="ada", message="", at=at, entries=count)
+            )
+            self.listed[digest] = entries
+
+    def at(self, version: str) -> Commit:
+        return next(one for one in self.commits if one.digest == version)
+
+    def log(self, version: str) -> Iterator[Commit]:
+        return reversed(self.commits[: self.commits.index(self.at(version)) + 1])
+
+    def entries(self, version: str) -> Iterator[Entry]:
+        return iter(self.listed[version])
+
+    def difference(self, before: str, after: str, *, limit: int) -> DatasetDifference:
+        raise AssertionError("the test does not compare versions")
 
 
 def digest(number: int) -> str:
@@ -65,3 +114,47 @@ def test_a_file_that_another_copy_deletes_at_the_same_time_is_skipped(
     monkeypatch.setattr(Path, "iterdir", lambda _folder: iter((gone, transfers / "old.tar")))
     transfers_folder()
     assert not (transfers / "old.tar").exists()
+
+
+def written(dataset: ListedDataset, path: Path) -> None:
+    """Write an archive of the newest version, without the earlier versions."""
+    head = dataset.commits[-1]
+    write_archive(dataset, head.digest, path, ignore_progress, since=head.parents, check=lambda _contents: None)
+
+
+def test_a_finished_archive_gets_its_name_before_another_process_may_write_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = ListedDataset([])
+    replace = Path.replace
+
+    def replace_while_another_process_writes(part: Path, path: Path) -> Path:
+        with pytest.raises(ArchiveInUse):
+            written(dataset, path)
+        return replace(part, path)
+
+    monkeypatch.setattr(Path, "replace", replace_while_another_process_writes)
+    written(dataset, tmp_path / "gaits.tar")
+    with (tmp_path / "gaits.tar").open("rb") as file:
+        check_archive(Archive(file))
+
+
+def test_a_file_that_was_finished_just_before_it_was_locked_is_not_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finished = tmp_path / "gaits.tar"
+    lock = fcntl.flock
+
+    def lock_after_another_process_has_finished(file: Any, how: int) -> None:
+        if not finished.exists():
+            (part,) = tmp_path.glob("*.part")
+            part.write_bytes(b"finished")
+            os.link(part, tmp_path / "kept.tar")
+            part.rename(finished)
+        lock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", lock_after_another_process_has_finished)
+    written(ListedDataset([]), finished)
+    assert (tmp_path / "kept.tar").read_bytes() == b"finished"
+    with finished.open("rb") as file:
+        check_archive(Archive(file))
