@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
 
 from marey_client.archives.contents import first_documents, request_contents
 from marey_client.blobs import Blobs
-from marey_client.errors import ArchiveInUse, NothingToArchive, UnexpectedAnswer
+from marey_client.errors import ArchiveInUse, BadRequest, NothingToArchive, UnexpectedAnswer
 from marey_client.progress import OnProgress
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
 from marey_schemas.datasets.contents import (
@@ -243,8 +243,8 @@ class _Making:
         """Return the entries that differ between a commit and its first parent, by path and kind."""
         if not commit.parents:
             return {_place(one): _EntryPair(one, None) for one in self.dataset.entries(commit.digest)}
-        found = self.dataset.difference(commit.parents[0], commit.digest, limit=MOST_LISTED)
-        if found.complete:
+        found = self._difference(commit.parents[0], commit.digest)
+        if found is not None:
             gone = {_place(one.before): _EntryPair(None, None) for one in found.entries if one.before is not None}
             now = {
                 _place(one.after): _EntryPair(one.after, one.before) for one in found.entries if one.after is not None
@@ -256,6 +256,16 @@ class _Making:
         )
         both = {place: _EntryPair(after.get(place), before.get(place)) for place in before.keys() | after.keys()}
         return {place: one for place, one in both.items() if _line(place, one.before) != _line(place, one.after)}
+
+    def _difference(self, before: str, after: str) -> DatasetDifference | None:
+        """Return the entries that differ in two versions; None if they are too many for one answer of the server."""
+        try:
+            found = self.dataset.difference(before, after, limit=MOST_LISTED)
+        except BadRequest as error:
+            if error.code != "large-difference":
+                raise
+            return None
+        return found if found.complete else None
 
     # -- content -------------------------------------------------------------------------------------------------------
 

@@ -14,11 +14,13 @@ import pytest
 
 from marey_client.archives.transfers import MOST_DAYS_KEPT, transfers_folder
 from marey_client.archives.writing import short_name, write_archive
-from marey_client.errors import ArchiveInUse
+from marey_client.errors import ArchiveInUse, BadRequest
 from marey_client.progress import ignore_progress
 from marey_client.transport import Transport
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
 from marey_schemas.datasets.differences import DatasetDifference
+from marey_schemas.kinds import Kind
+from marey_schemas.problems import Problem
 from marey_versions.archive.checking import check_archive
 from marey_versions.archive.reading import Archive
 from marey_versions.records import CommitRecord, key_of
@@ -35,6 +37,8 @@ class ListedDataset:
     transport = cast(Transport, None)
     project_url = "/projects/lab"
     name = "gaits"
+    refusal = "large-difference"
+    """Code of the error with which the dataset refuses to compare versions."""
 
     def __init__(self, *versions: Sequence[Entry]) -> None:
         self.listed: dict[str, Sequence[Entry]] = {}
@@ -61,7 +65,7 @@ class ListedDataset:
         return iter(self.listed[version])
 
     def difference(self, before: str, after: str, *, limit: int) -> DatasetDifference:
-        raise AssertionError("the test does not compare versions")
+        raise BadRequest(Problem(type="", title="", status=400, detail="", instance="", code=self.refusal))
 
 
 def digest(number: int) -> str:
@@ -158,3 +162,23 @@ def test_a_file_that_was_finished_just_before_it_was_locked_is_not_changed(
     assert (tmp_path / "kept.tar").read_bytes() == b"finished"
     with finished.open("rb") as file:
         check_archive(Archive(file))
+
+
+def entry(path: str) -> Entry:
+    parts = {"motion": digest(sum(path.encode()))}
+    return Entry(path=path, kind=Kind.CLIP, parts=parts, tags=(), item=None, revision=None)
+
+
+def test_versions_that_the_server_refuses_to_compare_are_listed_whole(tmp_path: Path) -> None:
+    dataset = ListedDataset([entry("a"), entry("b"), entry("c")], [entry("b")])
+    written(dataset, tmp_path / "gaits.tar")
+    with (tmp_path / "gaits.tar").open("rb") as file:
+        changes = Archive(file).changes(dataset.commits[-1].digest)
+    assert {key: change.value for key, change in changes.items()} == {key_of(path, "clip"): None for path in "ac"}
+
+
+def test_another_refusal_to_compare_versions_is_reported(tmp_path: Path) -> None:
+    dataset = ListedDataset([entry("a")], [])
+    dataset.refusal = "bad-version"
+    with pytest.raises(BadRequest):
+        written(dataset, tmp_path / "gaits.tar")
