@@ -56,11 +56,12 @@ def fetched_versions(
 
     The archive's file is deleted after the `with` block, but kept if the block ends with an error. If the program is
     interrupted while it writes the file, the next call continues writing. Consents are not checked here: take records
-    are copied with their clips, so that the other server checks them.
+    are copied with their clips, so that the other server checks them. Raises `LargeCommit` if the other server would
+    refuse one of the commits.
     """
     path = transfers_folder() / f"{short_name(head.digest, bases)}.tar"
     if not path.exists():
-        write_archive(source, head.digest, path, on_progress, since=bases, check=_accept)
+        write_archive(source, head.digest, path, on_progress, since=bases, check=_accept, to_send=True)
     with path.open("rb") as file:
         yield Archive(file)
     path.unlink(missing_ok=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
 
 from marey_client.archives.contents import first_documents, request_contents
+from marey_client.archives.receiving import require_receivable
 from marey_client.blobs import Blobs
 from marey_client.errors import ArchiveInUse, BadRequest, NothingToArchive, UnexpectedAnswer
 from marey_client.progress import OnProgress
@@ -84,20 +85,22 @@ def write_archive(
     *,
     since: Sequence[str] = (),
     check: CheckContents,
+    to_send: bool = False,
 ) -> Commit:
     """Write an archive of a version and check it; the versions `since` and all versions before them are left out.
 
     Before the documents of revisions are read, `check` is called with the content digests of these revisions, and may
     raise an error. An interrupted call leaves a file whose name ends in `.part`; the next call with the same arguments
     continues it. Raises `ArchiveInUse` if another process is writing the file, and `NothingToArchive` if no version is
-    left.
+    left. With `to_send`, also raises `LargeCommit`, before documents are read, if no server would receive one of the
+    commits.
     """
     head = dataset.at(version)
     bases = [dataset.at(one) for one in since]
     part = path.with_name(f"{path.name}.{short_name(head.digest, [one.digest for one in bases])}.part")
     part.parent.mkdir(parents=True, exist_ok=True)
     with _opened(part) as file, tempfile.TemporaryDirectory(dir=part.parent) as folder:
-        _Making(dataset, ArchiveWriter(file), Path(folder), on_progress, check).run(head, bases)
+        _Making(dataset, ArchiveWriter(file), Path(folder), on_progress, check, to_send).run(head, bases)
         try:
             check_archive(Archive(file), lambda done, of: on_progress("checking", done, of))
         except BadArchive as error:
@@ -166,6 +169,8 @@ class _Making:
     """Folder for files that were downloaded from the server and are not in the archive yet."""
     on_progress: OnProgress
     check: CheckContents
+    to_send: bool
+    """Whether the archive is useless if it cannot be imported."""
     known: set[str] = field(default_factory=set)
     """Content digests of the revisions that the archive has, or will have."""
     documents: dict[str, PartOfContent] = field(default_factory=dict)
@@ -215,6 +220,8 @@ class _Making:
         if record.digest != commit.digest:
             raise UnexpectedAnswer(f"the server's commit {commit.digest} does not match its digest")
         changes = self._changes(commit)
+        if self.to_send:
+            require_receivable(commit.digest, len(changes))
         lines = []
         for place, change in sorted(changes.items()):
             earlier = change.before if unchanged else None

@@ -8,13 +8,16 @@ import time
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
-from marey_client.archives.transfers import MOST_DAYS_KEPT, transfers_folder
+from marey_client.archives import receiving
+from marey_client.archives.receiving import ReceivingDataset, send_versions
+from marey_client.archives.transfers import MOST_DAYS_KEPT, fetched_versions, transfers_folder
 from marey_client.archives.writing import short_name, write_archive
-from marey_client.errors import ArchiveInUse, BadRequest
+from marey_client.errors import ArchiveInUse, BadRequest, LargeCommit
 from marey_client.progress import ignore_progress
 from marey_client.transport import Transport
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
@@ -182,3 +185,30 @@ def test_another_refusal_to_compare_versions_is_reported(tmp_path: Path) -> None
     dataset.refusal = "bad-version"
     with pytest.raises(BadRequest):
         written(dataset, tmp_path / "gaits.tar")
+
+
+@pytest.fixture
+def one_change_is_received(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Limit the changes of a commit that a server receives to one."""
+    monkeypatch.setattr(receiving, "MOST_RECEIVED_CHANGES", 1)
+
+
+@pytest.mark.usefixtures("one_change_is_received")
+def test_a_commit_that_no_server_receives_is_archived_but_not_imported(tmp_path: Path) -> None:
+    dataset = ListedDataset([entry("a"), entry("b")], [])
+    base, large = dataset.commits
+    written(dataset, tmp_path / "gaits.tar")
+    receiver = cast(ReceivingDataset, SimpleNamespace(has=lambda commit: commit == base.digest))
+    with (
+        (tmp_path / "gaits.tar").open("rb") as file,
+        pytest.raises(LargeCommit, match=f"{large.digest} changes 2 .* 1"),
+    ):
+        send_versions(receiver, Archive(file), ignore_progress)
+
+
+@pytest.mark.usefixtures("one_change_is_received", "transfers")
+def test_a_copy_with_a_commit_that_no_server_receives_ends_before_documents_are_read() -> None:
+    # The dataset has no transport, so a request for documents would be another error.
+    dataset = ListedDataset([entry("a"), entry("b")])
+    with pytest.raises(LargeCommit), fetched_versions(dataset, dataset.commits[0], (), ignore_progress):
+        pass
