@@ -62,6 +62,10 @@ class EarlierVersionsMissing(MareyError):
     """The archive builds on a version that the dataset does not have."""
 
 
+class LargeCommit(MareyError):
+    """A commit changes more entries than a server accepts in a commit from an archive or another server."""
+
+
 class NothingToArchive(MareyError):
     """An archive would contain no commit, because all of its commits are to be left out."""
 

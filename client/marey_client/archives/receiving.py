@@ -10,11 +10,17 @@ from typing import Any, NamedTuple, Protocol
 
 from marey_client.archives.contents import request_contents
 from marey_client.blobs import Blobs
-from marey_client.errors import EarlierVersionsMissing
+from marey_client.errors import EarlierVersionsMissing, LargeCommit
 from marey_client.progress import OnProgress
 from marey_client.transport import Transport, as_json, read_model
 from marey_schemas.datasets.commits import Commit
-from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, ReceivedChange, ReceivedCommit
+from marey_schemas.datasets.contents import (
+    MOST_CONTENTS,
+    MOST_RECEIVED_CHANGES,
+    ContentsRequest,
+    ReceivedChange,
+    ReceivedCommit,
+)
 from marey_schemas.documents.blob_references import references_of
 from marey_schemas.encoding.canonical import attach_arrays
 from marey_schemas.kinds import Kind
@@ -55,7 +61,8 @@ def send_versions(
     """Record the versions of an archive in a dataset, with their digests; return the newest version.
 
     If `begins` names a branch without commits, this branch moves to the newest version; no other branch moves. After an
-    interrupted import, the next import sends only the data that the server lacks.
+    interrupted import, the next import sends only the data that the server lacks. Raises `LargeCommit`, before anything
+    is sent, if the server would refuse one of the versions.
     """
     return _Import(dataset, archive, on_progress).run(begins)
 
@@ -68,6 +75,15 @@ def require_base(archive: Archive, has: Callable[[str], bool]) -> None:
                 f"the archive has only the versions after {commit}, which the dataset does not have; import an archive "
                 "with this version first"
             )
+
+
+def require_receivable(commit: str, changed: int) -> None:
+    """Raise `LargeCommit` if a commit changes so many entries that no server would receive it."""
+    if changed > MOST_RECEIVED_CHANGES:
+        raise LargeCommit(
+            f"the commit {commit} changes {changed:,} entries, but a commit that is imported, pushed or pulled may "
+            f"change at most {MOST_RECEIVED_CHANGES:,}; it can only be archived"
+        )
 
 
 class _Revision(NamedTuple):
@@ -99,6 +115,8 @@ class _Import:
         # All at first, because a document may refer to a revision that only a later commit has as an entry.
         put = {digest: self._put(changes[digest]) for digest, _ in history}
         known = self._known(history)
+        for digest in changes.keys() - known:
+            require_receivable(digest, len(changes[digest]))
         for digest in known & changes.keys():
             self._note(put[digest])
         for done, (digest, record) in enumerate(history):

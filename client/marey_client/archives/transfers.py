@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import shutil
+import stat
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -54,11 +56,12 @@ def fetched_versions(
 
     The archive's file is deleted after the `with` block, but kept if the block ends with an error. If the program is
     interrupted while it writes the file, the next call continues writing. Consents are not checked here: take records
-    are copied with their clips, so that the other server checks them.
+    are copied with their clips, so that the other server checks them. Raises `LargeCommit` if the other server would
+    refuse one of the commits.
     """
-    path = transfers_folder() / f"{short_name([head.digest, *bases])}.tar"
+    path = transfers_folder() / f"{short_name(head.digest, bases)}.tar"
     if not path.exists():
-        write_archive(source, head.digest, path, on_progress, since=bases, check=_accept)
+        write_archive(source, head.digest, path, on_progress, since=bases, check=_accept, to_send=True)
     with path.open("rb") as file:
         yield Archive(file)
     path.unlink(missing_ok=True)
@@ -69,11 +72,17 @@ def _accept(_contents: Sequence[str]) -> None:
 
 
 def transfers_folder() -> Path:
-    """Return the folder for archives of running copies, below `XDG_CACHE_HOME` or `~/.cache`; delete its old files."""
+    """Return the folder for archives of running copies, below `XDG_CACHE_HOME` or `~/.cache`; delete its old content.
+
+    A copy that was killed leaves its archive, and also the folder of its downloaded files.
+    """
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "marey" / "transfers"
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     oldest = time.time() - MOST_DAYS_KEPT * 86_400
     for path in folder.iterdir():
-        if path.stat().st_mtime < oldest:
-            path.unlink(missing_ok=True)
+        with suppress(FileNotFoundError):  # another copy may delete the same files
+            found = path.lstat()
+            if found.st_mtime < oldest:
+                delete = shutil.rmtree if stat.S_ISDIR(found.st_mode) else os.unlink
+                delete(path)
     return folder

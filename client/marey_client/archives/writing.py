@@ -6,13 +6,15 @@ import fcntl
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
 
 from marey_client.archives.contents import first_documents, request_contents
+from marey_client.archives.receiving import require_receivable
 from marey_client.blobs import Blobs
-from marey_client.errors import ArchiveInUse, NothingToArchive, UnexpectedAnswer
+from marey_client.errors import ArchiveInUse, BadRequest, NothingToArchive, UnexpectedAnswer
 from marey_client.progress import OnProgress
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
 from marey_schemas.datasets.contents import (
@@ -83,24 +85,22 @@ def write_archive(
     *,
     since: Sequence[str] = (),
     check: CheckContents,
+    to_send: bool = False,
 ) -> Commit:
     """Write an archive of a version and check it; the versions `since` and all versions before them are left out.
 
     Before the documents of revisions are read, `check` is called with the content digests of these revisions, and may
     raise an error. An interrupted call leaves a file whose name ends in `.part`; the next call with the same arguments
     continues it. Raises `ArchiveInUse` if another process is writing the file, and `NothingToArchive` if no version is
-    left.
+    left. With `to_send`, also raises `LargeCommit`, before documents are read, if no server would receive one of the
+    commits.
     """
     head = dataset.at(version)
     bases = [dataset.at(one) for one in since]
-    part = path.with_name(f"{path.name}.{short_name(one.digest for one in (head, *bases))}.part")
+    part = path.with_name(f"{path.name}.{short_name(head.digest, [one.digest for one in bases])}.part")
     part.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        os.fdopen(os.open(part, os.O_RDWR | os.O_CREAT, 0o666), "r+b") as file,
-        tempfile.TemporaryDirectory(dir=part.parent) as folder,
-    ):
-        _lock(file, part)
-        _Making(dataset, ArchiveWriter(file), Path(folder), on_progress, check).run(head, bases)
+    with _opened(part) as file, tempfile.TemporaryDirectory(dir=part.parent) as folder:
+        _Making(dataset, ArchiveWriter(file), Path(folder), on_progress, check, to_send).run(head, bases)
         try:
             check_archive(Archive(file), lambda done, of: on_progress("checking", done, of))
         except BadArchive as error:
@@ -110,7 +110,7 @@ def write_archive(
             ) from error
         file.flush()
         os.fsync(file.fileno())
-    part.replace(path)
+        part.replace(path)  # before the file is unlocked, so that no other process changes the finished archive
     return head
 
 
@@ -128,17 +128,35 @@ def check_consents(dataset: DatasetReader, reason: str | None, contents: Sequenc
     return frozenset(ended)
 
 
-def short_name(commits: Iterable[str]) -> str:
-    """Return a short text that identifies commits, for file names."""
-    return "-".join(digest.removeprefix("sha256:")[:12] for digest in commits)
+def short_name(head: str, bases: Iterable[str]) -> str:
+    """Return a text of 32 characters, for file names, that identifies the content of an archive.
+
+    `head` is the digest of the archive's newest commit, and `bases` are those of the commits that it leaves out.
+    """
+    return digest_of("\n".join([head, *sorted(set(bases))]).encode()).removeprefix("sha256:")[:32]
 
 
-def _lock(file: BinaryIO, path: Path) -> None:
-    """Keep other processes from writing the file until it is closed."""
+@contextmanager
+def _opened(part: Path) -> Iterator[BinaryIO]:
+    """Open an unfinished archive, and keep other processes from writing it until it is closed."""
+    while True:
+        with os.fdopen(os.open(part, os.O_RDWR | os.O_CREAT, 0o666), "r+b") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise ArchiveInUse(f"another process is writing {part}; wait until that process has ended") from error
+            if _is_at(part, file):
+                yield file
+                return
+            # Another process finished the archive between the two steps, so this file is no longer the unfinished one.
+
+
+def _is_at(path: Path, file: BinaryIO) -> bool:
+    """Return whether the path leads to this opened file, and not to another file or to none."""
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise ArchiveInUse(f"another process is writing {path}; wait until that process has ended") from error
+        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False
 
 
 @dataclass
@@ -151,6 +169,8 @@ class _Making:
     """Folder for files that were downloaded from the server and are not in the archive yet."""
     on_progress: OnProgress
     check: CheckContents
+    to_send: bool
+    """Whether the archive is useless if it cannot be imported."""
     known: set[str] = field(default_factory=set)
     """Content digests of the revisions that the archive has, or will have."""
     documents: dict[str, PartOfContent] = field(default_factory=dict)
@@ -200,6 +220,8 @@ class _Making:
         if record.digest != commit.digest:
             raise UnexpectedAnswer(f"the server's commit {commit.digest} does not match its digest")
         changes = self._changes(commit)
+        if self.to_send:
+            require_receivable(commit.digest, len(changes))
         lines = []
         for place, change in sorted(changes.items()):
             earlier = change.before if unchanged else None
@@ -228,8 +250,8 @@ class _Making:
         """Return the entries that differ between a commit and its first parent, by path and kind."""
         if not commit.parents:
             return {_place(one): _EntryPair(one, None) for one in self.dataset.entries(commit.digest)}
-        found = self.dataset.difference(commit.parents[0], commit.digest, limit=MOST_LISTED)
-        if found.complete:
+        found = self._difference(commit.parents[0], commit.digest)
+        if found is not None:
             gone = {_place(one.before): _EntryPair(None, None) for one in found.entries if one.before is not None}
             now = {
                 _place(one.after): _EntryPair(one.after, one.before) for one in found.entries if one.after is not None
@@ -241,6 +263,16 @@ class _Making:
         )
         both = {place: _EntryPair(after.get(place), before.get(place)) for place in before.keys() | after.keys()}
         return {place: one for place, one in both.items() if _line(place, one.before) != _line(place, one.after)}
+
+    def _difference(self, before: str, after: str) -> DatasetDifference | None:
+        """Return the entries that differ in two versions; None if they are too many for one answer of the server."""
+        try:
+            found = self.dataset.difference(before, after, limit=MOST_LISTED)
+        except BadRequest as error:
+            if error.code != "large-difference":
+                raise
+            return None
+        return found if found.complete else None
 
     # -- content -------------------------------------------------------------------------------------------------------
 

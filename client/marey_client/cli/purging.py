@@ -66,7 +66,7 @@ def purge(
     `--dataset`, a deleted dataset is purged: its versions, branches, tags and proposals, but not its items. Only owners
     of the project may purge.
     """
-    from marey_client.handles.purges import combined, purge_items, purge_step_by_step
+    from marey_client.handles.purges import combined, purge_items, purge_step_by_step, without_contained
 
     addresses = addresses_in_one_project(places)
     with connect(context) as marey:
@@ -76,13 +76,16 @@ def purge(
                 raise WrongUsage("with --dataset, give only the project of the dataset")
             return _purge_dataset(project, dataset, preview=preview, yes=yes, as_json=as_json)
         requests = [_request(project, place, kind, query, older_than) for place in places]
-        previews = [one.model_copy(update={"preview": True}) for one in requests]
-        expected = combined([purge_items(project.transport, project.name, one) for one in previews])
-        if not expected.purged and not expected.refused:
+        previews = [
+            purge_items(project.transport, project.name, one.model_copy(update={"preview": True})) for one in requests
+        ]
+        needed = without_contained(previews)
+        if not needed:
             raise WrongUsage(
                 f"there is nothing to purge at {', '.join(places)}; `marey ls --deleted {project.name}` lists the "
                 "removed items"
             )
+        expected = combined([previews[place] for place in needed])
         if preview or not expected.purged:
             return _report(project.name, expected, as_json)
         if not yes:
@@ -91,7 +94,7 @@ def purge(
         answers: list[PurgeAnswer] = []
         with progress() as advance:
             for answer in (
-                one for each in requests for one in purge_step_by_step(project.transport, project.name, each)
+                one for place in needed for one in purge_step_by_step(project.transport, project.name, requests[place])
             ):
                 answers.append(answer)
                 done = sum(len(one.purged) + len(one.refused) for one in answers)

@@ -63,7 +63,8 @@ class Datasets:
         Otherwise, the branch does not move, and the caller can merge the version into the branch.
 
         Raises `marey_versions.archive.members.BadArchive`, which names the member that was changed or is missing, and
-        `EarlierVersionsMissing` if the archive builds on a version that the dataset does not have.
+        `EarlierVersionsMissing` if the archive builds on a version that the dataset does not have. Raises `LargeCommit`
+        if a version changes more entries than an imported version may change.
         """
         from marey_client.archives.receiving import require_base
         from marey_versions.archive.checking import check_archive

@@ -24,8 +24,28 @@ def purge_items(transport: Transport, project: str, request: PurgeRequest) -> Pu
     return combined(list(purge_step_by_step(transport, project, request)))
 
 
+def without_contained(previews: Sequence[PurgeAnswer]) -> list[int]:
+    """Return, in order, the places of the previews that are needed for all items.
+
+    Left out are previews whose items all occur in larger ones: the same bytes would count twice, and the purge of these
+    items would be requested twice.
+    """
+    items = [{one.item for one in each.purged} | {one.item for one in each.refused} for each in previews]
+    kept: list[int] = []
+    found: set[str] = set()
+    for place in sorted(range(len(items)), key=lambda one: len(items[one]), reverse=True):
+        if not items[place] <= found:
+            kept.append(place)
+            found |= items[place]
+    return sorted(kept)
+
+
 def combined(answers: Sequence[PurgeAnswer]) -> PurgeAnswer:
-    """Combine the answers of a purge into one answer; an item that occurs in several previews is listed once."""
+    """Combine the answers of a purge into one answer.
+
+    An item that occurs in several answers is listed once, but its bytes count in each. Bytes that items of different
+    answers have in common are not counted in previews, so the purge may free more than they state.
+    """
     return PurgeAnswer(
         preview=answers[0].preview,
         purged=tuple({one.item: one for answer in answers for one in answer.purged}.values()),

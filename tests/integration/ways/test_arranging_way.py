@@ -168,6 +168,15 @@ def test_what_was_removed_is_purged_after_a_yes_and_never_comes_back(run: Comman
     assert done["freed_bytes"] > 0  # other tests have clips with the same poses
 
 
+def test_an_item_in_a_folder_that_is_purged_too_is_purged_and_counted_once(run: Command, lab: ProjectHandle) -> None:
+    item = next(lab.clips.list(path="raw/a")).id
+    run("rm", "lab/raw", "--yes")
+    alone = json.loads(run("purge", "lab/raw/", "--preview", "--json").stdout)
+    both = json.loads(run("purge", "lab/raw/", f"lab/{item}", "--preview", "--json").stdout)
+    assert both == alone
+    assert "3 items purged for good" in run("purge", "lab/raw/", f"lab/{item}", "--yes").stderr
+
+
 def test_a_query_and_an_age_select_what_is_purged(run: Command, lab: ProjectHandle) -> None:
     run("record", "lab/raw/b", "--set", "subject=02")
     run("rm", "lab/raw", "--yes")
