@@ -357,6 +357,48 @@ def test_a_conflict_is_listed_and_decided(owner: httpx.Client, two_branches: Cal
     assert entries(owner)["a"]["parts"] == entries(owner, "trial")["a"]["parts"]
 
 
+def test_two_conflicts_at_one_path_are_decided_one_after_the_other(
+    owner: httpx.Client, two_branches: Callable[..., None]
+) -> None:
+    """Our side has removed `b` and moved `a` to its place; their side has changed `b`."""
+
+    def replace() -> None:
+        item = item_at(owner, "gaits/b")
+        owner.delete(f"{LAB}/skeletons/{item['id']}", headers={"If-Match": "*"})
+        change(owner, "gaits/a", name="b")
+
+    two_branches(lambda: put(owner, "gaits/b", "Pelvis"), replace)
+    ours = entries(owner)["b"]["parts"]
+    restore = {"path": "b", "kind": "skeleton", "take": "theirs"}
+    request = {"version": "trial", "resolutions": [restore]}
+    conflict = refused(owner.post(f"{GAITS}/merges", json=request), 409, "merge-conflicts")["context"]
+    assert [(one["path"], one["parts"], one["ours"]["parts"]) for one in conflict["conflicts"]] == [
+        ("b", ["path"], ours)
+    ]
+    ok(owner.post(f"{GAITS}/merges", json={**request, "resolutions": [restore, restore]}))
+    found, trial = entries(owner), entries(owner, "trial")
+    assert {path: one["parts"] for path, one in found.items()} == {path: one["parts"] for path, one in trial.items()}
+    assert found["a"]["parts"] == ours
+
+
+def test_an_entry_that_cannot_go_back_to_its_place_stays_in_conflict(
+    owner: httpx.Client, two_branches: Callable[..., None]
+) -> None:
+    """Both sides have moved an entry to `z`; their side has another one at the former path of its entry."""
+
+    def shift() -> None:
+        change(owner, "gaits/b", name="z")
+        ok(owner.post(f"{LAB}/skeletons", json=skeleton("x")), 201)
+        change(owner, "gaits/x", name="b")
+
+    two_branches(shift, lambda: change(owner, "gaits/a", name="z"))
+    take = [{"path": "z", "kind": "skeleton", "take": "ours"}]
+    request = {"version": "trial", "resolutions": take}
+    (conflict,) = refused(owner.post(f"{GAITS}/merges", json=request), 409, "merge-conflicts")["context"]["conflicts"]
+    assert (conflict["path"], conflict["parts"]) == ("z", ["path"])
+    assert "would go back to 'b'" in conflict["reason"]
+
+
 def put_labels(owner: httpx.Client, path: str, *segments: tuple[str, int, int]) -> None:
     """Replace the segments of an annotation."""
     (found,) = ok(owner.get(f"{LAB}/annotations", params={"path": path}))["items"]

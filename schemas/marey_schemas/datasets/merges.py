@@ -30,7 +30,12 @@ class Side(StrEnum):
 
 
 class Resolution(Request):
-    """Decision about a conflict: the side whose version of an entry is kept."""
+    """Decision about a conflict: the side whose version of an entry is kept.
+
+    If two entries want one path, the other entry goes back to its own path on the branch or in the base. An entry that
+    one side has added has no such path, and is dropped. Several conflicts can have the same path and kind. The first
+    resolution decides the first of them, the second resolution the second one, and so on.
+    """
 
     path: EntryPath
     kind: Kind
@@ -102,7 +107,9 @@ class EntryConflict(Answer):
     ours: Entry | None
     theirs: Entry | None
     reason: str = Field(
-        "", description="Reason why the changes of an annotation cannot be combined; empty for other parts."
+        "",
+        description="Reason why the changes of an annotation cannot be combined, or why a resolution cannot be "
+        "applied; empty for other conflicts.",
     )
     segments: ConflictingSegments | None = Field(
         None, description="Segments of an annotation that exclude each other; null if the reason is another one."
