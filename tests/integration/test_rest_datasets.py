@@ -16,6 +16,7 @@ from marey_schemas.encoding.canonical import document_digest
 from marey_server.access.principal import SYSTEM
 from marey_server.store import fsck
 from marey_server.store.database.connections import Database
+from marey_server.store.datasets import checkout
 from marey_server.store.fsck import check_store
 from marey_server.store.tables import dataset_commit, revision, tree_chunk
 from marey_server.store.transaction import Transaction
@@ -243,6 +244,28 @@ def test_a_checkout_gives_the_folder_a_version_and_keeps_ids(
     ok(owner.post(f"{GAITS}/checkout", json={}))
     assert sorted(entries(owner)) == ["a", "c"]
     assert not list(check_store(database))
+
+
+def test_a_version_with_a_path_that_no_item_can_have_is_not_checked_out(
+    owner: httpx.Client, gaits: Callable[..., Any]
+) -> None:
+    """The path of the entry's folder is short enough, but not below the folder of the dataset."""
+    folder = "/".join(["f" * 200] * 5 + ["f" * 17])
+    move = {"change": "move", "path": "b", "kind": "skeleton", "to": f"{folder}/b"}
+    ok(owner.post(f"{GAITS}/refs", json={"name": "deep", "kind": "branch"}), 201)
+    gaits("deep", branch="deep", changes=[move])
+    refused(owner.post(f"{GAITS}/checkout", json={"version": "deep"}), 422, "long-path")
+
+
+def test_a_version_with_more_tags_than_an_item_can_have_is_not_checked_out(
+    owner: httpx.Client, gaits: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    change(owner, "gaits/a", tags=["one", "two"])
+    gaits("second")
+    ok(owner.post(f"{GAITS}/checkout", json={"version": "main~1"}))
+    monkeypatch.setattr(checkout, "MOST_TAGS", 1)
+    answer = refused(owner.post(f"{GAITS}/checkout", json={}), 422, "too-many-tags")
+    assert "'a' has 2 tags" in answer["detail"]
 
 
 def test_a_checkout_swaps_names(owner: httpx.Client, gaits: Callable[..., Any]) -> None:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from marey_schemas.datasets.merges import Side
 from marey_schemas.kinds import PARTS, Kind
+from marey_schemas.names import MOST_TAGS
 from marey_versions.annotations import AnnotationClash
 from marey_versions.compared import ComparedEntry
 from marey_versions.records import DatasetEntry
@@ -29,6 +30,7 @@ class MergeConflict(NamedTuple):
     """Names of the parts that both sides have changed in different ways.
 
     `path` is among them if both sides have moved the entry to different paths, or want different entries at one path.
+    `tags` is among them if the entry would have more tags than an item can have.
     If one side has removed the entry, `entry` is the only name.
     """
     clash: AnnotationClash | None = None
@@ -306,7 +308,8 @@ def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: Datas
         if _excludes(*(tuple(parts.get(name) for name in pair) for parts in (of_base, ours.parts, theirs.parts))):
             clashing.update(pair)
     moved = base is not None and _excludes(base.path, ours.path, theirs.path)
-    return (*(("path",) if moved else ()), *sorted(clashing))
+    crowded = len(_merged_tags(base, ours, theirs)) > MOST_TAGS
+    return (*(("path",) if moved else ()), *sorted(clashing), *(("tags",) if crowded else ()))
 
 
 def _made_together(kind: str) -> Iterator[tuple[str, str]]:
@@ -334,9 +337,14 @@ def _combined(sides: _Sides, choice: Side = Side.OURS) -> DatasetEntry | None:
         is not None
     } | sides.merged
     path = preferred.path if base is None else _newer("path" in clashes, base.path, preferred.path, other.path)
-    old = set() if base is None else set(base.tags)
-    tags = (old | set(ours.tags) | set(theirs.tags)) - (old - set(ours.tags)) - (old - set(theirs.tags))
+    tags = preferred.tags if "tags" in clashes else _merged_tags(base, ours, theirs)
     return DatasetEntry(path or preferred.path, ours.kind, parts, tuple(sorted(tags)))
+
+
+def _merged_tags(base: DatasetEntry | None, ours: DatasetEntry, theirs: DatasetEntry) -> set[str]:
+    """Return the tags that both sides have kept or one side has added."""
+    old = set() if base is None else set(base.tags)
+    return (old | set(ours.tags) | set(theirs.tags)) - (old - set(ours.tags)) - (old - set(theirs.tags))
 
 
 def _newer(clash: bool, base: str | None, preferred: str | None, other: str | None) -> str | None:

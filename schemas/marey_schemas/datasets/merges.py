@@ -101,7 +101,8 @@ class EntryConflict(Answer):
     kind: Kind
     parts: tuple[str, ...] = Field(
         description="Parts that both sides have changed. `path`: both sides have moved the entry, or have different "
-        "entries at the same path. `entry`: one side has removed the entry."
+        "entries at the same path. `tags`: the entry would have more than 64 tags. `entry`: one side has removed the "
+        "entry."
     )
     base: Entry | None
     ours: Entry | None

@@ -11,6 +11,7 @@ from tests.support.tiers import examples
 
 from marey_schemas.datasets.differences import ChangeKind
 from marey_schemas.datasets.merges import Side
+from marey_schemas.names import MOST_TAGS
 from marey_versions.annotations import ADDED_TWICE, AnnotationClash
 from marey_versions.compared import ComparedEntry, compare_entries
 from marey_versions.merging import ChangedPart, MergedEntries, merge_entries
@@ -303,6 +304,18 @@ def test_conflicts_name_the_parts_and_are_decided_part_by_part() -> None:
     assert merge(base, ours, theirs, {key: Side.OURS})[0] == state(a=entry("2", "2", "x"))
     assert merge(base, ours, theirs, {key: Side.THEIRS})[0] == state(a=entry("3", "2", "x"))
     assert merge(base, ours, theirs, {key: Side.BASE})[0] == base
+
+
+def test_more_tags_than_an_item_can_have_are_a_conflict() -> None:
+    many = [f"tag {number}" for number in range(MOST_TAGS)]
+    base, key = state(a=entry("1", None, *many[1:])), key_of("a", "clip")
+    ours, theirs = state(a=entry("1", None, *many)), state(a=entry("2", None, *many[1:], "theirs"))
+    _, merged = merge(base, ours, theirs)
+    assert [(one.key, one.parts) for one in merged.conflicts] == [(key, ("tags",))]
+    assert merge(base, ours, theirs, {key: Side.OURS})[0] == state(a=entry("2", None, *many))
+    assert merge(base, ours, theirs, {key: Side.THEIRS})[0] == theirs
+    fewer = state(a=entry("1", None, *many[2:], "ours"))
+    assert not merge(base, fewer, theirs)[1].conflicts
 
 
 def test_a_removed_entry_that_the_other_side_changed_is_a_conflict() -> None:
