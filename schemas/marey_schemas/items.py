@@ -8,7 +8,7 @@ from pydantic import Field
 from marey_schemas.access import Role
 from marey_schemas.base import Answer, Request
 from marey_schemas.kinds import Kind
-from marey_schemas.names import CollectionPath, Digest, ItemName, Message, Tag
+from marey_schemas.names import MOST_TAGS, CollectionPath, Digest, ItemName, Message, Tag
 
 LOOP_TAG = "loop"
 """Tag of clips that are played as loops."""
@@ -47,7 +47,7 @@ class ItemCreate(Request):
 
     name: ItemName
     collection: CollectionPath = ""
-    tags: tuple[Tag, ...] = Field((), max_length=64)
+    tags: tuple[Tag, ...] = Field((), max_length=MOST_TAGS)
     parts: dict[str, Any] = Field(min_length=1)
     message: Message = ""
 
@@ -57,7 +57,7 @@ class ItemChange(Request):
 
     name: ItemName | None = None
     collection: CollectionPath | None = None
-    tags: tuple[Tag, ...] | None = Field(None, max_length=64)
+    tags: tuple[Tag, ...] | None = Field(None, max_length=MOST_TAGS)
 
 
 class ItemRevert(Request):

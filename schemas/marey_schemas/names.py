@@ -25,6 +25,9 @@ CollectionPath = Annotated[
 
 Tag = Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=r"^[^,\x00-\x1f\x7f]+$")]
 
+MOST_TAGS = 64
+"""Greatest number of tags of an item."""
+
 DIGEST_PATTERN = r"^sha256:[0-9a-f]{64}$"
 Digest = Annotated[str, StringConstraints(pattern=DIGEST_PATTERN)]
 """Digest of bytes: `sha256:` and 64 hexadecimal digits."""

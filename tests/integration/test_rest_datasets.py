@@ -16,6 +16,7 @@ from marey_schemas.encoding.canonical import document_digest
 from marey_server.access.principal import SYSTEM
 from marey_server.store import fsck
 from marey_server.store.database.connections import Database
+from marey_server.store.datasets import checkout
 from marey_server.store.fsck import check_store
 from marey_server.store.tables import dataset_commit, revision, tree_chunk
 from marey_server.store.transaction import Transaction
@@ -259,6 +260,28 @@ def test_a_checkout_gives_the_folder_a_version_and_keeps_ids(
     assert not list(check_store(database))
 
 
+def test_a_version_with_a_path_that_no_item_can_have_is_not_checked_out(
+    owner: httpx.Client, gaits: Callable[..., Any]
+) -> None:
+    """The path of the entry's folder is short enough, but not below the folder of the dataset."""
+    folder = "/".join(["f" * 200] * 5 + ["f" * 17])
+    move = {"change": "move", "path": "b", "kind": "skeleton", "to": f"{folder}/b"}
+    ok(owner.post(f"{GAITS}/refs", json={"name": "deep", "kind": "branch"}), 201)
+    gaits("deep", branch="deep", changes=[move])
+    refused(owner.post(f"{GAITS}/checkout", json={"version": "deep"}), 422, "long-path")
+
+
+def test_a_version_with_more_tags_than_an_item_can_have_is_not_checked_out(
+    owner: httpx.Client, gaits: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    change(owner, "gaits/a", tags=["one", "two"])
+    gaits("second")
+    ok(owner.post(f"{GAITS}/checkout", json={"version": "main~1"}))
+    monkeypatch.setattr(checkout, "MOST_TAGS", 1)
+    answer = refused(owner.post(f"{GAITS}/checkout", json={}), 422, "too-many-tags")
+    assert "'a' has 2 tags" in answer["detail"]
+
+
 def test_a_checkout_swaps_names(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
     ids = {name: item_at(owner, f"gaits/{name}")["id"] for name in ("a", "b")}
     change(owner, "gaits/a", name="x")
@@ -369,6 +392,48 @@ def test_a_conflict_is_listed_and_decided(owner: httpx.Client, two_branches: Cal
     theirs = [{"path": "a", "kind": "skeleton", "take": "theirs"}]
     ok(owner.post(f"{GAITS}/merges", json={"version": "trial", "resolutions": theirs}))
     assert entries(owner)["a"]["parts"] == entries(owner, "trial")["a"]["parts"]
+
+
+def test_two_conflicts_at_one_path_are_decided_one_after_the_other(
+    owner: httpx.Client, two_branches: Callable[..., None]
+) -> None:
+    """Our side has removed `b` and moved `a` to its place; their side has changed `b`."""
+
+    def replace() -> None:
+        item = item_at(owner, "gaits/b")
+        owner.delete(f"{LAB}/skeletons/{item['id']}", headers={"If-Match": "*"})
+        change(owner, "gaits/a", name="b")
+
+    two_branches(lambda: put(owner, "gaits/b", "Pelvis"), replace)
+    ours = entries(owner)["b"]["parts"]
+    restore = {"path": "b", "kind": "skeleton", "take": "theirs"}
+    request = {"version": "trial", "resolutions": [restore]}
+    conflict = refused(owner.post(f"{GAITS}/merges", json=request), 409, "merge-conflicts")["context"]
+    assert [(one["path"], one["parts"], one["ours"]["parts"]) for one in conflict["conflicts"]] == [
+        ("b", ["path"], ours)
+    ]
+    ok(owner.post(f"{GAITS}/merges", json={**request, "resolutions": [restore, restore]}))
+    found, trial = entries(owner), entries(owner, "trial")
+    assert {path: one["parts"] for path, one in found.items()} == {path: one["parts"] for path, one in trial.items()}
+    assert found["a"]["parts"] == ours
+
+
+def test_an_entry_that_cannot_go_back_to_its_place_stays_in_conflict(
+    owner: httpx.Client, two_branches: Callable[..., None]
+) -> None:
+    """Both sides have moved an entry to `z`; their side has another one at the former path of its entry."""
+
+    def shift() -> None:
+        change(owner, "gaits/b", name="z")
+        ok(owner.post(f"{LAB}/skeletons", json=skeleton("x")), 201)
+        change(owner, "gaits/x", name="b")
+
+    two_branches(shift, lambda: change(owner, "gaits/a", name="z"))
+    take = [{"path": "z", "kind": "skeleton", "take": "ours"}]
+    request = {"version": "trial", "resolutions": take}
+    (conflict,) = refused(owner.post(f"{GAITS}/merges", json=request), 409, "merge-conflicts")["context"]["conflicts"]
+    assert (conflict["path"], conflict["parts"]) == ("z", ["path"])
+    assert "would go back to 'b'" in conflict["reason"]
 
 
 def put_labels(owner: httpx.Client, path: str, *segments: tuple[str, int, int]) -> None:

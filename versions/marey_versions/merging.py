@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from marey_schemas.datasets.merges import Side
 from marey_schemas.kinds import PARTS, Kind
+from marey_schemas.names import MOST_TAGS
 from marey_versions.annotations import AnnotationClash
 from marey_versions.compared import ComparedEntry
 from marey_versions.records import DatasetEntry
@@ -28,10 +30,14 @@ class MergeConflict(NamedTuple):
     """Names of the parts that both sides have changed in different ways.
 
     `path` is among them if both sides have moved the entry to different paths, or want different entries at one path.
+    `tags` is among them if the entry would have more tags than an item can have.
     If one side has removed the entry, `entry` is the only name.
     """
     clash: AnnotationClash | None = None
     """The reason why an annotation could not be merged segment by segment."""
+    no_way_back: str | None = None
+    """Path at which the entry that gives way cannot stay, because another entry is there. Set only if a resolution has
+    decided the conflict: it remains a conflict, because the entry would be lost."""
 
     @property
     def key(self) -> str:
@@ -79,7 +85,7 @@ class MergedEntries:
 def merge_entries(
     ours: Iterable[ComparedEntry],
     theirs: Iterable[ComparedEntry],
-    resolutions: Mapping[str, Side],
+    resolutions: Iterable[tuple[str, Side]],
     merge_parts: MergeParts | None = None,
 ) -> MergedEntries:
     """Merge the changes that two sides have made since their base.
@@ -87,7 +93,8 @@ def merge_entries(
     Parameters
     ----------
     ours, theirs : the entries that differ between the base and each side
-    resolutions : the side to take for each conflict, by the key of the conflict
+    resolutions : keys of conflicts, with the side to take. Each decides one conflict; of several conflicts with the
+        same key, the first resolution with this key decides the first, and so on
     merge_parts : merges the parts that both sides have changed; None: such parts are in conflict
 
     Returns
@@ -106,15 +113,33 @@ def merge_entries(
     if merge_parts is not None:
         _merge_documents(sides, merge_parts)
     merged = MergedEntries()
+    choices = _Choices(resolutions, merged.decided)
     decided: list[_Decided] = []
     for three in sides:
-        found = _decide(three, resolutions, merged.decided)
+        found = _decide(three, choices)
         if isinstance(found, MergeConflict):
             merged.conflicts.append(found)
         else:
             decided.append(found)
-    _apply(decided, {one.after.key: one.after for one in mine if one.after is not None}, resolutions, merged)
+    _apply(decided, mine, choices, merged)
     return merged
+
+
+class _Choices:
+    """Resolutions that are left. Each decides one conflict only, because a person has seen no other one."""
+
+    def __init__(self, resolutions: Iterable[tuple[str, Side]], used: set[str]) -> None:
+        self._left: defaultdict[str, deque[Side]] = defaultdict(deque)
+        for key, side in resolutions:
+            self._left[key].append(side)
+        self._used = used
+
+    def take(self, key: str) -> Side | None:
+        """Return the next resolution of a conflict with this key and use it up, or None if there is none."""
+        if key not in self._left or not self._left[key]:
+            return None
+        self._used.add(key)
+        return self._left[key].popleft()
 
 
 class _Decided(NamedTuple):
@@ -137,6 +162,24 @@ class _Decided(NamedTuple):
     def moves(self) -> bool:
         """Whether the merged entry gets a path or kind that it does not have on our side."""
         return self.merged is not None and (self.ours is None or self.ours.key != self.merged.key)
+
+    @property
+    def result(self) -> DatasetEntry:
+        """The merged entry, which must exist."""
+        assert self.merged is not None
+        return self.merged
+
+    def place_beside(self, key: str) -> str | None:
+        """Return the path to which the entry goes back if another entry gets `key`; None if it has been nowhere else.
+
+        This is its path on our side, or its path in the base if our side has it at `key` or not at all.
+        """
+        back = self.base if self.ours is None or self.ours.key == key else self.ours
+        return None if back is None else back.path
+
+    def at(self, path: str) -> _Decided:
+        """Return the entry with another path."""
+        return self._replace(merged=self.result._replace(path=path))
 
 
 @dataclass
@@ -176,7 +219,7 @@ def _merge_documents(sides: Sequence[_Sides], merge_parts: MergeParts) -> None:
             one.clashes = tuple(name for name in one.clashes if name != part.part)
 
 
-def _decide(sides: _Sides, resolutions: Mapping[str, Side], used: set[str]) -> _Decided | MergeConflict:
+def _decide(sides: _Sides, choices: _Choices) -> _Decided | MergeConflict:
     base, ours, theirs = sides.base, sides.ours, sides.theirs
     if theirs in (ours, base):
         return _Decided(base, ours, theirs, ours)
@@ -185,10 +228,9 @@ def _decide(sides: _Sides, resolutions: Mapping[str, Side], used: set[str]) -> _
     if not sides.clashes:
         return _Decided(base, ours, theirs, _combined(sides))
     conflict = MergeConflict(base, ours, theirs, sides.clashes, sides.clash)
-    choice = resolutions.get(conflict.key)
+    choice = choices.take(conflict.key)
     if choice is None:
         return conflict
-    used.add(conflict.key)
     if choice is Side.BASE:
         return _Decided(base, ours, theirs, base)
     whole = "entry" in sides.clashes or base is None
@@ -197,36 +239,57 @@ def _decide(sides: _Sides, resolutions: Mapping[str, Side], used: set[str]) -> _
 
 
 def _apply(
-    decided: Sequence[_Decided],
-    occupied: dict[str, DatasetEntry],
-    resolutions: Mapping[str, Side],
-    merged: MergedEntries,
+    decided: Sequence[_Decided], mine: Iterable[ComparedEntry], choices: _Choices, merged: MergedEntries
 ) -> None:
     """Add changes of our tree to `merged`; if another entry already has the new key of an entry, add a conflict.
 
-    `occupied` contains the entries that our side has changed, by their keys on our side.
+    `mine` contains the entries that our side has changed.
     """
+    held = {one.after.key: _Decided(one.before, one.after, one.before, one.after) for one in mine if one.after}
     for one in decided:
-        if one.ours is not None and (one.moves or one.merged is None):
+        if one.ours is not None:
+            held.pop(one.ours.key, None)
             merged.changes[one.ours.key] = None
-            occupied.pop(one.ours.key, None)
-    for one in decided:
-        if one.merged is None or one.merged == one.ours:
+    held.update((one.result.key, one) for one in decided if one.merged is not None and not one.moves)
+    # Entries that go back to the base come first, so that a conflict never lists an entry of theirs as ours.
+    moving = sorted((one for one in decided if one.moves), key=_gets_place_of_theirs)
+    colliding = [one for one in moving if held.setdefault(one.result.key, one) is not one]
+    # Collisions come last, so that no entry goes back to a place that another entry gets.
+    merged.conflicts += (conflict for one in colliding if (conflict := _collide(one, held, choices)) is not None)
+    for key, one in held.items():
+        if one.merged == one.ours:
+            merged.changes.pop(key, None)
             continue
-        key = one.merged.key
-        if one.moves and key in occupied:
-            choice = resolutions.get(key)
-            if choice is None:
-                merged.conflicts.append(MergeConflict(None, occupied[key], one.merged, ("path",)))
-            else:
-                merged.decided.add(key)
-            if choice is not Side.THEIRS:
-                continue
-        if one.moves:
-            occupied[key] = one.merged
-        merged.changes[key] = one.merged.value
+        merged.changes[key] = one.result.value
         if (combined := one.combined) is not None:
             merged.combined.append(combined)
+
+
+def _gets_place_of_theirs(one: _Decided) -> bool:
+    return one.theirs is not None and one.merged is not None and one.theirs.key == one.merged.key
+
+
+def _collide(one: _Decided, held: dict[str, _Decided], choices: _Choices) -> MergeConflict | None:
+    """Decide which of two entries gets a key; the other one goes back to its own place.
+
+    `held` contains entries by key; one of them has the key that `one` should get. Only an entry that has no other
+    place, because one side has added it, is dropped. The result is a conflict if there is no resolution, or if the
+    place of the other entry is taken.
+    """
+    key = one.result.key
+    other = held[key]
+    conflict = MergeConflict(None, other.merged, one.merged, ("path",))
+    choice = choices.take(key)
+    if choice is None:
+        return conflict
+    winner, loser = (one, other) if choice is Side.THEIRS else (other, one)
+    if (back := loser.place_beside(key)) is not None:
+        moved = loser.at(back)
+        if moved.result.key in held:
+            return conflict._replace(no_way_back=back)
+        held[moved.result.key] = moved
+    held[key] = winner
+    return None
 
 
 def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: DatasetEntry | None) -> tuple[str, ...]:
@@ -245,7 +308,8 @@ def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: Datas
         if _excludes(*(tuple(parts.get(name) for name in pair) for parts in (of_base, ours.parts, theirs.parts))):
             clashing.update(pair)
     moved = base is not None and _excludes(base.path, ours.path, theirs.path)
-    return (*(("path",) if moved else ()), *sorted(clashing))
+    crowded = len(_merged_tags(base, ours, theirs)) > MOST_TAGS
+    return (*(("path",) if moved else ()), *sorted(clashing), *(("tags",) if crowded else ()))
 
 
 def _made_together(kind: str) -> Iterator[tuple[str, str]]:
@@ -273,9 +337,14 @@ def _combined(sides: _Sides, choice: Side = Side.OURS) -> DatasetEntry | None:
         is not None
     } | sides.merged
     path = preferred.path if base is None else _newer("path" in clashes, base.path, preferred.path, other.path)
-    old = set() if base is None else set(base.tags)
-    tags = (old | set(ours.tags) | set(theirs.tags)) - (old - set(ours.tags)) - (old - set(theirs.tags))
+    tags = preferred.tags if "tags" in clashes else _merged_tags(base, ours, theirs)
     return DatasetEntry(path or preferred.path, ours.kind, parts, tuple(sorted(tags)))
+
+
+def _merged_tags(base: DatasetEntry | None, ours: DatasetEntry, theirs: DatasetEntry) -> set[str]:
+    """Return the tags that both sides have kept or one side has added."""
+    old = set() if base is None else set(base.tags)
+    return (old | set(ours.tags) | set(theirs.tags)) - (old - set(ours.tags)) - (old - set(theirs.tags))
 
 
 def _newer(clash: bool, base: str | None, preferred: str | None, other: str | None) -> str | None:

@@ -19,7 +19,10 @@ PATH = "path"
 TAGS = "tags"
 """Name of the origin of an entry's tags."""
 MOST_CHANGES = 100_000
-"""Number of changed entries up to which moved entries are searched for in a commit."""
+"""Number of changed entries up to which moved entries are searched for in a commit.
+
+The search continues in other commits until it has read more entries than this in total.
+"""
 
 
 class FoundOrigin(NamedTuple):
@@ -43,7 +46,9 @@ class _OriginSearch:
     sought: dict[tuple[str, str], set[str]] = field(default_factory=dict)
     """For each commit and key: names of the parts whose origin is this commit or an earlier one."""
     ended: set[str] = field(default_factory=set)
-    """Commits that changed so many entries that moved entries were not searched for."""
+    """Commits in which moved entries were not searched for, because they or the commits before changed too many."""
+    compared: int = 0
+    """Number of changed entries that were read to search for moved entries."""
 
     def add(self, commit: str, key: str, names: set[str]) -> None:
         if (commit, key) not in self.sought:
@@ -60,8 +65,10 @@ class _OriginSearch:
         same, present = self.entry(parent, key), self.entry(commit, key)
         if trees[0] == trees[1] or (same and present and same.parts.items() & present.parts.items()):
             return same
-        changes = list(islice(difference(self.reader, *trees), MOST_CHANGES + 1))
-        if len(changes) > MOST_CHANGES:
+        most = MOST_CHANGES if self.compared <= MOST_CHANGES else -1
+        changes = list(islice(difference(self.reader, *trees), most + 1))
+        self.compared += len(changes)
+        if len(changes) > most:
             self.ended.add(commit)
             return None
         for one in compare_entries(changes):

@@ -12,7 +12,7 @@ from marey_schemas.consents import ConsentOverride
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, EntryPath
 from marey_schemas.datasets.naming import RefName
 from marey_schemas.kinds import Kind
-from marey_schemas.names import Digest, Message, Tag
+from marey_schemas.names import MOST_TAGS, Digest, Message, Tag
 
 MOST_CONTENTS = 256
 """Greatest number of revisions, and of documents, in one request."""
@@ -100,7 +100,7 @@ class ReceivedChange(Request):
     parts: dict[PartName, Digest] | None = Field(
         description="Content digest of each part; null: the commit removed the entry."
     )
-    tags: tuple[Tag, ...] = Field((), max_length=64)
+    tags: tuple[Tag, ...] = Field((), max_length=MOST_TAGS)
 
 
 class ReceivedCommit(Request):

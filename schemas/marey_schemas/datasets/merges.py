@@ -30,7 +30,12 @@ class Side(StrEnum):
 
 
 class Resolution(Request):
-    """Decision about a conflict: the side whose version of an entry is kept."""
+    """Decision about a conflict: the side whose version of an entry is kept.
+
+    If two entries want one path, the other entry goes back to its own path on the branch or in the base. An entry that
+    one side has added has no such path, and is dropped. Several conflicts can have the same path and kind. The first
+    resolution decides the first of them, the second resolution the second one, and so on.
+    """
 
     path: EntryPath
     kind: Kind
@@ -96,13 +101,16 @@ class EntryConflict(Answer):
     kind: Kind
     parts: tuple[str, ...] = Field(
         description="Parts that both sides have changed. `path`: both sides have moved the entry, or have different "
-        "entries at the same path. `entry`: one side has removed the entry."
+        "entries at the same path. `tags`: the entry would have more than 64 tags. `entry`: one side has removed the "
+        "entry."
     )
     base: Entry | None
     ours: Entry | None
     theirs: Entry | None
     reason: str = Field(
-        "", description="Reason why the changes of an annotation cannot be combined; empty for other parts."
+        "",
+        description="Reason why the changes of an annotation cannot be combined, or why a resolution cannot be "
+        "applied; empty for other conflicts.",
     )
     segments: ConflictingSegments | None = Field(
         None, description="Segments of an annotation that exclude each other; null if the reason is another one."

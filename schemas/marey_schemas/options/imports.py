@@ -8,7 +8,7 @@ from pydantic import Field
 
 from marey_schemas.base import Options
 from marey_schemas.formats import UNITS_M, LengthUnit
-from marey_schemas.names import CollectionPath, Tag
+from marey_schemas.names import MOST_TAGS, CollectionPath, Tag
 
 UpAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Handedness = Literal["right", "left"]
@@ -51,7 +51,7 @@ class ImportOptions(Options):
         None, gt=0, le=100_000, description="Frame rate of the clips, in hertz. Absent: the rate in the files."
     )
     trim_rest_pose: bool = Field(False, description="Remove rest poses at the beginning and at the end of each clip.")
-    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags that every clip gets.")
+    tags: tuple[Tag, ...] = Field((), max_length=MOST_TAGS, description="Tags that every clip gets.")
     subject: str | None = Field(None, max_length=255, description="The performer.")
     licence: str | None = Field(None, max_length=255, description="Licence of the data.")
     capture_system: str | None = Field(None, max_length=255, description="The device or system that recorded the data.")

@@ -14,6 +14,7 @@ from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, ExportFormat, Wr
 from marey_schemas.imports import ImportFile
 from marey_schemas.names import (
     MAX_NAME_LENGTH,
+    MOST_TAGS,
     ItemId,
     ItemName,
     Label,
@@ -34,7 +35,7 @@ from marey_schemas.options.modelling import ModelOptions, TreeOptions
 class TaggedResults(Request):
     """Base of parameters with tags for the results."""
 
-    tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags that the results get.")
+    tags: tuple[Tag, ...] = Field((), max_length=MOST_TAGS, description="Tags that the results get.")
 
 
 class SuffixedResults(TaggedResults):

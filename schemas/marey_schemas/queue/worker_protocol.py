@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from marey_schemas.base import Answer, Request
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.kinds import Kind
-from marey_schemas.names import CollectionPath, ItemName, Tag
+from marey_schemas.names import MOST_TAGS, CollectionPath, ItemName, Tag
 from marey_schemas.queue.facets import MOST_MEASURED, ItemFacets
 from marey_schemas.queue.jobs import ItemInput, JobOutput, JobState, Progress, Resources
 
@@ -138,7 +138,7 @@ class StagedOutput(Request):
     kind: Kind
     item_name: ItemName
     collection: CollectionPath = Field("", description="Collection of the result, relative to the job's `into`.")
-    tags: tuple[Tag, ...] = Field((), max_length=64)
+    tags: tuple[Tag, ...] = Field((), max_length=MOST_TAGS)
     parts: dict[str, Any] = Field(min_length=1)
     sources: dict[str, tuple[ItemInput, ...]] = Field(
         default_factory=dict, description="Inputs that this result was made from, by input name."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar
 
@@ -104,27 +104,59 @@ def merge_states(base: State, ours: State, theirs: State, take: Mapping[Key, Sid
     """Apply the changes from `base` to `theirs` to `ours`; `take` contains the resolutions of conflicts."""
     mine, their = follow(base, ours), follow(base, theirs)
     merged = Merged(dict(ours))
-    results: list[tuple[Located | None, Located]] = []
+    origins: dict[Key, Origin] = {now: (now, old) for old, now in mine.items() if now is not None}
+    results: list[tuple[Origin, Located]] = []
     for three in _changes(base, ours, theirs, mine, their):
         outcome = _decide(*three, take, merged)
-        before = three[1]
+        old, before, _ = three
         if outcome == before:
             continue
-        if before is not None and (outcome is None or outcome.key != before.key):
+        stays = before is not None and outcome is not None and outcome.key == before.key
+        if before is not None and not stays:
             del merged.state[before.key]
-        if outcome is not None:
-            results.append((before, outcome))
-    for before, (key, entry) in results:
-        if (before is None or before.key != key) and key in merged.state:
-            choice = take.get(key)
-            if choice is None:
-                merged.conflicts.append((key, ("path",)))
-            else:
-                merged.decided.add(key)
-            if choice is not Side.THEIRS:
-                continue
-        merged.state[key] = entry
+        if outcome is not None and stays:
+            merged.state[outcome.key] = outcome.entry
+        elif outcome is not None:
+            results.append(((before.key if before else None, old.key if old else None), outcome))
+    results.sort(key=lambda result: result[1].key != result[0][1])  # those that go back to the base come first
+    waiting: list[tuple[Origin, Located]] = []
+    for origin, (key, entry) in results:
+        if key in merged.state:
+            waiting.append((origin, Located(key, entry)))
+        else:
+            merged.state[key], origins[key] = entry, origin
+    _settle(waiting, origins, take, merged)
     return merged
+
+
+Origin = tuple[Key | None, Key | None]
+"""Keys of an entry on our side and in the base."""
+
+
+def _settle(
+    waiting: Iterable[tuple[Origin, Located]], origins: dict[Key, Origin], take: Mapping[Key, Side], merged: Merged
+) -> None:
+    """Give each key that two entries want to one of them; the other one goes back to its own place, if it has one.
+
+    `origins` contains the origin of each entry in `merged.state` by its key there.
+    """
+    for origin, (key, entry) in waiting:
+        choice = None if key in merged.decided else take.get(key)
+        if choice is None:
+            merged.conflicts.append((key, ("path",)))
+            continue
+        merged.decided.add(key)
+        winner, loser = (origin, entry), (origins.get(key, (key, None)), merged.state[key])
+        if choice is not Side.THEIRS:
+            winner, loser = loser, winner
+        at_ours, at_base = loser[0]
+        back = at_base if at_ours in (None, key) else at_ours
+        if back in merged.state:
+            merged.conflicts.append((key, ("path",)))
+            continue
+        if back is not None:
+            origins[back], merged.state[back] = loser
+        origins[key], merged.state[key] = winner
 
 
 Three = tuple[Located | None, Located | None, Located | None]
@@ -133,7 +165,10 @@ Three = tuple[Located | None, Located | None, Located | None]
 def _changes(
     base: State, ours: State, theirs: State, mine: Mapping[Key, Key | None], their: Mapping[Key, Key | None]
 ) -> list[Three]:
-    """Return each entry that differs between `base` and `theirs`, as (base, ours, theirs), in the order of paths."""
+    """Return each entry that differs between `base` and `theirs`, as (base, ours, theirs), in the order of paths.
+
+    If their side has removed an entry and has another one at its path, the removed entry comes first.
+    """
     found: list[Three] = [
         (_at(base, old), _at(ours, mine[old]), _at(theirs, now))
         for old, now in their.items()
@@ -144,7 +179,7 @@ def _changes(
         (None, _at(ours, key if key in added_by_us else None), _at(theirs, key))
         for key in theirs.keys() - set(their.values())
     ]
-    return sorted(found, key=lambda three: by_path((three[2] or three[0] or three[1]).key))
+    return sorted(found, key=lambda three: (by_path((three[2] or three[0] or three[1]).key), three[2] is not None))
 
 
 def _decide(
@@ -159,7 +194,7 @@ def _decide(
         return _combined(base, ours, theirs, labels, clashes, Side.OURS)
     named = ours or base or theirs
     assert named is not None
-    choice = take.get(named.key)
+    choice = None if named.key in merged.decided else take.get(named.key)  # a resolution decides one conflict only
     if choice is None:
         merged.conflicts.append((named.key, clashes))
         return ours

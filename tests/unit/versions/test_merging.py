@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import pytest
 from hypothesis import given, settings
@@ -11,6 +11,7 @@ from tests.support.tiers import examples
 
 from marey_schemas.datasets.differences import ChangeKind
 from marey_schemas.datasets.merges import Side
+from marey_schemas.names import MOST_TAGS
 from marey_versions.annotations import ADDED_TWICE, AnnotationClash
 from marey_versions.compared import ComparedEntry, compare_entries
 from marey_versions.merging import ChangedPart, MergedEntries, merge_entries
@@ -49,9 +50,10 @@ def compared(before: State, after: State) -> list[ComparedEntry]:
 
 
 def merge(
-    base: State, ours: State, theirs: State, resolutions: Mapping[str, Side] | None = None
+    base: State, ours: State, theirs: State, resolutions: Mapping[str, Side] | Sequence[tuple[str, Side]] = ()
 ) -> tuple[State, MergedEntries]:
-    merged = merge_entries(compared(base, ours), compared(base, theirs), resolutions or {})
+    pairs = list(resolutions.items()) if isinstance(resolutions, Mapping) else resolutions
+    merged = merge_entries(compared(base, ours), compared(base, theirs), pairs)
     result: dict[str, Value | None] = {**ours, **merged.changes}
     return {key: value for key, value in result.items() if value is not None}, merged
 
@@ -108,6 +110,109 @@ def test_nothing_of_either_side_disappears(base: State, ours: State, theirs: Sta
             for part in one.parts:
                 if part in one.after.parts:
                     assert (part, one.after.parts[part]) in kept
+
+
+@st.composite
+def histories(draw: st.DrawFn) -> tuple[State, State, State]:
+    """A base and two sides that keep, edit, rename, remove and add entries; the motion tells which entry is which."""
+    base = {key_of(path, "clip"): entry(path, path) for path in draw(st.sets(paths))}
+    sides = []
+    for side in ("ours", "theirs"):
+        state: State = {}
+        for key, value in sorted(base.items()):
+            to = draw(st.just(key) | st.none() | paths.map(lambda path: key_of(path, "clip")))
+            if to is not None and to not in state:
+                state[to] = entry(value["parts"]["motion"], draw(st.sampled_from([value["parts"]["info"], side])))
+        for key in sorted({key_of(path, "clip") for path in draw(st.sets(paths))} - state.keys()):
+            state[key] = entry(f"{key} of {side}", f"{key} of {side}")
+        sides.append(state)
+    return base, sides[0], sides[1]
+
+
+def motions(entries: Iterable[Value]) -> set[str]:
+    return {one["parts"]["motion"] for one in entries}
+
+
+@settings(max_examples=examples(300), deadline=None)
+@given(histories(), st.lists(st.sampled_from(Side), min_size=20, max_size=20))
+def test_no_entry_disappears_by_a_resolution_of_other_entries(
+    versions: tuple[State, State, State], choices: list[Side]
+) -> None:
+    """A person answers the listed conflicts one by one, and those that the answers bring up."""
+    base, ours, theirs = versions
+    kept_by_both = motions(ours.values()) & motions(theirs.values())
+    resolutions: list[tuple[str, Side]] = []
+    shown: set[str] = set()
+    for choice in choices:
+        result, merged = merge(base, ours, theirs, resolutions)
+        expected = (motions(ours.values()) | motions(theirs.values())) - motions(base.values()) | kept_by_both
+        shown |= motions(side.value for one in merged.conflicts for side in one[:3] if side is not None)
+        assert expected - shown <= motions(result.values())
+        if not merged.conflicts:
+            break
+        resolutions.append((merged.conflicts[0].key, choice))
+
+
+RESTORED = (
+    state(a=entry("1", "1"), b=entry("2", "2")),
+    state(b=entry("1", "1")),
+    state(a=entry("1", "1"), b=entry("2", "3")),
+)
+"""A base, our side that removed `b` and moved `a` to its place, and their side that changed `b`."""
+
+
+def test_a_restored_entry_does_not_replace_one_that_no_conflict_has_shown() -> None:
+    base, ours, theirs = RESTORED
+    key = key_of("b", "clip")
+    assert [(one.key, one.parts) for one in merge(base, ours, theirs)[1].conflicts] == [(key, ("entry",))]
+    _, merged = merge(base, ours, theirs, [(key, Side.THEIRS)])
+    assert [(one.key, one.parts, one.ours and one.ours.parts) for one in merged.conflicts] == [
+        (key, ("path",), entry("1", "1")["parts"])
+    ]
+    result, merged = merge(base, ours, theirs, [(key, Side.THEIRS)] * 2)
+    assert (result, merged.conflicts) == (theirs, [])
+    result, merged = merge(base, ours, theirs, [(key, Side.OURS)])
+    assert (result, merged.conflicts) == (ours, [])
+
+
+def test_a_decision_about_an_entry_does_not_remove_the_one_that_was_moved_to_its_place() -> None:
+    base, theirs, ours = RESTORED
+    key = key_of("b", "clip")
+    _, merged = merge(base, ours, theirs)
+    assert [(one.key, one.parts) for one in merged.conflicts] == [(key, ("entry",)), (key, ("path",))]
+    _, merged = merge(base, ours, theirs, [(key, Side.OURS)])
+    assert [(one.key, one.parts) for one in merged.conflicts] == [(key, ("path",))]
+    result, merged = merge(base, ours, theirs, [(key, Side.OURS)] * 2)
+    assert (result, merged.conflicts) == (ours, [])
+    _, merged = merge(base, ours, theirs, [(key, Side.OURS), (key, Side.THEIRS)])
+    assert [(one.parts, one.no_way_back) for one in merged.conflicts] == [(("path",), "b")]
+    result, merged = merge(base, ours, theirs, [(key, Side.THEIRS)])
+    assert (result, merged.conflicts) == (theirs, [])
+
+
+@pytest.mark.parametrize(
+    ("take", "expected"),
+    [
+        (Side.OURS, state(z=entry("1"), b=entry("2"))),
+        (Side.BASE, state(z=entry("1"), b=entry("2"))),
+        (Side.THEIRS, state(a=entry("1"), z=entry("2"))),
+    ],
+)
+def test_the_entry_that_does_not_get_a_place_keeps_its_own(take: Side, expected: State) -> None:
+    base = state(a=entry("1"), b=entry("2"))
+    result, merged = merge(
+        base, state(z=entry("1"), b=entry("2")), state(a=entry("1"), z=entry("2")), [(key_of("z", "clip"), take)]
+    )
+    assert (result, merged.conflicts) == (expected, [])
+
+
+def test_an_entry_whose_own_place_is_taken_stays_in_conflict() -> None:
+    base, key = state(a=entry("1"), b=entry("2"), c=entry("3")), key_of("z", "clip")
+    ours, theirs = state(z=entry("1"), b=entry("2"), c=entry("3")), state(a=entry("1"), z=entry("2"), b=entry("3"))
+    result, merged = merge(base, ours, theirs, [(key, Side.OURS)])
+    assert [(one.key, one.no_way_back) for one in merged.conflicts] == [(key, "b")]
+    result, merged = merge(base, ours, theirs, [(key, Side.THEIRS)])
+    assert (result, merged.conflicts) == (theirs, [])
 
 
 @settings(max_examples=examples(300), deadline=None)
@@ -201,6 +306,18 @@ def test_conflicts_name_the_parts_and_are_decided_part_by_part() -> None:
     assert merge(base, ours, theirs, {key: Side.BASE})[0] == base
 
 
+def test_more_tags_than_an_item_can_have_are_a_conflict() -> None:
+    many = [f"tag {number}" for number in range(MOST_TAGS)]
+    base, key = state(a=entry("1", None, *many[1:])), key_of("a", "clip")
+    ours, theirs = state(a=entry("1", None, *many)), state(a=entry("2", None, *many[1:], "theirs"))
+    _, merged = merge(base, ours, theirs)
+    assert [(one.key, one.parts) for one in merged.conflicts] == [(key, ("tags",))]
+    assert merge(base, ours, theirs, {key: Side.OURS})[0] == state(a=entry("2", None, *many))
+    assert merge(base, ours, theirs, {key: Side.THEIRS})[0] == theirs
+    fewer = state(a=entry("1", None, *many[2:], "ours"))
+    assert not merge(base, fewer, theirs)[1].conflicts
+
+
 def test_a_removed_entry_that_the_other_side_changed_is_a_conflict() -> None:
     base, key = state(a=entry("1")), key_of("a", "clip")
     _, merged = merge(base, {}, state(a=entry("2")))
@@ -226,7 +343,7 @@ def test_documents_of_parts_that_both_sides_have_changed_are_merged() -> None:
         asked.extend(changed)
         return ["23" if one.ours.path == "a" else ADDED_TWICE for one in changed]
 
-    merged = merge_entries(compared(base, ours), compared(base, theirs), {}, merge_parts)
+    merged = merge_entries(compared(base, ours), compared(base, theirs), (), merge_parts)
     assert [(one.part, one.ours.path) for one in asked] == [("motion", "a"), ("motion", "b")]
     assert merged.changes == {key_of("a", "clip"): entry("23", "2", "x")}
     assert [one.entry.path for one in merged.combined] == ["a"]
@@ -242,9 +359,9 @@ def test_a_merged_document_is_kept_where_a_side_decides_the_path(take: Side, pat
         for at, digest in (("a", "1"), ("y", "2"), ("z", "3"))
     )
     sides = [ComparedEntry(base, ours)], [ComparedEntry(base, theirs)]
-    undecided = merge_entries(*sides, {}, lambda changed: ["23" for _ in changed])
+    undecided = merge_entries(*sides, (), lambda changed: ["23" for _ in changed])
     assert [one.parts for one in undecided.conflicts] == [("path",)]
-    merged = merge_entries(*sides, {ours.key: take}, lambda changed: ["23" for _ in changed])
+    merged = merge_entries(*sides, [(ours.key, take)], lambda changed: ["23" for _ in changed])
     expected = {key_of(path, "clip"): {"parts": {"motion": motion, "info": "1"}, "tags": []}}
     assert {key: value for key, value in merged.changes.items() if value is not None} == expected
 

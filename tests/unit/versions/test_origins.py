@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.tiers import examples
 
+from marey_versions import origins
 from marey_versions.origins import PATH, TAGS, FoundOrigin, find_origins
 from marey_versions.records import key_of
 from marey_versions.tree.building import build
@@ -109,6 +111,19 @@ def test_a_merge_is_the_origin_of_what_differs_from_both_sides() -> None:
     assert {name: one.commit for name, one in found.items()} == {
         "motion": ours, "info": theirs, TAGS: merge, PATH: base,
     }  # fmt: skip
+
+
+def test_a_search_that_has_compared_too_many_entries_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each commit moves the entry, so each is compared with the one before: two changed entries."""
+    history = History()
+    keys = [key_of(f"a{place}", "clip") for place in range(6)]
+    last = history.add({keys[0]: entry("1", "1")})
+    for key in keys[1:]:
+        last = history.add({key: entry("1", "1")}, last)
+    monkeypatch.setattr(origins, "MOST_CHANGES", 10)
+    assert history.origins(last, keys[-1])["motion"] == FoundOrigin("0", keys[0], certain=True)
+    monkeypatch.setattr(origins, "MOST_CHANGES", 3)
+    assert history.origins(last, keys[-1])["motion"] == FoundOrigin("3", keys[3], certain=False)
 
 
 def test_a_search_that_ends_early_is_not_certain() -> None:

@@ -209,7 +209,7 @@ def _print_result(found: MergeAnswer, into: str) -> None:
 
 
 def _print_reason(conflict: EntryConflict) -> None:
-    """Print why an annotation could not be merged, and the segments of both sides that cannot be combined."""
+    """Print why the changes or the resolution could not be applied, and the segments that cannot be combined."""
     from marey_schemas.datasets.merges import Side
 
     if conflict.reason:

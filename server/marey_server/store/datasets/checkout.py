@@ -14,10 +14,11 @@ from marey_schemas.datasets.commits import MOST_CHANGES
 from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest
 from marey_schemas.items import ItemChange
 from marey_schemas.kinds import Kind
+from marey_schemas.names import MOST_TAGS
 from marey_schemas.wording import counted
 from marey_server.access.folder_rights import FolderRoleProblem
 from marey_server.errors import ConflictProblem, InvalidProblem
-from marey_server.store import items, projects
+from marey_server.store import collections, items, projects
 from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.folders import FolderState, read_folder
 from marey_server.store.datasets.history import revisions_with, tree_of
@@ -66,6 +67,7 @@ def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest
             code="large-checkout",
         )
     compared = compare_entries(changes)
+    _require_possible(found, compared)
     _Checkout(tx, project_row, found, state).apply(compared)
     # A commit of the folder that is being recorded sees by `rev` that the folder has other content now.
     values = {"folder_commit": digest, "updated_us": tx.now_us, "rev": dataset.c.rev + 1}
@@ -88,6 +90,23 @@ def _require_recorded(tx: Transaction, found: Row[Any], state: FolderState, stor
             code="uncommitted-changes",
             context={"count": len(changed)},
         )
+
+
+def _require_possible(found: Row[Any], compared: Sequence[ComparedEntry]) -> None:
+    """Raise `InvalidProblem` if an entry cannot become an item: its folder is too long, or it has too many tags."""
+    for entry in (one.after for one in compared if one.after is not None):
+        collections.check_length(_folder_of(found, entry))
+        if len(entry.tags) > MOST_TAGS:
+            raise InvalidProblem(
+                f"The entry at {entry.path!r} has {len(entry.tags)} tags; an item has at most {MOST_TAGS}. Commit the "
+                "entry with fewer tags, or check out another version.",
+                code="too-many-tags",
+            )
+
+
+def _folder_of(found: Row[Any], entry: DatasetEntry) -> str:
+    """Return the path of the folder for an entry of a dataset, in the project."""
+    return "/".join(filter(None, (found.path, entry.path.rpartition("/")[0])))
 
 
 @dataclass(frozen=True)
@@ -143,13 +162,10 @@ class _Checkout:
         items.delete_item(self.tx, self.project.name, kind, self._item(one), expected_rev=None)
 
     def _place(self, one: ComparedEntry, temporary: str | None) -> None:
-        folder, _, name = one.present.path.rpartition("/")
-        change = ItemChange(name=temporary or name, collection=self._folder(folder))
+        name = one.present.path.rpartition("/")[2]
+        change = ItemChange(name=temporary or name, collection=_folder_of(self.dataset, one.present))
         kind = Kind(one.present.kind)
         items.change_item(self.tx, self.project.name, kind, self._item(one), change, expected_rev=None)
-
-    def _folder(self, folder: str) -> str:
-        return "/".join(filter(None, (self.dataset.path, folder)))
 
     def _change(self, one: ComparedEntry, documents: Mapping[str, tuple[str, Mapping[str, str]]]) -> None:
         assert one.after is not None
@@ -168,15 +184,15 @@ class _Checkout:
         assert one.after is not None
         kind = Kind(one.after.kind)
         item_id, parts = documents[one.after.content]
-        folder, _, name = one.after.path.rpartition("/")
+        name, folder = one.after.path.rpartition("/")[2], _folder_of(self.dataset, one.after)
         if self._can_restore(kind, item_id):
             items.restore_item(self.tx, self.project.name, kind, item_id)
-            place = ItemChange(name=name, collection=self._folder(folder), tags=one.after.tags)
+            place = ItemChange(name=name, collection=folder, tags=one.after.tags)
             items.change_item(self.tx, self.project.name, kind, item_id, place, expected_rev=None)
             items.set_parts(self.tx, self.project, kind, item_id, parts, self._message)
             return
         draft = Draft(
-            name_in_batch="", kind=kind, item_name=name, collection=self._folder(folder), tags=one.after.tags,
+            name_in_batch="", kind=kind, item_name=name, collection=folder, tags=one.after.tags,
             parts={part: StoredDocument(digest) for part, digest in parts.items()}, reuse="new",
             message=self._message,
         )  # fmt: skip

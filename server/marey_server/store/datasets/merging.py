@@ -152,11 +152,11 @@ def _combine(
         build(store, []) if one is None else tree_of(tx, commit.dataset_id, one)
         for one in (answer.base, answer.ours, answer.theirs)
     )
-    resolutions = {key_of(one.path, one.kind): one.take for one in request.resolutions}
+    resolutions = [(key_of(one.path, one.kind), one.take) for one in request.resolutions]
     mine, their = (_changed(store, base, side, most) for side in (ours, theirs))
     annotations = AnnotationMerger(tx, project_id)
     merged = merge_entries(mine, their, resolutions, annotations.merge)
-    if unknown := sorted(resolutions.keys() - merged.decided):
+    if unknown := sorted({key for key, _ in resolutions} - merged.decided):
         path, kind = path_and_kind(unknown[0])
         raise InvalidProblem(
             f"The {kind} at {path!r} is not in conflict; remove its resolution from the request.", code="no-conflict"
@@ -233,9 +233,18 @@ def _shown(one: MergeConflict, held: Mapping[str, tuple[str, int]]) -> EntryConf
     path, kind = path_and_kind(one.key)
     return EntryConflict(
         path=path, kind=Kind(kind), parts=one.parts, base=base, ours=ours, theirs=theirs,
-        reason=one.clash.reason if one.clash else "",
+        reason=_reason(one),
         segments=_shown_segments(one.clash.segments) if one.clash and one.clash.segments else None,
     )  # fmt: skip
+
+
+def _reason(one: MergeConflict) -> str:
+    if one.no_way_back is not None:
+        return (
+            f"With this resolution, the other entry would go back to {one.no_way_back!r}, but another entry is there. "
+            "Decide differently, or rename an entry before the merge."
+        )
+    return one.clash.reason if one.clash else ""
 
 
 def _shown_segments(clash: LabelClash[LabelledRange]) -> ConflictingSegments:

@@ -197,7 +197,7 @@ def _merged(
         now = {key: entry_of(key, value) for key, value in Tree(reader, head).get_several(entries).items()}
     others = [_compared(before.get(key), now.get(key)) for key in entries if before.get(key) != now.get(key)]
     own = [_compared(before.get(key), one) for key, one in entries.items() if before.get(key) != one]
-    return merge_entries(others, own, {}, annotations.merge)
+    return merge_entries(others, own, (), annotations.merge)
 
 
 def _compared(before: DatasetEntry | None, after: DatasetEntry | None) -> ComparedEntry:
