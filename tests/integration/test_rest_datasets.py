@@ -616,6 +616,26 @@ def test_damaged_versions_are_found(owner: httpx.Client, gaits: Callable[..., An
     assert ok(owner.get(f"{GAITS}/refs/main")) == before
 
 
+def test_a_tag_or_dataset_that_is_made_again_is_sent_again(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    (first,) = ok(owner.get(f"{GAITS}/commits"))["items"]
+    change(owner, "gaits/a", tags=["slow"])
+    second = gaits("second")
+    tag = f"{GAITS}/refs/v1"
+
+    def made_again(url: str, list_url: str, body: dict[str, Any]) -> Any:
+        held = owner.get(url).headers["ETag"]
+        assert owner.get(url, headers={"If-None-Match": held}).status_code == 304
+        assert owner.delete(url, headers={"If-Match": held}).status_code == 204
+        ok(owner.post(list_url, json=body), 201)
+        return ok(owner.get(url, headers={"If-None-Match": held}))
+
+    ok(owner.post(f"{GAITS}/refs", json={"name": "v1", "kind": "tag", "at": first["digest"]}), 201)
+    body = {"name": "v1", "kind": "tag", "at": second["digest"]}
+    assert made_again(tag, f"{GAITS}/refs", body)["commit"] == second["digest"]
+    was = ok(owner.get(GAITS))["id"]
+    assert made_again(GAITS, f"{LAB}/datasets", {"name": "gaits", "collection": "gaits"})["id"] != was
+
+
 def test_the_numbers_of_datasets_and_of_tags_are_limited(
     owner: httpx.Client, gaits: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
