@@ -288,7 +288,7 @@ def test_who_may_write_but_not_read_does_not_see_what_they_change(house: House) 
             changed = writer.patch(path, json={}, headers={"If-Match": "*"})
             assert changed.status_code == status
             assert bool(changed.content) == (status == 200)
-            assert "ETag" in changed.headers
+            assert changed.headers["ETag"].count(".") == (2 if status == 200 else 1)  # with a digest of the answer
         created = writer.post("/projects/lab/collections", json={"path": f"made/{'-'.join(scopes)}".replace("!", "")})
         assert created.status_code == (201 if status == 200 else 204)
         assert created.headers["Location"].startswith("/api/v1/projects/lab/collections/")

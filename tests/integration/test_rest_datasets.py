@@ -695,6 +695,26 @@ def test_damaged_versions_are_found(owner: httpx.Client, gaits: Callable[..., An
     assert ok(owner.get(f"{GAITS}/refs/main")) == before
 
 
+def test_a_tag_or_dataset_that_is_made_again_is_sent_again(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    (first,) = ok(owner.get(f"{GAITS}/commits"))["items"]
+    change(owner, "gaits/a", tags=["slow"])
+    second = gaits("second")
+    tag = f"{GAITS}/refs/v1"
+
+    def made_again(url: str, list_url: str, body: dict[str, Any]) -> Any:
+        held = owner.get(url).headers["ETag"]
+        assert owner.get(url, headers={"If-None-Match": held}).status_code == 304
+        assert owner.delete(url, headers={"If-Match": held}).status_code == 204
+        ok(owner.post(list_url, json=body), 201)
+        return ok(owner.get(url, headers={"If-None-Match": held}))
+
+    ok(owner.post(f"{GAITS}/refs", json={"name": "v1", "kind": "tag", "at": first["digest"]}), 201)
+    body = {"name": "v1", "kind": "tag", "at": second["digest"]}
+    assert made_again(tag, f"{GAITS}/refs", body)["commit"] == second["digest"]
+    was = ok(owner.get(GAITS))["id"]
+    assert made_again(GAITS, f"{LAB}/datasets", {"name": "gaits", "collection": "gaits"})["id"] != was
+
+
 def test_the_numbers_of_datasets_and_of_tags_are_limited(
     owner: httpx.Client, gaits: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -741,3 +761,26 @@ def test_contents_of_other_projects_and_unknown_ones_are_null(owner: httpx.Clien
     assert contents(owner, **unknown) == {"revisions": [None], "documents": [None]}
     many = ["sha256:" + "0" * 64] * 257
     refused(owner.post(f"{LAB}/contents", json={"revisions": many}), 422, "invalid-body")
+
+
+def test_references_to_other_projects_tell_nothing(
+    owner: httpx.Client, gaits: Callable[..., Any], server: Server, database: Database
+) -> None:
+    """A stranger's documents refer to a revision of a private project, and to one that does not exist."""
+    real = {"item": item_at(owner, "gaits/a")["id"], "revision": 1}
+    absent = {**real, "revision": 2}
+    stranger = server.client(server.make_user("stranger"))
+    ok(stranger.post("/projects", json={"name": "own"}), 201)
+    parts = {"character": {"schema": "marey/document@1", "real": real, "absent": absent}}
+    ok(stranger.post("/projects/own/characters", json={"name": "spy", "collection": "c", "parts": parts}), 201)
+    ok(stranger.post("/projects/own/datasets", json={"name": "spies", "collection": "c"}), 201)
+    database.write(SYSTEM, lambda tx: tx.execute(update(revision).values(content=None)))
+    ok(stranger.post("/projects/own/datasets/spies/commits", json={"message": "m"}), 201)
+    (entry,) = ok(stranger.get("/projects/own/datasets/spies/entries"))["items"]
+    content = revision_content(entry["kind"], entry["parts"])
+    wanted = [{"content": content, "part": "character"}]
+    (document,) = contents(stranger, "/projects/own", documents=wanted)["documents"]
+    assert (document["real"], document["absent"]) == (real, absent)
+    assert document_digest(document) == entry["parts"]["character"]
+    stored = select(revision.c.content).where(revision.c.item_id == real["item"])
+    assert database.read(SYSTEM, lambda tx: tx.execute(stored).scalars().all()) == [None]

@@ -164,6 +164,20 @@ def test_an_item_with_new_facets_is_sent_again(server: Server, owner: httpx.Clie
     assert owner.get(clip, headers={"If-None-Match": changed.headers["ETag"]}).status_code == 304
 
 
+def test_what_has_moved_along_with_its_folder_is_sent_again(owner: httpx.Client, clip: str) -> None:
+    """The paths of items and datasets contain the paths of folders, which change without a new `rev`."""
+    folder = owner.post("/projects/lab/collections", json={"path": "takes"}).json()["id"]
+    assert owner.patch(clip, json={"collection": "takes"}, headers={"If-Match": "*"}).status_code == 200
+    assert owner.post("/projects/lab/datasets", json={"name": "takes", "collection": "takes"}).status_code == 201
+    held = {path: owner.get(path).headers["ETag"] for path in (clip, "/projects/lab/datasets/takes")}
+    url = f"/projects/lab/collections/{folder}"
+    assert owner.patch(url, json={"path": "walks"}, headers={"If-Match": "*"}).status_code == 200
+    for path, etag in held.items():
+        answer = owner.get(path, headers={"If-None-Match": etag})
+        assert (answer.status_code, answer.json()["collection"]) == (200, "walks")
+        assert owner.get(path, headers={"If-None-Match": answer.headers["ETag"]}).status_code == 304
+
+
 def test_a_change_says_which_state_it_changes(owner: httpx.Client, clip: str) -> None:
     etag = owner.get(clip).headers["ETag"]
     change = {"name": "run"}
@@ -173,8 +187,9 @@ def test_a_change_says_which_state_it_changes(owner: httpx.Client, clip: str) ->
     assert changed.headers["ETag"] != etag
     late = owner.patch(clip, json={"name": "jump"}, headers={"If-Match": etag})
     assert late.status_code == 412
-    assert late.headers["ETag"] == changed.headers["ETag"]
+    assert late.headers["ETag"] == f'"{changed.json()["rev"]}.json"'
     assert owner.get(clip).json()["name"] == "run"
+    assert owner.patch(clip, json=change, headers={"If-Match": late.headers["ETag"]}).status_code == 200
     assert owner.patch(clip, json={"name": "jump"}, headers={"If-Match": "*"}).status_code == 200
 
 

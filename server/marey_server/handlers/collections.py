@@ -7,7 +7,7 @@ from pydantic import Field
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate
 from marey_server.http.declarations import Access, reads, writes
 from marey_server.http.queries import PageQuery
-from marey_server.http.reply import Rendered, Reply, with_role
+from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store import collections
 
@@ -65,7 +65,7 @@ class CollectionResource(Resource):
     @reads(access=Access.READER, answer=Collection, etag=True)
     async def get(self, project: str, collection: str) -> Rendered:
         """Return a folder."""
-        return await self.answer_with(with_role, collections.read_collection, project, collection)
+        return await self.answer(collections.read_collection, project, collection)
 
     @writes(
         access=Access.CONTRIBUTOR,

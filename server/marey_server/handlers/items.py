@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert, Lineage, QueryExplanation, Revision, Staleness
 from marey_schemas.kinds import Kind
 from marey_schemas.lineage import LineageGraph, LineageRequest
@@ -90,16 +87,6 @@ def kind_of(plural: str) -> Kind:
         ) from None
 
 
-def reply_with(found: Item) -> Reply:
-    """Return the answer that shows an item.
-
-    The ETag depends on `rev` and on the facets, because jobs can change the facets without a new `rev`.
-    """
-    if not found.facets:
-        return Reply(found, rev=found.rev)
-    return Reply(found, rev=f"{found.rev}.{hashlib.sha256(canonical_json(found.facets)).hexdigest()[:16]}")
-
-
 class ItemsOfKind(Resource):
     """Items of a kind in a project."""
 
@@ -151,7 +138,7 @@ class ItemResource(Resource):
     @reads(access=Access.READER, answer=Item, etag=True, attempts=True)
     async def get(self, project: str, kind: str, item: str) -> Rendered:
         """Return an item at its newest revision: name, folder, tags, summary, documents."""
-        return await self.answer_with(reply_with, items.read_item, project, kind_of(kind), item)
+        return await self.answer(items.read_item, project, kind_of(kind), item)
 
     @writes(
         access=Access.CONTRIBUTOR, body=ItemChange, answer=Item, precondition="required", etag=True, in_folders=True
@@ -159,9 +146,7 @@ class ItemResource(Resource):
     async def patch(self, project: str, kind: str, item: str, body: ItemChange) -> Rendered:
         """Rename, move or tag an item."""
         expected_rev = self.precondition.expected_rev
-        return await self.answer_with(
-            reply_with, items.change_item, project, kind_of(kind), item, body, expected_rev=expected_rev
-        )
+        return await self.answer(items.change_item, project, kind_of(kind), item, body, expected_rev=expected_rev)
 
     @writes(access=Access.MAINTAINER, precondition="required", in_folders=True)
     async def delete(self, project: str, kind: str, item: str) -> Rendered:
@@ -179,7 +164,7 @@ class ItemRestoration(Resource):
     @writes(access=Access.MAINTAINER, answer=Item, etag=True, idempotency="key", in_folders=True)
     async def post(self, project: str, kind: str, item: str) -> Rendered:
         """Restore a deleted item."""
-        return await self.answer_with(reply_with, items.restore_item, project, kind_of(kind), item)
+        return await self.answer(items.restore_item, project, kind_of(kind), item)
 
 
 class ItemReversion(Resource):
@@ -200,9 +185,7 @@ class ItemReversion(Resource):
     async def post(self, project: str, kind: str, item: str, body: ItemRevert) -> Rendered:
         """Create a revision with the content of an earlier revision; name, folder and tags do not change."""
         expected_rev = self.precondition.expected_rev
-        return await self.answer_with(
-            reply_with, items.revert_item, project, kind_of(kind), item, body, expected_rev=expected_rev
-        )
+        return await self.answer(items.revert_item, project, kind_of(kind), item, body, expected_rev=expected_rev)
 
 
 class Revisions(Resource):

@@ -7,7 +7,7 @@ from pydantic import Field
 from marey_schemas.access import Member, MemberChange, Project, ProjectChange, ProjectCreate, QuotaChange, QuotasInUse
 from marey_server.http.declarations import Access, reads, writes
 from marey_server.http.queries import PageQuery
-from marey_server.http.reply import Rendered, Reply, with_role
+from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store import members, projects
 
@@ -62,7 +62,7 @@ class ProjectResource(Resource):
     @reads(access=Access.READER, answer=Project, etag=True)
     async def get(self, project: str) -> Rendered:
         """Return a project and your role in it."""
-        return await self.answer_with(with_role, projects.read_project, project)
+        return await self.answer(projects.read_project, project)
 
     @writes(access=Access.OWNER, body=ProjectChange, answer=Project, precondition="required", etag=True)
     async def patch(self, project: str, body: ProjectChange) -> Rendered:

@@ -1,9 +1,13 @@
 """Entity tags and preconditions (RFC 9110, section 13).
 
 A tag is `"<state>.<form>"`: the state of a resource, and the form (media type) in which it was sent. If the resource
-can be changed, the state begins with the `rev` of the resource. After a dot, the state can contain the caller's role,
-if the answer depends on the role, or a digest of members that change without a new `rev`. Preconditions of writes
-compare only the `rev`, so that a resource read as MessagePack can be changed with JSON.
+can be changed, the state begins with the `rev` of the resource. If the resource is described by a model, a dot and a
+digest of the answer follow, because the answer can change without a new `rev`: if the caller gets another role, a job
+publishes facets, a folder above an item is moved, or a deleted branch is created again under the same name.
+
+Preconditions of writes compare only the `rev`, so that a resource read as MessagePack can be changed with JSON, and a
+client that knows only the `rev` can send it. So If-Match also accepts a tag of a deleted resource if the new resource
+of the same name has the same `rev`.
 """
 
 from __future__ import annotations
@@ -40,6 +44,12 @@ ABSENT = Precondition(absent=True)
 def entity_tag(state: int | str, form: str) -> str:
     """Return the ETag header for a state and a form."""
     return f'"{state}.{form}"'
+
+
+def without_digest(tag: str) -> str:
+    """Return a tag without the digest of the answer."""
+    rev, *_, form = tag.strip('"').split(".")
+    return entity_tag(rev, form)
 
 
 def parse_tags(header: str) -> list[str]:

@@ -7,6 +7,7 @@ connection of the transaction.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,14 +15,12 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from marey_schemas.access import Project
 from marey_schemas.address import API
 from marey_schemas.encoding.codecs import JSON as JSON_NAME
 from marey_schemas.encoding.codecs import encode_tree
-from marey_schemas.items import Collection
 from marey_schemas.lru import LruCache
 from marey_server.http.caching import REVALIDATED
-from marey_server.http.etags import entity_tag, matches
+from marey_server.http.etags import entity_tag, matches, without_digest
 from marey_server.http.negotiation import MediaType
 
 AnswerCache = LruCache[tuple[str, str], bytes]
@@ -63,8 +62,8 @@ Content = BaseModel | Mapping[str, Any] | bytes
 class Reply:
     """Answer of a handler: a model, a document tree, bytes with their media type, or nothing.
 
-    The ETag is made from the field `rev`, which is the `rev` of a resource, optionally followed by a full stop and more
-    text. `location` is a path below the API's root.
+    The ETag is made from the field `rev`, which is the `rev` of a resource or another name of its state; `render` adds
+    a digest of the answer if the content is a model. `location` is a path below the API's root.
     """
 
     content: Content | Lasting | Loaded | None = None
@@ -73,11 +72,6 @@ class Reply:
     location: str | None = None
     media_type: str | None = None
     headers: Mapping[str, str] = field(default_factory=dict)
-
-
-def with_role(content: Project | Collection) -> Reply:
-    """Return the answer for a document that shows the caller's role; the role can change without a new `rev`."""
-    return Reply(content, rev=f"{content.rev}.{content.role or 'guest'}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +83,13 @@ class Rendered:
     body: bytes
 
     def without_content(self) -> Rendered:
-        """Return this answer without its body, for a caller who may make the change but not read its result."""
+        """Return this answer without its body, for a caller who may make the change but not read its result.
+
+        The ETag contains no digest of the body, because the caller could check guesses of the content with it.
+        """
         headers = {name: value for name, value in self.headers.items() if name != "Content-Type"}
+        if "ETag" in headers:
+            headers["ETag"] = without_digest(headers["ETag"])
         return Rendered(204, headers, b"")
 
 
@@ -129,6 +128,8 @@ def render(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Rendered:
     If the client already has this state in this form, the status is 304 and there is no body. Encoded documents are
     added to `answers`.
     """
+    if reply.rev is not None and isinstance(reply.content, BaseModel):
+        reply = _with_digest(reply, encode(reply.content, form.media), form.media)
     headers = {"Vary": "Accept, Accept-Encoding", **reply.headers}
     if reply.location is not None:
         headers["Location"] = API + reply.location
@@ -141,6 +142,12 @@ def render(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Rendered:
         return Rendered(reply.status or form.status, headers, b"")
     headers["Content-Type"] = reply.media_type or str(form.media)
     return Rendered(reply.status or form.status, headers, _body(reply.content, form.media, answers))
+
+
+def _with_digest(reply: Reply, body: bytes, media: MediaType) -> Reply:
+    """Return the reply with its encoded model `body` as content, and with a digest of this body in its `rev`."""
+    state = f"{reply.rev}.{hashlib.sha256(body).hexdigest()[:16]}"
+    return replace(reply, content=body, media_type=reply.media_type or str(media), rev=state)
 
 
 def _body(content: Content | Lasting | Loaded, media: MediaType, answers: AnswerCache) -> bytes:

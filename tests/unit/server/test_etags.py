@@ -3,11 +3,23 @@
 import pytest
 
 from marey_server.errors import BadRequestProblem, PreconditionFailedProblem, PreconditionRequiredProblem
-from marey_server.http.etags import ABSENT, ANY_STATE, entity_tag, matches, parse_tags, write_precondition
+from marey_server.http.etags import (
+    ABSENT,
+    ANY_STATE,
+    entity_tag,
+    matches,
+    parse_tags,
+    without_digest,
+    write_precondition,
+)
 
 
 def test_a_tag_names_state_and_form() -> None:
     assert entity_tag(7, "msgpack") == '"7.msgpack"'
+
+
+def test_the_digest_of_an_answer_can_be_left_out() -> None:
+    assert without_digest('"7.0a1b2c.json"') == without_digest('"7.json"') == '"7.json"'
 
 
 @pytest.mark.parametrize("header", ['"7.json"', 'W/"7.json"', '"6.json", "7.json"', "*"])

@@ -75,7 +75,8 @@ class AnnotationMerger:
             for content in three
         }
         bodies = documents.load_bodies(self._tx, chosen)
-        contents = find_contents_of(self._tx, {one for body in bodies.values() for one in references_in(body["clip"])})
+        clips = {one for body in bodies.values() for one in references_in(body["clip"])}
+        contents = find_contents_of(self._tx, self._project_id, clips)
         return [
             refusal or self._merge_versions([bodies[digests[content]] for content in three], contents)
             for three, refusal in zip(versions, refused, strict=True)

@@ -309,7 +309,8 @@ def _from_changes(
     before = before or build(store, [])
     put = [one for one in changes if isinstance(one, PutEntry)]
     rows = _items_named(tx, project_row, put)
-    contents = find_contents_of(tx, {RevisionKey(one.item, one.revision or rows[one.item].head) for one in put})
+    wanted = {RevisionKey(one.item, one.revision or rows[one.item].head) for one in put}
+    contents = find_contents_of(tx, project_row.id, wanted)
     tags = tags_of(tx, [one.item for one in put])
     keys = {key_of(one.path, one.kind) for one in changes if isinstance(one, RemoveEntry | MoveEntry)}
     keys |= {key_of(one.to, one.kind) for one in changes if isinstance(one, MoveEntry)}

@@ -27,16 +27,16 @@ class Contents:
     """Content digests of parts that are not stored yet: by revision, then by name of the part."""
 
 
-def find_contents_of(tx: Transaction, wanted: Iterable[RevisionKey]) -> Contents:
-    """Return the content digests of existing revisions and of the revisions to which they refer.
+def find_contents_of(tx: Transaction, project_id: str, wanted: Iterable[RevisionKey]) -> Contents:
+    """Return the content digests of the wanted revisions of a project, and of the revisions to which they refer.
 
-    Missing digests are computed.
+    Revisions that do not exist or belong to other projects are left out. Missing digests are computed.
     """
     found = Contents()
     waiting: dict[RevisionKey, _Waiting] = {}
     further = set(wanted)
     while further:
-        read = _read(tx, sorted(further), found)
+        read = _read(tx, project_id, sorted(further), found)
         waiting |= read
         referred = {reference for one in read.values() for reference in one.references}
         further = referred - waiting.keys() - found.revisions.keys() - further
@@ -78,14 +78,21 @@ class _Waiting:
         return {reference for body in self.bodies.values() for reference in references_in(body)}
 
 
-def _read(tx: Transaction, wanted: Sequence[RevisionKey], found: Contents) -> dict[RevisionKey, _Waiting]:
+def _read(
+    tx: Transaction, project_id: str, wanted: Sequence[RevisionKey], found: Contents
+) -> dict[RevisionKey, _Waiting]:
     """Add the stored digests of the wanted revisions to `found`, and return the revisions without a stored digest.
 
-    Revisions that do not exist are left out.
+    Only revisions of the project are read. Anybody can write a reference to a revision of another project into free
+    members of a document, and the digest of this revision would show whether it exists and what it contains.
     """
     waiting: dict[RevisionKey, _Waiting] = {}
     for some in map(set, in_lists(wanted)):
-        rows = [row for row in tx.execute(_PARTS.where(*_among(some))) if RevisionKey(row.item_id, row.number) in some]
+        rows = [
+            row
+            for row in tx.execute(_PARTS.where(*_among(some)))
+            if row.project_id == project_id and RevisionKey(row.item_id, row.number) in some
+        ]
         lacking = {row.document_digest for row in rows if row.of_revision is None}
         bodies = _bodies(tx, lacking)
         by_revision: dict[RevisionKey, list[Any]] = {}
@@ -112,6 +119,7 @@ _PARTS = (
         revision_part.c.content,
         revision.c.content.label("of_revision"),
         item.c.kind,
+        item.c.project_id,
     )
     .join(revision, and_(revision.c.item_id == revision_part.c.item_id, revision.c.number == revision_part.c.number))
     .join(item, item.c.id == revision_part.c.item_id)
@@ -123,7 +131,8 @@ def _among(wanted: Collection[RevisionKey]) -> tuple[ColumnElement[bool], ...]:
 
     Ids and numbers are compared separately, because SQLite would scan the whole table to compare pairs. So the parts of
     a revision that is not wanted meet the conditions, too, if the id and the number of this revision each occur in
-    `wanted`. Callers skip such parts.
+    `wanted`. Callers skip such parts. They compare the project, too: SQLite would scan all items of a project that the
+    conditions name.
     """
     ids, numbers = {one.item for one in wanted}, {one.revision for one in wanted}
     return revision_part.c.item_id.in_(sorted(ids)), revision_part.c.number.in_(sorted(numbers))

@@ -54,7 +54,7 @@ def read_folder(tx: Transaction, project_row: ProjectRow, found: Row[Any]) -> Fo
             f"The folder {found.path!r} of the dataset is deleted; restore it first.", code="folder-deleted"
         )
     rows = tx.execute(_items_in(project_row, found.path)).all()
-    contents = find_contents_of(tx, [RevisionKey(row.id, row.head) for row in rows])
+    contents = find_contents_of(tx, project_row.id, [RevisionKey(row.id, row.head) for row in rows])
     tags = tags_of(tx, [row.id for row in rows])
     entries, items = {}, {}
     for row in rows:

@@ -52,10 +52,10 @@ def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> di
     project_row = projects.require(tx, project)
     wanted = {*request.revisions, *(one.content for one in request.documents)}
     held = {one: RevisionKey(*key) for one, key in revisions_with(tx, project_row.id, wanted).items()}
-    contents = find_contents_of(tx, held.values())
+    contents = find_contents_of(tx, project_row.id, held.values())
     return {
         "revisions": _described(tx, held, contents, request),
-        "documents": _loaded(tx, held, request),
+        "documents": _loaded(tx, project_row.id, held, request),
     }
 
 
@@ -72,7 +72,9 @@ def _described(
     ]
 
 
-def _loaded(tx: Transaction, held: Mapping[str, RevisionKey], request: ContentsRequest) -> list[dict[str, Any] | None]:
+def _loaded(
+    tx: Transaction, project_id: str, held: Mapping[str, RevisionKey], request: ContentsRequest
+) -> list[dict[str, Any] | None]:
     parts = read_part_digests(tx, {held[one.content] for one in request.documents if one.content in held})
     digests = [parts[held[one.content]].get(one.part) if one.content in held else None for one in request.documents]
     present = sorted({digest for digest in digests if digest is not None})
@@ -83,7 +85,7 @@ def _loaded(tx: Transaction, held: Mapping[str, RevisionKey], request: ContentsR
     chosen = _that_fit(digests, sizes)
     loaded = documents.load_documents(tx, {digest for digest in chosen if digest is not None})
     referred = {one for tree in loaded.values() for one in references_in(tree)}
-    contents = find_contents_of(tx, referred)
+    contents = find_contents_of(tx, project_id, referred)
     return [None if digest is None else portable_document(loaded[digest], contents.revisions.get) for digest in chosen]
 
 

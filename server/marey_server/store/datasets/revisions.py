@@ -67,7 +67,7 @@ def publish_contents(
         tx, project_row, lacking, author_id=author_id, rights=rights, job_id=job_id, refer_to_deleted=True
     )  # fmt: skip
     keys = {one.name: RevisionKey(one.item, one.revision) for one in made}
-    contents = find_contents_of(tx, keys.values())
+    contents = find_contents_of(tx, project_row.id, keys.values())
     for content, key in keys.items():
         if contents.revisions[key] != content:
             raise InvalidProblem(

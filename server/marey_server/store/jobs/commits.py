@@ -280,7 +280,7 @@ def _publish_entries(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft
     Also stores the content digests of the outputs, so that a parent job need not compute them.
     """
     outputs = staging.publish_drafts(tx, row, drafts)
-    store_contents(tx, find_contents_of(tx, map(_revision, outputs)))
+    store_contents(tx, find_contents_of(tx, row.project_id, map(_revision, outputs)))
     return [{**one, "entry": _entry_path(row, drafts[one["name"]])} for one in outputs]
 
 
@@ -314,7 +314,7 @@ def _entries_of(tx: Transaction, row: Any, outputs: Iterable[Mapping[str, Any]])
     entries: dict[str, DatasetEntry] = {}
     revisions: dict[str, RevisionKey] = {}
     for some in in_lists(outputs):
-        contents = find_contents_of(tx, map(_revision, some))
+        contents = find_contents_of(tx, row.project_id, map(_revision, some))
         tags = tags_of(tx, sorted({one["item"] for one in some}))
         for one in some:
             path = _free_path(one, revisions)
