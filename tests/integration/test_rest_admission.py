@@ -18,7 +18,7 @@ from marey_schemas.encoding import blocks
 from marey_server.access.principal import SYSTEM
 from marey_server.http.resource import GUEST_BODY_BYTES, Resource
 from marey_server.store.database.connections import Database
-from marey_server.store.database.lanes import SERVER
+from marey_server.store.database.lanes import SERVER, Client
 
 INVENTED = "marey_aaaaaaaaaaaa_" + "b" * 64
 MIB = 2**20
@@ -93,7 +93,7 @@ def test_arrays_take_from_the_memory_of_requests_before_they_are_decoded(
         client = server.client(server.make_project())
         monkeypatch.setattr("marey_schemas.encoding.codecs.array_from_leaf", None)
         body = packed(np.zeros((MIB, 1), np.float32))
-        server.app.services.memory.take("somebody else", 0, 1, reserved=False)
+        server.app.services.memory.take(Client("somebody else"), 0, 1, reserved=False)
         refused = client.post(CLIPS, content=body, headers=MSGPACK)
         assert (refused.status_code, refused.json()["code"]) == (503, "memory")
 

@@ -11,6 +11,7 @@ from tests.support.search_primitives import walking
 from marey_motion.documents import skeleton_to_document
 from marey_motion.modelling.primitive_documents import primitive_to_tree
 from marey_schemas.encoding import codecs
+from marey_server.store.database.lanes import Client
 
 
 def created(owner: httpx.Client, kind: str, name: str, **parts: object) -> dict[str, Any]:
@@ -36,7 +37,7 @@ def test_the_documents_of_a_model_count_as_memory_before_they_are_packed(
     server: Server, owner: httpx.Client, place: str
 ) -> None:
     services = server.app.services
-    services.memory.take("somebody else", 0, services.memory.total_bytes, reserved=False)
+    services.memory.take(Client("somebody else"), 0, services.memory.total_bytes, reserved=False)
     refused = owner.get(f"{place}/samples")
     assert (refused.status_code, refused.json()["code"], len(services.models)) == (503, "memory", 0)
 

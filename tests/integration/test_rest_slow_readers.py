@@ -130,7 +130,7 @@ def test_the_documents_of_an_export_count_as_memory_before_they_are_packed(
     with running(database, tmp_path, request_memory_bytes=DOCUMENT_BYTES) as server:
         token = server.make_project()
         path = add_long_document(server, token).replace("parts/study", "export?format=json")
-        server.app.services.memory.take("somebody else", 0, DOCUMENT_BYTES // 2, reserved=False)
+        server.app.services.memory.take(Client("somebody else"), 0, DOCUMENT_BYTES // 2, reserved=False)
         refused = server.client(token).get(path)
         assert (refused.status_code, refused.json()["code"]) == (503, "memory")
 

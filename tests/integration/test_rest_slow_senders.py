@@ -17,6 +17,7 @@ from marey_server.handlers.blobs import Blob
 from marey_server.handlers.imports import MAX_FORM_BYTES
 from marey_server.store.blobs import SPOOLED_BYTES, digest_of
 from marey_server.store.database.connections import Database
+from marey_server.store.database.lanes import Client
 
 BODY = b"HIERARCHY"
 BLOB = f"/blobs/{digest_of(BODY)}"
@@ -65,10 +66,10 @@ def test_the_memory_of_a_streamed_body_counts_before_the_body_comes(
     wait_until(lambda: memory.held_bytes == 0)
     with sending(server, token, method, path.format(upload=upload), length, content_type):
         wait_until(lambda: memory.held_bytes == held_bytes)
-        memory.take("somebody else", 0, memory.total_bytes - held_bytes, reserved=True)
+        memory.take(Client("somebody else"), 0, memory.total_bytes - held_bytes, reserved=True)
         with sending(server, token, method, path.format(upload=upload), length, content_type) as second:
             assert second.recv(12) == b"HTTP/1.1 503"
-        memory.give_back("somebody else", memory.total_bytes - held_bytes)
+        memory.give_back(Client("somebody else"), memory.total_bytes - held_bytes)
     wait_until(lambda: memory.held_bytes == 0)
 
 

@@ -194,7 +194,7 @@ def test_expired_rows_go_a_few_at_a_time_and_others_stay(
         for name in names:
             hour_us = tx.now_us + 3600 * 10**6
             project_id = tx.execute(sqlalchemy.text("SELECT id FROM project")).scalar_one()
-            rows_of = {
+            rows_of: dict[str, dict[str, Any]] = {
                 "idempotency_key": {"principal": "user", "key": name, "fingerprint": "f"},
                 "token": {"id": name, "user_id": lab.owner.user_id, "name": name, "prefix": name, "secret_hash": "h",
                           "scopes": [], "expires_us": hour_us},

@@ -303,8 +303,8 @@ def test_a_user_whose_receivers_do_not_answer_does_not_delay_others(lab: Lab, mo
     sender = Silence()
 
     async def deliver() -> None:
-        services = SimpleNamespace(settings=SimpleNamespace(webhook_networks=()), database=lab.database)
-        deliverer = delivering.Deliverer(services)
+        services: Any = SimpleNamespace(settings=SimpleNamespace(webhook_networks=()), database=lab.database)
+        deliverer: Any = delivering.Deliverer(services)
         deliverer._sender.close()
         deliverer._sender = sender
         running = asyncio.create_task(deliverer.run())
