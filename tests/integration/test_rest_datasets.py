@@ -390,6 +390,9 @@ def test_a_conflict_is_listed_and_decided(owner: httpx.Client, two_branches: Cal
     other = [{"path": "b", "kind": "skeleton", "take": "ours"}]
     refused(owner.post(f"{GAITS}/merges", json={"version": "trial", "resolutions": other}), 422, "no-conflict")
     theirs = [{"path": "a", "kind": "skeleton", "take": "theirs"}]
+    twice = [*theirs, {"path": "a", "kind": "skeleton", "take": "ours"}]
+    refused(owner.post(f"{GAITS}/merges", json={"version": "trial", "resolutions": twice}), 422, "no-conflict")
+    assert ok(owner.get(f"{GAITS}/commits/main")) == before
     ok(owner.post(f"{GAITS}/merges", json={"version": "trial", "resolutions": theirs}))
     assert entries(owner)["a"]["parts"] == entries(owner, "trial")["a"]["parts"]
 

@@ -80,6 +80,8 @@ class MergedEntries:
     conflicts: list[MergeConflict] = field(default_factory=list)
     decided: set[str] = field(default_factory=set)
     """Keys of the resolutions that decided a conflict."""
+    unused: list[str] = field(default_factory=list)
+    """Keys of the resolutions that decided no conflict, in order; a key may also be in `decided`."""
 
 
 def merge_entries(
@@ -122,6 +124,7 @@ def merge_entries(
         else:
             decided.append(found)
     _apply(decided, mine, choices, merged)
+    merged.unused += choices.left()
     return merged
 
 
@@ -140,6 +143,10 @@ class _Choices:
             return None
         self._used.add(key)
         return self._left[key].popleft()
+
+    def left(self) -> list[str]:
+        """Return the keys of the resolutions that are left, in order."""
+        return sorted(key for key, sides in self._left.items() for _ in sides)
 
 
 class _Decided(NamedTuple):

@@ -25,6 +25,7 @@ from marey_client.cli.addresses import Address, require_item, the_thing
 from marey_client.cli.app import app
 from marey_client.cli.clip_jobs import _print_aligned, _print_warnings, print_labelled
 from marey_client.cli.datasets import combining
+from marey_client.cli.datasets.combining import resolutions_of
 from marey_client.cli.files import uploading
 from marey_client.cli.files.listing import _items_in
 from marey_client.cli.files.uploading import _print_entries
@@ -489,6 +490,13 @@ def test_a_token_whose_file_cannot_be_written_is_never_made(
     with pytest.raises(Forbidden):
         tokens.create_token(NO_OPTIONS, "ci", output=tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+def test_a_conflict_cannot_be_decided_for_two_sides() -> None:
+    [one, same] = resolutions_of(None, ["raw/a:clip", "raw/a:clip"], None)
+    assert one == same
+    with pytest.raises(WrongUsage, match="two different sides"):
+        resolutions_of(["raw/a:clip"], None, ["/raw/a:clip"])
 
 
 def test_a_token_is_bound_to_labels_and_listed_with_them(

@@ -179,13 +179,17 @@ def resolutions_of(
     """Return the decision for each conflict that the options --ours, --theirs and --base name."""
     from marey_schemas.datasets.merges import Resolution, Side
 
-    found = []
+    found: list[Resolution] = []
     for side, places in ((Side.OURS, ours), (Side.THEIRS, theirs), (Side.BASE, base)):
         for place in places or ():
             path, colon, kind = place.rpartition(":")
             if not colon:
                 raise WrongUsage(f"{place!r} names no kind; write path:kind, such as raw/walk:clip")
-            found.append(Resolution.model_validate({"path": path.strip("/"), "kind": kind, "take": side}))
+            one = Resolution.model_validate({"path": path.strip("/"), "kind": kind, "take": side})
+            if any((other.path, other.kind) == (one.path, one.kind) and other.take != side for other in found):
+                # Their order would decide which conflict each resolves, and options of different names have no order.
+                raise WrongUsage(f"{place!r} has two different sides; to choose them one by one, use Python or REST")
+            found.append(one)
     return found
 
 

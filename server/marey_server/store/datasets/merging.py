@@ -156,7 +156,9 @@ def _combine(
     mine, their = (_changed(store, base, side, most) for side in (ours, theirs))
     annotations = AnnotationMerger(tx, project_id)
     merged = merge_entries(mine, their, resolutions, annotations.merge)
-    if unknown := sorted({key for key, _ in resolutions} - merged.decided):
+    # While conflicts remain, a further resolution of a decided key may be for one that only the next answer shows.
+    unknown = [key for key in merged.unused if key not in merged.decided or not merged.conflicts]
+    if unknown:
         path, kind = path_and_kind(unknown[0])
         raise InvalidProblem(
             f"The {kind} at {path!r} is not in conflict; remove its resolution from the request.", code="no-conflict"
