@@ -73,6 +73,14 @@ def test_the_memory_of_a_streamed_body_counts_before_the_body_comes(
     wait_until(lambda: memory.held_bytes == 0)
 
 
+def test_a_refused_body_holds_no_memory(server: Server) -> None:
+    client, memory = server.client(server.make_project()), server.app.services.memory
+    for _ in range(3):
+        refused = client.patch("/uploads/invented", content=b"a" * 10_000, headers={"Upload-Offset": "0"})
+        assert refused.status_code == 404
+    wait_until(lambda: memory.held_bytes == 0)
+
+
 def test_who_sends_nothing_for_a_while_is_cut_off(database: Database, tmp_path: Path) -> None:
     with running(database, tmp_path, body_timeout_s=0.5) as server:
         token, memory = server.make_project(), server.app.services.memory

@@ -162,8 +162,13 @@ class Resource(CallingExchange):
         """Whether the request waits for a body from a caller without a token, who may never send it."""
         return not self.performing and hasattr(self, "caller") and self.caller.token is None and self.expects_body()
 
-    async def _wait_for_refusal(self) -> None:
-        """Delay the answer to a refused request if the event loop is late and this client was refused several times."""
+    async def _wait_for_refusal(self, error: ApiProblem) -> None:
+        """Delay the answer to a refused request if the event loop is late and this client was refused several times.
+
+        A busy server is no fault of the client, so its refusals (status 503) do not count.
+        """
+        if error.status >= 500:
+            return
         if delay_s := self.services.refusal_brake.delay_s(self.client.key):
             self._release_memory()
             await self.pause(delay_s)
@@ -228,7 +233,8 @@ class Resource(CallingExchange):
                 self.request.connection.set_body_timeout(self.services.settings.upload_timeout_s)  # type: ignore[union-attr]
                 self._pauses.start()
         except ApiProblem as error:
-            await self._wait_for_refusal()
+            self._release_memory()  # `perform` does not release it, because the method of this request never runs
+            await self._wait_for_refusal(error)
             await self.refuse(error)
 
     def _turn(self) -> asyncio.Future[None] | None:
@@ -350,8 +356,8 @@ class Resource(CallingExchange):
         self.performing = True
         try:
             await self._perform(method)
-        except ApiProblem:
-            await self._wait_for_refusal()
+        except ApiProblem as error:
+            await self._wait_for_refusal(error)
             raise
         finally:
             self.holding.release()

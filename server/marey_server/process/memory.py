@@ -72,7 +72,8 @@ def _shares(client: Client) -> dict[str, float]:
     """Return for whom the bytes of a client are counted, each with the largest fraction of the memory it may hold."""
     if client.known:
         return {client.key: CLIENT_SHARE}
-    return {client.key: UNKNOWN_SHARE_EACH, UNKNOWN_CLIENTS: UNKNOWN_SHARE}
+    # A user who is often refused is unknown for a while; bytes that the user held before must not count in this share.
+    return {f"unknown {client.key}": UNKNOWN_SHARE_EACH, UNKNOWN_CLIENTS: UNKNOWN_SHARE}
 
 
 class Holding:

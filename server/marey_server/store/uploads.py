@@ -136,7 +136,9 @@ def finish(tx: Transaction, upload_id: str, digest: str, copy: Path | None) -> S
     if tx.execute(claimed.values(finished_digest=digest, updated_us=tx.now_us)).rowcount:
         row = {"digest": digest, "size_bytes": found.length, "created_us": tx.now_us}
         row["upload_id"] = upload_id if copy is None else None
-        if blobs.insert_new(tx, blob, [row]) and copy is not None:
+        if not blobs.insert_new(tx, blob, [row]):
+            take_back_sent(tx, found.length)
+        elif copy is not None:
             tx.blobs.adopt(copy, digest)
         blobs.add_holder(tx, digest, _places(found))
     faults.point("upload.finish.before_commit")

@@ -33,3 +33,14 @@ def test_a_stranger_leaves_memory_to_other_strangers_and_all_of_them_to_users() 
         holding.release()
     assert memory.held_bytes == 0
     late.grow(TOTAL_BYTES + 1)
+
+
+def test_bytes_that_a_user_held_do_not_count_while_the_user_is_treated_as_a_stranger() -> None:
+    memory = RequestMemory(TOTAL_BYTES)
+    running = Holding(memory, ANNA, reserved=False)
+    running.grow(int(CLIENT_SHARE * TOTAL_BYTES))
+    refused_often = Holding(memory, Client(ANNA.key, known=False), reserved=False)
+    refused_often.grow(10)
+    refused_often.release()
+    running.release()
+    assert memory.held_bytes == 0

@@ -146,6 +146,16 @@ def test_bytes_of_a_cancelled_upload_count_if_they_were_received(lab: Lab) -> No
     lab.write(uploads.create_upload, 699)
 
 
+def test_an_upload_of_bytes_that_are_there_does_not_count(lab: Lab) -> None:
+    lab.database.quotas = Quotas(user_daily_bytes=1300)
+    data = b"a" * 600
+    first = lab.write(uploads.create_upload, len(data))
+    lab.write(uploads.append, first.id, 0, data)
+    lab.write(blobs.put_blob, data)
+    lab.write(uploads.finish, first.id, digest_of(data), None)
+    lab.write(blobs.put_blob, b"b" * 600)
+
+
 def test_every_quota_is_a_setting_with_the_same_default() -> None:
     assert Settings().quotas == Quotas()
     assert {field.name for field in fields(Quotas)} <= Settings.model_fields.keys()

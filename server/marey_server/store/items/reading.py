@@ -11,6 +11,7 @@ from sqlalchemy.types import NullType
 
 from marey_schemas.items import Item, PartPlace, PartSummary
 from marey_schemas.kinds import Kind
+from marey_schemas.sizes import MIB
 from marey_server.errors import GoneProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import documents, projects
 from marey_server.store.database.clock import datetime_of
@@ -256,7 +257,11 @@ def read_part(
     return Part(found.digest, found.revision, found.rev, found.size_bytes, tree)
 
 
-MOST_BYTES_AT_ONCE = 32 << 20
+MOST_BYTES_AT_ONCE = 12 * MIB
+"""Bytes of documents that one answer contains, unless the first document alone is larger.
+
+With the request and the encoded answer, they fit into the memory that one stranger may hold (`process/memory.py`).
+"""
 
 
 @dataclass(frozen=True, slots=True)
