@@ -246,9 +246,9 @@ class Imports:
                 notify("hashing", len(digests), len(files))
             lacking = self.blobs.missing(digests.values())
             by_digest = {digests[file.name]: file for file in files if digests[file.name] in lacking}
-            sending = (pool.submit(self.blobs.put_file, file.path, digest=digest) for digest, file in by_digest.items())
-            for done, upload in enumerate(list(sending), start=1):
-                upload.result()
+            # After a failure or an interruption, `map` cancels the uploads that have not begun.
+            sending = pool.map(lambda one: self.blobs.put_file(one[1].path, digest=one[0]), by_digest.items())
+            for done, _ in enumerate(sending, start=1):
                 notify("sending", done, len(by_digest))
         return tuple(ImportFile(name=file.name, blob=digests[file.name]) for file in files)
 

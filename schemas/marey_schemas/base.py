@@ -9,8 +9,9 @@ class Request(BaseModel):
     """Base of requests. Unknown fields are refused, so that a misspelt option is never ignored silently."""
 
     model_config = ConfigDict(
-        extra="forbid", frozen=True, arbitrary_types_allowed=True, populate_by_name=True, serialize_by_alias=True
-    )
+        extra="forbid", frozen=True, arbitrary_types_allowed=True, populate_by_name=True, serialize_by_alias=True,
+        hide_input_in_errors=True,  # a traceback must not print a password
+    )  # fmt: skip
 
 
 class Answer(BaseModel):

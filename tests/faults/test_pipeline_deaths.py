@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
-from tests.support.tiers import is_soak
 
 from marey_client.handles.pipelines import PipelineRun
 from marey_client.imports import LocalFile, find_files
@@ -30,9 +29,9 @@ StartWorker = Callable[..., WorkerProcess]
 
 @pytest.fixture(scope="module")
 def takes(tmp_path_factory: pytest.TempPathFactory) -> list[LocalFile]:
-    """Different short walks as BVH files; in the tier `soak`, more of them."""
+    """Different short walks as BVH files."""
     folder = tmp_path_factory.mktemp("takes")
-    for number in range(40 if is_soak() else 12):
+    for number in range(40):
         clip = generate_gait(1.0 + number / 100, 0.0, 0.5, 30)
         (folder / f"walk-{number:02d}.bvh").write_bytes(write_motion(clip, "bvh"))
     return list(find_files([folder]).files)

@@ -51,8 +51,8 @@ class FakeServer:
 
     Tests add names of jobs to sets that change the answers. A job in `lost` has lost its lease. Requests about a job in
     `silent` are answered as if the server were unavailable, and counted in `refused`. Results of a job in `slow` are
-    answered only after the job is removed from `slow`. Results of a job in `unwelcome` are refused. A job in
-    `over_quota` cannot complete.
+    answered only after the job is removed from `slow`. Results of a job in `unwelcome` are refused. The completion of a
+    job in `refusals` gets this status and code.
 
     `order` lists claims and ends of jobs. `claimants` contains, for each claim, the tokens with which it was sent. If
     `valid_tokens` is set, claims with other tokens are refused.
@@ -73,7 +73,7 @@ class FakeServer:
         self.silent: set[str] = set()
         self.slow: set[str] = set()
         self.unwelcome: set[str] = set()
-        self.over_quota: set[str] = set()
+        self.refusals: dict[str, tuple[int, str]] = {}
         self.order: list[tuple[str, str]] = []
         self.refused: defaultdict[str, int] = defaultdict(int)
         self.leased: dict[str, FakeJob] = {}
@@ -220,8 +220,8 @@ def _handler(server: FakeServer) -> type[BaseHTTPRequestHandler]:
         def on_complete(self, job: str, body: bytes) -> None:
             server.completing.add(job)
             server.may_complete.wait(60)
-            if job in server.over_quota:
-                return self.problem(409, "quota-exceeded")
+            if job in server.refusals:
+                return self.problem(*server.refusals[job])
             server.completed[job] = json.loads(body)
             server.order.append(("ended", job))
             return self.reply(200, json.dumps({"job": job, "state": "succeeded"}).encode())

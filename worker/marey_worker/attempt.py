@@ -22,7 +22,17 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from marey_client.errors import BlobTooLarge, Conflict, LeaseLost, MareyError, NotFound
+from marey_client.errors import (
+    BlobTooLarge,
+    Conflict,
+    Forbidden,
+    Invalid,
+    LeaseLost,
+    MareyError,
+    NotFound,
+    ServerFailed,
+    TooLarge,
+)
 from marey_schemas.items import PartPlace
 from marey_schemas.processes.child_process import BadMessage, ChildProcess
 from marey_schemas.queue.job_kinds import find_kind
@@ -60,6 +70,8 @@ LOG_LIMIT_BYTES = 64 * MIB
 ANSWER_LIMIT_BYTES = 32 * MIB
 MOST_BLOB_BYTES = 1 << 30
 """Greatest size of a blob that a job may read, because this process, whose memory has no limit, holds it in memory."""
+_REFUSED = (Conflict, Forbidden, Invalid, NotFound, TooLarge)
+"""Answers of the server that say why results cannot be published."""
 MEMORY_PER_BLOB = 4
 """Least ratio of a job's memory limit to the size of a blob; the child needs several times the size of a file."""
 TRANSFERS_AT_ONCE = 4
@@ -365,8 +377,10 @@ class RunningAttempt:
                 self._complete(end)
             except LeaseLost:
                 raise
-            except Conflict as error:  # such as a quota that is exceeded; to compute the results again would not help
+            except _REFUSED as error:  # such as a quota that is exceeded; to compute the results again would not help
                 end = Failed(error.code, f"the results cannot be published: {error}", None, retryable=False)
+            except ServerFailed as error:
+                end = Failed(error.code, f"the results could not be published: {error}", None, retryable=True)
         if not isinstance(end, Done):
             self._api.fail(self._failure(end))
         return end
@@ -389,7 +403,7 @@ class RunningAttempt:
             code, detail, retryable = end.value, self._watch.explain(end), end is not Stop.LOG
             signature = end.value if end in (Stop.MEMORY, Stop.LOG) else None
         return FailRequest(
-            write_id=uuid.uuid4().hex, code=code[:128], detail=detail[-20_000:], signature=signature,
+            write_id=uuid.uuid4().hex, code=(code or "exception")[:128], detail=detail[-20_000:], signature=signature,
             retryable=retryable, interrupted=end is Stop.INTERRUPTED,
         )  # fmt: skip
 

@@ -73,8 +73,9 @@ def scan_frames(lines: TextLines, skeleton: AsfSkeleton) -> tuple[NDArray[np.flo
     """
     text = ending_in_a_line(np.frombuffer(lines.data, np.uint8))
     table = BoneTable.of(skeleton.bones)
-    # Sized by what the text can hold: a frame takes at least its names and two bytes a value.
-    shortest = int(table.name_ends[-1] + 2 * table.first_columns[-1] + 2)
+    # Sized by what the text can hold: a frame has a number, and a line for each bone with channels, but no others.
+    lengths, widths = np.diff(table.name_ends, prepend=0), np.diff(table.first_columns)
+    shortest = 2 + int(np.sum((lengths + 1 + 2 * widths)[widths > 0]))
     values = np.zeros(((len(lines.data) - lines.position) // shortest + 1, int(table.first_columns[-1])))
     seen = np.full(len(skeleton.bones), -1, np.int64)
     long_tokens = np.empty((_LONG_TOKENS_PER_CALL, 5), np.int64)

@@ -20,8 +20,8 @@ from marey_schemas.lru import LruCache
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 _CHANNEL_BY_KEY = {name.lower().encode(): name for name in CHANNELS}
-_FRAMES = re.compile(rb"frames\s*:?\s*(\S+)", re.IGNORECASE)
-_FRAME_TIME = re.compile(rb"frame\s*time\s*:?\s*(\S+)", re.IGNORECASE)
+_FRAMES = re.compile(rb"frames\s*(?::\s*)?(\S+)", re.IGNORECASE)
+_FRAME_TIME = re.compile(rb"frame\s*time\s*(?::\s*)?(\S+)", re.IGNORECASE)
 _BRACES = re.compile(rb"([{}])")
 _END_SITE = -1
 _MOTION_LINE = re.compile(rb"[\r\n][ \t]*motion[ \t]*(?:\r\n|\n|\r)", re.IGNORECASE)

@@ -46,6 +46,8 @@ def detect_format(data: bytes, name: str) -> FileFormat:
     if not start.strip(_BLANK) and not data.strip(_BLANK):
         raise UnknownFormat("the file is empty", code="file-empty", file=name)
     named = next((one for one in IMPORTED if one.names(name)), None)
+    if named is not None and named.name == "predecessor" and int.from_bytes(data[:4], "little") == len(data):
+        return named  # BSON begins with its length, whose bytes may be those with which another format begins
     archive = next((kind for mark, kind in _ARCHIVES.items() if data.startswith(mark)), None)
     if data.startswith(_ZIP):
         if named is not None and named.archive:

@@ -7,6 +7,7 @@ database, and takes and returns only plain values, bytes and arrays. Its results
 from __future__ import annotations
 
 import numpy as np
+from pydantic import ValidationError
 
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_from_document, clip_to_tree, skeleton_from_document
@@ -76,6 +77,10 @@ def import_file(file: FileToImport) -> ImportedFile:
         return _imported(file)
     except MotionError as error:
         return ImportedFile(file.planned.name, refusal=refusal_of(error))
+    except (OverflowError, UnicodeError, ValidationError) as error:  # of a value that no document may contain
+        first = str(error.errors(include_url=False)[0]["msg"]) if isinstance(error, ValidationError) else str(error)
+        refused = FormatError(f"the file contains a value that cannot be stored: {first}", code="value-range")
+        return ImportedFile(file.planned.name, refusal=refusal_of(refused))
 
 
 def refusal_of(error: MotionError) -> Refusal:

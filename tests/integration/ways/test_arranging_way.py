@@ -16,7 +16,8 @@ from tests.support.server_process import ServerProcess
 from tests.support.store_fixtures import skeleton_tree
 
 from marey_client.cli import main
-from marey_client.errors import Conflict
+from marey_client.errors import Conflict, Unreachable
+from marey_client.handles.clips import ClipHandle
 from marey_client.imports import find_files
 from marey_client.items import Items
 from marey_client.marey import Marey
@@ -125,6 +126,8 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, la
         (["restore", "lab", "--query", "name = a"], 2, "the query selects no deleted item of the kind clip in lab;"),
         (["restore", "lab/nowhere", "--query", "name = a"], 2, "there is no folder at lab/nowhere"),
         (["restore", "lab/raw/a", "--preview"], 2, "--preview lists the items that a query selects; add --query"),
+        (["ls", "--deleted", "lab", "--stale"], 2, "--deleted cannot be combined with --explain or --stale"),
+        (["ls", "lab", "--explain", "--query", "name = a", "--tag", "x"], 2, "leave out --tag, --find and --stale"),
     ],
 )
 def test_what_cannot_be_is_told_and_changes_nothing(
@@ -132,6 +135,23 @@ def test_what_cannot_be_is_told_and_changes_nothing(
 ) -> None:
     assert told in run(*arguments, status=status).stderr
     assert clips(lab) == ["raw/a", "raw/b", "raw/c"]
+
+
+def test_clips_whose_records_cannot_be_changed_are_named_with_the_reason(
+    run: Command, lab: ProjectHandle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(self: ClipHandle, _info: object) -> None:
+        raise Unreachable("the server has stopped")
+
+    monkeypatch.setattr(ClipHandle, "put_info", refuse)
+    told = run("record", "lab/raw", "--set", "licence=CC0", status=1).stderr
+    assert "3 clips not changed:" in told
+    assert "raw/b: the server has stopped" in told
+
+
+def test_explanations_of_several_kinds_are_one_document(run: Command, lab: ProjectHandle) -> None:
+    arguments = ("ls", "lab", "--explain", "--query", "name = a", "--kind", "clip", "--kind", "skeleton", "--json")
+    assert len(json.loads(run(*arguments).stdout)) == 2
 
 
 def test_what_was_removed_is_listed_and_comes_back(run: Command, lab: ProjectHandle) -> None:
@@ -142,6 +162,8 @@ def test_what_was_removed_is_listed_and_comes_back(run: Command, lab: ProjectHan
     deleted = json.loads(run("ls", "--deleted", "lab", "--json").stdout)
     assert sorted(f"{one['collection']}/{one['name']}" for one in deleted["items"]) == ["raw/a", "raw/b", "raw/c"]
     assert [one["path"] for one in deleted["collections"]] == ["raw"]
+    selected = json.loads(run("ls", "--deleted", "lab", "--kind", "clip", "--query", "name = a", "--json").stdout)
+    assert ([one["name"] for one in selected["items"]], selected["collections"]) == (["a"], [])
     run("restore", "lab/raw/")
     assert clips(lab) == ["raw/b", "raw/c"]  # what went with the folder, and not what went before
     run("restore", "lab/raw/a")

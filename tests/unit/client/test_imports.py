@@ -2,7 +2,8 @@
 
 import json
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 from tests.support.scripted_server import ScriptedServer
 
 from marey_client import errors
-from marey_client.imports import FILES_PER_IMPORT, LocalFile, batches, find_files, refusal_text
+from marey_client.imports import FILES_PER_IMPORT, Imports, LocalFile, batches, find_files, refusal_text
 from marey_schemas.options.imports import ImportOptions
 
 
@@ -184,3 +185,28 @@ def test_an_asf_never_travels_without_the_amc_files_that_need_it() -> None:
     portions = names_of(batches(named(names)))
     assert sorted({name for portion in portions for name in portion}) == names
     assert all(any(name.endswith(".amc") for name in portion) for portion in portions if "b/b.asf" in portion)
+
+
+class FullDisk:
+    """Blobs of a server that stores nothing."""
+
+    def __init__(self) -> None:
+        self.sent: list[str] = []
+
+    def missing(self, digests: Iterable[str]) -> set[str]:
+        return set(digests)
+
+    def put_file(self, _path: Path, *, digest: str) -> None:
+        self.sent.append(digest)
+        time.sleep(0.01)
+        raise errors.Unreachable("the server has stopped")
+
+
+def test_after_a_failure_no_further_file_is_sent(tmp_path: Path) -> None:
+    for number in range(200):
+        (tmp_path / f"walk-{number}.bvh").write_text(str(number))
+    full: Any = FullDisk()
+    nothing: Any = None
+    with pytest.raises(errors.Unreachable):
+        Imports(nothing, "lab", full, nothing).send(find_files([tmp_path]).files)
+    assert len(full.sent) < 100

@@ -222,3 +222,21 @@ class TestPairing:
         assert "no ASF" in str(alone.reason)
         assert unlike.companion is None
         assert "2 ASF" in str(unlike.reason)
+
+
+def test_frames_may_be_shorter_than_the_names_of_bones_without_channels() -> None:
+    fixed = "".join(
+        f"  begin\n    id {number}\n    name {'x' * 100}{number}\n    direction 0 -1 0\n    length 1\n"
+        "    axis 0 0 0 XYZ\n  end\n"
+        for number in range(4, 31)
+    )
+    names = " ".join(f"{'x' * 100}{number}" for number in range(4, 31))
+    asf = ASF.replace(":hierarchy", f"{fixed}:hierarchy", 1)
+    asf = asf.replace("  root thigh", f"  root thigh {names}", 1)
+    assert asf.count("begin") > ASF.count("begin")
+    head, frames = AMC.split("\n1\n", 1)
+    one = frames.split("\n2\n", 1)[0]
+    text = head + "".join(f"\n{number}\n{one.rstrip()}" for number in range(1, 501)) + "\n"
+    rotations = read(text, asf).rotations
+    assert rotations is not None
+    assert len(rotations) == 500

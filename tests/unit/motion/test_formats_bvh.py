@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from tests.support.motion_files import ARM, POSITIONS, ZXY, bvh, nested, rows_of
 
 from marey_motion.errors import FormatError, FormatLimit
-from marey_motion.formats import bvh_hierarchy
+from marey_motion.formats import bvh_hierarchy, read_motion
 from marey_motion.formats.bvh import read_bvh
 from marey_motion.importing.source import SourceMotion
 from marey_schemas.lru import LruCache
@@ -318,3 +318,19 @@ def test_files_of_one_skeleton_read_alike_whether_its_hierarchy_was_read_before_
     with pytest.raises(FormatError) as refused:
         read_bvh(bvh(["0 0 0 0 0 0 0 0 0", "0 0 x 0 0 0 0 0 0"]), "take.bvh")
     assert refused.value.line == 20
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("line", ["Frames" + " " * 300_000 + "1 2", "Frame Time" + " " * 300_000 + "1 2"])
+def test_a_long_line_of_the_header_is_refused_soon(line: str) -> None:
+    text = bvh().decode()
+    word = line.split(" " * 10, 1)[0]
+    found = next(one for one in text.splitlines() if one.startswith(word))
+    with pytest.raises(FormatError):
+        read_motion(text.replace(found, line).encode(), "take.bvh")
+
+
+@pytest.mark.timeout(60)
+def test_a_long_word_that_is_no_number_is_refused_soon() -> None:
+    with pytest.raises(FormatError):
+        read_motion(bvh().replace(b"OFFSET 0", b"OFFSET " + b"1" * 300_000 + b"x", 1), "take.bvh")

@@ -28,6 +28,8 @@ from marey_schemas.formats import MOTION_FORMATS
         (bz2.compress(b"x"), "take", "predecessor"),
         (b"\x02\x50" + bytes(510), "take", "c3d"),
         (b"anything", "take.BVH", "bvh"),
+        (b"\x02\x50\x00\x00" + bytes(0x5002 - 4), "take.bson", "predecessor"),
+        (b"\x1f\x8b\x00\x00" + bytes(0x8B1F - 4), "take.bson", "predecessor"),
     ],
 )
 def test_bytes_count_more_than_names(data: bytes, name: str, expected: str) -> None:

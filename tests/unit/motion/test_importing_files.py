@@ -25,6 +25,7 @@ from marey_motion.importing.items import FileToImport, ImportedFile
 from marey_motion.importing.plan import PlannedFile, plan_imports
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.references import OutputRef
+from marey_schemas.documents.skeletons import MAX_JOINTS
 from marey_schemas.lru import LruCache
 from marey_schemas.options.imports import ImportOptions
 
@@ -142,6 +143,17 @@ def test_a_file_that_cannot_be_read_is_a_refusal_with_its_line() -> None:
     found = import_file(FileToImport(planned, bvh(["0 0 x 0 0 0 0 0 0"], hierarchy=ARM), DIGEST))
     assert found.refusal is not None
     assert (found.refusal.code, found.refusal.line, found.items) == ("bad-number", 19, ())
+
+
+def test_a_file_with_a_value_that_no_document_may_contain_is_a_refusal() -> None:
+    (planned,) = plan_imports(["take.bvh"])
+    end_sites = "End Site\n{\nOFFSET 0 0 0\n}\n" * (4 * MAX_JOINTS + 1)
+    hierarchy = f"HIERARCHY\nROOT a\n{{\nOFFSET 0 0 0\nCHANNELS 3 Xposition Yposition Zposition\n{end_sites}}}\n"
+    data = f"{hierarchy}MOTION\nFrames: 1\nFrame Time: 0.01\n0 1 0\n".encode()
+    options = ImportOptions(unit_scale_m=1.0, up_axis="y")
+    found = import_file(FileToImport(planned, data, DIGEST, options=options))
+    assert found.refusal is not None
+    assert (found.refusal.code, found.items) == ("value-range", ())
 
 
 def test_a_collection_that_is_too_long_is_a_refusal() -> None:

@@ -71,12 +71,23 @@ def test_results_that_are_refused_while_the_next_job_runs_fail_their_own_job(
     assert first not in shared_server.completed
 
 
-def test_results_that_exceed_a_quota_fail_their_job_for_good(shared_server: FakeServer) -> None:
-    shared_server.over_quota.add("toomuch")
-    shared_server.submit("make", {"results": 2}, job="toomuch")
-    failed = shared_server.ended("toomuch")
-    assert (failed["code"], failed["retryable"]) == ("quota-exceeded", False)
-    assert failed["detail"].startswith("the results cannot be published: ")
+@pytest.mark.parametrize(
+    ("job", "status", "code", "retryable"),
+    [
+        ("toomuch", 409, "quota-exceeded", False),
+        ("deletedskeleton", 422, "no-skeleton", False),
+        ("toolarge", 413, "too-large", False),
+        ("brokenserver", 500, "internal", True),
+    ],
+)
+def test_results_that_cannot_be_published_fail_their_job_with_the_reason(
+    shared_server: FakeServer, job: str, status: int, code: str, retryable: bool
+) -> None:
+    shared_server.refusals[job] = (status, code)
+    shared_server.submit("make", {"results": 2}, job=job)
+    failed = shared_server.ended(job)
+    assert (failed["code"], failed["retryable"]) == (code, retryable)
+    assert failed["detail"].startswith("the results ")
     next_job = shared_server.submit("add", {"a": 1, "b": 2})
     assert shared_server.ended(next_job)["result"]
 

@@ -105,8 +105,12 @@ def ls(
         return list_projects(context, as_json)
     address = Address.parse(place)
     if deleted:
-        return _show_deleted(context, address, kind, tag, as_json)
+        if explain or stale:
+            raise WrongUsage("--deleted cannot be combined with --explain or --stale")
+        return _show_deleted(context, address, kind, tag, find, query, as_json)
     if explain:
+        if tag or find or stale:
+            raise WrongUsage("--explain counts only what --query excludes; leave out --tag, --find and --stale")
         return _explain(context, address, kind, query, as_json)
     everywhere = bool(recursive or find or query)
     shown, order = _columns(columns), _columns(sort.removeprefix("-"), also=("name",))[:1]
@@ -141,11 +145,12 @@ def _explain(
         raise WrongUsage("--explain counts the items that each condition of a query excludes; add --query")
     with connect(context) as marey:
         project = marey.project(address.project)
-        for kind in map(kind_named, kinds or ["clip"]):
-            explained = project.items(kind).explain(query, collection=address.path or None)
-            if as_json:
-                print_json(explained)
-                continue
+        wanted = [kind_named(name) for name in kinds or ["clip"]]
+        answers = [project.items(kind).explain(query, collection=address.path or None) for kind in wanted]
+    if as_json:
+        print_json(answers[0] if len(answers) == 1 else answers)
+    else:
+        for kind, explained in zip(wanted, answers, strict=True):
             print_message(f"{explained.selected:,} of {counted(explained.items, str(kind))}")
             rows = [(one.condition, one.hides, one.alone) for one in explained.conditions]
             print_table(("condition", "hides", "alone"), rows, right=["hides", "alone"])
@@ -187,11 +192,20 @@ def _stale(items: Sequence[ItemHandle]) -> list[ItemHandle]:
 
 
 def _show_deleted(
-    context: typer.Context, address: Address, kinds: Sequence[str] | None, tag: str | None, as_json: bool
+    context: typer.Context,
+    address: Address,
+    kinds: Sequence[str] | None,
+    tag: str | None,
+    find: str,
+    query: str | None,
+    as_json: bool,
 ) -> None:
+    """List removed items and, unless `find` or `query` selects items, removed folders."""
     with connect(context) as marey:
-        folders = list(marey.project(address.project).collections.list(path=address.path, deleted=True))
-        items = _items_in(marey, address, recursive=True, kinds=kinds, tag=tag, deleted=True)
+        selected = bool(find or query)
+        listed = () if selected else marey.project(address.project).collections.list(path=address.path, deleted=True)
+        folders = list(listed)
+        items = _items_in(marey, address, recursive=True, kinds=kinds, tag=tag, find=find, query=query, deleted=True)
     if as_json:
         return print_json({"collections": folders, "items": [one.item for one in items]})
     rows = [(f"{one.path}/", "collection", one.deleted_at, one.id) for one in folders]

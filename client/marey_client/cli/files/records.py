@@ -230,4 +230,5 @@ def _apply(changes: Sequence[_RecordChange]) -> None:
     failed = [outcome for outcome in outcomes if isinstance(outcome, str)]
     print_message(f"{counted(outcomes.count(True), 'record')} changed, {outcomes.count(False)} unchanged")
     if failed:
-        raise Refused("\n".join([f"{counted(len(failed), 'clip')} not changed:", *failed]))
+        print_message("\n".join([f"{counted(len(failed), 'clip')} not changed:", *failed]))
+        raise Refused

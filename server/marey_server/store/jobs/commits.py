@@ -23,7 +23,14 @@ from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.jobs import FailureReason
 from marey_server.access import roles, scopes
 from marey_server.access.folder_rights import FolderRoleProblem
-from marey_server.errors import AUTHOR_LOST, ApiProblem, ForbiddenProblem, InvalidProblem, NotFoundProblem
+from marey_server.errors import (
+    AUTHOR_LOST,
+    ApiProblem,
+    DamagedProblem,
+    ForbiddenProblem,
+    InvalidProblem,
+    NotFoundProblem,
+)
 from marey_server.store.datasets.committing import author_of
 from marey_server.store.datasets.contents import find_contents_of, store_contents
 from marey_server.store.datasets.folders import tags_of
@@ -39,6 +46,7 @@ from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import job, member, user
 from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.records import DatasetEntry, RevisionKey, key_of
+from marey_versions.tree.chunks import DamagedChunk
 
 Target = dict[str, Any]
 """Stored commit of a job: the fields of `OutputsCommit`, `dataset_id`, `base` (the newest commit of the branch when the
@@ -302,6 +310,9 @@ def _commit(tx: Transaction, row: Any, outputs: Sequence[Mapping[str, Any]]) -> 
         return _columns(commit_outputs(tx, _entries_of(tx, row, outputs), _mover(tx, row)))
     except ApiProblem as error:
         raise _CommitRefused(row.commit_to, error) from None
+    except DamagedChunk as error:
+        problem = DamagedProblem(f"The stored data of the dataset are damaged: {error}.")
+        raise _CommitRefused(row.commit_to, problem) from error
 
 
 def _columns(made: CommittedOutputs) -> dict[str, Any]:
