@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from sqlalchemy import update
 from tests.support.committing_desk import CommittingDesk
 from tests.support.queue_desk import Desk, document
 from tests.support.store_fixtures import skeleton_tree
@@ -24,6 +25,7 @@ from marey_server.store import datasets, events, fsck, items, members, users
 from marey_server.store.items.drafts import Draft
 from marey_server.store.jobs import commits, completion, reading, retrying, staging
 from marey_server.store.retention import Retention, retire
+from marey_server.store.tables import tree_chunk
 
 
 def test_a_job_commits_its_outputs_when_it_completes(gaits: CommittingDesk) -> None:
@@ -72,6 +74,15 @@ def test_a_path_that_somebody_changed_meanwhile_is_not_overwritten(gaits: Commit
     assert gaits.entries(made) == {f"made/{one.name}": one.item for one in gaits.desk.outputs(made)}
     assert found.commit is not None
     assert found.commit.digest == gaits.head(made)
+
+
+def test_a_job_fails_if_the_dataset_to_which_it_commits_is_damaged(gaits: CommittingDesk) -> None:
+    gaits.put("own", number=1)
+    made = gaits.submit(into="made")
+    gaits.desk.database.write(SYSTEM, lambda tx: tx.execute(update(tree_chunk).values(data=b"damaged")))
+    gaits.work("a")
+    found = gaits.job(made)
+    assert (found.state, found.failure and found.failure.code) == ("failed", "dataset-damaged")
 
 
 def test_an_entry_that_was_removed_meanwhile_is_a_conflict(gaits: CommittingDesk) -> None:
