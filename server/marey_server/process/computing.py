@@ -29,14 +29,14 @@ BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 class ComputeThreads:
     """Three lanes (threads with a queue).
 
-    The first lane has a thread for each processor, but at least two; one client, or all clients without a known token,
-    may use all but one. The second encodes answers. The third is for the long computations of housekeeping, which would
+    In the first lane, one client, or all clients without a known token, may use a thread for each processor, but at
+    least two; one more thread is left to the others. The second encodes answers. The third is for the long computations of housekeeping, which would
     otherwise delay requests.
     """
 
     def __init__(self, threads: int | None = None) -> None:
-        count = max(2, threads or os.cpu_count() or 2)
-        self._lane = Lane(THREAD_NAME, count, most_each=count - 1)
+        most_each = max(2, threads or os.cpu_count() or 2)
+        self._lane = Lane(THREAD_NAME, most_each + 1, most_each=most_each)
         self.rendering = Lane(f"{THREAD_NAME}-rendering", RENDERING_THREADS, most_each=RENDERING_THREADS - 1)
         self._housekeeping = Lane(f"{THREAD_NAME}-housekeeping", HOUSEKEEPING_THREADS)
 
