@@ -5,15 +5,12 @@ from pathlib import Path
 
 import pytest
 from tests.support.store_fixtures import Lab
-from tests.support.store_writer import FILES, LARGE_FILES, StoreWriter
+from tests.support.store_writer import ALL_US, FILES, LARGE_FILES, StoreWriter
 
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import Principal
 from marey_server.store import blobs, fsck, garbage, items
 from marey_server.store.blobs import digest_of
-
-ALL_US = -60_000_000
-"""Grace period with which all garbage is deleted. On SQLite, the clock of each process starts up to a second ahead."""
 
 in_rows_and_in_files = pytest.mark.parametrize("backing", ["rows", "files"])
 

@@ -24,7 +24,10 @@ from marey_server.store.transaction import Transaction
 
 LARGE_FILES = [bytes([number]) * 2**20 for number in range(12)]
 """Files that together make the write-ahead log of SQLite long."""
+ALL_US = -60_000_000
+"""Grace period with which all garbage is deleted. On SQLite, the clock of each process starts up to a second ahead."""
 LONGEST_S = 60.0
+"""Longest time that a process may take for its work."""
 FILES = [f"file {number}".encode() * 1000 for number in range(3)]
 
 
@@ -101,7 +104,7 @@ def _do(url: str, who: Principal, folder: str, work: str, fault: str, sender: Co
         commit_deferred(database)
     else:
         assert name == "collect"
-        garbage.collect_garbage(database, grace_us=-60_000_000)
+        garbage.collect_garbage(database, grace_us=ALL_US)
     database.close()
 
 

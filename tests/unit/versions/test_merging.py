@@ -114,7 +114,7 @@ def test_nothing_of_either_side_disappears(base: State, ours: State, theirs: Sta
 
 @st.composite
 def histories(draw: st.DrawFn) -> tuple[State, State, State]:
-    """A base and two sides that keep, edit, rename, remove and add entries; the motion tells which entry is which."""
+    """A base and two sides that keep, edit, rename, remove and add entries; each entry has a motion of its own."""
     base = {key_of(path, "clip"): entry(path, path) for path in draw(st.sets(paths))}
     sides = []
     for side in ("ours", "theirs"):
