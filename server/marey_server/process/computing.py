@@ -30,8 +30,8 @@ class ComputeThreads:
     """Three lanes (threads with a queue).
 
     In the first lane, one client, or all clients without a known token, may use a thread for each processor, but at
-    least two; one more thread is left to the others. The second encodes answers. The third is for the long computations of housekeeping, which would
-    otherwise delay requests.
+    least two; one more thread is left to the others. The second encodes answers. The third is for the long
+    computations of housekeeping, which would otherwise delay requests.
     """
 
     def __init__(self, threads: int | None = None) -> None:
