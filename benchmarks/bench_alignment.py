@@ -117,7 +117,7 @@ def _against(
 
 
 def _each(calls: int, repeats: int, *contenders: Callable[[], object]) -> list[Timing]:
-    """Return the timing of one call of each function, measured over `calls` calls in a row."""
+    """Call each function `calls` times in a row, repeatedly; return the time of one call of each function."""
 
     def many(call: Callable[[], object]) -> Callable[[], None]:
         def run() -> None:
@@ -172,8 +172,8 @@ def _large_set() -> Row:
 def _examples(count: int, frames: tuple[int, int]) -> tuple[list[SourceExample], MatchingBody]:
     """Return variants of one walk, and the body of the walker.
 
-    The variants differ in timing (by a sine of up to 0.08 of the duration), in the scale of the root's path (0.9 to
-    1.1), and in a random drift of the joint rotations (0.002 per frame).
+    The variants differ in timing, by a sine of up to 0.08 of the duration. They also differ in the scale of the root's
+    path (0.9 to 1.1), and in a random drift of the joint rotations (0.002 per frame).
     """
     random = np.random.default_rng(5)
     walk = generate_gait(1.3, 0.2, 50 / 60)

@@ -1,6 +1,6 @@
 """Versions of a dataset with as many entries as the largest public collection, and with a million.
 
-For comparison, the same run times commits by Git of one changed file, in a repository with as many small files as the
+For comparison, the same run times commits by Git of one changed file. The repository has as many small files as the
 dataset has entries. The commands write only to the index, the objects and the branch, not to a working tree.
 """
 

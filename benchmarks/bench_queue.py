@@ -72,7 +72,10 @@ def _measure(clips: list[Clip], slots: int) -> tuple[float, float]:
 
 
 def _seed(project: ProjectHandle, clips: list[Clip]) -> str:
-    """Store `clips` in the folder `takes`, other clips in `first`, and a target skeleton; return the skeleton's id."""
+    """Store `clips` in the folder `takes`, and a target skeleton; return the skeleton's id.
+
+    Other clips, for a warm-up of the worker, are stored in the folder `first`.
+    """
     skeletons = []
     for name, skeleton in (("studio", clips[0].skeleton), ("game", game_skeleton())):
         mapping = map_joints(skeleton)

@@ -1,8 +1,8 @@
 """Upload of a folder of motion files with the client, compared with pymotion, which only reads the BVH files.
 
-Marey's time is how long a person waits for `marey upload`: for each file, it includes hashing and sending the file,
-reading and checking the motion, and storing both. pymotion reads the BVH files in one process and stores nothing; it
-has no reader for other formats.
+Marey's time is how long a person waits for `marey upload`. For each file, this includes hashing and sending the file,
+reading and checking the motion, and storing file and motion. pymotion reads the BVH files in one process and stores
+nothing; it has no reader for other formats.
 """
 
 from __future__ import annotations

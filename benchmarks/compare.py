@@ -44,8 +44,8 @@ def as_markdown(before: Sequence[Row], after: Sequence[Row]) -> str:
 def matched(before: Sequence[Row], after: Sequence[Row]) -> Iterator[tuple[Row | None, Row | None]]:
     """Pair the rows of two runs that have the same job and size; a row without a counterpart is paired with None.
 
-    Rows of the same job are also paired if their sizes differ only in numbers, because a size may contain measurements
-    of the run, such as processor time.
+    A size may contain measurements of the run, such as processor time. So rows of the same job are also paired if their
+    sizes differ only in numbers.
     """
     left = list(before)
     pairs = [(_take(left, row, str), row) for row in after]

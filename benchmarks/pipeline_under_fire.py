@@ -1,7 +1,7 @@
 """Check that a pipeline whose workers are killed at random moments gives the same bytes as an undisturbed one.
 
 `python -m benchmarks.pipeline_under_fire [TAKES [KILLS [SEED]]]` makes a model of 200 generated takes three times: with
-one worker, with two workers, and with one worker that is killed ten times. It prints the duration of each time.
+one worker, with two workers, and with one worker that is killed ten times. It prints the duration of each run.
 """
 
 from __future__ import annotations
@@ -116,8 +116,9 @@ def _attempts(marey: Marey, lab: ProjectHandle) -> Iterator[str | None]:
 
 
 def digests(lab: ProjectHandle) -> dict[str, str]:
-    """Return the digest of each array of aligned clips and models, by the path of the item and the place in its
-    documents.
+    """Return the digest of each array of aligned clips and models.
+
+    The keys contain the path of the item and the place of the array in the item's documents.
     """
     found: dict[str, str] = {}
     for kind, parts in PARTS.items():

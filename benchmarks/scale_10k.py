@@ -1,8 +1,8 @@
 """Measurement of a server with ten thousand uploaded clips: `python -m benchmarks.scale_10k`.
 
-It uploads clips of 300 frames with the client, several at a time, into one project of a new server on SQLite, and
-samples the memory of the server meanwhile. Then it measures pages of lists, and checks every digest and reference of
-the database. All of this takes minutes and leaves no data behind. The exit status is 1 if a goal was missed.
+It uploads clips of 300 frames with the client, several at a time, into one project of a new server on SQLite.
+Meanwhile, it samples the memory of the server. Then it measures pages of lists, and checks every digest and reference
+of the database. All of this takes minutes and leaves no data behind. The exit status is 1 if a goal was missed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Timing of several functions in turn, so that a change of the machine's speed affects all of them.
 
-Functions in this process are measured by their processor time, summed over all threads, because wall time would also
-depend on other programs on the machine.
+Functions in this process are measured by their processor time, summed over all threads. Wall time would also depend on
+other programs on the machine.
 """
 
 from __future__ import annotations
@@ -43,7 +43,10 @@ class Row:
 
 
 def time_in_turn(*contenders: Callable[[], object], repeats: int = 7) -> list[Timing]:
-    """Call each function once as a warm-up, then all functions in turn, `repeats` times; return timings by function."""
+    """Call each function once as a warm-up, then all functions in turn, `repeats` times.
+
+    Returns one timing for each function, in the same order.
+    """
     for call in contenders:
         call()
     seconds: list[list[float]] = [[] for _ in contenders]

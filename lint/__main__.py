@@ -37,7 +37,10 @@ def check(house: House, root: Path) -> Iterator[tuple[str, Offence]]:
 
 
 def main() -> int:
-    """Print every offence; return the exit status, 1 if there are any. With `--shrink`, lower the baseline instead."""
+    """Print every offence; return the exit status, 1 if there are any.
+
+    With `--shrink`, lower the counts in `wording.toml` to the present numbers instead.
+    """
     parser = argparse.ArgumentParser(prog="python -m lint", description=__doc__)
     parser.add_argument("--shrink", action="store_true", help="lower the counts in wording.toml to what is left")
     house = read_house(ROOT)

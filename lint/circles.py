@@ -1,4 +1,4 @@
-"""Rule: no module imports itself through other modules, neither at its top, nor in a function, nor for types only."""
+"""Rule: no module imports itself through other modules. Imports in functions, and those for types only, count, too."""
 
 from __future__ import annotations
 

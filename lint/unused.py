@@ -1,8 +1,8 @@
 """Rule: tests are not the only users of any code: other code of the product names every function, class and method.
 
 The rule compares only names: a method counts as used if any code names an attribute like this method. Names in
-benchmarks and in code blocks of the docs count, too. A local function counts as used only if the function that contains
-it names it.
+benchmarks and in code blocks of the docs count, too. A local function counts as used only if its name occurs in the
+function that contains it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Claims that can be repeated, and attempts that do not count before their first write."""
+"""Claims that can be repeated, and attempts that count as tries of the job only after their first write."""
 
 import sqlalchemy as sa
 from alembic import op

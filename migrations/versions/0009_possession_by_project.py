@@ -36,7 +36,7 @@ FOR_EVERY_PROJECT = """
 def upgrade() -> None:
     """Add the project to each record of possession, and create a table of the blobs that attempts possess.
 
-    A blob that a user sent before the upgrade belongs to the user in every project, so tokens that are not bound to
+    A blob that a user sent before the upgrade belongs to the user in every project. So tokens that are not bound to
     projects can use the blob as before. Tokens that are bound to projects can use only the blobs to which these
     projects refer; clients must send other blobs again. Running attempts keep the blobs that they have sent.
     """

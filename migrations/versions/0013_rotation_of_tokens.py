@@ -1,4 +1,4 @@
-"""Rotation of tokens: the token that each token replaced, and a hash of the id of the rotation that replaced it."""
+"""Rotation of tokens: the predecessor of each token, and a hash of the id of the rotation that replaced the token."""
 
 import sqlalchemy as sa
 from alembic import op

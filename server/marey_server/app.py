@@ -114,7 +114,10 @@ def _fields(handler: Resource, route: str, status: int, duration_s: float) -> di
 
 
 def create_app(settings: Settings, database: Database, children: Children | None = None) -> Application:
-    """Return an application that uses a database with the current schema; several applications may share `children`."""
+    """Return an application that uses a database with the current schema.
+
+    Several applications may share the child processes `children`.
+    """
     return Application(settings, database, children)
 
 
@@ -248,7 +251,10 @@ async def serve(settings: Settings) -> None:
 
 @asynccontextmanager
 async def warming(children: Children) -> AsyncIterator[None]:
-    """Compile all numeric kernels in a separate process, then start the children, while the server answers requests."""
+    """Compile all numeric kernels in a separate process, then start the child processes in `children`.
+
+    The server answers requests meanwhile. At the end of the `async with` block, an unfinished compilation is stopped.
+    """
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "marey_motion.warm_up", env=clean_environment()
     )

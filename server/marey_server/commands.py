@@ -51,7 +51,7 @@ def serve(**settings: Any) -> None:
 
 
 def _new_event_loop() -> asyncio.AbstractEventLoop:
-    """Return a new event loop of uvloop, or of asyncio if uvloop is not installed (it is not available on Windows)."""
+    """Return a new event loop of uvloop; if uvloop is not installed, as on Windows, return one of asyncio."""
     try:
         uvloop = import_module("uvloop")
     except ModuleNotFoundError:
@@ -158,7 +158,7 @@ def clock(*, set_now: bool = False, **settings: Any) -> None:
         moved = set_clock(connection) if set_now else None
     _say(str(state))
     if moved is not None:
-        _say(f"the clock of the database is now the clock of this machine; {moved:,} later times were set back to it")
+        _say(f"the clock of the database now has the time of this machine; {moved:,} later times were set back")
 
 
 def purge(**settings: Any) -> None:

@@ -40,10 +40,10 @@ class ApiProblem(Exception):
 
 
 def forget_origin(error: BaseException) -> None:
-    """Remove the traceback and the causes from an `ApiProblem`, which is sent to the client and never logged.
+    """Remove the traceback and the causes from an error that is sent to the client and never logged.
 
-    If a function stores an error in a future, the stack frame of the function refers to the error, and the traceback of
-    the error refers to the frame. Such reference cycles would keep the whole body of a refused request in memory until
+    If a function stores an error in a future, the stack frame of the function refers to the error. The traceback of the
+    error also refers to the frame. Such reference cycles would keep the whole body of a refused request in memory until
     the next garbage collection, which stops all threads.
     """
     if isinstance(error, ApiProblem):

@@ -42,7 +42,7 @@ _faults: list[_Fault] = []
 
 
 def plan(texts: str) -> None:
-    """Plan the faults that `texts` lists, in the form of the variable, in place of those planned before."""
+    """Replace the planned faults by those in `texts`, which has the form of the variable `MAREY_FAULT`."""
     _faults[:] = [_Fault(text) for text in texts.split(",") if text]
 
 

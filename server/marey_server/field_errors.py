@@ -24,10 +24,10 @@ def json_pointer(steps: Sequence[str]) -> str:
 def field_errors(
     error: ValidationError, tree: Any, pointer: Callable[[list[str]], str] = json_pointer
 ) -> list[FieldError]:
-    """Return the first `MAX_ERRORS` validation errors of `tree`; `pointer` converts the location of each to text.
+    """Return the first `MAX_ERRORS` validation errors of `tree`; `pointer` converts the location of an error to text.
 
-    pydantic counts only the valid items of a list, so it also reports that a list with an invalid item is too short;
-    such a report is left out.
+    pydantic counts only the valid items of a list. So if an item is invalid, pydantic may also report that the list is
+    too short. Such a report is left out.
     """
     entries = error.errors(include_url=False, include_context=False, include_input=False)
     wrong = {entry["loc"][:length] for entry in entries for length in range(len(entry["loc"]))}

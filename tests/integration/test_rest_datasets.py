@@ -653,7 +653,7 @@ def test_an_entry_without_origins_is_named_with_the_commit_that_removed_it(
     assert context == {"removed_by": renamed, "moved_to": "c"}
     assert missing("c", "main~1") == ("The version has no skeleton at 'c'.", {})  # only a later version has it
     monkeypatch.setattr("marey_server.store.datasets.history.MOST_EXAMINED", 1)
-    assert missing("b") == ("The version has no skeleton at 'b', nor do the 1 versions before it.", {})
+    assert missing("b") == ("The version has no skeleton at 'b', and neither have the 1 versions before it.", {})
 
 
 def test_an_entry_that_a_merge_removed_is_named_with_the_merge(

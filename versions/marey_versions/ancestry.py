@@ -30,8 +30,8 @@ _COMMON = _OURS | _THEIRS
 def nearest_common(commit_of: Callable[[str], HistoricCommit], ours: str, theirs: str) -> list[str]:
     """Return the nearest common ancestors of two commits, sorted by digest.
 
-    These are the common ancestors from which no other common ancestor descends. A commit counts as its own ancestor.
-    The search reads commits in the order of decreasing generation. It stops when all commits that are left to read are
+    A common ancestor is nearest if no other common ancestor descends from it. A commit counts as its own ancestor. The
+    search reads commits in the order of decreasing generation. It stops when all commits that are left to read are
     ancestors of common ancestors. So its time does not depend on the length of the history before the common ancestors.
 
     Parameters

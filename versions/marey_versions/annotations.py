@@ -139,7 +139,7 @@ def merge_segments(
     """Combine the segments that two sides have added and removed.
 
     The result has the segments that both sides have kept, and those that one side has added. Two changes exclude each
-    other in two cases: the sides have added different segments that overlap, or both sides have removed a segment and
+    other in two cases. The sides have added different segments that overlap; or both sides have removed a segment, and
     have not added the same segments in its place.
 
     Parameters
@@ -182,8 +182,8 @@ def merge_keyframes(
     """Combine the keyframes that two sides have added and removed.
 
     The result has the keyframes that both sides have kept, and those that one side has added. Changes exclude each
-    other if both sides have removed the same keyframe of the base, and have added different keyframes in its place:
-    keyframes with the frame or the label of the removed one.
+    other if both sides have removed the same keyframe of the base, and have added different keyframes in its place. A
+    keyframe with the frame or the label of the removed keyframe counts as added in its place.
 
     Returns
     -------

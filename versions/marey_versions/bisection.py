@@ -8,16 +8,16 @@ from collections.abc import Iterator, Mapping, Sequence
 class BadCommitSearch:
     """State of a search. The suspects are the commits that can be the first bad one; each test rules out some.
 
-    The search assumes that the commits after a bad commit are bad, and that the ancestors of a good commit are good.
-    A test leaves one number of suspects if the tested commit is bad, and another number if it is good. The search tests
+    The search assumes that the commits after a bad commit are bad, and that the ancestors of a good commit are good. A
+    test leaves one number of suspects if the tested commit is bad, and another number if it is good. The search tests
     the commit for which the larger of the two numbers is smallest. In a history without merges, this takes at most
     log2(n) tests for n commits, rounded up. With merges, which have two parents, a test leaves about two thirds of the
     commits in the worst case.
 
     Parameters
     ----------
-    parents : for `bad` and each of its ancestors that is not known to be good: the digests of the commit's parents, by
-        the digest of the commit; parents that are not keys of this mapping are known to be good
+    parents : mapping from the digest of a commit to the digests of its parents. The keys are `bad` and those of its
+        ancestors that are not known to be good; other parents are known to be good
     bad : digest of a commit that is known to be bad
     """
 

@@ -63,8 +63,8 @@ def compare_entries(changes: Iterable[Changed]) -> list[ComparedEntry]:
     moved entry if all their parts are equal. Of the entries that remain, a removed and an added entry of the same kind
     count as moved if one part is equal. If there are several possible pairs, the order of the paths decides.
 
-    An entry whose parts have all changed usually counts as changed. There is one exception: if its old parts are now
-    those of another differing entry, or its new parts were those of another entry before, the entry is divided into a
+    An entry whose parts have all changed usually counts as changed. There is an exception: its old parts are now those
+    of another differing entry, or its new parts were those of another entry before. Then the entry is divided into a
     removed and an added entry, which are paired as above. So two entries that exchanged their names count as moved.
     """
     compared = [

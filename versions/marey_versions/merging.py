@@ -95,8 +95,8 @@ def merge_entries(
     Parameters
     ----------
     ours, theirs : the entries that differ between the base and each side
-    resolutions : keys of conflicts, with the side to take. Each decides one conflict; of several conflicts with the
-        same key, the first resolution with this key decides the first, and so on
+    resolutions : keys of conflicts, with the side to take. Each resolution decides one conflict. If several conflicts
+        have the same key, their resolutions are used in order
     merge_parts : merges the parts that both sides have changed; None: such parts are in conflict
 
     Returns
@@ -129,7 +129,7 @@ def merge_entries(
 
 
 class _Choices:
-    """Resolutions that are left. Each decides one conflict only, because a person has seen no other one."""
+    """Resolutions that are not used yet. Each decides one conflict only: the one that its author has seen."""
 
     def __init__(self, resolutions: Iterable[tuple[str, Side]], used: set[str]) -> None:
         self._left: defaultdict[str, deque[Side]] = defaultdict(deque)
@@ -159,7 +159,10 @@ class _Decided(NamedTuple):
 
     @property
     def combined(self) -> CombinedEntry | None:
-        """The merged entry, with those of both sides; None if one is missing, or if a version has all merged parts."""
+        """The merged entry, with the entries of both sides; None if one of the three is missing.
+
+        Also None if the base or one side has exactly the merged parts, so that no parts were combined.
+        """
         if self.merged is None or self.ours is None or self.theirs is None:
             return None
         known = [one.parts for one in (self.base, self.ours, self.theirs) if one is not None]
@@ -177,15 +180,16 @@ class _Decided(NamedTuple):
         return self.merged
 
     def place_beside(self, key: str) -> str | None:
-        """Return the path to which the entry goes back if another entry gets `key`; None if it has been nowhere else.
+        """Return the path to which this entry returns if another entry gets `key`, or None if there is no such path.
 
-        This is its path on our side, or its path in the base if our side has it at `key` or not at all.
+        This is the path of the entry on our side. If our side does not have the entry, or has it at `key`, it is the
+        path in the base.
         """
         back = self.base if self.ours is None or self.ours.key == key else self.ours
         return None if back is None else back.path
 
     def at(self, path: str) -> _Decided:
-        """Return the entry with another path."""
+        """Return the same entry with `path` as its merged path."""
         return self._replace(merged=self.result._replace(path=path))
 
 
@@ -248,9 +252,10 @@ def _decide(sides: _Sides, choices: _Choices) -> _Decided | MergeConflict:
 def _apply(
     decided: Sequence[_Decided], mine: Iterable[ComparedEntry], choices: _Choices, merged: MergedEntries
 ) -> None:
-    """Add changes of our tree to `merged`; if another entry already has the new key of an entry, add a conflict.
+    """Add to `merged` the changes that turn our tree into the merged tree.
 
-    `mine` contains the entries that our side has changed.
+    If two entries should get the same key, and this cannot be resolved, a conflict is added. `mine` contains the
+    entries that our side has changed.
     """
     held = {one.after.key: _Decided(one.before, one.after, one.before, one.after) for one in mine if one.after}
     for one in decided:
@@ -277,11 +282,11 @@ def _gets_place_of_theirs(one: _Decided) -> bool:
 
 
 def _collide(one: _Decided, held: dict[str, _Decided], choices: _Choices) -> MergeConflict | None:
-    """Decide which of two entries gets a key; the other one goes back to its own place.
+    """Decide which of two entries gets a key; the other entry returns to an earlier path.
 
-    `held` contains entries by key; one of them has the key that `one` should get. Only an entry that has no other
-    place, because one side has added it, is dropped. The result is a conflict if there is no resolution, or if the
-    place of the other entry is taken.
+    `held` contains entries by key; one of them has the key that `one` should get. The other entry is dropped if it has
+    no earlier path, because a side has added it. The result is a conflict if there is no resolution, or if the earlier
+    path is taken.
     """
     key = one.result.key
     other = held[key]
@@ -302,9 +307,8 @@ def _collide(one: _Decided, held: dict[str, _Decided], choices: _Choices) -> Mer
 def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: DatasetEntry | None) -> tuple[str, ...]:
     """Return the parts that both sides have changed in different ways.
 
-    If a part is computed from another part, the two count as one part: both are returned if one side has changed the
-    first part and the other side has changed the second part. For example, the sample tree of one side does not fit the
-    model of the other.
+    If a part is computed from another part, the two count as one. If one side has changed the first part and the other
+    side the second part, both parts are returned. For example, our sample tree does not fit the model of their side.
     """
     if ours is None or theirs is None:
         return ("entry",)

@@ -1,8 +1,8 @@
 """Entries and commits of datasets, and digests of content that do not depend on the ids of a server.
 
-Documents refer to other items by id and revision, which differ between servers. Therefore, the content digest of a
-document is computed after each reference has been replaced by the content digest of the revision that it refers to. So
-two servers with the same content have the same digests, and the same trees.
+Documents refer to other items by id and revision, which differ between servers. Therefore, each reference in a document
+is first replaced by the content digest of the revision that it refers to. Then the content digest of the document is
+computed. So two servers with the same content have the same digests, and the same trees.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ class LogUploader:
 
     @property
     def size_bytes(self) -> int:
-        """The number of bytes printed so far."""
+        """The number of bytes that the job has printed so far."""
         return self.path.stat().st_size
 
     def send(self) -> None:
@@ -329,7 +329,8 @@ class RunningAttempt:
     def _read_parts(self, places: Sequence[PartPlace]) -> list[bytes | None]:
         """Return encoded documents from the cache or the server, and None for a document that does not exist.
 
-        If the documents together exceed `ANSWER_LIMIT_BYTES`, those at the end are omitted, but never the first.
+        If the documents together exceed `ANSWER_LIMIT_BYTES`, documents at the end are omitted, but never the first
+        one.
         """
         keys = [self._cache_key(f"{place.item}@{place.revision}/{place.part}") for place in places]
         found = self._cache.get_many(keys, lambda missing: self._api.read_parts([places[index] for index in missing]))
@@ -337,7 +338,10 @@ class RunningAttempt:
         return found[: max(1, sum(size <= ANSWER_LIMIT_BYTES for size in sizes))]
 
     def _cache_key(self, name: str) -> str:
-        """Return the key of a part in the cache; names of parts are unique only on one server and in one project."""
+        """Return the key of a part in the cache: server, project and name.
+
+        Names of parts are unique only on one server and in one project.
+        """
         return f"{self._server} {self._lease.project} {name}"
 
     def _death(self, child: ChildProcess) -> Failed:

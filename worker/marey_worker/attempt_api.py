@@ -63,7 +63,7 @@ class AttemptApi:
     def append_log(self, offset: int, piece: bytes) -> LogAnswer:
         """Append `piece` to the attempt's log, and return the length of the log.
 
-        If the log is not exactly `offset` bytes long, nothing is appended.
+        `offset` must be the length of the log so far; otherwise, nothing is appended.
         """
         headers = {"Upload-Offset": str(offset)}
         try:

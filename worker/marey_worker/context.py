@@ -118,9 +118,10 @@ class Context:
     def documents(
         self, pins: Iterable[PinnedInput], part: str, *, required: bool = True
     ) -> Iterator[tuple[PinnedInput, Any]]:
-        """Yield each input with its part named `part`, or with None if the part is not required and does not exist.
+        """Yield each input with its part named `part`.
 
-        While the caller uses one input, the parts of the next inputs are read.
+        If the part does not exist, and it is not `required`, None is yielded in place of the part. While the caller
+        uses one input, the parts of the next inputs are read.
         """
         for pin, (document,) in self.documents_of_each(pins, part):
             if document is None and required:
@@ -160,7 +161,11 @@ class Context:
         return results
 
     def blob(self, digest: str) -> bytes:
-        """Return the bytes of a blob. Raises `NoSuchThing` if it does not exist, `FileTooLarge` if it is too large."""
+        """Return the bytes of a blob.
+
+        Raises `NoSuchThing` if the blob does not exist, and `FileTooLarge` if it does not fit into the memory of the
+        job.
+        """
         data: bytes = self._value(self._send(lambda request: ReadBlob(request, digest)), "no-blob")
         return data
 
@@ -242,8 +247,8 @@ class Context:
     def _value(self, request: int, missing: str = "not-found") -> Any:
         """Wait for the answer to a request, and return its value.
 
-        If the requested object does not exist, raises `NoSuchThing` with the code `missing`; if it is too large for the
-        job, raises `FileTooLarge`; if the request failed for another reason, raises `RequestRefused`.
+        Raises `NoSuchThing` with the code `missing` if the requested object does not exist. Raises `FileTooLarge` if
+        the object is too large for the job. Raises `RequestRefused` if the request failed for another reason.
         """
         while request not in self._replies:
             reply: ChildReply = unpack(self._pipe.recv_bytes())

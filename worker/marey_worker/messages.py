@@ -47,8 +47,8 @@ class Run:
 class ChildReply:
     """Answer to a request: the requested value, or the reason why the request failed.
 
-    `missing` is true if the reason is that the requested object does not exist, and `too_large` if it is too large for
-    the job's memory limit.
+    `missing` is true if the requested object does not exist. `too_large` is true if it is too large for the job's
+    memory limit.
     """
 
     request: int

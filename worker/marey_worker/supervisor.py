@@ -87,7 +87,8 @@ class Supervisor:
     def run(self) -> int:
         """Run jobs until the worker is stopped, and return the exit status.
 
-        The status is not 0 if a job was running at that time, if the worker failed, or if the server refused it.
+        The status is not 0 if a job was running at that time, if the worker failed, or if the server refused the
+        worker.
         """
         slots = [threading.Thread(target=self._work, name=f"slot-{n}", daemon=True) for n in range(self._options.slots)]
         for slot in slots:
@@ -198,8 +199,8 @@ class Supervisor:
 class _OpenClaim:
     """Claim that is repeated with the same token and the same id until it is answered.
 
-    The same token is used even if it is rotated in the meantime, because the server repeats an answer only for the
-    token with which the claim was sent first.
+    The server repeats an answer only for the token with which the claim was sent first. So this token is used even if
+    it was replaced in the meantime.
     """
 
     transport: Transport

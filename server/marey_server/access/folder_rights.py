@@ -28,9 +28,9 @@ class FolderRoleProblem(ForbiddenProblem):
 class FolderRights:
     """Role of a user in a project, and in the folders that have overrides for this user.
 
-    `overrides` has the key None for folders that are not deleted, and one key for each time at which folders were
-    deleted. Each value maps the path of a folder to the user's role in the folder. `overrides` is empty for users
-    without overrides, such as owners.
+    `overrides` has the key None for existing folders, and one key for each time at which folders were deleted. Each
+    value maps the paths of folders to the user's roles in these folders. `overrides` is empty for users without
+    overrides, such as owners.
     """
 
     project: str
@@ -38,11 +38,11 @@ class FolderRights:
     overrides: Mapping[FolderState, Mapping[str, Role]] = field(default_factory=dict)
 
     def role_in(self, path: str, deleted_us: FolderState = None) -> Role:
-        """Return the role in the folder `path`; `deleted_us` is the time at which the folder was deleted, if it was.
+        """Return the role in the folder `path`; `deleted_us` is the time at which the folder was deleted, or None.
 
-        The folders above a deleted folder may have been deleted later, and new folders may have been created at their
-        paths. So two roles are computed: one from the overrides of deleted folders only, and one from the overrides of
-        all folders at these paths. The lower role is returned.
+        A folder above a deleted folder may have been deleted later, and a new folder may now have its path. So for a
+        deleted folder, two roles are computed: one from the overrides of folders that were deleted at this time or
+        later, and one from these overrides together with those of existing folders. The lower role is returned.
         """
         existing = self.overrides.get(None, {})
         if deleted_us is None:
@@ -77,9 +77,9 @@ class FolderRights:
     def require_restoration(self, path: str, deleted_us: FolderState) -> None:
         """Raise `FolderRoleProblem` unless an item of the folder `path` may be restored.
 
-        `deleted_us` is the time at which the folder was deleted, or None. If the folder is deleted, the item is
-        restored into another folder at this path, to which the overrides of the deleted folder do not apply. So the
-        role must suffice in both folders.
+        `deleted_us` is the time at which the folder was deleted, or None. If the folder was deleted, the item is
+        restored into an existing or a new folder with the same path. The overrides of the deleted folder do not apply
+        there, so the role must suffice in both folders.
         """
         for state in (deleted_us, None):
             self.require(path, Role.MAINTAINER, state)
@@ -100,7 +100,10 @@ class FolderRights:
 
 
 def _nearest(path: str, overrides: Sequence[Mapping[str, Role]]) -> Role | None:
-    """Return the lowest override of the folder `path`, or of the nearest folder above it with an override, or None."""
+    """Return the lowest role that overrides give in the folder `path`, or None if there are no overrides.
+
+    If the folder itself has no override, the nearest folder above it with an override counts.
+    """
     for folder in with_ancestors(path):
         found = [roles[folder] for roles in overrides if folder in roles]
         if found:

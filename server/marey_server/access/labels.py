@@ -16,7 +16,10 @@ LONGEST_KEY = 512
 
 
 def labels_key(labels: Mapping[str, str]) -> str:
-    """Return the labels in a fixed order, such as `gpu=a100,site=lyon`. Raises `InvalidProblem` for too many."""
+    """Return labels as one text in a fixed order, such as `gpu=a100,site=lyon`.
+
+    Raises `InvalidProblem` if there are too many labels.
+    """
     pairs = _checked_pairs(labels)
     key = ",".join(pairs)
     if len(key) > LONGEST_KEY:
@@ -25,7 +28,10 @@ def labels_key(labels: Mapping[str, str]) -> str:
 
 
 def keys_within(labels: Mapping[str, str]) -> list[str]:
-    """Return the key of every set of labels that a worker with `labels` satisfies, beginning with the empty set."""
+    """Return the key of every subset of a worker's `labels`, beginning with the empty set.
+
+    The worker satisfies the jobs whose labels have one of these keys.
+    """
     pairs = _checked_pairs(labels)
     return [",".join(subset) for size in range(len(pairs) + 1) for subset in combinations(pairs, size)]
 

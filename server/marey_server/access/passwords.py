@@ -28,7 +28,7 @@ class _Parsed(NamedTuple):
 def hash_password(password: str) -> str:
     """Hash a password with a random salt, and return `scrypt$15$8$1$<salt>$<key>`.
 
-    This takes about 0.1 s, so it must not run on the event loop.
+    Hashing takes about 0.1 s, so this function must not run on the event loop.
     """
     salt = secrets.token_bytes(16)
     key = _derive(password, salt, LOG2_N, _BLOCK, _PARALLEL, _KEY_BYTES)
@@ -36,7 +36,10 @@ def hash_password(password: str) -> str:
 
 
 def password_matches(password: str, stored: str | None) -> bool:
-    """Return whether `password` matches the hash `stored`; if `stored` is None, take as long and return False."""
+    """Return whether `password` matches the hash `stored`.
+
+    If `stored` is None, return False, but only after the time that a comparison takes.
+    """
     parsed = _parse(stored or _nobody())
     key = _derive(password, parsed.salt, parsed.log2_n, parsed.block, parsed.parallel, len(parsed.key))
     return hmac.compare_digest(key, parsed.key) and stored is not None

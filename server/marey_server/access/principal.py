@@ -14,8 +14,8 @@ class Principal:
     """Caller, with the scopes of its credential.
 
     `scopes` are texts such as `write` or `write!project=walk`. The kind `attempt` is a worker that runs a job. Such a
-    worker does not have the rights of a user, not even those of the job's author: it may read the inputs of the job and
-    the documents to which these inputs refer, and write only data of its attempt. After the end of the attempt
+    worker does not have the rights of a user, not even those of the job's author. It may read the inputs of the job and
+    the documents to which these inputs refer. It may write only data of its attempt. After the end of the attempt
     (`ended`), the worker may only repeat the request that ended the attempt.
     """
 

@@ -33,9 +33,9 @@ class RequiredRole:
     """Role and scope that an operation requires in a project.
 
     Handlers declare the required role, the transaction of a request contains it, and `store.projects.require` enforces
-    it. `guests` is false if callers without a role may not perform the operation even in a public project. If
-    `in_folders` is true, members who have the role only in some folder are admitted, too; the function that changes
-    something in a folder then checks the role in this folder (`store.folder_roles.rights`).
+    it. If `guests` is true, callers without a role may perform the operation in a public project. If `in_folders` is
+    true, members who have the role only in some folder are admitted, too; the function that changes something in a
+    folder then checks the role in this folder (`store.folder_roles.rights`).
     """
 
     role: Role

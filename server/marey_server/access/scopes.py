@@ -20,7 +20,7 @@ def reaches_somewhere(scopes: Iterable[str], need: str) -> bool:
 
 
 def only_work(scopes: Iterable[str]) -> bool:
-    """Return whether `scopes` allow nothing but to claim jobs, as those of a worker's token should."""
+    """Return whether `scopes` contain only the scope `work`; the token of a worker should have no other scope."""
     return all(scope.partition("!")[0] == "work" for scope in scopes)
 
 

@@ -48,7 +48,7 @@ def issue_invitation() -> IssuedToken:
 
 
 def derive_token_key(secret: str) -> bytes:
-    """Return the key that `derive_attempt_token` and `derive_successor` use, from the secret of a user's token."""
+    """Derive, from the secret of a user's token, the key for `derive_attempt_token` and `derive_successor`."""
     return hmac.digest(secret.encode("utf-8", "surrogatepass"), b"marey attempt tokens", "sha256")
 
 

@@ -26,7 +26,7 @@ def issue_secret() -> str:
 
 
 def is_secret(text: str) -> bool:
-    """Return whether a text is a complete secret."""
+    """Return whether a text is a secret of a webhook: the prefix, and the right number of bytes in Base64."""
     try:
         key = base64.b64decode(text.removeprefix(KEY_PREFIX), validate=True)
     except ValueError:

@@ -298,7 +298,7 @@ class UserResource(PasswordResource):
         )
 
     async def _verify(self, user: str, body: UserChange) -> str | None:
-        """Check the current password in a request, and return the stored hash that it matches.
+        """Check the current password in a request, and return the stored hash of this password.
 
         Return None if the request contains no current password. Raises `ForbiddenProblem` if the password is wrong.
         """

@@ -81,7 +81,7 @@ class MissingBlobs(Resource):
 
     @writes(access=Access.SIGNED_IN, scope="read", body=BlobsQuery, answer=BlobsMissing)
     async def post(self, body: BlobsQuery) -> Reply:
-        """Return the digests, among the given ones, of blobs that must be sent before documents can refer to them."""
+        """Return those of the given digests whose blobs must be sent before documents can refer to them."""
         missing = await self.look_up(blobs.missing, body.digests)
         return Reply(BlobsMissing(missing=tuple(missing)))
 

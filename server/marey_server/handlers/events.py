@@ -49,8 +49,8 @@ class Events(Resource):
     async def get(self, project: str, query: EventsQuery) -> Reply | None:
         """Return events in the order of their commits; as text/event-stream, also send events that occur later.
 
-        If events that follow the event `after` were deleted because of their age, the answer is 410 (`events-deleted`),
-        and `context` contains the number after which the remaining events begin.
+        If events that follow the event `after` were deleted because of their age, the answer is 410 (`events-deleted`).
+        `context` then contains the number after which the remaining events begin.
         """
         after = self._last_received(query)
         await self.services.number_events()

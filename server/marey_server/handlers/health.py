@@ -43,9 +43,9 @@ class Readyz(Resource):
     async def get(self) -> Reply:
         """Return whether the server is ready for requests.
 
-        It is ready if the database is reachable and has the current schema, there is space for blobs, and the server is
-        not stopping. If the server is not ready, the log gives the reason; the answer gives the reason only to
-        administrators.
+        The server is ready if the database is reachable and has the current schema. There must also be space for blobs,
+        and the server must not be stopping. If the server is not ready, the log gives the reason; the answer gives the
+        reason only to administrators.
         """
         if self.services.draining.is_set():
             raise UnavailableProblem(

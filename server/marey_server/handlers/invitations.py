@@ -1,7 +1,7 @@
 """Resources of invitations: of a project, of the server, and their acceptance.
 
-The code of an invitation is a secret, so only bodies of requests contain it, and the answer to the request that creates
-the invitation.
+The code of an invitation is a secret. It occurs only in bodies of requests, and in the answer to the request that
+creates the invitation.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ class SignUps(CodeResource):
         reserved=True,
     )
     async def post(self, body: SignUp) -> Reply:
-        """Create your account with an invitation of an administrator, and join its project.
+        """Create your account with an invitation of an administrator, and join the project that the invitation names.
 
         The answer contains a new token, shown only once. A repeated request with the same name and password gets the
         same membership and another token.

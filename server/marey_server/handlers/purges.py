@@ -17,12 +17,12 @@ class ProjectPurges(Resource):
 
     @writes(access=Access.OWNER, body=PurgeRequest, answer=PurgeAnswer, idempotency="key")
     async def post(self, project: str, body: PurgeRequest) -> Rendered:
-        """Purge deleted items: delete their revisions, documents and names for good, or preview this.
+        """Purge deleted items: delete their revisions, documents and names for good, or preview the purge.
 
         An item is not purged if a version of a dataset, a document of another item, or an unfinished job still needs
-        it; the answer lists these holders. If the request names only this item, the answer is 409, with the holders in
-        `context`. Garbage collection frees the bytes later. One request examines a limited number of items; send `next`
-        of the answer as `after` to continue.
+        it; the answer lists these holders. If the only requested item is still needed, the answer is 409, with the
+        holders in `context`. Garbage collection frees the bytes later. One request examines a limited number of items;
+        send `next` of the answer as `after` to continue.
         """
         if body.preview:
             return await self.render_document(Reply(await self.look_up(purging.preview_purge, project, body)))
@@ -38,7 +38,7 @@ class DatasetPurges(Resource):
 
     @writes(access=Access.OWNER, body=DatasetPurgeRequest, answer=DatasetPurgeAnswer, idempotency="key")
     async def post(self, project: str, body: DatasetPurgeRequest) -> Rendered:
-        """Purge a deleted dataset: delete its versions, branches, tags and proposals for good, or preview this.
+        """Purge a deleted dataset: delete its versions, branches, tags and proposals for good, or preview the purge.
 
         A version is still needed by items that a job made from it, and by unfinished jobs that read it. If there are
         such items or jobs, the answer is 409 (`still-held`), and `context` lists them. The purge does not delete the

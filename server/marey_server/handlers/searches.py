@@ -50,9 +50,9 @@ class Search(Searcher):
     async def post(self, project: str, kind: str, item: str, body: SearchRequest) -> Reply:
         """Return the motion of a model (kind `models`) that meets constraints best, or a sequence of motions.
 
-        The model's tree is searched, and the best sample is refined. If the model has no tree, or the tree belongs to
-        another state of the model, a tree of new samples is built for the search; `steps[].tree` reports this. Nothing
-        is stored, and the same request gets the same answer.
+        The model's tree is searched, and the best sample is refined. If the model has no tree, or a tree for another
+        state of the model, a tree of new samples is built for the search; `steps[].tree` reports this. Nothing is
+        stored, and the same request gets the same answer.
         """
         models, limits = await self.searched_models(project, kind, item, body), search_answers.search_limits()
         order = SearchAnswerOrder(request=body, models=models, limits=limits, encoding=self.media.encoding)

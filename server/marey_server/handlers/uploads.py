@@ -1,6 +1,6 @@
 """Resumable uploads: how they are created, receive pieces, show their state, and are stored as blobs.
 
-Long bodies of other requests are also stored piece by piece, because one transaction for all bytes of a body would
+Long bodies of other requests are also stored piece by piece. Otherwise, one transaction for all bytes of a body would
 delay the writes of other requests.
 """
 
@@ -67,7 +67,7 @@ async def _let_database_catch_up(resource: Resource) -> None:
 
 
 async def finish_upload(resource: Resource, upload: uploads.StoredUpload) -> uploads.StoredUpload:
-    """Hash the bytes that are not hashed yet, store the upload as a blob, and return its state."""
+    """Hash the bytes that are not hashed yet, store the upload as a blob, and return the state of the upload."""
     hashes = resource.services.upload_hashes
     while (content := await resource.compute(hashes.finish, resource.principal or ANONYMOUS, upload)) is None:
         upload = await resource.look_up(uploads.read_upload, upload.id)

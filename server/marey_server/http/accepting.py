@@ -57,7 +57,10 @@ def raise_descriptor_limit() -> None:
 
 
 def default_connections() -> int:
-    """Return the number of connections for which there are file descriptors, apart from the reserved descriptors."""
+    """Return the number of connections that the limit on open files allows, at most `MOST_CONNECTIONS`.
+
+    Some file descriptors are reserved for other purposes.
+    """
     if sys.platform == "win32":
         return MOST_CONNECTIONS
     import resource
@@ -112,7 +115,7 @@ class Connections:
     server : server that handles the connections
     most : greatest number of connections
     most_each : greatest number of connections of one address, as `limited_address` returns it
-    write_timeout_s : time in seconds in which a client must receive `LEAST_TAKEN_BYTES`, or all bytes that wait for it
+    write_timeout_s : time in seconds in which a client must receive `LEAST_TAKEN_BYTES`, or all bytes if fewer wait
     busy : returns the streams on which a request is being answered; all other streams are idle
     count_closed : counts a refused or closed connection by its reason
     """
@@ -194,7 +197,10 @@ class Connections:
         self._server.handle_stream(stream, address)
 
     def _evict(self, host: str | None) -> None:
-        """Close the oldest idle connections of `host`, or, if None, of the address with the most idle connections."""
+        """Close the oldest idle connections of the address `host`.
+
+        If `host` is None, close those of the address with the most idle connections.
+        """
         busy = self._busy()
         idle = [one for one in self._open if one not in busy and not one.writing()]
         if host is None and idle:
@@ -214,7 +220,7 @@ class Connections:
     def _pause(self, listening: socket.socket, error: OSError) -> None:
         """Stop accepting connections for a moment.
 
-        Otherwise the event loop would repeat a failed `accept` at once and without end.
+        Without this pause, the event loop would repeat a failed `accept` at once and without end.
         """
         loop = asyncio.get_running_loop()
         loop.remove_reader(listening)

@@ -23,11 +23,11 @@ from marey_server.store.transaction import Transaction
 P = ParamSpec("P")
 T = TypeVar("T")
 
-CLIENT_GONE = "The client closed the connection before this was computed."
+CLIENT_GONE = "The client closed the connection before the answer was computed."
 
 
 class CallingExchange(Exchange):
-    """Exchange that uses threads, child processes and memory from its caller's share."""
+    """HTTP request that uses threads, child processes and memory; each caller gets only a share of these."""
 
     operation: Operation
     caller: Caller
@@ -66,7 +66,10 @@ class CallingExchange(Exchange):
 
     @cached_property
     def client(self) -> Client:
-        """Client to which queues attribute this request: owner of a token that was accepted before, or an address."""
+        """Client for which this request waits in queues: the owner of its token, or else the client's address.
+
+        The owner of a token counts only if the server has accepted the token before.
+        """
         token = None
         with suppress(UnauthenticatedProblem):
             token = bearer_token(self.request.headers.get("Authorization"))
@@ -112,7 +115,7 @@ class CallingExchange(Exchange):
             self._in_children.discard(task)
 
     async def compute_apart(self, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> T:
-        """Call a function in a child process as `compute_in_child` does, and count the request during the call.
+        """Call a function in a child process as `compute_in_child` does; the request counts as one that uses children.
 
         Raises `UnavailableProblem` if too many requests use child processes or wait for one.
         """

@@ -52,9 +52,9 @@ class Caller:
         tx.required_role = self.operation.required_role
 
     def sees_answer(self, project: str | None) -> bool:
-        """Return whether the caller may read the answer, which may show content of the project.
+        """Return whether the caller may read the answer.
 
-        To read the answer to a change, the caller needs the scope `read` in the project, too.
+        If a change answers with content of the project, the caller needs the scope `read` in the project, too.
         """
         held = self.principal.scopes if self.principal is not None else ()
         return not self.operation.shows_project or scopes.allows(held, "read", project)
@@ -62,9 +62,10 @@ class Caller:
 
 @dataclass(frozen=True, slots=True)
 class BodyTarget:
-    """Target of a request with a body: the name of a project, or an attempt, given by the job's id and the fence.
+    """Target of a request with a body: a project, or an attempt of a job.
 
-    The caller needs a role in this project, or the token of this attempt.
+    A project is given by its name, an attempt by the job's id and the fence (number of the claim). The caller needs a
+    role in this project, or the token of this attempt.
     """
 
     project: str | None = None
@@ -85,7 +86,7 @@ def admission_of(caller: Caller, target: BodyTarget) -> Admission:
 
 
 def require_access(operation: Operation, principal: Principal) -> None:
-    """Refuse callers who may not perform the operation at all, whatever the object.
+    """Refuse callers who may not perform the operation on any object.
 
     Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
     """
@@ -132,7 +133,7 @@ def _require_attempt_access(operation: Operation, principal: Principal) -> None:
 
 @dataclass(frozen=True, slots=True)
 class IdempotentRequest:
-    """Request with an idempotency key."""
+    """Request with an idempotency key; a repetition of the request gets the stored answer."""
 
     key: str
     fingerprint: str
@@ -191,7 +192,10 @@ def _repeated(tx: Transaction, caller: Caller, idempotent: IdempotentRequest, st
 
 
 def _require_role_again(idempotent: IdempotentRequest, tx: Transaction) -> None:
-    """Refuse a caller whose role in the project of the address, or of its job, has ended since the first request."""
+    """Refuse a caller who has lost the role in the project since the first request with the same idempotency key.
+
+    The project is the one in the address of the request, or the project of the job in the address.
+    """
     if idempotent.project is not None:
         projects.require(tx, idempotent.project)
     if idempotent.job is not None:

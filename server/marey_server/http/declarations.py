@@ -28,7 +28,7 @@ Declared = Callable[..., Coroutine[Any, Any, None]]
 class Access(StrEnum):
     """Minimum access that an operation requires.
 
-    A member with the name of a role requires this role, or a higher one, in the project that the path names.
+    Values with the name of a role, such as `reader`, require at least this role in the project that the path names.
     """
 
     ANYONE = "anyone"
@@ -44,7 +44,7 @@ class Access(StrEnum):
 
     @property
     def role(self) -> Role | None:
-        """The role in a project, or None for an access that is not a role."""
+        """The role with the same name as this access, or None if there is none."""
         return next((role for role in Role if role.value == self.value), None)
 
 
@@ -68,8 +68,8 @@ class RequestBody:
     """Body of a request: a model, a document, bytes or files.
 
     `streamed` bodies are passed to the resource piece by piece while they are received. If `results` is true, the body
-    contains results of a job. The arrays in these results may have up to `max_bytes` when decoded, and are stored as
-    they are sent, without decoding, if possible.
+    contains results of a job. The arrays in these results may have up to `max_bytes` when decoded. If possible, they
+    are stored as they are sent, without decoding.
     """
 
     content: Content | type[Files]
@@ -120,7 +120,10 @@ class Operation:
 
     @property
     def stores(self) -> bool:
-        """Whether the operation stores a request body and may need much disk space; false for `reserved` operations."""
+        """Whether the operation stores a request body, which may need much disk space.
+
+        False for `reserved` operations.
+        """
         changes = self.access is Access.ATTEMPT or self.scope in ("write", "jobs")
         return changes and self.body is not None and not self.reserved
 
@@ -157,7 +160,7 @@ def reads(
 
     Parameters
     ----------
-    body : query that may be too long for a URL
+    body : model of a body that contains the query, for queries that may be too long for a URL
     answer : type of the answer, or, with `paged`, of one element of a page
     answer_types : media types of the answer, if they differ from those of models and documents
     also : further statuses, each with the type of its answer

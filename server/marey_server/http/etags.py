@@ -2,12 +2,13 @@
 
 A tag is `"<state>.<form>"`: the state of a resource, and the form (media type) in which it was sent. If the resource
 can be changed, the state begins with the `rev` of the resource. If the resource is described by a model, a dot and a
-digest of the answer follow, because the answer can change without a new `rev`: if the caller gets another role, a job
-publishes facets, a folder above an item is moved, or a deleted branch is created again under the same name.
+digest of the answer follow, because the answer can change without a new `rev`. For example, the caller gets another
+role, a job publishes facets, or a folder above an item is moved. Or a deleted branch is created again with the same
+name.
 
-Preconditions of writes compare only the `rev`, so that a resource read as MessagePack can be changed with JSON, and a
-client that knows only the `rev` can send it. So If-Match also accepts a tag of a deleted resource if the new resource
-of the same name has the same `rev`.
+Preconditions of writes compare only the `rev`. So a resource that was read as MessagePack can be changed with JSON, and
+a client that knows only the `rev` can send it. If-Match also accepts a tag of a deleted resource if the new resource of
+the same name has the same `rev`.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ def entity_tag(state: int | str, form: str) -> str:
 
 
 def without_digest(tag: str) -> str:
-    """Return a tag without the digest of the answer."""
+    """Return an entity tag without the digest of the answer that it may contain."""
     rev, *_, form = tag.strip('"').split(".")
     return entity_tag(rev, form)
 
@@ -85,8 +86,8 @@ def matches(if_none_match: str | None, tag: str) -> bool:
 def write_precondition(if_match: str | None, if_none_match: str | None, *, may_create: bool = False) -> Precondition:
     """Return the precondition of a write.
 
-    Raises `PreconditionRequiredProblem` if the request has no precondition, `PreconditionFailedProblem` if no tag
-    begins with a number, as the tags of resources do, and `BadRequestProblem` if the tags are malformed or too many.
+    Raises `PreconditionRequiredProblem` if the request has no precondition, and `BadRequestProblem` if the tags are
+    malformed or too many. Raises `PreconditionFailedProblem` if no tag begins with the `rev` of a resource.
     """
     if if_none_match is not None and may_create:
         if if_none_match.strip() != "*":

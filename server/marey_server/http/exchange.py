@@ -51,8 +51,8 @@ log = logging.getLogger(__name__)
 class Departure:
     """Function without arguments that returns whether the client of a request has closed the connection.
 
-    The request refers to this object. The object does not refer to the request, because only the garbage collector
-    would free such a reference cycle.
+    The request refers to this object, but this object does not refer to the request. Otherwise, the two would form a
+    reference cycle, which only the garbage collector frees.
     """
 
     gone = False
@@ -120,7 +120,7 @@ class Exchange(RequestHandler):
     def send(self, rendered: Rendered, *, whole_bytes: int | None = None) -> None:
         """Set status, headers and body of the response.
 
-        If `whole_bytes` is given, `body` is only the beginning of a body with this number of bytes.
+        If `whole_bytes` is given, the body of `rendered` is only the beginning of a body with this number of bytes.
         """
         self.set_status(rendered.status)
         for name, value in rendered.headers.items():

@@ -137,7 +137,8 @@ class _Models:
     def document(self) -> Schema:
         """Return the schema that matches every kind of document.
 
-        It uses `anyOf`, not `oneOf`, because the schema of `OpenDocument` also matches documents of other schemas.
+        The schema uses `anyOf`, not `oneOf`, because the schema of `OpenDocument` also matches documents of other
+        schemas.
         """
         return {"anyOf": [self.reading(model) for model in SCHEMAS.values()]}
 

@@ -31,18 +31,18 @@ class PauseLimit:
         self._timer: asyncio.TimerHandle | None = None
 
     def start(self) -> None:
-        """Start to wait for the next bytes."""
+        """Start the time limit for the next bytes."""
         self._timer = asyncio.get_running_loop().call_later(self._limit_s, self._close)
 
     def stop(self) -> None:
-        """Wait for no more bytes."""
+        """Stop the time limit."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
     @contextmanager
     def suspended(self) -> Iterator[None]:
-        """Do not count the time in which the server processes bytes, because the client may have to wait for it."""
+        """Stop the time limit while the `with` block processes bytes, because the client may have to wait for this."""
         started = self._timer is not None
         self.stop()
         try:

@@ -1,7 +1,7 @@
 """Answers of handlers, and functions that encode answers as bytes; the functions can run in any thread.
 
-A reply is *settled* in its transaction, which loads the document, and *rendered*, which means encoded, after the
-transaction: encoding a long document takes longer than loading it, and other requests need the thread and the
+A reply is *settled* in its transaction, which loads the document. It is *rendered*, which means encoded, after the
+transaction. Encoding a long document takes longer than loading it, and other requests need the thread and the
 connection of the transaction.
 """
 
@@ -37,7 +37,7 @@ MakeTree = Callable[[], Mapping[str, Any]]
 
 @dataclass(frozen=True, slots=True)
 class Lasting:
-    """Document that never changes, identified by its digest; `load` is called if its rendered bytes are not cached."""
+    """Document that never changes, identified by its digest; `load` reads it if no encoded form of it is cached."""
 
     digest: str
     load: Callable[[], Mapping[str, Any]]
@@ -62,8 +62,8 @@ Content = BaseModel | Mapping[str, Any] | bytes
 class Reply:
     """Answer of a handler: a model, a document tree, bytes with their media type, or nothing.
 
-    The ETag is made from the field `rev`, which is the `rev` of a resource or another name of its state; `render` adds
-    a digest of the answer if the content is a model. `location` is a path below the API's root.
+    The ETag is made from the field `rev`, which is the `rev` of a resource or another text that changes with its state.
+    If the content is a model, `render` adds a digest of the answer. `location` is a path below the API's root.
     """
 
     content: Content | Lasting | Loaded | None = None
@@ -83,7 +83,7 @@ class Rendered:
     body: bytes
 
     def without_content(self) -> Rendered:
-        """Return this answer without its body, for a caller who may make the change but not read its result.
+        """Return this answer without its body, for a caller who may make the change, but may not read its result.
 
         The ETag contains no digest of the body, because the caller could check guesses of the content with it.
         """

@@ -123,7 +123,7 @@ class Resource(CallingExchange):
         return outcome if isinstance(outcome, Rendered) else await self.render_document(outcome)
 
     def _idempotent(self) -> IdempotentRequest | None:
-        """Return the request with its idempotency key, or None if it has none or the operation accepts none."""
+        """Return the request with its idempotency key; None if the request has no key or the operation accepts none."""
         if self.operation.idempotency != "key":
             return None
         place = {name: self.path_kwargs.get(name) for name in ("project", "job")}
@@ -238,7 +238,10 @@ class Resource(CallingExchange):
             await self.refuse(error)
 
     def _turn(self) -> asyncio.Future[None] | None:
-        """Return a future that ends when it is the turn of this request, or None if the request may begin at once."""
+        """Return a future that ends when this request may begin, or None if it may begin at once.
+
+        Clients take turns.
+        """
         operation = self._declared()
         reserved = operation is not None and operation.reserved
         return self.services.turns.take(self.client, reserved=reserved)
@@ -247,7 +250,7 @@ class Resource(CallingExchange):
         """Refuse callers who may not send a body, before any of the body is received or decoded.
 
         The transaction of the request checks the caller again. Here, an earlier check of the same caller may be reused
-        for `ADMISSION_S` seconds, except for results of jobs, whose bodies may be the largest.
+        for `ADMISSION_S` seconds. It is not reused for results of jobs, whose bodies may be the largest.
         """
         operation = self.operation
         project = self.path_kwargs.get("project") if operation.access.role is not None else None

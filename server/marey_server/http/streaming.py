@@ -138,7 +138,7 @@ class BlobSender(Resource):
         return None
 
     async def _send_rest(self, digest: str, position: int, end: int) -> None:
-        """Send the pieces after the first one, each when the one before was sent, and wait until all are sent."""
+        """Send the pieces after the first one, one at a time, and wait until all are sent."""
         while position < end:
             await self.flush()
             stop = min(end, position + PIECE_BYTES)

@@ -4,9 +4,10 @@ It carries out one order after another, each within limits of memory and time. A
 
 Messages between server and child are MessagePack that the receiver validates; nothing is pickled.
 
-Arguments: the pipe's file descriptor, the memory in bytes that orders may use, `FORK_SERVER` or `SINGLE`, and functions
-to call at the start, which load modules. The parent kills a child if an order takes too long, or if the client that
-waits for its result has closed the connection.
+The first arguments are the pipe's file descriptor, and the memory in bytes that orders may use. Then follows
+`FORK_SERVER` if the process forks children that carry out the orders, or `SINGLE` if it carries them out itself. The
+other arguments are functions to call at the start, which load modules. The parent kills a child if an order takes too
+long, or if the client that waits for its result has closed the connection.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ FORK_SERVER, SINGLE = "fork-server", "single"
 
 
 class Message(BaseModel):
-    """Message with named fields."""
+    """Base of messages between processes, whose named fields are packed as MessagePack."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -81,7 +82,10 @@ def pack_tree(tree: Any) -> bytes:
 
 
 def unpack_tree(packed: bytes) -> Any:
-    """Decode a document that `pack_tree` has encoded, and its arrays. Raises `TooLargeProblem` if it is too large."""
+    """Decode a document that `pack_tree` has encoded, with its arrays.
+
+    Raises `TooLargeProblem` if the document is too large.
+    """
     try:
         return decode_tree(packed, MSGPACK)
     except CodecError as error:

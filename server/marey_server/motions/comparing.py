@@ -41,7 +41,7 @@ MOST_FIELDS = 1000
 
 @dataclass(frozen=True, slots=True)
 class ComparedSide:
-    """One of the two compared revisions, with the documents of the parts that differ.
+    """Revision on one side of a comparison, with the documents of the parts that differ.
 
     `hierarchy` is the skeleton of the motion, if the part `motion` differs.
     """
@@ -62,7 +62,7 @@ class DifferenceSource:
 
 
 class SideOrder(Message):
-    """One of the two revisions of a `DifferenceOrder`, with its documents as bytes."""
+    """Revision on one side of a `DifferenceOrder`, with its documents as bytes."""
 
     place: ComparedRevision
     parts: dict[str, bytes]

@@ -54,8 +54,8 @@ ADVANCE_COVERAGE = "marey_server.motions.coverage:advance_coverage"
 class Given:
     """Skeleton and evaluation that a new stream refers to.
 
-    `skeleton` and `evaluation` are references to revisions; `rig` is the encoded skeleton with its joint mapping, and
-    `measured` is the part `evaluation` of the evaluation.
+    `skeleton` and `evaluation` are references to revisions. `rig` is the encoded skeleton with its joint mapping.
+    `measured` is the document of the evaluation (its part `evaluation`).
     """
 
     skeleton: Tree | None = None
@@ -67,7 +67,7 @@ class Given:
 class BeginOrder(Message):
     """Message that asks a child process to start a stream.
 
-    If the stream starts from an evaluation, `measured` is the encoded part `evaluation` of this evaluation.
+    If the stream starts from an evaluation, `measured` is the encoded document of this evaluation.
     """
 
     request: CoverageStreamCreate
@@ -77,7 +77,7 @@ class BeginOrder(Message):
     measured: bytes | None
 
     def given(self) -> Given:
-        """Return the skeleton and the evaluation of the new stream; the part `evaluation` is decoded."""
+        """Return the skeleton and the evaluation of the new stream, with the decoded document of the evaluation."""
         return Given(
             self.skeleton, self.rig, self.evaluation, None if self.measured is None else unpack_tree(self.measured)
         )

@@ -62,8 +62,8 @@ def read_source(
 ) -> ExportSource:
     """Return an item with all documents that a file format may need.
 
-    `permitted` says that the export is allowed even if the consent for the clip has ended. Raises `NotFoundProblem`,
-    and `ConflictProblem` if the consent has ended.
+    Raises `NotFoundProblem` if the item does not exist. Raises `ConflictProblem` if the consent for the clip has ended,
+    unless the caller has `permitted` the export.
     """
     found = items.read_item(tx, project, kind, item_id)
     if kind in WITH_MOTION and not permitted:
@@ -115,8 +115,8 @@ def find_original(
 ) -> OriginalFile:
     """Return the file that a clip, a model, a model's tree or a graph was imported from.
 
-    `permitted` is as for `read_source`. Raises `NotFoundProblem` if the item was not imported from a file, or if a
-    model, tree or graph was changed since, and `ConflictProblem` if the consent for the clip has ended.
+    Raises `NotFoundProblem` if the item was not imported from a file, or if a model, tree or graph was changed since.
+    Raises `ConflictProblem` if the consent for the clip has ended, unless the caller has `permitted` the export.
     """
     if kind in (Kind.MODEL, Kind.GRAPH):
         asked = PredecessorOptions(part=options.part)  # in whatever layout it came

@@ -77,7 +77,7 @@ def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
 
 
 def plan(names: Sequence[str]) -> list[PlannedFile]:
-    """Return the import plan of each file of a batch."""
+    """Decide for each file of a batch whether it is imported, read together with another file, or refused."""
     with LOADING:
         from marey_motion.importing.plan import plan_imports
 
@@ -85,7 +85,10 @@ def plan(names: Sequence[str]) -> list[PlannedFile]:
 
 
 def planned_entry(planned: PlannedFile) -> PreparedImport | None:
-    """Return the answer's entry for a companion file or a file with a refused name; None for a file to be read."""
+    """Return the answer's entry for a file that is not read by itself; None for a file to be read.
+
+    Such a file is the companion of another file, and read together with it, or its name is refused.
+    """
     with LOADING:
         from marey_motion.importing.files import planned_entry
 

@@ -10,12 +10,13 @@ import threading
 class Loading:
     """Lock held by every thread of the server while it imports modules of the motion library.
 
-    Python locks every module while it is imported. If one thread imports a package while another imports a module of
-    that package, each can wait for a lock that the other holds; Python then ends one of the imports with an error. With
-    this lock, only one thread imports at a time. Child processes need no lock, because they import in a single thread.
+    Python locks every module while it is imported. Suppose that one thread imports a package while another imports a
+    module of that package. Then each can wait for a lock that the other holds, and Python ends one of the imports with
+    an error. With this lock, only one thread imports at a time. Child processes need no lock, because they import in a
+    single thread.
 
     After an import that has loaded modules, the lock excludes all existing objects from garbage collection. Nearly all
-    of them belong to modules, which live as long as the process, and a search of them stops all threads for 0.2 s.
+    of these objects belong to modules, which live as long as the process. A search of them stops all threads for 0.2 s.
     """
 
     def __init__(self) -> None:

@@ -30,8 +30,8 @@ class PredecessorOptions:
     """Options of the file formats of Marey's predecessor.
 
     `end_index` and `form` apply to annotations, `layout` to models. By default, an unchanged model is exported as its
-    imported file; other models are written in layout 3. `part` selects a model or its tree, or the alignment of an
-    aligned clip instead of its motion.
+    imported file; other models are written in layout 3. `part` selects the part of the item to export: for a model, its
+    tree; for an aligned clip, its alignment. By default, the model or the motion of the clip is exported.
     """
 
     end_index: EndIndex = DEFAULT_END_INDEX
@@ -77,8 +77,8 @@ def write_predecessor(
 ) -> tuple[str, bytes]:
     """Return the name and the bytes of a file in a format of Marey's predecessor.
 
-    Raises `InvalidProblem` if the item cannot be written in such a format, and `NotFoundProblem` if a tree
-    is requested, but the model has none.
+    Raises `InvalidProblem` if the item cannot be written in such a format. Raises `NotFoundProblem` if a tree is
+    requested of a model without a tree.
     """
     from marey_motion.errors import MotionError
 

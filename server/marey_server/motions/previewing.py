@@ -80,7 +80,7 @@ class PreviewOrder(Message):
 def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, request: EditPreviewRequest) -> PreviewSource:
     """Return the inputs of a preview.
 
-    Raises `NotFoundProblem` if an input does not exist, `InvalidProblem` if the stored edit is not valid, and
+    Raises `NotFoundProblem` if an input does not exist, and `InvalidProblem` if the stored edit is not valid. Raises
     `TooLargeProblem` if the motions are so large that only a job may edit them.
     """
     if kind is not Kind.CLIP:

@@ -152,7 +152,7 @@ class MappingOrder(Message):
 def load() -> None:
     """Load the modules and kernels that child processes need.
 
-    This is done in advance, because compiling missing kernels takes far longer than reading a file.
+    The kernels are loaded in advance, because compiling missing kernels takes far longer than reading a file.
     """
     compile_kernels(["files", "editing", "searches", "coverage"])
 

@@ -59,7 +59,7 @@ class SearchLimits:
 class SearchOrder(Message):
     """Message that asks a child process to run a search.
 
-    A search has one or more steps; each step searches one model for one motion.
+    A search consists of steps; each step searches one model for one motion.
     """
 
     request: SearchRequest

@@ -56,7 +56,7 @@ class FoundSearchable:
 
 
 class SearchedModels(Message):
-    """Models of the steps of a search; `packed` contains a `PackedModel` for each item."""
+    """Models of the steps of a search; `packed` maps the id of each model's item to the bytes of a `PackedModel`."""
 
     found: tuple[FoundSearchable, ...]
     packed: dict[str, bytes]

@@ -61,7 +61,11 @@ class ChildLimits:
 
     @property
     def requests_of_guest(self) -> int:
-        """Greatest number of these requests from one guest, if all guests together are one caller."""
+        """Greatest number of requests of one guest that use children or wait for one.
+
+        All guests together count as one caller. One guest may have half of the requests of this caller, but at least
+        one.
+        """
         return max(1, self.requests_each // 2)
 
 

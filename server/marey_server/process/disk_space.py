@@ -55,11 +55,14 @@ class DiskSpace:
 
 
 def free_bytes(folder: Path) -> int:
-    """Return the free bytes of a folder's disk; if fewer than `RESERVE_BYTES` are free, first delete the reserve."""
+    """Return the free bytes of a folder's disk.
+
+    If fewer than `RESERVE_BYTES` are free, first delete the reserve file.
+    """
     free, file = shutil.disk_usage(folder).free, folder / RESERVE_FILE
     if free >= RESERVE_BYTES or not file.exists():
         return free
-    log.warning("the disk of %s is full: the file %s, its reserve, is removed", folder, file.name)
+    log.warning("the disk of %s is full; removing its reserve file %s", folder, file.name)
     file.unlink(missing_ok=True)
     return shutil.disk_usage(folder).free
 

@@ -1,7 +1,7 @@
-"""Waking of waiting requests after new events in the feed, which shows the changes of every server process.
+"""Wakes waiting requests of this process after new events in the feed, which lists the changes by all processes.
 
-One task per process reads the feed after each commit, after each notification of Postgres, and also periodically, in
-case a notification was lost. So even many waiting requests cause no work while nothing changes.
+One task per process reads the feed after each commit and after each notification of Postgres. It also reads the feed
+periodically, in case a notification was lost. So even many waiting requests cause no work while nothing changes.
 """
 
 from __future__ import annotations
@@ -65,7 +65,10 @@ async def _follow(services: Services) -> None:
 
 
 class _FeedPosition:
-    """Number of the last event that this process has read, and time up to which it has announced due retries."""
+    """Position in the feed: the number of the last event that this process has read.
+
+    It also holds the time up to which the process has announced retries that became due.
+    """
 
     def __init__(self, services: Services) -> None:
         self._services = services
@@ -91,7 +94,7 @@ class _FeedPosition:
     async def _announce_due(self) -> None:
         """Wake workers that wait for a kind of job if a retry of such a job has become due.
 
-        This function reads the whole queue, so it is not called after each commit.
+        Finding due retries reads the whole queue, so this is not done after each commit.
         """
         if time.monotonic() < self._look_for_due_at_s:
             return

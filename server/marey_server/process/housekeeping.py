@@ -1,9 +1,9 @@
 """Periodic work of the server.
 
-It reclaims expired leases, shares cached results with waiting jobs, commits the outputs of jobs that have many outputs,
-merges waiting proposals, and deletes old or unreferenced data. Only the leading process does this work, but concurrent
-housekeeping would be safe, because every statement checks its conditions again. Each kind of work runs in a separate
-task, so that a failure does not affect other kinds of work.
+It reclaims expired leases, and shares cached results with waiting jobs. It commits the outputs of jobs that have many
+outputs, and merges waiting proposals. It deletes old or unreferenced data. Only the leading process does this work, but
+concurrent housekeeping would be safe, because every statement checks its conditions again. Each kind of work runs in a
+separate task, so that a failure does not affect other kinds of work.
 """
 
 from __future__ import annotations
@@ -142,7 +142,10 @@ async def _merge_waiting(services: Services, holder: str, merges: WaitingMerges)
 
 
 async def _commit_outputs(services: Services, holder: str, *, listener: Listener, longest_wait_s: float) -> None:
-    """Wait at most `longest_wait_s` for jobs with many outputs to commit; then commit the outputs, and end the jobs."""
+    """Commit the outputs of jobs that have many outputs, and end these jobs; first wait for such jobs.
+
+    The wait takes at most `longest_wait_s` seconds.
+    """
     await listener.wait(longest_wait_s)
     if await _write(services, _leads, holder):
         await _in_thread(services, commit_deferred, services.database)
@@ -167,8 +170,8 @@ async def _in_thread(services: Services, function: Callable[P, T], *args: P.args
 async def _forget_tries(services: Services, holder: str) -> None:
     """Delete the expired rows of the limits on sign-ins.
 
-    This takes little time, because there are few rows: each sign-in adds three rows, and passwords are hashed one by
-    one.
+    The deletion takes little time, because there are few rows: each sign-in adds three rows, and passwords are hashed
+    one by one.
     """
     if await _write(services, _leads, holder):
         while await _write(services, rate_limits.forget_ended) == rate_limits.FORGOTTEN_AT_ONCE:

@@ -1,4 +1,4 @@
-"""Limit on the memory for requests: for bodies until they are decoded, and for answers until they are sent."""
+"""Limit on the memory for requests: bodies count until they are decoded, and answers until they are sent."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class RequestMemory:
     def take(self, client: Client, bytes_now: int, more: int, *, reserved: bool) -> None:
         """Count `more` bytes for `client`, whose request already holds `bytes_now` bytes.
 
-        Reserved operations have no limit for their owner, and the limit on all requests together is higher for them:
-        `total_bytes * (1 + RESERVED_SHARE)`. Raises `UnavailableProblem` if a limit would be exceeded.
+        For a reserved operation, such as a heartbeat, the share of the client is not limited. All requests together may
+        then hold more: `total_bytes * (1 + RESERVED_SHARE)`. Raises `UnavailableProblem` if a limit would be exceeded.
         """
         with self._lock:
             others = self.held_bytes > bytes_now
@@ -69,7 +69,10 @@ class RequestMemory:
 
 
 def _shares(client: Client) -> dict[str, float]:
-    """Return for whom the bytes of a client are counted, each with the largest fraction of the memory it may hold."""
+    """Return the keys under which a client's bytes are counted, each with its greatest share of the memory.
+
+    The bytes of an unknown client are counted under a key of its own, and under one key for all unknown clients.
+    """
     if client.known:
         return {client.key: CLIENT_SHARE}
     # A user who is often refused is unknown for a while; bytes that the user held before must not count in this share.

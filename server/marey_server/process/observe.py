@@ -1,7 +1,7 @@
 """Logs, request ids and metrics.
 
 Labels of metrics are route templates, methods and codes that the server defines, never values that a client sent. So
-metrics reveal no names, and the number of metrics grows neither with the data nor in an attack.
+metrics reveal no names. The number of metrics does not grow with the data, and an attack cannot increase it.
 """
 
 from __future__ import annotations
@@ -61,9 +61,10 @@ def configure_logging(form: LogForm, level: str) -> None:
 
 
 def without_received_text(record: logging.LogRecord) -> bool:
-    """Remove what the client sent from Tornado's message about a malformed request; return True, so that it is logged.
+    """Remove what the client sent from Tornado's message about a malformed request; return True.
 
-    Only the kind of the fault is kept. The rest is removed, because it may quote a header that contains a token.
+    Only the kind of the fault is kept and logged. The rest is removed, because it may quote a header that contains a
+    token.
     """
     if isinstance(record.args, tuple):
         record.args = tuple(_kind_of_fault(arg) if isinstance(arg, Exception) else arg for arg in record.args)
@@ -176,7 +177,10 @@ class Metrics:
             self.received.inc(bytes_in)
 
     def count_stopped_child(self, reason: str, work: str) -> None:
-        """Count a child process that ended before its work was done; both arguments are names in the server's code."""
+        """Count a child process that ended before its work was done.
+
+        `reason` and `work` are names that the server's code defines.
+        """
         self.children_stopped.labels(reason, work).inc()
 
     def watch(self, lanes: Mapping[str, Sized]) -> None:

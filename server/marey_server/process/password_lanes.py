@@ -1,8 +1,8 @@
 """Threads that hash passwords, and the part of a client's address for which sign-ins are limited.
 
-A hash takes 0.1 s and 32 MiB, so few run at once, and none in the threads of the database or of other computations.
-There is one thread for users at addresses from which they have signed in before, and one thread for all other sign-ins.
-So these other sign-ins do not delay known users, and use at most one processor.
+A hash takes 0.1 s and 32 MiB, so few hashes are computed at once. They never use the threads of the database or of
+other computations. There is one thread for users at addresses from which they have signed in before, and one thread for
+all other sign-ins. So these other sign-ins do not delay known users, and use at most one processor.
 """
 
 from __future__ import annotations
@@ -110,7 +110,10 @@ class RefusedTries:
                 raise too_many_sign_ins(limit, wait_s)
 
     def note(self, attempt: SignInTry, refusal: TooManyRequestsProblem) -> None:
-        """Remember until when tries are refused: all from this address, or those for this name from this address."""
+        """Remember until when tries are refused.
+
+        Depending on the limit, these are all tries from this address, or those for this name from this address.
+        """
         limit: LimitScope = refusal.context["limit"]
         name = None if limit == "address" else attempt.name
         self._until.put((name, attempt.address), (self._clock() + refusal.context["wait_s"], limit))

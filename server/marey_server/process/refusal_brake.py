@@ -1,9 +1,9 @@
 """Clients whose requests are refused often: their refusals are delayed while the event loop is late.
 
 Every request, even a refused one, takes a few milliseconds of the event loop. If two hundred connections send only
-refused requests, all other clients wait for seconds. So if the event loop is late, a client that was refused several
-times must wait before it is refused again, and the event loop has time for other clients. Such a client is also treated
-as a client without a known token, so that its requests begin after the requests of other clients.
+refused requests, all other clients wait for seconds. So while the event loop is late, a client that was refused several
+times must wait for its next refusal. Meanwhile, the event loop has time for other clients. Such a client is also
+treated as a client without a known token, so that its requests begin after the requests of other clients.
 """
 
 from __future__ import annotations

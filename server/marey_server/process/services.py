@@ -113,7 +113,7 @@ class Services:
         self.metrics.database_connections.set_function(lambda: self.database.connections_in_use)
 
     def note_faults(self, faults: Sequence[str]) -> None:
-        """Log the reasons why the server is not ready whenever these reasons change, and log when it is ready again."""
+        """Log the reasons why the server is not ready when these reasons change; also log when it is ready again."""
         if list(faults) != self._faults:
             self._faults = list(faults)
             if faults:

@@ -1,8 +1,8 @@
 """Line of requests whose headers have arrived: few begin in each round of the event loop, and clients take turns.
 
 In each round, the event loop first handles everything that has arrived, then looks at the network again; a request
-takes several rounds. If two hundred connections send requests without a pause, and all of them begin at once, each
-round takes two hundred times as long as a request, and all clients wait for several rounds. If a few begin in each
+takes several rounds. Suppose that two hundred connections send requests without a pause. If all of them begin at once,
+each round takes two hundred times as long as a request, and all clients wait for several rounds. If a few begin in each
 round, a round takes some milliseconds, and a client waits for one request of every other client.
 """
 
@@ -38,7 +38,8 @@ class Turns:
     def take(self, client: Client, *, reserved: bool) -> asyncio.Future[None] | None:
         """Return a future that ends when the request may begin, or None if the request may begin at once.
 
-        With `reserved`, the request waits in the line of reserved operations, which have `RESERVED_PER_ROUND` places.
+        With `reserved`, the request waits in the line of reserved operations, such as heartbeats. In each round, this
+        line has `RESERVED_PER_ROUND` places of its own.
         """
         if not self._in_round:
             self._in_round = True

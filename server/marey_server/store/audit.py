@@ -1,7 +1,7 @@
 """Audit log: the events that concern access and deletion, newest first.
 
-Entries are deleted only when they are older than the settings allow. They are changed only when an item is purged: in
-its entries, the id of the item then replaces the name.
+Entries are deleted only when they are older than the settings allow. Entries are changed only when an item is purged:
+in the entries of this item, its id then replaces its name.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class AuditFilter(NamedTuple):
     until: datetime | None = None
 
     def conditions(self) -> list[ColumnElement[bool]]:
-        """Return the conditions for rows of `event`."""
+        """Return the SQL conditions of this filter, for rows of the table `event`."""
         found: list[ColumnElement[bool]] = []
         if self.kind is not None:
             found.append(event.c.kind == self.kind)
@@ -54,13 +54,13 @@ class AuditFilter(NamedTuple):
 
 
 def list_audit(tx: Transaction, wanted: AuditFilter, *, cursor: str | None, limit: int) -> Page:
-    """List the entries of the whole server. Only administrators may do this."""
+    """List the audit entries of the whole server. Only administrators may do this."""
     require_administrator(tx.principal)
     return _list(tx, wanted, [], "", cursor, limit)
 
 
 def list_project_audit(tx: Transaction, name: str, wanted: AuditFilter, *, cursor: str | None, limit: int) -> Page:
-    """List the entries of a project."""
+    """List the audit entries of a project."""
     project_id = projects.require(tx, name).id
     return _list(tx, wanted, [event.c.project_id == project_id], project_id, cursor, limit)
 
@@ -68,7 +68,7 @@ def list_project_audit(tx: Transaction, name: str, wanted: AuditFilter, *, curso
 def _list(
     tx: Transaction, wanted: AuditFilter, of: list[ColumnElement[bool]], project_id: str, cursor: str | None, limit: int
 ) -> Page:
-    """Return a page of entries. On Postgres, `number_events` must be called first."""
+    """Return a page of audit entries. On Postgres, `number_events` must be called first."""
     number = events.number_of(tx)
     statement = (
         select(*_COLUMNS, number.label("number"), project.c.name.label("project"))

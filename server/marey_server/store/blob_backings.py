@@ -137,11 +137,11 @@ class DatabaseBlobs:
         connection.execute(delete(blob_chunk).where(blob_chunk.c.digest == digest))
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:  # noqa: ARG002
-        """Yield no digests: a foreign key prevents bytes without a row."""
+        """Yield no digests, because a foreign key prevents bytes without a row in `blob`."""
         return iter(())
 
     def remove_stray(self, digest: str) -> None:
-        """Do nothing: there are no bytes without a row."""
+        """Do nothing, because there are no bytes without a row in `blob`."""
 
     def new_copy(self) -> None:
         """Return None: no copy is needed, because the stored pieces of an upload become the blob."""

@@ -142,7 +142,8 @@ EVERY_PROJECT = ""
 def places_of_sender(tx: Transaction) -> tuple[str, ...]:
     """Return the ids of the projects in which the caller can use bytes after uploading them, or `EVERY_PROJECT`.
 
-    Raises `ForbiddenProblem` if the caller's token is limited to projects in none of which the user may write.
+    Raises `ForbiddenProblem` if the caller's token is limited to certain projects, and the user may write in none of
+    these.
     """
     names = scopes.projects_of(tx.principal.scopes, "write")
     if tx.principal.kind != "user" or EVERY_PROJECT in names:
@@ -227,9 +228,9 @@ def add_holder(tx: Transaction, digest: str, places: Iterable[str]) -> None:
 
 
 def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
-    """Return the subset of digests that the caller may refer to.
+    """Return those of the digests that the caller may refer to, and protect their blobs.
 
-    The blobs with the returned digests cannot be deleted before the end of this transaction.
+    These blobs cannot be deleted before the end of this transaction.
     """
     return _renew(tx, blob, readable(tx, digests))
 
@@ -287,12 +288,18 @@ def missing(tx: Transaction, digests: Iterable[str]) -> list[str]:
 
 
 def require_readable(tx: Transaction, digest: str) -> int:
-    """Return the size of a blob in bytes. Raises `NotFoundProblem` if it is missing or the caller may not read it."""
+    """Return the size of a blob in bytes.
+
+    Raises `NotFoundProblem` if the blob is missing or the caller may not read it.
+    """
     return sizes_of_readable(tx, [digest])[digest]
 
 
 def sizes_of_readable(tx: Transaction, digests: Collection[str]) -> dict[str, int]:
-    """Return the sizes of blobs in bytes, by digest. Raises `NotFoundProblem` if any may not be read."""
+    """Return the sizes of blobs in bytes, by digest.
+
+    Raises `NotFoundProblem` if the caller may not read one of the blobs.
+    """
     sizes = sizes_of(tx, readable(tx, digests))
     for digest in digests:
         if digest not in sizes:

@@ -1,8 +1,8 @@
 """Correction of the clock that an SQLite database stores, after a server ran while the clock of its machine was wrong.
 
 The stored clock never goes back by itself. If a server once started with a clock that was years ahead, all leases,
-tokens and ages would be compared with that time. This module sets the stored clock to the time of this machine, and
-corrects all stored times that are later than this.
+tokens and ages would be compared with that time. This module sets the stored clock to the time of this machine. It also
+corrects all stored times that are later than the time of this machine.
 """
 
 from __future__ import annotations

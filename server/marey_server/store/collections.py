@@ -120,7 +120,10 @@ def find_collection(tx: Transaction, project_row: ProjectRow, collection_id: str
 def _find(
     tx: Transaction, project_row: ProjectRow, collection_id: str, state: ColumnElement[bool], *, lock: bool = False
 ) -> Row[Any]:
-    """Return the row of a collection in the given state; with `lock`, lock the row. Raises `NotFoundProblem`."""
+    """Return the row of a collection that meets the condition `state`, for example that it is not deleted.
+
+    With `lock`, the row is locked. Raises `NotFoundProblem`.
+    """
     statement = select(collection).where(
         collection.c.id == collection_id, collection.c.project_id == project_row.id, state
     )
@@ -211,7 +214,7 @@ def _lock_inside(tx: Transaction, project_row: ProjectRow, path: str) -> Sequenc
     """Lock all folders below the locked folder at `path`, and return their paths.
 
     No folder below `path` is changed or added before this write ends, because `ensure` locks the parent while it adds a
-    folder. While this function waits for the lock of a folder, subfolders may be added to this folder, so the search is
+    folder. While this function waits for the lock of a folder, subfolders may be added to this folder. So the search is
     repeated until there are no more unlocked folders.
     """
     statement = select(collection.c.path).where(*_inside(project_row, path)).order_by(collection.c.path)

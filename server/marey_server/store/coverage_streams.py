@@ -1,7 +1,7 @@
 """Coverage streams: frames are sent during a recording, and each answer shows which motions are still missing.
 
 Each stream is one row, updated by compare-and-swap. The row holds the whole state of the stream, and the answer to the
-last request, so that a sender who did not receive the answer gets it by repeating the request.
+last request. So a sender who did not receive this answer gets it by repeating the request.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def require_offset(stream: Stream, offset: int) -> None:
 
 
 def _elsewhere(stream: Stream) -> CoverageOffset:
-    detail = f"The stream has {stream.offset} frames; go on from there."
+    detail = f"The stream has {stream.offset} frames; send the next frames at the offset {stream.offset}."
     return CoverageOffset(detail, context={"offset": stream.offset})
 
 

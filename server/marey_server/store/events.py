@@ -3,7 +3,7 @@
 SQLite has one writer, so that `event.seq`, given at the insertion, already follows the order of commits. On Postgres
 transactions overlap, so events get their numbers after the commit, in `number_events`. A transaction that numbers
 events holds a lock until its own commit, sees only committed events, and continues after the last number. So no event
-gets a lower number than one that was already listed, writers do not wait for each other, and the order depends on
+gets a lower number than one that was already listed. Writers do not wait for each other, and the order depends on
 nothing but the tables.
 
 Entries of the audit log are events that are kept longer than others. The feed begins after the last event that was old
@@ -84,10 +84,7 @@ def list_events(
 
 
 def require_kept(tx: Transaction, after: int) -> None:
-    """Check that no event after the one numbered `after` was deleted, so that a client has missed none.
-
-    Raises `GoneProblem`.
-    """
+    """Raise `GoneProblem` if an event after the one numbered `after` was deleted, so that a client has missed it."""
     last = _last_deleted(tx)
     if 0 < after < last:
         raise GoneProblem(
@@ -104,7 +101,11 @@ def _last_deleted(tx: Transaction) -> int:
 
 
 def start_of_feed(tx: Transaction, after: int) -> int:
-    """Return the number of the event after which a client reads on, if it has received the events up to `after`."""
+    """Return the number of the event after which a client continues to read.
+
+    The client has received the events up to `after`. If later events were deleted from the feed, the client continues
+    after the last deleted event.
+    """
     return max(after, _last_deleted(tx))
 
 
@@ -112,10 +113,10 @@ def start_of_feed(tx: Transaction, after: int) -> int:
 
 
 def find_last_old(tx: Transaction, age_us: int) -> int | None:
-    """Return the number of the last event that may be deleted because it and all earlier ones are older than `age_us`.
+    """Return the number of the last event that may be deleted, or None if there is no such event.
 
-    Returns None if there is no such event. At most `DELETED_AT_ONCE` events of the feed have numbers up to the returned
-    one. The newest event is not among these events.
+    This event and all earlier ones are older than `age_us`. At most `DELETED_AT_ONCE` events of the feed have numbers
+    up to the returned number. The newest event always has a greater number.
     """
     number = number_of(tx)
     oldest = select(number.label("number"), event.c.at_us).where(follows(tx, _last_deleted(tx)))
@@ -153,7 +154,7 @@ _COLUMNS = (event.c.at_us, event.c.kind, event.c.subject, event.c.actor, event.c
 
 
 def number_of(tx: Transaction) -> ColumnElement[int]:
-    """Return the column of the numbers of events."""
+    """Return the column of the table `event` that contains the numbers of events."""
     return event.c.number if tx.is_postgres else event.c.seq
 
 

@@ -120,7 +120,7 @@ def _check_page(
 
 
 def _check_file(tx: Transaction) -> list[StoreDefect]:
-    """Return the faults that SQLite finds in its file and in foreign keys; none on Postgres, which prevents them."""
+    """Return the faults that SQLite finds in its file and in foreign keys; on Postgres, return none."""
     if tx.is_postgres:
         return []
     pages = [row[0] for row in tx.execute(text("PRAGMA integrity_check(100)")) if row[0] != "ok"]
@@ -362,7 +362,10 @@ def _is_consistent(one: Row[Any], branches: set[str]) -> bool:
 
 
 def _check_job(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return a fault for each item that a job names without a row in the table `job_item`, which purges rely on."""
+    """Return a fault for each item that a job names, but that has no row in the table `job_item` for this job.
+
+    Purges rely on this table.
+    """
     naming = NamingJob(row.id, row.inputs, {} if row.parent_id is not None else row.params, row.outputs or ())
     recorded = set(tx.execute(select(job_item.c.item_id).where(job_item.c.job_id == row.id)).scalars())
     return [

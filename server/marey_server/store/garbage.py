@@ -1,6 +1,6 @@
 """Garbage collection: deletes unreferenced documents and blobs, abandoned uploads and streams, and expired rows.
 
-Rows that expire are keys of repeated requests, tokens and invitations.
+Expired rows are old idempotency keys, expired tokens and expired invitations.
 
 A read finds the candidates. Each batch is then deleted in a transaction of its own that locks the rows and checks them
 again. A write that adds a reference to a document or blob first updates the time in the row of the document or blob. So
@@ -54,7 +54,7 @@ MOST_UPLOADS = 10_000
 
 @dataclass(frozen=True, slots=True)
 class Collected:
-    """Numbers of deleted rows."""
+    """Numbers of deleted rows and files, by sort."""
 
     documents: int
     blobs: int
@@ -98,7 +98,7 @@ def _collect(
 def _candidates(tx: Transaction, table: Table, grace_us: int, behind: str) -> list[str]:
     """Return at most `BATCH` digests, the next after `behind`, that have had no references for `grace_us`.
 
-    Together, the documents or blobs have at most `BATCH_BYTES`; a single one may have more.
+    Together, these documents or blobs have at most `BATCH_BYTES`. A document or blob with more bytes is returned alone.
     """
     rows = select(table.c.digest, table.c.size_bytes).where(table.c.digest > behind, *_garbage(tx, table, grace_us))
     chosen: list[str] = []
@@ -112,7 +112,7 @@ def _candidates(tx: Transaction, table: Table, grace_us: int, behind: str) -> li
 
 
 def _garbage(tx: Transaction, table: Table, grace_us: int) -> tuple[ColumnElement[bool], ...]:
-    """Return SQL conditions for rows that may be deleted; they do not exclude staged documents, so the caller must."""
+    """Return SQL conditions for rows that may be deleted; the caller must exclude staged documents separately."""
     old = table.c.created_us < tx.now_us - grace_us
     if table is document:
         return old, ~exists().where(revision_part.c.document_digest == document.c.digest)
@@ -121,7 +121,7 @@ def _garbage(tx: Transaction, table: Table, grace_us: int) -> tuple[ColumnElemen
 
 
 def _still_garbage(tx: Transaction, table: Table, digests: Sequence[str], grace_us: int) -> list[str]:
-    """Return the digests whose rows may still be deleted, and lock these rows so that this stays true."""
+    """Lock the rows with the given digests, and return the digests of those that may still be deleted."""
     chosen = table.c.digest.in_(digests)
     tx.execute(select(table.c.digest).where(chosen).order_by(table.c.digest).with_for_update()).all()
     return list(tx.execute(select(table.c.digest).where(chosen, *_garbage(tx, table, grace_us))).scalars())
@@ -141,7 +141,7 @@ def _staged_documents(tx: Transaction) -> set[str]:
     """Return the digests of the documents of staged outputs: results that a running job has not published yet.
 
     Documents that are staged after this read are not deleted either, because staging updates the time of their rows.
-    If an attempt has completed, the documents that it staged are kept only while something else refers to them.
+    After an attempt has completed, its staged documents are kept only while something else refers to them.
     """
     running = select(job.c.id).where(job.c.state == JobState.RUNNING.value)
     staged = select(staged_output.c.draft).where(staged_output.c.job_id.in_(running))
@@ -183,7 +183,7 @@ def _remove_stray(tx: Transaction, digest: str) -> int:
 
 
 def _delete_uploads(database: Database) -> int:
-    """Delete abandoned uploads, and pieces that no upload and no blob needs; return the number of these uploads.
+    """Delete abandoned uploads, and pieces that no upload and no blob needs; return the number of deleted uploads.
 
     Uses several short transactions.
     """

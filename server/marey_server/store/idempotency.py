@@ -3,7 +3,7 @@
 Key, answer and effects are written in one transaction, so that all exist or none. A concurrent request with the same
 key waits for that transaction.
 
-A request may be refused before its transaction begins, because the first request with the key has had its effects. So
+The effects of the first request can be a reason to refuse the repeated request, even before its transaction begins. So
 the server looks up the key of a refused request, too, before it answers.
 """
 
@@ -38,9 +38,9 @@ class StoredAnswer:
 def begin(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
     """Reserve `key` for a request and return None, or return the stored answer to an earlier, equal request.
 
-    `fingerprint` identifies the request and the scopes of the token, so that a token with fewer rights cannot get the
-    answer given to one with more. Raises `InvalidProblem` if the key was used for another request. The caller must call
-    `finish` in the same transaction.
+    `fingerprint` identifies the request and the scopes of the token. So a token with fewer rights cannot get the answer
+    given to a token with more rights. Raises `InvalidProblem` if the key was used for another request. The caller must
+    call `finish` in the same transaction.
     """
     fingerprint = _with_reach(fingerprint, tx.principal)
     mine = _mine(tx.principal, key)
@@ -66,19 +66,22 @@ def find(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
 
 def _answer(stored: Row[Any], fingerprint: str) -> StoredAnswer:
     if stored.fingerprint != fingerprint:
-        detail = "This Idempotency-Key was used for another request, or with a token of other scopes."
+        detail = "This Idempotency-Key was used for another request, or with a token that has other scopes."
         raise InvalidProblem(detail, code="idempotency-key-reused")
     return StoredAnswer(stored.status, dict(stored.headers), bytes(stored.body))
 
 
 def finish(tx: Transaction, key: str, status: int, headers: Mapping[str, str], body: bytes) -> None:
-    """Store the answer to the request for which `begin` claimed the key."""
+    """Store the answer to the request for which `begin` has reserved the key."""
     answer = {"status": status, "headers": dict(headers), "body": body}
     tx.execute(update(idempotency_key).where(*_mine(tx.principal, key)).values(**answer))
 
 
 def principal_key(principal: Principal) -> str:
-    """Return, as a text, who owns the caller's idempotency keys: an attempt, a user, or all callers of another kind."""
+    """Return a text that identifies the owner of the caller's idempotency keys.
+
+    The owner is an attempt, a user, or all callers of another kind together.
+    """
     if principal.kind == "attempt":
         return f"{principal.job_id}/{principal.fence}"
     return principal.user_id or principal.kind

@@ -1,4 +1,7 @@
-"""Leader election among server processes, by a row with a lease and a fence."""
+"""Leader election among server processes, by a row with a lease and a fence.
+
+The fence is a number that each new leader increases.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ class Lead:
 def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | None:
     """Become or stay the leader for the task `name` during `ttl_us`.
 
-    Returns the fence, or None if another process is the leader.
+    Returns the fence (a number that each new leader increases), or None if another process is the leader.
     """
     free = or_(leader.c.holder == holder, leader.c.expires_us <= tx.now_us)
     renewed = tx.execute(

@@ -42,7 +42,7 @@ class Order:
     def after(self, values: Sequence[Any]) -> ColumnElement[bool]:
         """Return the condition for the rows after the row with these values.
 
-        Its first term restricts the first column to a range, so that an index can be used.
+        The first term of the condition restricts the first column to a range, so that an index can be used.
         """
         (first, falls), *rest = self.columns
         beyond: ColumnElement[bool] = first < values[0] if falls else first > values[0]

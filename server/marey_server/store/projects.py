@@ -106,11 +106,11 @@ def require(
 ) -> ProjectRow:
     """Return the project `name` if the caller has the role and the scope that the transaction's operation declares.
 
-    `at_least` can require a higher role than the declared one, but not a lower one. `deleted=True` looks for the
-    project of this name that was deleted last. If the operation declares `in_folders`, a role in some folder suffices,
-    but the result contains the role in the project.
+    If `at_least` is higher than the declared role, it is required instead. `deleted=True` looks for the project of this
+    name that was deleted last. If the operation declares `in_folders`, a role in some folder suffices, but the result
+    contains the role in the project.
 
-    Raises `NotFoundProblem` if the caller may not know that the project exists, and `ForbiddenProblem` if the caller
+    Raises `NotFoundProblem` if the caller may not know that the project exists. Raises `ForbiddenProblem` if the caller
     lacks the role or the scope. An anonymous caller gets `UnauthenticatedProblem` instead of `ForbiddenProblem`,
     because signing in may help.
     """

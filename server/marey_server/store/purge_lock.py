@@ -2,10 +2,10 @@
 
 Such a write reads items and then stores something that refers to them: a revision, an input of a job, a commit. Between
 reading and storing, another request could delete and purge the items. So each of these writes first acquires a lock
-that excludes purges of its project, before it reads items and before it locks any row; many such writes run side by
-side. A purge waits until the writes that hold the lock have ended, and later writes wait until the purge has ended.
-Neither a purge nor such a write waits for this lock while it holds a row that the other needs, so there are no
-deadlocks.
+that excludes purges of its project. The write does so before it reads items and before it locks any row. Many such
+writes run side by side. A purge waits until the writes that hold the lock have ended, and later writes wait until the
+purge has ended. While a purge or such a write waits for this lock, it holds no row that the other side needs. So there
+are no deadlocks.
 
 A commit is prepared in one transaction and recorded in a later one. The preparation reads the time of the project's
 last purge. Recording fails if another purge has followed.

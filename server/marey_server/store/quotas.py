@@ -125,8 +125,8 @@ def count_sent(tx: Transaction, size_bytes: int) -> None:
         return
     remedy = "The operator can raise the setting `user_daily_bytes`."
     raise QuotaExceededProblem(
-        f"You may send {most:,} new bytes per day, and this needs {size_bytes:,} more. "
-        + (remedy if wait_s is None else f"Send it in {wait_s} s. {remedy}"),
+        f"You may send {most:,} new bytes per day, and this request needs {size_bytes:,} more. "
+        + (remedy if wait_s is None else f"Send the data in {wait_s} s. {remedy}"),
         context={"quota": "user_daily_bytes", "limit": most, "wait_s": wait_s},
     )
 
@@ -138,7 +138,7 @@ def take_back_sent(tx: Transaction, size_bytes: int) -> None:
 
 
 def _part_of_day(tx: Transaction, size_bytes: int) -> DailyAmount | None:
-    """Return the limit that an amount of bytes uses up, or None if it is not limited."""
+    """Return the daily limit for the bytes that the caller sends, or None if no limit applies."""
     if tx.principal.user_id is None or tx.principal.kind != "user" or size_bytes == 0:
         return None
     key = key_of("sent-bytes", tx.principal.user_id)
@@ -150,7 +150,7 @@ def _part_of_day(tx: Transaction, size_bytes: int) -> DailyAmount | None:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """Numbers of items, and of the bytes of their revisions."""
+    """Number of items, and number of bytes of their revisions."""
 
     items: int = 0
     stored_bytes: int = 0

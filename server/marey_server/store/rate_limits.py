@@ -1,8 +1,8 @@
 """Limits on how often something may happen, shared by all servers.
 
-A limit is a row with one time (the generic cell rate algorithm): each event moves the time into the future by an
-interval, and an event that would move it too far is refused and not counted. So a limit always ends after the time that
-its refusal states. Rows whose time has passed have no effect, and are deleted. Keys are hashes, so that a stolen
+A limit is a row with one time (the generic cell rate algorithm). Each event moves the time into the future by an
+interval. An event that would move the time too far is refused and not counted. So a limit always ends after the time
+that its refusal states. Rows whose time has passed have no effect, and are deleted. Keys are hashes, so that a stolen
 database does not show the names and addresses in them.
 """
 
@@ -32,21 +32,27 @@ class RateLimit:
     interval_us: int
 
     def latest_us(self, now_us: int) -> int:
-        """Return the latest time that the row may contain if another event is to be allowed now."""
+        """Return the latest time that the row of this limit may contain if another event is to be allowed now."""
         return now_us + (self.burst - 1) * self.interval_us
 
 
 @dataclass(frozen=True, slots=True)
 class DailyAmount(RateLimit):
-    """Limit on an amount per day, such as bytes: an event uses up an amount that is free again after `interval_us`."""
+    """Limit on an amount per day, such as bytes.
+
+    An event uses up an amount, which becomes free again after `interval_us`.
+    """
 
     @classmethod
     def part(cls, key: str, amount: int, most: int) -> DailyAmount:
-        """Return the limit for an event that uses up `amount` of `most`; `most` is free at first, and again per day."""
+        """Return the limit for an event that uses up `amount`.
+
+        `most` is the amount that is free at first, and that becomes free again in each day.
+        """
         return cls(key, burst=1, interval_us=max(1, amount * DAY_US // most))
 
     def latest_us(self, now_us: int) -> int:
-        """Return the latest time that the row may contain if the event is to be allowed now."""
+        """Return the latest time that the row of this limit may contain if the event is to be allowed now."""
         return now_us + DAY_US - self.interval_us
 
 

@@ -158,8 +158,8 @@ task = job.alias("task")
 def _old_jobs(tx: Transaction, age_us: int, after: str) -> list[str]:
     """Return the ids of the next jobs, after the id `after`, that can be deleted.
 
-    These jobs ended long ago, neither they nor their tasks created a revision or a commit, and no other job depends on
-    them.
+    Such a job ended long ago, and no other job depends on it. Neither the job nor one of its tasks created a revision
+    or a commit.
     """
     tasks = select(task.c.id).where(task.c.parent_id == job.c.id)
     with_tasks = or_(job_dependency.c.on_job_id == job.c.id, job_dependency.c.on_job_id.in_(tasks))

@@ -55,6 +55,7 @@ def change_row(
 def moved_on(current_rev: int) -> PreconditionFailedProblem:
     """Return the error for a resource that was changed by another request; `context.rev` is its current `rev`."""
     return PreconditionFailedProblem(
-        f"This has changed since you read it (it is at rev {current_rev} now). Read it again, then repeat the change.",
+        f"The resource has changed since you read it; its rev is {current_rev} now. Read it again, then repeat the "
+        "change.",
         context={"rev": current_rev},
     )

@@ -131,7 +131,7 @@ class Transaction:
     def lock(self, name: str, *, shared: bool = False) -> None:
         """Acquire the lock `name` and hold it until the end of the write; `shared` locks exclude only exclusive locks.
 
-        On SQLite it does nothing, because there is only one writer at a time.
+        On SQLite, nothing is locked, because there is only one writer at a time.
         """
         if not self.is_postgres or (name, shared) in self._locks:
             return
@@ -155,7 +155,7 @@ class Transaction:
     def audit(self, kind: AuditKind, subject: str, *, about: str, project_id: str | None = None, **body: Any) -> None:
         """Record an event that is also an entry of the audit log.
 
-        `about` is the name of the user or object that is changed; only the audit log shows it, and neither it nor the
+        `about` is the name of the user or object that is changed; only the audit log shows it. Neither `about` nor the
         body may contain a secret.
         """
         token_id = self.principal.token_id

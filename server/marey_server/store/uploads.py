@@ -55,7 +55,7 @@ class StoredUpload:
 
     @property
     def is_received(self) -> bool:
-        """Return whether all bytes were received, but were neither stored as a blob nor refused yet."""
+        """Return whether all bytes were received, and the upload was not stored as a blob or refused yet."""
         return self.offset == self.length and self.digest is None and self.actual_digest is None
 
 
@@ -195,7 +195,7 @@ def delete_dropped(tx: Transaction, limit: int) -> int:
 
 
 def _sender(tx: Transaction) -> dict[str, Any]:
-    """Return the columns of a new upload that record who sends it and for which projects."""
+    """Return the columns of a new upload that record the sender, and the projects in which the bytes can be used."""
     caller = tx.principal
     blobs.require_sender(caller)
     if caller.kind == "attempt":

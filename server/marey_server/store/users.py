@@ -118,8 +118,8 @@ def change_user(
     """Change a user: administrators may change all fields, users their own display name and password.
 
     A new password ends the user's sessions, unless the request says which tokens end. `password_hash` is the hash of
-    `request.password`. `verified_hash` is the hash against which `request.current_password` was checked; it must still
-    be the hash of the user when the change is written.
+    `request.password`. `verified_hash` is the hash against which `request.current_password` was checked. The change is
+    refused if the user has another hash by then.
     """
     itself = _require_changes(tx.principal, name, request)
     which: tuple[ColumnElement[bool], ...] = (user.c.name == name,)

@@ -1,8 +1,8 @@
 """Requests to the URLs of webhooks.
 
 A host name is resolved for each attempt, and the connection goes to the address that was checked. So a name cannot lead
-to a private network, not even if its address changes after the check. Redirects are not followed, and the body of the
-answer is not used: neither the target of a redirect nor the body appears in errors or logs.
+to a private network, even if its address changes after the check. Redirects are not followed, and the body of the
+answer is not used. So errors and logs contain neither the target of a redirect nor the body.
 """
 
 from __future__ import annotations

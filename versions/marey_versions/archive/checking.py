@@ -99,8 +99,8 @@ class _Check:
 def check_archive(archive: Archive, on_progress: OnProgress = lambda _done, _all: None) -> None:
     """Check that an archive contains everything to which its commits refer, unchanged, and nothing else.
 
-    If an archive has only the later part of a history, the entries of its versions are not compared with the digests in
-    its commits, because this needs the earlier versions; the server compares them when it imports the archive. Raises
+    To compare the entries of a version with the digest in its commit, all earlier versions are needed. So if an archive
+    has only the later part of a history, these digests are compared only when the server imports the archive. Raises
     `BadArchive`, which names the faulty member.
     """
     _Check(archive, on_progress).run()

@@ -162,8 +162,8 @@ class Archive:
     def versions(self) -> Versions:
         """Compute the entries of all versions from the changes of their commits.
 
-        Raises `BadArchive` if the entries of a version do not have the digest in its commit, or if the archive has only
-        the later part of a history.
+        Raises `BadArchive` if the digest of a version's entries is not the digest in its commit. Also raises
+        `BadArchive` if the archive has only the later part of a history.
         """
         if self.manifest.base:
             earlier = self.manifest.base[0]

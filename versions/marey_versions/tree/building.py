@@ -1,11 +1,11 @@
 """Construction of trees from sorted entries, and the rule that says where chunks end.
 
-The rule depends on keys alone, so that a changed value never moves an end. The entry or child with the key k at level l
-ends its chunk if the first 4 bytes of SHA-256 of the text "l k", read as a big-endian number, are below 2^32 / n. In
-leaves n is `MEAN_ENTRIES`, in the chunks above the leaves it is `MEAN_CHILDREN`. There are two exceptions. The first
-member of a chunk never ends it, so that each level has at most about half as many chunks as the level below. A chunk
-with `LONGEST` times n members ends in any case, so that keys which somebody has chosen on purpose cannot make a chunk
-arbitrarily large.
+The rule depends on keys alone, so that a changed value never moves an end. Let k be the key of an entry or child at
+level l. The first 4 bytes of the SHA-256 of the text "l k" are read as a big-endian number. The entry or child ends its
+chunk if this number is below 2^32 / n. In leaves n is `MEAN_ENTRIES`, in the chunks above the leaves it is
+`MEAN_CHILDREN`. There are two exceptions. The first member of a chunk never ends it, so each level has at most about
+half as many chunks as the level below. A chunk with `LONGEST` times n members ends in any case, so nobody can make a
+chunk arbitrarily large by a choice of keys.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ class KeyRange(NamedTuple):
         return (self.after is None or key > self.after) and (self.last is None or key <= self.last)
 
     def overlaps(self, before: str | None, child: Child) -> bool:
-        """Return whether `child`, all of whose keys are greater than `before`, can have keys in the range."""
+        """Return whether a chunk can have keys in the range; all keys of `child` are greater than `before`."""
         starts_in_time = self.last is None or before is None or before < self.last
         return starts_in_time and (self.after is None or child.last_key > self.after)
 
@@ -73,7 +73,7 @@ class KeyRange(NamedTuple):
 def _compare(
     reader: ChunkReader, level: int, before: Sequence[Child], after: Sequence[Child], within: KeyRange
 ) -> Iterator[Changed]:
-    """Yield the differing keys, within a range of keys, below chunks of one level in two trees."""
+    """Compare the chunks of one level in two trees; yield the keys in the range `within` whose values differ."""
     shared = {child.digest for child in before} & {child.digest for child in after}
     before, after = ([child for child in side if child.digest not in shared] for side in (before, after))
     if level == 0:

@@ -57,8 +57,8 @@ class _Change:
     def _rewrite(self, level: int, changes: Sequence[tuple[str, Any]]) -> list[tuple[str, Child | None]]:
         """Add the new chunks of one level after `changes`, and return the resulting changes of the level above.
 
-        `changes` contains entries if the level is that of the leaves, and children of branches otherwise, by key; None
-        removes the key.
+        `changes` contains, by key, entries if the level is that of the leaves, and otherwise children of branches. None
+        removes a key.
         """
         changed: dict[str, Child | None] = {}
         old = _ChunksOfLevel(self._writer.reader, self._root, level)

@@ -102,7 +102,7 @@ class Tree:
                 yield key, value
 
     def _from(self, chunk: Chunk, start: str) -> Iterator[Entry]:
-        """Return those entries below a chunk whose keys are not less than `start`."""
+        """Return the entries below a chunk whose keys are `start` or greater."""
         if isinstance(chunk, Leaf):
             yield from chunk.entries[bisect_left(chunk.entries, start, key=_key_of) :]
             return

@@ -144,7 +144,7 @@ def build_set(
 ) -> MatchingDatabase:
     """Return the matching database of a set of clips.
 
-    Raises `JobRefused` if the clips have several skeletons or a trim is outside its clip, and `MotionError` if the
+    Raises `JobRefused` if the clips have several skeletons or a trim is outside its clip. Raises `MotionError` if the
     clips cannot be used for motion matching.
     """
     motions = list(read_motions(context, wanted.clips))

@@ -15,7 +15,10 @@ UNUSABLE = (MotionError, ValidationError, Unreadable)
 
 
 def present(pin: PinnedInput, document: Any) -> Any:
-    """Return `document`; if it is None because the input was deleted while the job waited, raise `NoSuchThing`."""
+    """Return `document`, the document of the input `pin`.
+
+    Raises `NoSuchThing` if `document` is None, because the input was deleted while the job waited.
+    """
     if document is None:
         raise NoSuchThing(f"revision {pin.revision} of the item {pin.item} no longer exists", f"no-{pin.kind}")
     return document

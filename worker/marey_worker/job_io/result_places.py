@@ -26,8 +26,8 @@ class ResultPlaces:
     def take(self, kind: Kind, collection: str, *names: str) -> None:
         """Reserve names in a collection below `into` for results.
 
-        Raises `MotionError`, and reserves no name, if a name is too long or already reserved, or if the result of this
-        name would replace an input.
+        Raises `MotionError` if a name is too long or already reserved, or if the result of this name would replace an
+        input. Then no name is reserved.
         """
         for name in names:
             self._require_free(kind, collection, name)

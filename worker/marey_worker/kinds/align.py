@@ -243,7 +243,8 @@ class _Job:
     def _options(self) -> AlignOptions:
         """Return the options of the alignment.
 
-        If the reference is the id of a clip, it is replaced by the uid of the newest revision among the inputs.
+        If the reference is the id of a clip, it is replaced by a name of the clip's newest revision among the inputs.
+        The name consists of the id and the number of the revision.
         """
         options = AlignOptions.of(self._params)
         if options.reference in (MEDOID, NEAREST_MEAN_LENGTH):

@@ -99,8 +99,8 @@ class _Cutting:
         """Return the annotated clip with its name and folder.
 
         If clips are inputs of the job, name and folder are those at the time of submission: results are cached for jobs
-        with the same inputs, so later changes must not affect the results. Raises `MotionError` if the clip is not an
-        input of the job although other clips are, and `NoSuchThing` if the clip does not exist.
+        with the same inputs, so later changes must not affect the results. Then `MotionError` is raised if this clip is
+        not among the inputs. Raises `NoSuchThing` if the clip does not exist.
         """
         if not self._clips:
             return self._context.item(Kind.CLIP, clip.item)
@@ -113,7 +113,7 @@ class _Cutting:
         return self._clip_pins.get((clip.item, clip.revision), self._clips[clip.item])
 
     def _named(self, annotation: Annotation, clip: Item | PinnedInput) -> Iterator[tuple[Segment, str]]:
-        """Yield each selected segment with the name of its piece; all segments with the same label are numbered."""
+        """Yield each selected segment with the name of its piece; segments of one label are numbered in order."""
         numbers: Counter[str] = Counter()
         for one in annotation.segments:
             numbers[one.label] += 1

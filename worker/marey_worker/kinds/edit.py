@@ -32,8 +32,8 @@ def run(context: Context, params: EditParams) -> dict[str, Any]:
     """Apply the commands to every clip of the job.
 
     A clip that cannot be edited is listed as a refusal in the result, with code and reason. Raises `JobRefused` if the
-    commands or the places of the results are missing or ambiguous, or if a clip to which a command refers cannot be
-    used.
+    commands, or the places of the results, are missing or ambiguous. Also raises `JobRefused` if a clip to which a
+    command refers cannot be used.
     """
     return _Editing(context, params).run()
 
@@ -201,7 +201,8 @@ class _Editing:
 def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | None, EditDocument]:
     """Return the edit item and its commands; the item is None if the parameters of the job contain the commands.
 
-    Raises `JobRefused` if both the item and the parameters give commands, if neither does, or if the item is not valid.
+    Raises `JobRefused` unless exactly one of the two gives commands: the item or the parameters. Also raises
+    `JobRefused` if the item is not valid.
     """
     (pin,) = context.inputs.get("edit", ()) or (None,)
     if (pin is None) == (not params.commands):

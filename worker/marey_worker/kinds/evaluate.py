@@ -90,7 +90,10 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
 
 
 def _trials(params: EvaluateParams, options: EvaluationOptions) -> tuple[Trial, ...]:
-    """Return all trials of the evaluation. Raises `JobRefused` if a figure is requested for a trial not among them."""
+    """Return all trials of the evaluation.
+
+    Raises `JobRefused` if a figure is requested for a trial that the evaluation does not have.
+    """
     with refusing_motion_errors():
         trials = suite_trials(options)
     if unknown := set(params.trial_figures) - {trial.name for trial in trials}:

@@ -54,7 +54,10 @@ def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
 
 
 def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> MatchingDatabase:
-    """Return one database with the clips of the set and all candidates. Raises `JobRefused` if that is not possible."""
+    """Return one database with the clips of the set and all candidates.
+
+    Raises `JobRefused` if the clips cannot be combined in one database.
+    """
     unusable = [f"{one.folder} ({one.detail})" for one in candidates.unusable]
     mismatched = [name for name, other in candidates.databases.items() if not same_skeleton(database, other)]
     if unusable or mismatched:

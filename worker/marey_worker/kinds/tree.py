@@ -23,8 +23,8 @@ from marey_worker.job_io.skeleton_cache import Rig, read_rigged
 def run(context: Context, params: TreeParams) -> dict[str, Any]:
     """Build a search tree of samples of a model, and stage it as a part of the model; other parts are unchanged.
 
-    Raises `JobRefused` if the model was moved or renamed while the job waited, if the place of the result is ambiguous,
-    or if the tree cannot be built.
+    Raises `JobRefused` if the model was moved or renamed while the job waited. Also raises `JobRefused` if the place of
+    the result is ambiguous, or if the tree cannot be built.
     """
     started = time.monotonic()
     (pin,) = context.inputs["model"]

@@ -51,10 +51,10 @@ class ExportChecks(Resource):
     async def post(self, project: str, dataset: str, body: ExportCheck) -> Reply:
         """Check that the consent for the clips of an export has not ended.
 
-        A program that writes an archive or other files sends this request before it reads the documents with `POST
-        /projects/{project}/contents`. Aligned clips are checked, too. If the consent for one or more items has ended,
-        the answer is an error (409, `consent-expired`) that names these items. Maintainers can allow the export with
-        `allow_expired_consent` and a reason; an event then records these items.
+        A program that writes an archive or other files sends this request first, and then reads the documents with
+        `POST /projects/{project}/contents`. Aligned clips are checked, too. If the consent for one or more items has
+        ended, the answer is an error (409, `consent-expired`) that names these items. Maintainers can allow the export
+        with `allow_expired_consent` and a reason; an event then records these items.
         """
         run = self.change if body.allow_expired_consent else self.look_up
         return Reply(await run(datasets.check_export, project, dataset, body))
@@ -100,9 +100,9 @@ class ReceivedCommits(Resource):
     async def post(self, project: str, dataset: str, body: ReceivedCommit) -> Rendered:
         """Record a commit from an archive or another server, with its author and time, so that it keeps its digest.
 
-        The server applies the changes of the commit to the tree of its first parent, and refuses the commit if the
-        result differs from the commit's tree. A branch without commits can be set to the commit; no other branch moves.
-        To add the commit to another branch, merge it.
+        The server applies the changes of the commit to the tree of its first parent. If the result differs from the
+        commit's tree, the server refuses the commit. A branch without commits can be set to the commit; no other branch
+        moves. To add the commit to another branch, merge it.
         """
         prepared = await self.look_up(datasets.prepare_receipt, project, dataset, body)
         return await self.answer(datasets.record_receipt, project, dataset, body, prepared)

@@ -239,8 +239,8 @@ class FolderCheckout(Resource):
     async def post(self, project: str, dataset: str, body: CheckoutRequest) -> Rendered:
         """Bring the folder of the dataset to the state of a version: items are added, changed, moved and removed.
 
-        If the folder has changes that no commit has recorded, the request is refused with 409, unless it asks to
-        discard them. Removed items can be restored, and earlier revisions of items remain.
+        If the folder has changes that no commit has recorded, the answer is 409; the request can ask to discard these
+        changes. Removed items can be restored, and earlier revisions of items remain.
         """
         return await self.answer(datasets.check_out, project, dataset, body)
 

@@ -23,8 +23,8 @@ class DifferenceResource(Resource):
         """Return how a revision differs from an earlier one, or from a revision of another item of the same kind.
 
         Frames are matched by content. The answer has the schema `marey/difference@1`. It lists removed and inserted
-        frames, changes of timing, of rotations and of the root's path, changed segments, joints and examples of models,
-        and other changed fields.
+        frames, and changes of timing, of rotations and of the root's path. It also lists changed segments, changed
+        joints, changed examples of models, and other changed fields.
         """
         source = await self.look_up(comparing.read_difference, project, kind_of(kind), item, query)
         order = partial(comparing.difference_order, source, query, self.media.encoding)

@@ -99,16 +99,20 @@ class ProposalComments(Resource):
 
 
 class WaitingProposal(Resource):
-    """Base of resources that may meet the last requirement of a waiting proposal, which is then merged."""
+    """Base of resources whose requests may meet the last requirement of a proposal that waits for an automatic merge.
+
+    The proposal is then merged.
+    """
 
     tag = "Proposals"
 
     async def settle(
         self, function: Callable[..., Any], project: str, dataset: str, proposal: int, body: Request
     ) -> Rendered:
-        """Prepare a merge of the proposal, pass it to `function`, which may perform it, and answer with the result.
+        """Prepare the merge of the proposal, call `function` with the prepared merge, and answer with the result.
 
-        If a branch has moved since the merge was prepared, prepare the merge and run `function` again.
+        `function` stores the request, and may perform the merge. If a branch has moved since the merge was prepared,
+        both steps are repeated.
         """
         for _ in range(TRIES - 1):
             try:

@@ -22,8 +22,8 @@ def rotate_token(tx: Transaction, token_id: str, request: TokenRotation) -> NewT
     If the replaced token is itself the successor of another token, that older token ends at once. The secret of the
     successor is derived from the secret of the replaced token and from `rotation_id`. So a repeated request gets the
     same successor, although no secret is stored. Raises `ForbiddenProblem` if `token_id` is not the token of this
-    request, and `ConflictProblem` if the token was already rotated with another `rotation_id`, or if the successor was
-    revoked.
+    request. Raises `ConflictProblem` if the token was already rotated with another `rotation_id`, or if the successor
+    was revoked.
     """
     principal = tx.principal
     if principal.kind != "user" or principal.token_id != token_id:

@@ -1,8 +1,8 @@
 """Limits on wrong passwords and invitation codes, shared by all servers; they never lock out the owner of an account.
 
 Every try with a wrong password counts towards two limits: one for this account from this address, and one for this
-address with all accounts. If the address is unknown, which means that nobody has signed in to the account from it
-lately, the try also counts towards a third limit: one for this account from all unknown addresses together. The third
+address with all accounts. An address is unknown if nobody has signed in to the account from it lately. A try from an
+unknown address also counts towards a third limit: one for this account from all unknown addresses together. The third
 limit does not apply to known addresses. So guesses from elsewhere never lock out an owner who signs in from a known
 address (docs/decisions/0020-sign-in-limits.md). For the code of an invitation, the prefix of the code takes the place
 of the account.
@@ -35,7 +35,7 @@ LimitScope = Literal["account-at-address", "address", "account"]
 _IN_WORDS: dict[LimitScope, str] = {
     "account-at-address": "user name or code from your address",
     "address": "address of yours",
-    "account": "user name or code from addresses where it was never right",
+    "account": "user name or code from unknown addresses",
 }
 _MINUTE_US = 60_000_000
 
@@ -82,7 +82,7 @@ def take_back(tx: Transaction, attempt: SignInTry) -> None:
 
 
 def _limits(attempt: SignInTry, *, known: bool) -> Iterator[tuple[RateLimit, LimitScope]]:
-    """Yield the limits of a try in a fixed order, in which every transaction locks the rows of the limits."""
+    """Yield the limits of a try, sorted by key, so that all transactions lock the rows of limits in the same order."""
     few, many = attempt.per_minute, MORE_FOR_MANY * attempt.per_minute
     pair, address = key_of("pair", attempt.name, attempt.address), key_of("address", attempt.address)
     limits: list[tuple[RateLimit, LimitScope]] = [
@@ -95,7 +95,7 @@ def _limits(attempt: SignInTry, *, known: bool) -> Iterator[tuple[RateLimit, Lim
 
 
 def too_many_sign_ins(limit: LimitScope, wait_s: int) -> TooManyRequestsProblem:
-    """Return the error for a try that exceeds a limit, whether or not the account exists."""
+    """Return the error for a try that exceeds a limit; the error does not show whether the account exists."""
     return TooManyRequestsProblem(
         f"Too many wrong passwords or invitation codes for this {_IN_WORDS[limit]}; wait {wait_s} s.",
         code="too-many-sign-ins",

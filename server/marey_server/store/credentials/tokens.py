@@ -93,7 +93,7 @@ def resolve_token(tx: Transaction, text: str) -> Principal:
 
 
 def unknown_token() -> UnauthenticatedProblem:
-    """Return the error for a token that is not valid, whatever the reason."""
+    """Return the error for a token that is not valid; the error does not show the reason."""
     return UnauthenticatedProblem("The token is unknown, expired or revoked.", code="bad-token")
 
 
@@ -143,9 +143,9 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
 def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
     """Create a token of the caller; its secret is shown once.
 
-    Raises `ForbiddenProblem` if the new token would have a scope that the caller's own token lacks, would allow workers
-    a label that the caller's token does not allow, or would be valid longer than the caller's token. Raises
-    `InvalidProblem` for labels without the scope `work`.
+    The new token may have no rights that the caller's own token lacks: no further scope, no further label of workers,
+    and no longer validity. Otherwise, raises `ForbiddenProblem`. Raises `InvalidProblem` for labels without the scope
+    `work`.
     """
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
@@ -241,7 +241,8 @@ def list_tokens(
 ) -> Page:
     """Return the caller's tokens, or for an administrator the tokens of any user, newest first and without secrets.
 
-    Raises `ForbiddenProblem`, or `NotFoundProblem` for a user whom the caller may not see.
+    Raises `NotFoundProblem` if other callers ask for the tokens of another user, and `ForbiddenProblem` if they ask for
+    the tokens of all users.
     """
     own_id = _require_user(tx.principal, "read")
     conditions: list[ColumnElement[bool]] = []
@@ -263,7 +264,10 @@ def list_tokens(
 
 
 def _id_of(tx: Transaction, name: str) -> str:
-    """Return the id of a user. Raises `NotFoundProblem` without such a user, or if the caller is no administrator."""
+    """Return the id of a user.
+
+    Raises `NotFoundProblem` if the user does not exist, or if the caller is no administrator.
+    """
     unknown = NotFoundProblem(f"There is no user {name!r} that you may see.", code="no-user")
     require_administrator(tx.principal, hidden=unknown)
     found = tx.execute(select(user.c.id).where(user.c.name == name)).scalar()

@@ -40,10 +40,10 @@ class Clock(Protocol):
 class DatabaseClock:
     """Clock of the database: on Postgres the time of the Postgres server, on SQLite a clock that never goes back.
 
-    On SQLite, the clock starts at the wall clock or at the stored high-water mark (the latest time that earlier
-    processes may have used), whichever is later. Then it follows the monotonic clock, so that a jump of the wall clock
-    neither extends nor ends a lease. If the wall clock is far ahead of the stored time, the server does not start,
-    because the stored time could not go back afterwards.
+    On SQLite, the clock starts at the wall clock or at the stored high-water mark, whichever is later. The high-water
+    mark is the latest time that earlier processes may have used. Then the clock follows the monotonic clock, so that a
+    jump of the wall clock neither extends nor ends a lease. If the wall clock is far ahead of the stored time, the
+    server does not start, because the stored time could not go back afterwards.
     """
 
     def __init__(self) -> None:
@@ -70,8 +70,8 @@ class DatabaseClock:
                     )
                 if (ahead_s := (stored_us - wall_us) / 1e6) > NOTABLY_AHEAD_S:
                     log.warning(
-                        "the database was last used %.0f s after the time of this machine and goes on from there; "
-                        "stop the server and see `marey db clock`", ahead_s,
+                        "the database was last used %.0f s after the time of this machine, and its clock continues "
+                        "from there; stop the server and see `marey db clock`", ahead_s,
                     )  # fmt: skip
                 self._start_us = max(wall_us, stored_us)
                 self._start_monotonic_ns = time.monotonic_ns()

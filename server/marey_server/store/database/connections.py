@@ -5,8 +5,8 @@ transactions on which the server and its workers depend: heartbeats, claims, com
 admission.
 
 A read sees one snapshot and cannot write. A write is READ COMMITTED on Postgres, so that the conditions of an UPDATE
-are checked against the current row once it is locked. SQLite has one writer lane: writes run one after another, each
-starting with `BEGIN IMMEDIATE`, and reads run at the same time as writes.
+are checked against the current row once it is locked. On SQLite, a single thread runs the writes one after another.
+Each write starts with `BEGIN IMMEDIATE`, and reads run at the same time as writes.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class Database:
         """Run `function(tx, ...)` and commit, in the calling thread.
 
         The function runs again from the start after a deadlock, a serialisation failure, or a connection that broke
-        before the commit. So it must have no effect except through its transaction.
+        before the commit. So the function may change things only through its transaction.
         """
         for attempt in range(WRITE_TRIES):
             try:
@@ -208,9 +208,9 @@ class Database:
     def queue_read(
         self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False
     ) -> Future[T]:
-        """Run `self.read(principal, function)` for a client, in a thread for ordinary or for reserved reads.
+        """Run `self.read(principal, function)` for a client, in a thread for ordinary reads.
 
-        Raises `UnavailableProblem` if too many calls wait.
+        With `reserved`, use a thread for reserved reads. Raises `UnavailableProblem` if too many calls wait.
         """
         lane = self._reserved if reserved else self._ordinary
         return lane.submit(client, self.read, principal, function)
@@ -230,9 +230,9 @@ class Database:
         return lane.submit(client, self.write, principal, function)
 
     async def notifications(self, channel: str) -> AsyncGenerator[None]:
-        """Listen to a channel of Postgres: yield once when this has begun, and then after each notification.
+        """Listen to a channel of Postgres: yield once when the server listens, and then after each notification.
 
-        Raises `UnavailableProblem` if the connection, which is outside of the pool, breaks.
+        The connection is not taken from the pool. Raises `UnavailableProblem` if it breaks.
         """
         arguments, options = self.engine.dialect.create_connect_args(self.url)
         driver = self.engine.dialect.loaded_dbapi

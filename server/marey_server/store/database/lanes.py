@@ -67,8 +67,8 @@ class _QueuedCall:
 def finish(future: Future[Any], function: Callable[[], Any]) -> None:
     """Set a future to the result or the error of a function.
 
-    A `StopIteration` is replaced by a `RuntimeError`: a future cannot hold a `StopIteration`, so the waiting request
-    would never end.
+    A future cannot hold a `StopIteration`: the request that waits for the future would never end. So a `RuntimeError`
+    replaces this error.
     """
     try:
         result = function()

@@ -108,7 +108,7 @@ class _Form:
 
 
 def _members(names: Sequence[str], given: Sequence[Any]) -> Iterable[tuple[str, Any]]:
-    """Pair the names of a list parameter's members with their values; a list of tuples is flattened first."""
+    """Pair the placeholder names of a list parameter with the values; a list of tuples is flattened first."""
     nested = bool(given) and isinstance(given[0], tuple)
     return zip(names, chain.from_iterable(given) if nested else given, strict=True)
 

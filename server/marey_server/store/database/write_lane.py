@@ -37,7 +37,7 @@ class _Write:
 
 
 class WriteLane:
-    """Thread that runs writes; `write(principal, function)` must run a function in a transaction and commit.
+    """Thread that runs the queued writes; `write(principal, function)` runs a function in a transaction and commits.
 
     Clients take turns, as in every lane; reserved writes, such as heartbeats, come before all others.
     """

@@ -53,8 +53,8 @@ class AnnotationMerger:
     def merge(self, changed: Sequence[ChangedPart]) -> list[str | AnnotationClash | None]:
         """Merge the annotations among the parts that both sides have changed.
 
-        Returns, for each part, the content digest of the merged annotation, or the reason why it cannot be merged, or
-        None if the part is not an annotation.
+        Returns one value for each part: the content digest of the merged annotation, or the reason why it cannot be
+        merged. The value is None if the part is not an annotation.
         """
         outcomes: list[str | AnnotationClash | None] = [None] * len(changed)
         places = [at for at, one in enumerate(changed) if one.ours.kind == Kind.ANNOTATION.value and one.part == PART]

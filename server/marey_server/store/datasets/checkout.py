@@ -42,9 +42,9 @@ def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest
     An item whose entry has moved or changed keeps its id. If the folder lacks an entry of the version, the deleted item
     of this entry is restored if possible; otherwise a new item is created.
 
-    Raises `ForbiddenProblem` unless the caller is a maintainer in all folders of the dataset, and `InvalidProblem` if
-    too many entries differ. Raises `ConflictProblem` if another request changes the folder, or if the folder has
-    changes that no commit has recorded and the request does not discard them.
+    Raises `ForbiddenProblem` unless the caller is a maintainer in all folders of the dataset. Raises `InvalidProblem`
+    if too many entries differ. Raises `ConflictProblem` if another request changes the folder. Unless the request
+    discards them, changes in the folder that no commit has recorded are a `ConflictProblem`, too.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
@@ -105,7 +105,7 @@ def _require_possible(found: Row[Any], compared: Sequence[ComparedEntry]) -> Non
 
 
 def _folder_of(found: Row[Any], entry: DatasetEntry) -> str:
-    """Return the path of the folder for an entry of a dataset, in the project."""
+    """Return the path, in the project, of the folder that holds the item of an entry."""
     return "/".join(filter(None, (found.path, entry.path.rpartition("/")[0])))
 
 

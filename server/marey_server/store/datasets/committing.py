@@ -82,8 +82,8 @@ class PreparedCommit:
 def prepare_commit(tx: Transaction, project: str, name: str, request: CommitCreate) -> PreparedCommit:
     """Compute the version that a request describes.
 
-    Raises `NotFoundProblem` for an unknown branch, entry or item, `ConflictProblem` if the branch is not at the
-    expected commit, and `InvalidProblem` if the new version would have the same entries as the version before it.
+    Raises `NotFoundProblem` for an unknown branch, entry or item, and `ConflictProblem` if the branch is not at the
+    expected commit. Raises `InvalidProblem` if the new version would have the same entries as the version before it.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
@@ -172,9 +172,9 @@ def move_branch_to(tx: Transaction, prepared: PreparedCommit, digest: str, mover
 
 
 def recorded_as(tx: Transaction, dataset_id: str, write_id: str | None) -> str | None:
-    """Return the commit that an earlier request with this `write_id` recorded, or to which that request moved a branch.
+    """Return the commit that an earlier request with this `write_id` recorded, or None if there was no such request.
 
-    Returns None if there was no such request.
+    If the request was a fast-forward merge, return the commit to which it moved the branch.
     """
     if write_id is None:
         return None
@@ -285,8 +285,8 @@ def _from_folder(
 def _follow_with_folder(tx: Transaction, prepared: PreparedCommit, digest: str) -> None:
     """Note that a commit is checked out in the folder from which it was made.
 
-    If somebody has checked out a version since the folder was read, the folder no longer has the entries of the commit,
-    and nothing is noted. Otherwise, the next commit of the folder would undo this one.
+    If somebody has checked out a version since the folder was read, the folder no longer has the entries of the commit.
+    Then nothing is noted, because the next commit of the folder would otherwise undo this commit.
     """
     unchanged = (
         dataset.c.id == prepared.dataset_id,

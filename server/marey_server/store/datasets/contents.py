@@ -84,7 +84,7 @@ def _read(
     """Add the stored digests of the wanted revisions to `found`, and return the revisions without a stored digest.
 
     Only revisions of the project are read. Anybody can write a reference to a revision of another project into free
-    members of a document, and the digest of this revision would show whether it exists and what it contains.
+    members of a document. The digest of this revision would show whether the revision exists and what it contains.
     """
     waiting: dict[RevisionKey, _Waiting] = {}
     for some in map(set, in_lists(wanted)):
@@ -129,10 +129,10 @@ _PARTS = (
 def _among(wanted: Collection[RevisionKey]) -> tuple[ColumnElement[bool], ...]:
     """Return SQL conditions that the parts of all wanted revisions meet.
 
-    Ids and numbers are compared separately, because SQLite would scan the whole table to compare pairs. So the parts of
-    a revision that is not wanted meet the conditions, too, if the id and the number of this revision each occur in
-    `wanted`. Callers skip such parts. They compare the project, too: SQLite would scan all items of a project that the
-    conditions name.
+    Ids and numbers are compared separately, because SQLite would scan the whole table to compare pairs. So parts of
+    other revisions can meet the conditions, too, if their id and their number each occur in `wanted`. Callers skip such
+    parts. Callers also compare the project themselves: with a condition on the project, SQLite would scan all its
+    items.
     """
     ids, numbers = {one.item for one in wanted}, {one.revision for one in wanted}
     return revision_part.c.item_id.in_(sorted(ids)), revision_part.c.number.in_(sorted(numbers))

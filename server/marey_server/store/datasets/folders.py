@@ -41,7 +41,7 @@ class FolderState:
 
 
 def read_folder(tx: Transaction, project_row: ProjectRow, found: Row[Any]) -> FolderState:
-    """Return the state of a dataset's folder.
+    """Return the current content of a dataset's folder.
 
     Raises `InvalidProblem` if the dataset has no folder, or if the folder was deleted.
     """

@@ -81,8 +81,8 @@ def list_commits(
 ) -> Page:
     """List a commit and the commits before it, newest first; of the parents of a merge, only the first is followed.
 
-    With `path`, list only the commits that differ from their first parent in entries at this path or below it, and
-    report these differences. A page ends after `MOST_EXAMINED` commits or `MOST_DIFFERENCES` compared entries, so it
+    With `path`, list only the commits that changed entries at this path or below it, compared with their first parent.
+    Also report these changes. A page ends after `MOST_EXAMINED` commits or `MOST_DIFFERENCES` compared entries. So it
     may have fewer than `limit` commits although more follow.
     """
     row = find_dataset(tx, projects.require(tx, project), name)
@@ -124,7 +124,8 @@ def _changing(
 ) -> tuple[list[tuple[Row[Any], ChangeAtPath | None]], Sequence[Row[Any]]]:
     """Return at most `limit` commits that changed a path, and the commit with which the next page begins.
 
-    The second result is empty if there is no next page. In `commits`, each commit is followed by its first parent.
+    The second result is empty if there is no next page. In the list `commits`, the first parent of each commit follows
+    the commit.
     """
     comparer = PathComparer(ChunkReader(StoredChunks(tx)), path, MOST_DIFFERENCES)
     found: list[tuple[Row[Any], ChangeAtPath | None]] = []
@@ -161,7 +162,7 @@ def read_origins(tx: Transaction, project: str, name: str, version: str, *, path
 
 
 def _no_entry(tx: Transaction, dataset_id: str, start: str, path: str, kind: Kind) -> NotFoundProblem:
-    """Return the error for an entry that a version does not have; it names the commit that removed or moved the entry.
+    """Return the error for an entry that a version does not have; the error names the commit that removed or moved it.
 
     The search for this commit follows first parents, through at most `MOST_EXAMINED` commits.
     """
@@ -178,7 +179,7 @@ def _no_entry(tx: Transaction, dataset_id: str, start: str, path: str, kind: Kin
             code="no-entry",
             context={"removed_by": removed_by.model_dump(mode="json"), "moved_to": to},
         )
-    searched = f", nor do the {MOST_EXAMINED:,} versions before it" if len(commits) > MOST_EXAMINED else ""
+    searched = f", and neither have the {MOST_EXAMINED:,} versions before it" if len(commits) > MOST_EXAMINED else ""
     return NotFoundProblem(f"{missing}{searched}.", code="no-entry")
 
 
@@ -303,7 +304,7 @@ def shown_entry(entry: DatasetEntry, held: Mapping[str, tuple[str, int]]) -> Ent
 def revisions_with(tx: Transaction, project_id: str, contents: Iterable[str]) -> dict[str, tuple[str, int]]:
     """Find, for each content digest, a revision of the project that has this content.
 
-    A revision of a deleted item is used only if no item that is not deleted has the content.
+    A revision of a deleted item is used only if all items with the content are deleted.
     """
     wanted = sorted(set(contents))
     found: dict[str, tuple[str, int]] = {}

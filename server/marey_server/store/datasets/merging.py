@@ -61,8 +61,8 @@ def prepare_merge(
 ) -> PreparedMerge:
     """Compute the merge of a version into a branch.
 
-    Raises `InvalidProblem` if the branch has all commits of the version, or if a side has more than `most` changes,
-    and `ConflictProblem` if the branch is not at the expected commit, or if the version and the branch have several
+    Raises `InvalidProblem` if the branch has all commits of the version, or if a side has more than `most` changes.
+    Raises `ConflictProblem` if the branch is not at the expected commit, or if the version and the branch have several
     nearest common commits (merge bases).
     """
     project_row = projects.require(tx, project)

@@ -219,7 +219,7 @@ def move_branch(
 
 
 def is_tag(name: str) -> InvalidProblem:
-    """Return the error for a tag where a branch is required."""
+    """Return the error for a request that names a tag where a branch is required."""
     return InvalidProblem(f"{name!r} is a tag, which never moves; name a branch.", code="is-tag")
 
 

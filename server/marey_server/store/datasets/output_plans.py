@@ -87,8 +87,8 @@ class PlannedCommit:
 def plan_outputs(tx: Transaction, wanted: OutputEntries, head: str | None, most: int) -> PlannedCommit:
     """Compute the commit of the outputs of a job to a branch whose newest commit is `head`.
 
-    The commit is refused if it would add, change and remove more than `most` entries in total, if a path is too long,
-    or if both the job and others have changed more than `MOST_COMBINED` entries.
+    The commit is refused in three cases: it would add, change and remove more than `most` entries in total; a path is
+    too long; or both the job and others have changed more than `MOST_COMBINED` entries.
     """
     store = StoredChunks(tx)
     reader = ChunkReader(store)
@@ -113,9 +113,9 @@ def plan_outputs(tx: Transaction, wanted: OutputEntries, head: str | None, most:
 def follow(tx: Transaction, wanted: OutputEntries, planned: PlannedCommit, head: str | None) -> PlannedCommit | None:
     """Return a plan for the commit `head`, to which others have moved the branch since the plan was computed.
 
-    The new plan keeps all chunks of `planned`. Some of them were stored already, but a purge may have deleted these
-    again, because it deletes chunks that only a deleted dataset needs. Returns None if the plan must be computed again,
-    because others have changed the same entries as the job, or too many entries.
+    The new plan keeps all chunks of `planned`, even those that are stored already: a purge of a deleted dataset may
+    have deleted them again. Returns None if the plan must be computed again, because others have changed the same
+    entries as the job, or too many entries.
     """
     if planned.head == head or planned.merged.conflicts:  # the commit to a branch of its own stays as it is
         return planned

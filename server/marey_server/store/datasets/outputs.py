@@ -1,9 +1,9 @@
 """Commits of the outputs of jobs, made in the transactions that end the jobs.
 
-The row of the branch is locked before the tree of the branch is read, so that several jobs commit to one branch one
-after another, and no commit is lost. If the branch has moved since the job started, the outputs are merged with the
-changes of others. If others have changed the same part of an entry, the outputs are committed to a new branch, which is
-named after the job.
+The row of the branch is locked before the tree of the branch is read. So several jobs commit to one branch one after
+another, and no commit is lost. If the branch has moved since the job started, the outputs are merged with the changes
+of others. If others have changed the same part of an entry, the outputs are committed to a new branch, which is named
+after the job.
 """
 
 from __future__ import annotations

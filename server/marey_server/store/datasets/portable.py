@@ -26,8 +26,8 @@ def check_export(tx: Transaction, project: str, name: str, request: ExportCheck)
     """Check that revisions of a dataset may be exported.
 
     Clips whose consent has ended may be exported if the request allows it; an event then names them. Raises
-    `ConflictProblem` if the consent has ended and the request does not allow the export, and `ForbiddenProblem` if
-    the request allows the export, but the caller is not a maintainer or an owner, or lacks the scope `write`.
+    `ConflictProblem` if the consent has ended and the request does not allow the export. The request may allow it only
+    for a maintainer or an owner with the scope `write`; for others, raises `ForbiddenProblem`.
     """
     role = Role.MAINTAINER if request.allow_expired_consent else Role.READER
     project_row = projects.require(tx, project, at_least=role)
@@ -92,7 +92,7 @@ def _loaded(
 def _that_fit(digests: list[str | None], sizes: Mapping[str, int]) -> list[str | None]:
     """Cut the list of digests so that the documents have at most `MOST_BYTES_AT_ONCE` bytes in total.
 
-    The first digest is always kept, even if its document is larger than this.
+    The first digest is always kept, even if its document alone is larger than this limit.
     """
     size_bytes = 0
     for place, digest in enumerate(digests):

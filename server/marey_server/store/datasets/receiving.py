@@ -110,7 +110,7 @@ def store_revisions(
     """Store received revisions; `drafts` maps content digests to drafts that were made with `local`.
 
     If a revision is the content of a dataset entry, its item is hidden. Raises `InvalidProblem` if the content digest
-    of a stored revision is not the one that the request gives, and `ConflictProblem` if items were purged since the
+    of a stored revision is not the one that the request gives. Raises `ConflictProblem` if items were purged since the
     drafts were made.
     """
     project_row = projects.require(tx, project)
@@ -174,9 +174,9 @@ def record_receipt(
 ) -> Commit:
     """Record a commit from an archive or another server; recording it again has no effect.
 
-    If the request names a branch without commits, the branch is set to this commit. Raises `ConflictProblem` if the
-    branch has other commits, or if items were purged or the dataset was replaced since the receipt was prepared, and
-    the errors of `require_move`.
+    If the request names a branch without commits, the branch is set to this commit. Raises the errors of
+    `require_move`. Raises `ConflictProblem` if the branch has other commits, or if items were purged or the dataset was
+    replaced since the receipt was prepared.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)

@@ -43,7 +43,7 @@ def require_contents(missing: Iterable[str]) -> None:
 
 
 def item_name(shown: str, content: str) -> str:
-    """Return a name for a new item, made of the last component of a path or other text, and of the content digest."""
+    """Return a name for a new item: the last component of the path or text `shown`, and part of the content digest."""
     return f"{shown.rpartition('/')[2][:LONGEST_NAME]} {content.removeprefix('sha256:')[:12]}"
 
 

@@ -1,4 +1,4 @@
-"""Roles of members in folders of a project, which owners set. `rights` reads them to check the caller."""
+"""Roles of members in folders of a project, which owners set. The module `rights` uses them to check callers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from marey_server.store.tables import collection, folder_role, member, user
 from marey_server.store.transaction import Transaction
 
 MOST_FOLDER_ROLES = 1000
-"""Greatest number of roles in those folders of one project that are not deleted. Restoring a folder may exceed it."""
+"""Greatest number of roles in the existing folders of a project; a restored folder may add roles beyond this number."""
 MOST_WITH_DELETED = 10_000
 """Greatest number of roles in all folders of one project; it lets a request read all roles that concern its caller."""
 
@@ -104,8 +104,8 @@ def put_folder_role(
 ) -> FolderRole:
     """Set the role of a member, or of all members, in a folder. With `absent`, an existing role is not changed.
 
-    Raises `NotFoundProblem` if the user is no member of the project, and `ConflictProblem` for an owner, or if the
-    project has too many roles in folders.
+    Raises `NotFoundProblem` if the user is no member of the project. Raises `ConflictProblem` if the user is an owner,
+    or if the project has too many roles in folders.
     """
     project_row, path = _lock(tx, project, collection_id)
     key = _key(project_row, collection_id, _find_member(tx, project_row, user_name))

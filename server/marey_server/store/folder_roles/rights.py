@@ -1,8 +1,8 @@
 """Rights in the folders of a project: of the caller, and of the author of a job.
 
 Every function that changes something in a folder checks these rights. They are read once per transaction, or once per
-savepoint. The transaction then holds a lock until its end, or until the rollback to this savepoint, so that nobody
-changes the roles in folders in the meantime, and nobody moves, deletes or restores a folder.
+savepoint. The transaction then holds a lock until its end, or until the rollback to this savepoint. While the lock is
+held, nobody changes the roles in folders, and nobody moves, deletes or restores a folder.
 """
 
 from __future__ import annotations
@@ -52,10 +52,9 @@ def lock_places(tx: Transaction, project: ProjectRow) -> None:
     """Lock the roles in folders and the paths of the folders that have them, until the transaction ends.
 
     Members who write compare the path of a folder with the paths at which they have roles. While another request moves,
-    deletes or restores a folder, one of these paths could be out of date. So a request that moves, deletes or restores
-    a folder, or changes a role in a folder or in the project, calls this function before it locks an item, a folder or
-    a job. The function waits for writes that have read roles. Later writes that read roles wait until the lock is
-    released.
+    deletes or restores a folder, one of these paths could be out of date. So such requests call this function before
+    they lock an item, a folder or a job. Requests that change a role in a folder or in the project do so, too. The
+    function waits for writes that have read roles. Later writes that read roles wait until the lock is released.
     """
     tx.lock(lock_name(project.id))
     forget_rights(tx)
@@ -64,8 +63,8 @@ def lock_places(tx: Transaction, project: ProjectRow) -> None:
 def rights_of_caller(tx: Transaction, project: ProjectRow) -> FolderRights:
     """Return the caller's rights in the folders of a project, which stay the same until the transaction ends.
 
-    Must be called before the write reads the path of an item or a folder, because the path may change before this call.
-    It must also be called before the write locks rows, because changes of roles lock rows after they lock the roles.
+    Call this function before the write reads the path of an item or a folder, because the path may change before the
+    call. Call it also before the write locks rows, because changes of roles lock rows after they lock the roles.
     """
     return _kept(tx, project, tx.principal.user_id, project.role)
 
@@ -95,12 +94,15 @@ def rights_of_author(tx: Transaction, project: ProjectRow, author_id: str | None
 
 
 def forget_rights(tx: Transaction) -> None:
-    """Read the rights again when they are needed next, because this transaction has changed folders or roles."""
+    """Discard the rights that were read, because this transaction has changed folders or roles.
+
+    They are read again when they are needed next.
+    """
     tx.folder_rights.clear()
 
 
 def _has_overrides(user_id: str | None, role: Role) -> bool:
-    """Return whether roles in folders may apply: not to an owner, and not to an attempt of a job, which has no user."""
+    """Return whether roles in folders may apply to a user; they never apply to an owner or to an attempt of a job."""
     return user_id is not None and role is not Role.OWNER
 
 

@@ -2,7 +2,7 @@
 
 Each acceptance locks the project and the invitation, in this order, before it checks anything. So another change is
 either complete before the acceptance, or waits until the acceptance has ended. Such changes are the last use of the
-invitation, other changes of the members, and a change that ends the inviter's right and so withdraws the invitation.
+invitation, other changes of the members, and a change that ends the inviter's right to invite.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _NO_HASH = hash_secret("")  # of no code, because secrets are not empty
 def invitation_invalid() -> NotFoundProblem:
     """Return the error for a code that is not valid; its text does not show why."""
     return NotFoundProblem(
-        "This invitation code is not valid for this: it is unknown or incomplete, or the invitation was used, was "
-        "withdrawn or has expired. Check that you copied the whole code, or ask for a new invitation.",
+        "This invitation code is not valid for this request: it is unknown or incomplete, or the invitation was used, "
+        "was withdrawn or has expired. Check that you copied the whole code, or ask for a new invitation.",
         code="invitation-invalid",
     )
 
@@ -70,7 +70,7 @@ def _has_used(tx: Transaction, row: Row[Any], user_id: str | None) -> bool:
 
 
 def accept_invitation(tx: Transaction, code: str, attempt: SignInTry) -> AcceptedInvitation:
-    """Give the caller the role of an invitation, and count one use of it.
+    """Give the caller the role of an invitation, and count one use of the invitation.
 
     If the caller has the same or a higher role, nothing changes and the invitation is not used. A repeated request gets
     the same answer. Nobody can use an invitation twice, for example after being removed from the project. Raises
@@ -122,10 +122,11 @@ def _use(tx: Transaction, row: Row[Any], user_id: str, user_name: str) -> None:
 
 
 def needs_password_check(tx: Transaction, code: str, name: str) -> bool:
-    """Return whether to check the password and call `sign_up_again`, instead of `sign_up`, for the user `name`.
+    """Return whether the request of the user `name` needs a password check and `sign_up_again` in place of `sign_up`.
 
-    The result is true if the user has used the code, or if the code cannot create an account: otherwise the answer to a
-    used code would show who has used it. Raises `NotFoundProblem` if the secret of the code is wrong.
+    The result is true if the user has used the code. If the code cannot create an account, the result is true for every
+    name. So the answer to a used code does not show who has used it. Raises `NotFoundProblem` if the secret of the code
+    is wrong.
     """
     row = _find(tx, code)
     user_id = tx.execute(select(user.c.id).where(user.c.name == name)).scalar()
@@ -139,9 +140,10 @@ def _require_open_for_accounts(row: Row[Any]) -> None:
 
 
 def sign_up(tx: Transaction, request: SignUp, password_hash: str, attempt: SignInTry) -> SignedUp:
-    """Create an account with the invitation of an administrator, join its project, and return the token of a sign-in.
+    """Create an account with the invitation of an administrator, and return the token of a sign-in.
 
-    Raises `NotFoundProblem` if the code cannot create an account, and `ConflictProblem` if the name is taken.
+    If the invitation names a project, the user joins the project. Raises `NotFoundProblem` if the code cannot create an
+    account, and `ConflictProblem` if the name is taken.
     """
     row = _lock(tx, request.code.get_secret_value())
     _require_open_for_accounts(row)
@@ -155,9 +157,8 @@ def sign_up_again(
 ) -> SignedUp:
     """Return a new token for a user who repeats `sign_up` with the same password, which matched `verified_hash`.
 
-    `login` is the counted try to use the password, `attempt` the counted try to use the code.
-
-    Raises `NotFoundProblem` if the password did not match, so that a code does not show who used it.
+    `login` is the counted try to use the password, `attempt` the counted try to use the code. Raises `NotFoundProblem`
+    if the password did not match. So the answer does not show who has used the code.
     """
     row = _find(tx, request.code.get_secret_value())
     if verified_hash is None:

@@ -1,7 +1,7 @@
 """Conditions under which an invitation is valid, and deletion of invitations.
 
-An invitation gives no more than its inviter may give: it is valid while the inviter is an active user who owns the
-project or is an administrator, and only administrators can invite people to create an account. A change that takes this
+An invitation gives no more than its inviter may give. It is valid while the inviter is an active user who owns the
+project or is an administrator. Only administrators can invite people to create an account. A change that takes this
 right from a user deletes the user's invitations in the same transaction. Every acceptance checks the conditions again.
 """
 
@@ -21,7 +21,10 @@ DELETED_AT_ONCE = 500
 
 
 def _exists(*which: ColumnElement[bool]) -> ColumnElement[bool]:
-    """Return the condition that a row meeting `which` exists for the invitation in the surrounding query."""
+    """Return the SQL condition that some row meets `which`.
+
+    `which` may compare the columns of this row with columns of the invitation in the surrounding query.
+    """
     return exists().where(*which).correlate(invitation)
 
 
@@ -54,7 +57,10 @@ def is_open(tx: Transaction) -> ColumnElement[bool]:
 
 
 def withdraw_unauthorised(tx: Transaction, *which: ColumnElement[bool]) -> None:
-    """Withdraw those of the chosen invitations that are no longer in force, after a change of rights."""
+    """Withdraw invitations that meet `which` and are no longer in force, after a change of rights.
+
+    Invitations that are used up or expired are left as they are.
+    """
     withdraw(tx, tx.execute(_locked(*which, is_unspent(tx), ~IN_FORCE)).all())
 
 

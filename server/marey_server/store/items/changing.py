@@ -39,8 +39,8 @@ from marey_server.store.transaction import Transaction
 def prepare_parts(kind: Kind, parts: dict[str, Any]) -> dict[str, PreparedDocument]:
     """Check and encode the documents of an item's parts, as `create_item` and `put_part` require.
 
-    This is the slow part of a write and needs no database. Raises `InvalidProblem`; its JSON Pointers start with the
-    name of the part.
+    Checking and encoding is the slow part of a write and needs no database. Raises `InvalidProblem`; its JSON Pointers
+    start with the name of the part.
     """
     return {part: prepare_part(kind, part, tree) for part, tree in parts.items()}
 
@@ -193,7 +193,7 @@ def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expe
 
 
 def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev = None) -> Item:
-    """Restore a deleted item, and its collection if that was deleted.
+    """Restore a deleted item, and its collection if the collection was deleted, too.
 
     Raises `ConflictProblem` if another item of the collection has the same name now, and `GoneProblem` if the item was
     purged.
@@ -219,8 +219,8 @@ def _find_to_change(
 ) -> Any:
     """Return the row of an item whose folder the caller may write to.
 
-    Raises `NotFoundProblem` if there is no such item, and `ForbiddenProblem` if the caller's role in the folder of the
-    item is lower than `needed`.
+    Raises `NotFoundProblem` if there is no such item. Raises `ForbiddenProblem` if the caller's role in the folder of
+    the item is lower than `needed`.
     """
     rights = rights_of_caller(tx, project_row)
     found = find_item(tx, project_row, kind, item_id)

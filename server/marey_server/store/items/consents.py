@@ -1,7 +1,8 @@
 """Consent of performers: clips whose consent has ended, and permissions to export them nevertheless.
 
-The take record of the newest revision counts for every revision of a clip, because a consent concerns the recording. An
-aligned clip has no take record of its own; the take record of its source clip counts.
+The take record of a clip (the facts about its recording) contains the last day of the consent. The take record of the
+newest revision counts for every revision of the clip, because a consent concerns the recording. An aligned clip has no
+take record of its own; the take record of its source clip counts.
 """
 
 from __future__ import annotations
@@ -101,10 +102,10 @@ def require_consent(ended: Collection[EndedConsent]) -> None:
 
 
 def permit_export(tx: Transaction, project: str, kind: Kind, item_id: str, override: ConsentOverride) -> bool:
-    """If the consent for an item has ended, record that the caller allows its export; return whether it has ended.
+    """Record that the caller allows the export of an item, if the consent for the item has ended.
 
-    Raises `ForbiddenProblem` unless the caller is a maintainer or an owner and has the scope `write`, and
-    `NotFoundProblem` if the item does not exist.
+    Returns whether the consent has ended. Raises `NotFoundProblem` if the item does not exist. Raises
+    `ForbiddenProblem` unless the caller is a maintainer or an owner and has the scope `write`.
     """
     project_row = projects.require(tx, project, at_least=Role.MAINTAINER)
     projects.require_scope(tx, project, "write")

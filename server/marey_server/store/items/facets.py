@@ -27,9 +27,9 @@ StoredFacets = list[list[Any]]
 def stored_facets(tx: Transaction, job_row: Any, facets: Sequence[ItemFacets]) -> StoredFacets:
     """Check the facets that an attempt states, and return them in the form in which they are staged.
 
-    `job_row` has the columns `inputs`, `kind` and `project_id` of the job. Raises `InvalidProblem` for a revision that
-    is neither an input of the job nor a clip of an evaluation among the inputs, for a revision that occurs twice, and
-    for a name that the kind of the job does not declare.
+    `job_row` has the columns `inputs`, `kind` and `project_id` of the job. Each facet must concern an input of the job,
+    or a clip of an evaluation among the inputs. Raises `InvalidProblem` for any other revision, for a revision that
+    occurs twice, and for a name that the kind of the job does not declare.
     """
     declared, given = find_kind(job_row.kind).facets, _measured(tx, job_row)
     stated: set[tuple[str, int]] = set()
@@ -131,8 +131,8 @@ def _not_purged(tx: Transaction, project_id: str, items: Sequence[str]) -> Seque
     """Return those items of a project that are not purged, sorted by id.
 
     So the facets of one job are written in the order of item ids. A transaction that publishes the facets of several
-    jobs begins this order again for each job, so two such transactions can deadlock; `Database.write` then repeats one
-    of the two.
+    jobs follows this order separately for each job. So two such transactions can deadlock; `Database.write` then
+    repeats one of them.
     """
     statement = select(item.c.id).where(
         item.c.id.in_(items), item.c.project_id == project_id, item.c.purged_us.is_(None)

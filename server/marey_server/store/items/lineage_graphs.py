@@ -56,8 +56,8 @@ def read_lineage_graph(
 ) -> LineageGraph:
     """Return the graph of the revisions from which a revision was made, and of the revisions made from this revision.
 
-    Revisions that the caller may not read are left out, and with them the revisions that are linked only through them.
-    The graph holds at most `MOST_REVISIONS` revisions and `MOST_LINKS` links in each direction.
+    Revisions that the caller may not read are left out, and so are revisions that are linked only through these. The
+    graph holds at most `MOST_REVISIONS` revisions and `MOST_LINKS` links in each direction.
     """
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
     start = (item_id, request.revision or found.head)

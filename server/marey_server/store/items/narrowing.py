@@ -35,7 +35,7 @@ condition, and items of other projects.
 class Narrowing(NamedTuple):
     """Condition that all items selected by a query meet, and for which the database has an index.
 
-    At most one of the two fields is set; if neither is set, no index helps.
+    At most one of the two fields is set. If no index helps, both are None.
     """
 
     few: ColumnElement[bool] | None = None
@@ -50,9 +50,10 @@ class Narrowing(NamedTuple):
 def narrow(tx: Transaction, project_id: str, kind: Kind, query: Query) -> Narrowing:
     """Return the condition by which the fewest items have to be read for a query.
 
-    It is one of the operands of the outermost `and`: the operand for which an index finds the fewest items. If an index
-    finds more than `MOST_ITEMS` items for each operand, only comparisons of a fact with a single value remain. Of
-    these, the rarest is chosen: the comparison whose newest `MOST_ITEMS` items reach furthest back in time.
+    The condition is one of the operands of the outermost `and`: the operand for which an index finds the fewest items.
+    If an index finds more than `MOST_ITEMS` items for each operand, only comparisons of a fact with a single value are
+    considered. Of these, the rarest is chosen: the comparison whose newest `MOST_ITEMS` items reach furthest back in
+    time.
     """
     fewest, few = MOST_ITEMS + 1, None
     oldest_us, ordered = None, None
@@ -73,7 +74,7 @@ def narrow(tx: Transaction, project_id: str, kind: Kind, query: Query) -> Narrow
 
 
 def _indexed(query: Query) -> Iterator[Condition]:
-    """Yield the conditions that must be true for the query to be true, and whose items an index finds."""
+    """Yield the conditions of a query that every selected item meets, and for which an index finds the items."""
     for part in operands_of(query):
         if isinstance(part, Condition) and (
             (part.operator == "=" and part.field in CANDIDATES) or part.field.startswith(FACET_PREFIX)
@@ -92,10 +93,10 @@ def _start(condition: Condition) -> ColumnElement[bool]:
 
 
 def _with_fact(condition: Condition, project_id: str, kind: Kind) -> Select[Any]:
-    """Return a query for the items whose fact has one of the values of the condition.
+    """Return a query for the ids and times of creation of the items whose fact has one of the values of the condition.
 
-    For a single value, the index of the fact returns the newest items first. For several values, it does not, and
-    SQLite would read all items in the order of creation instead, so the query has no order and no times.
+    For a single value, the index of the fact returns the newest items first. For several values, the query has no
+    order, and its times are null: with an order, SQLite would read all items in the order of creation.
     """
     present = (item.c.project_id == project_id, item.c.kind == kind.value, item.c.deleted_us.is_(None))
     if len(condition.values) > 1:

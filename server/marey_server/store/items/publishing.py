@@ -53,12 +53,12 @@ def publish(
     """Create items and revisions from drafts, all or none; return them in the order of the drafts.
 
     In a document, `{"output": name}` refers to another draft and is replaced by the item and revision published from
-    it. If the draft of a model has a sample tree, the tree's `model_digest` may be a reference, too, and is replaced by
-    the digest of the draft's model. With `refer_to_deleted`, documents may refer to items that are deleted. If an item
-    already has the content of a draft, no new revision is created. `rights` are the rights of the user who publishes;
-    they may be None only if all drafts are hidden.
+    it. The draft of a model may have a sample tree. The tree's `model_digest` may be such a reference, too, and is
+    replaced by the digest of the draft's model. With `refer_to_deleted`, documents may refer to items that are deleted.
+    If an item already has the content of a draft, no new revision is created. `rights` are the rights of the user who
+    publishes; they may be None only if all drafts are hidden.
 
-    Raises `InvalidProblem` for a draft that is not valid, `ConflictProblem` for a name that is taken, and
+    Raises `InvalidProblem` for a draft that is not valid, and `ConflictProblem` for a name that is taken. Raises
     `ForbiddenProblem` if `rights` do not allow writing to the folder of a new item or revision.
     """
     by_name = {draft.name_in_batch: draft for draft in drafts}
@@ -263,8 +263,8 @@ class _Publication:
     def _find(self, waiting: Sequence[_Ready], kind: Kind, reuse: str) -> dict[str, _Head]:
         """Return the existing items that drafts will use or revise, by the names of the drafts.
 
-        With `by_name`, an item is found by its place; with `by_content`, by its required parts; with `new`, none is
-        found.
+        With `by_name`, an item is found by its place (folder and name). With `by_content`, it is found by the documents
+        of its required parts. With `new`, none is found.
         """
         if reuse == "new":
             return {}
@@ -382,7 +382,7 @@ class _Publication:
     def _with_earlier_facts(self, one: _Ready, head: _Head) -> _Ready:
         """Return the draft of a clip, with empty facts about the recording filled in from the existing clip.
 
-        Otherwise, a second import of a file would remove the consent of the performer.
+        So a second import of a file does not remove the consent of the performer.
         """
         digest, earlier = one.digests.get("info"), head.parts.get("info")
         if digest is None or earlier is None or digest == earlier:

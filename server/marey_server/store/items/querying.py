@@ -78,9 +78,9 @@ def _lower_on_postgres(element: _LowerAscii, compiler: SQLCompiler, **options: A
 
 
 class _NumberIn(FunctionElement[float]):
-    """SQL expression for a number in the summary of an item.
+    """SQL expression for a number in the summary of an item, or null if the summary has no number there.
 
-    It is null if the summary has no number there; a plain cast to a number would fail.
+    A plain cast to a number would fail for other values.
     """
 
     type = Float()
@@ -113,7 +113,7 @@ def _contains(value: ColumnElement[Any], part: object) -> ColumnElement[bool]:
 
 
 def _texts(value: ColumnElement[Any], condition: Condition) -> ColumnElement[bool]:
-    """Return the SQL of a condition on a text that may be null."""
+    """Return the SQL for a condition of a query on a text that may be null."""
     if condition.operator == "has":
         return value.is_not(None)
     if condition.operator == "~":
@@ -122,7 +122,7 @@ def _texts(value: ColumnElement[Any], condition: Condition) -> ColumnElement[boo
 
 
 def _numbers(value: ColumnElement[Any], condition: Condition) -> ColumnElement[bool]:
-    """Return the SQL of a condition on a number that may be null."""
+    """Return the SQL for a condition of a query on a number that may be null."""
     if condition.operator == "has":
         return value.is_not(None)
     if condition.operator == "=":
@@ -152,7 +152,7 @@ def stored_text(value: object) -> str:
 
 
 def _day_of(name: str) -> Comparison:
-    """Return the comparison for a field that stores a day."""
+    """Return a function that converts conditions on a field with a day to SQL."""
 
     def compare(condition: Condition, _: str) -> ColumnElement[bool]:
         stored: ColumnElement[Any] = item.c.summary[name].as_string()
@@ -167,7 +167,7 @@ def _day_of(name: str) -> Comparison:
 
 
 def _time_of(column: ColumnElement[Any]) -> Comparison:
-    """Return the comparison for a column that stores a time in microseconds.
+    """Return a function that converts conditions on a column with a time in microseconds to SQL.
 
     If a condition gives a day, the day is compared as a whole, from midnight to midnight UTC.
     """

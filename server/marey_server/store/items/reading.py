@@ -111,8 +111,8 @@ _PART_OF_REVISION = Prepared(_PART.where(revision_part.c.number == bindparam("nu
 def find_item(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, *, deleted: bool = False) -> Any:
     """Return the row of an item; with `deleted`, the row of a deleted item.
 
-    Raises `NotFoundProblem` if the project has no such item of this kind, and `GoneProblem` if `deleted` is true and
-    the item was purged.
+    Raises `NotFoundProblem` if the project has no such item of this kind. With `deleted`, raises `GoneProblem` if the
+    item was purged.
     """
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value}
     row = tx.execute(_DELETED_ITEM, which).one_or_none() if deleted else tx.first(_ITEM, which)
@@ -260,7 +260,8 @@ def read_part(
 MOST_BYTES_AT_ONCE = 12 * MIB
 """Bytes of documents that one answer contains, unless the first document alone is larger.
 
-With the request and the encoded answer, they fit into the memory that one stranger may hold (`process/memory.py`).
+Together with the request and the encoded answer, they fit into the memory that one unknown client may hold
+(`process/memory.py`).
 """
 
 
@@ -275,7 +276,7 @@ class LoadedParts:
 def load_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace]) -> LoadedParts:
     """Load the documents of parts with encoded arrays, in the order of the request; None for a missing part.
 
-    The parts of deleted items count as missing. Only an attempt of a job can load them, if they are inputs of the job,
+    The parts of deleted items count as missing, with one exception: an attempt of a job can load parts of its inputs,
     because a version of a dataset may contain items that were deleted later. If the documents together are too large,
     the list ends before the first one that does not fit; the first document is always loaded.
     """

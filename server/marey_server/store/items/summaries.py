@@ -24,7 +24,7 @@ class Summary:
 
 
 def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
-    """Return the summary of a revision from the bodies of its parts (arrays as references)."""
+    """Return the summary of a revision from the documents of its parts, which have references in place of arrays."""
     if kind is Kind.SKELETON:
         return Summary({"joints": len(bodies["hierarchy"]["joints"])})
     if kind is Kind.EVALUATION:
@@ -43,7 +43,7 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
 
 
 def take_record(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those fields of the take record that are set in the part `info` of a clip."""
+    """Return those fields of the take record (facts about the recording) that are set in the part `info` of a clip."""
     return {name: info[name] for name in TakeRecord.model_fields if info.get(name)}
 
 

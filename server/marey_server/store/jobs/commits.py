@@ -61,8 +61,8 @@ def check_target(
 ) -> Target:
     """Check the commit of outputs that a submission requests, and return it in the form in which the job stores it.
 
-    Raises `InvalidProblem` with a pointer below `at` for an unknown dataset or branch, and for a job without outputs
-    to commit; `ForbiddenProblem` and `ConflictProblem` if the caller may not commit to the branch.
+    Raises `InvalidProblem` with a JSON Pointer below `at` for an unknown dataset or branch, and for a job without
+    outputs to commit. Raises `ForbiddenProblem` or `ConflictProblem` if the caller may not commit to the branch.
     """
     if not scopes.allows(tx.principal.scopes, "write", project.name):
         raise ForbiddenProblem(
@@ -98,7 +98,7 @@ def check_target(
         **request.model_dump(), "dataset_id": found.id, "base": ref.digest, "within": found.path or "", "kinds": kinds,
     }  # fmt: skip
     if request.replace and not _entry_folder(target, into):
-        detail = "The commit would replace the whole dataset; name a folder of it."
+        detail = "The commit would replace the whole dataset; name a folder of the dataset."
         raise _invalid(f"{at}/replace", "whole-dataset", detail)
     return target
 
@@ -113,8 +113,8 @@ def check_again(
 ) -> Target | None:
     """Check the commit of a job that is retried; return it, or None if the job makes no commit.
 
-    The commit keeps its base, unless the dataset was replaced by another one of the same name. Raises the errors of
-    `check_target`.
+    The commit keeps its base, which is an earlier head of the branch. But if the dataset was replaced by another one of
+    the same name, the commit gets a new base. Raises the errors of `check_target`.
     """
     if target is None:
         return None
@@ -172,8 +172,8 @@ def _joined(*names: str) -> str:
 class PublishedOutputs:
     """Published outputs of a job, and the values of the job's columns that the commit determines.
 
-    If `failure` is set, nothing was published, because the author may not write to a folder of the outputs any more, or
-    the commit is not allowed.
+    If `failure` is set, nothing was published. The reason is that the author may not write to a folder of the outputs
+    any more, or that the commit is not allowed.
     """
 
     outputs: list[dict[str, Any]] = field(default_factory=list)
@@ -202,9 +202,9 @@ JOB_COLUMNS = (
 def publish_outputs(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> PublishedOutputs:
     """Publish the drafts of a job, and commit them if the request for the job asks for a commit.
 
-    A task only publishes its drafts, which its parent job commits later. If the commit is refused, or the author of the
-    job may not write to a folder of the outputs, nothing is published, and the result contains the failure.
-    `row` has the columns `JOB_COLUMNS`.
+    A task only publishes its drafts, which its parent job commits later. Nothing is published if the commit is refused,
+    or if the author of the job may not write to a folder of the outputs. The result then contains the failure. `row`
+    has the columns `JOB_COLUMNS`.
     """
     if row.commit_to is None and not drafts:
         return PublishedOutputs()

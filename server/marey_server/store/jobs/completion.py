@@ -50,8 +50,8 @@ _Place = tuple[str, int]
 def complete(tx: Transaction, job_id: str, fence: int, request: CompleteRequest) -> CompleteAnswer:
     """End the job with success and publish its staged outputs; a repeated `write_id` gets the same answer.
 
-    If its cancellation was requested, the job is cancelled instead, and nothing is published. Raises `LeaseLostProblem`
-    if the attempt does not hold the job, or has ended the job with another `write_id`.
+    If the cancellation of the job was requested, the job is cancelled instead, and nothing is published. Raises
+    `LeaseLostProblem` if the attempt does not hold the job, or has ended the job with another `write_id`.
     """
     require_attempt(tx.principal, job_id, fence)
     hold_off_purges_of_jobs(tx, [job_id])
@@ -107,7 +107,8 @@ def _complete(
 ) -> dict[_Place, tuple[Ended, CompleteAnswer]]:
     """End the jobs whose attempts are still valid, and publish their outputs.
 
-    Returns, by job and fence, the ended job and the answer; attempts that are no longer valid are missing.
+    Returns, by job and fence (number of the claim), the ended job and the answer. Attempts that are no longer valid are
+    missing.
     """
     if not requests:
         return {}
@@ -211,7 +212,7 @@ def _same_answer(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswe
 
 
 def _end_cancelled(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswer:
-    """End a job as cancelled because its cancellation was requested before its worker completed it; return the answer.
+    """End a job as cancelled, because its cancellation was requested before the attempt completed; return the answer.
 
     Raises `LeaseLostProblem` if the attempt does not hold the job.
     """

@@ -56,7 +56,7 @@ def dependency_failure(cause: str, state: str) -> dict[str, Any]:
 def end_jobs(tx: Transaction, condition: ColumnElement[bool], state: str, **values: Any) -> list[Ended]:
     """Set the final `state` of the jobs that meet `condition`, and return these jobs.
 
-    The condition must include the check of the fence.
+    For a job that a worker runs, `condition` must require that no later attempt has claimed the job (`same_fence`).
     """
     statement = (
         update(job)

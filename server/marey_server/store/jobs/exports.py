@@ -35,7 +35,7 @@ def lease_inputs(tx: Transaction, kind_name: str, inputs: Mapping[str, Any]) -> 
     """Return the inputs of a job in the form that a worker gets.
 
     Each clip that the job exports and whose consent has ended gets the additional member `ENDED`, the last day of the
-    consent. This day is compared with the present day, not with the day of the submission.
+    consent. The consent has ended if this day is before the present day; the day of the submission does not matter.
     """
     try:
         kind = find_kind(kind_name)
@@ -57,7 +57,8 @@ def may_share(tx: Transaction, kind_name: str, inputs: Mapping[str, Any], result
     """Return whether consents allow a new job to share the result of an identical job.
 
     If the job exports clips, the consents of the same clips must have ended for both jobs. So the result is not shared
-    if the consent for another clip has ended since, or if a later last day of a consent was recorded.
+    if the consent for another clip has ended since. It is not shared either if a later last day of a consent was
+    recorded.
     """
     try:
         kind = find_kind(kind_name)
@@ -76,8 +77,8 @@ def record_permission(
 ) -> None:
     """Record an event if a new job may export clips whose consent has ended; the event names these clips.
 
-    Clips that are not known yet, or whose consent ends before the job runs, are not named; the result of the job lists
-    all of them. Raises `ForbiddenProblem` unless the caller is a maintainer or an owner.
+    Clips that are not known yet, or whose consent ends before the job runs, are missing in the event. The result of the
+    job lists them, too. Raises `ForbiddenProblem` unless the caller is a maintainer or an owner.
     """
     if kind.exports is None or not params.get("allow_expired_consent"):
         return

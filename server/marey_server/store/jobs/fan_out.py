@@ -1,7 +1,7 @@
 """End of fan-outs: combines the results of tasks, or queues the parent job so that a worker combines them.
 
-A commit of many outputs takes seconds. It is not made in the transaction that ends the last task, because other writers
-would wait. The parent job stays in the state `running`, without unfinished tasks, until `finishing` has ended it.
+A commit of many outputs takes seconds. If the transaction that ends the last task made such a commit, other writers
+would wait. So the parent job stays in the state `running`, without unfinished tasks, until `finishing` has ended it.
 """
 
 from __future__ import annotations
@@ -39,13 +39,16 @@ DEFERRED: ColumnElement[bool] = and_(
 def gather(tx: Transaction, parent_id: str) -> list[Ended]:
     """End a parent job whose tasks have all ended; return the jobs that ended.
 
-    If all tasks succeeded, the parent job succeeds, or fails if its outputs cannot be committed. In two cases it does
-    not end yet, and the list is empty: if a worker must combine the results of the tasks, the parent job is queued; if
-    the outputs are too many to be committed in this transaction, the module `finishing` commits them later.
+    If a task failed, the parent job fails. If no task failed, but some did not succeed, the parent job is cancelled. If
+    all tasks succeeded, there are three cases:
 
-    If a task failed, the parent job fails, unless the cancellation of the parent job was requested before. In all other
-    cases, the parent job is cancelled: if a task did not succeed, or if a worker would have to combine the results
-    after a request for cancellation.
+    * If a worker must combine the results of the tasks, the parent job is queued. The returned list is empty.
+    * If the outputs are too many to be committed in this transaction, the module `finishing` commits them later. The
+      returned list is empty.
+    * Otherwise, the parent job succeeds, or fails if its outputs cannot be committed.
+
+    If the cancellation of the parent job was requested before, the job is cancelled in two cases: if a task did not
+    succeed, and if the job would be queued.
     """
     columns = (*commits.JOB_COLUMNS, job.c.gathers, job.c.cancel_requested_us)
     head = tx.execute(select(*columns).where(job.c.id == parent_id)).one()

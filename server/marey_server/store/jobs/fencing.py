@@ -43,7 +43,7 @@ def same_fence(fence: int) -> ColumnElement[bool]:
 
 
 def held(job_id: str, fence: int) -> ColumnElement[bool]:
-    """Return the SQL condition that the attempt still holds its job; every write of a worker includes this."""
+    """Return the SQL condition, included in every write of a worker, that the attempt still holds its job."""
     return and_(job.c.id == job_id, job.c.state == RUNNING, same_fence(fence))
 
 
@@ -116,7 +116,10 @@ def hold(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any])
 
 
 def lease_lost(job_id: str, fence: int) -> LeaseLostProblem:
-    """Return the error that makes a worker stop its attempt."""
+    """Return the error for an attempt that no longer holds the lease of its job.
+
+    The error makes the worker stop the attempt.
+    """
     return LeaseLostProblem(f"Attempt {fence} has lost its lease of {job_id}. Stop working on it.")
 
 

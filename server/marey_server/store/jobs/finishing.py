@@ -74,7 +74,7 @@ def _commit_one(database: Database, job_id: str) -> bool:
 
 
 def _portions(chunks: Mapping[str, bytes]) -> Iterator[Mapping[str, bytes]]:
-    """Yield the chunks in portions, in the order of their digests, in which all writers lock them."""
+    """Yield the chunks in portions, sorted by digest: all writers lock chunks in this order."""
     digests = sorted(chunks)
     for start in range(0, len(digests), CHUNKS_AT_ONCE):
         yield {digest: chunks[digest] for digest in digests[start : start + CHUNKS_AT_ONCE]}

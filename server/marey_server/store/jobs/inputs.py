@@ -56,7 +56,7 @@ _ITEMS_BY_ID = Prepared(_ITEMS.where(item.c.id.in_(bindparam("ids", expanding=Tr
 
 
 def find_items(tx: Transaction, project: ProjectRow, requests: Iterable[JobCreate]) -> dict[str, FoundItem]:
-    """Return, by id, the items that the requests name by id, without those named through a collection or a dataset."""
+    """Return, by id, the items that the requests name by their ids, not through a collection or a dataset."""
     choices = (choice for request in requests for many in request.inputs.values() for choice in _as_many(many))
     return items_by_id(tx, project.id, (choice.item for choice in choices if isinstance(choice, ItemInput)))
 
@@ -85,8 +85,9 @@ def pin_inputs(
     Outputs of other jobs are pinned later (`late_inputs`). `known` holds the items that `find_items` returned for the
     request.
 
-    Raises `InvalidProblem` with a pointer below `at` for each fault: an input that the kind does not have, a required
-    input without a value, an item or revision that is not in the project, an item of another kind, an empty collection.
+    Raises `InvalidProblem`, which lists all faults with pointers below `at`. Faults are an input that the kind does not
+    have, a required input without a value, and an empty collection. Other faults are an item or revision that is not in
+    the project, and an item of another kind.
     """
     errors = _misnamed(kind, request, at)
     pins: PinnedInputs = {}
@@ -201,7 +202,7 @@ def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: st
 def _entries_of(
     tx: Transaction, project: ProjectRow, spec: InputSpec, choice: DatasetInput, place: str, errors: list[FieldError]
 ) -> Iterator[Pin]:
-    """Yield a pin for each entry of the dataset version that `choice` names, and add faults to `errors`.
+    """Yield a pin (exact revision) for each entry of the dataset version that `choice` names; add faults to `errors`.
 
     Each pin has the name and the folder of the entry in this version. `place` is the JSON Pointer to `choice` in the
     request.
@@ -231,7 +232,10 @@ def _entries_of(
 
 
 def _within(path: str) -> ColumnElement[bool]:
-    """Return the condition that a path is below another, compared as text; LIKE would ignore case on SQLite."""
+    """Return the SQL condition that a path is below `path`.
+
+    The paths are compared as texts, because LIKE would ignore case on SQLite.
+    """
     below = f"{path}/"
     return or_(collection.c.path == path, func.substr(collection.c.path, 1, len(below)) == below)
 
@@ -280,7 +284,7 @@ class NamingJob(NamedTuple):
     def items(self) -> set[str]:
         """Return the ids of the items that the job names.
 
-        An input that was split among tasks, or whose items do not exist yet, names none.
+        Inputs that were split among tasks are left out, and so are inputs whose items do not exist yet.
         """
         found = {one["item"] for one in self.outputs}
         for pins in self.inputs.values():

@@ -1,8 +1,8 @@
 """Late inputs: inputs of a job that are outputs of other jobs, pinned when those jobs have succeeded.
 
-They are pinned in the transaction that makes the job ready, while the row of the job is locked. The job is then
-processed like a submission with existing inputs: it is split into tasks, gets its cache key, and is queued or shares a
-result.
+To pin an input means to store the exact revisions that the job reads. Late inputs are pinned in the transaction that
+makes the job ready, while the row of the job is locked. The job is then processed like a submission with existing
+inputs: it is split into tasks, gets its cache key, and is queued or shares a result.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class LateInputError(Exception):
 def pin_late_inputs(tx: Transaction, ids: Sequence[str]) -> list[Ended]:
     """Pin the outputs of succeeded dependencies as inputs of the waiting jobs, and queue these jobs.
 
-    Returns the jobs that ended because of this: those for which there are no outputs to read, and those that share an
-    existing result.
+    Returns the jobs that ended now: those for which there are no outputs to read, and those that share an existing
+    result.
     """
     if not ids:
         return []
@@ -166,9 +166,10 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
 def _resolved(
     tx: Transaction, project_id: str, name: str, spec: InputSpec, entry: dict[str, Any], made: dict[str, _Made]
 ) -> list[Pin]:
-    """Return the pins of one entry of an input: the entry itself, or the outputs of the job that the entry names.
+    """Return the pins (exact revisions) of one entry of an input.
 
-    Raises `LateInputError` if a required input has no outputs.
+    An entry is a pin already, or names a job, whose outputs are then pinned. Raises `LateInputError` if a required
+    input has no outputs.
     """
     if "job" not in entry:
         return [entry]

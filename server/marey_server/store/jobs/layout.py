@@ -67,7 +67,7 @@ class NewJob:
         return self.submission.unbound
 
     def end(self) -> Ended:
-        """Return the end of a job that never starts because a dependency did not succeed."""
+        """Return the end of a job that never starts, because a job on which it depends failed or was cancelled."""
         return Ended(self.id, self.project_id, self.state, self.parent_id, self.failure)
 
 
@@ -91,8 +91,8 @@ def request_of(row: Row[Any]) -> JobCreate:
 def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dict[str, result_cache.SharedResult]]:
     """Split jobs with known inputs into tasks, and give them their cache keys.
 
-    Returns the tasks, and a mapping from the ids of jobs that share a result to the jobs that have computed, or are
-    computing, this result.
+    Returns the tasks, and a mapping for the jobs that share a result. It maps the id of such a job to the job that has
+    computed, or is computing, this result.
     """
     gathering = [one for one in heads if one.submission.kind.gathering is not None]
     sources = _find_results(tx, gathering)

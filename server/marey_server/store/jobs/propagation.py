@@ -42,8 +42,8 @@ def propagate_ends(tx: Transaction, ended: Iterable[Ended]) -> None:
 def make_ready(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
     """Queue waiting jobs whose dependencies have succeeded, start their tasks, or give them a cached result.
 
-    Late inputs of the jobs are pinned first. The rows hold `READY_COLUMNS`. Returns the jobs that ended because of
-    this.
+    First, inputs that are outputs of other jobs (late inputs) are pinned to exact revisions. The rows hold
+    `READY_COLUMNS`. Returns the jobs that ended as a result.
     """
     ended = late_inputs.pin_late_inputs(tx, [row.id for row in rows if row.unbound])
     for row in rows:

@@ -61,11 +61,12 @@ from marey_server.store.transaction import Transaction
 
 
 def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_POLICY) -> list[Lease]:
-    """Claim up to `request.max` queued jobs for the caller, in order of priority, each under a new fence.
+    """Claim up to `request.max` queued jobs for the caller, in order of priority.
 
-    A repeated `claim_id` gets those leases of the earlier claim that are still held. Raises `ForbiddenProblem` if the
-    caller may not claim jobs or may not announce these labels, `InvalidProblem` if the worker uses another version of
-    the protocol, and `LeaseLostProblem` if no lease of the earlier claim is held any more.
+    Each claim of a job increases its fence, the number by which the new attempt is identified. A repeated `claim_id`
+    gets those leases of the earlier claim that are still held. Raises `LeaseLostProblem` if there are none. Raises
+    `ForbiddenProblem` if the caller may not claim jobs or may not announce these labels. Raises `InvalidProblem` if the
+    worker uses another version of the protocol.
     """
     if request.protocol != PROTOCOL_VERSION:
         detail = f"The worker uses version {request.protocol} of the protocol, but the server uses {PROTOCOL_VERSION}."
@@ -130,7 +131,7 @@ def _issue_token(tx: Transaction, claim_id: str | None, row: Row[Any]) -> Issued
     """Return a token for the attempt.
 
     If the claim has a `claim_id`, it may be repeated. Then the token is derived from the caller's token, the claim and
-    the attempt, so that a repetition gets the same token although no secret is stored.
+    the attempt. So a repetition gets the same token although no secret is stored.
     """
     if claim_id is None:
         return issue_attempt_token()
@@ -269,7 +270,7 @@ def _is_workable(candidate: FromClause, restriction: _Restriction) -> ColumnElem
 
 
 class _Restriction(NamedTuple):
-    """Limits of a claim, apart from the kinds and labels of jobs."""
+    """Limits of a claim on the number and the projects of jobs; kinds and labels are limited separately."""
 
     one_job: bool
     named_projects: bool
@@ -335,7 +336,7 @@ def _leases(
 
 
 def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
-    """Return, by id, the number of tasks of each job that is the parent job of a given task."""
+    """Return, for each parent job of the given tasks, its number of tasks, by the id of the parent job."""
     parents = {row.parent_id for row in rows if row.parent_id is not None}
     if not parents:
         return {}

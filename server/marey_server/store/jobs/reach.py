@@ -1,8 +1,8 @@
 """Items that an attempt may read: the inputs of its job, and the items to which these inputs and the parameters refer.
 
-A clip names its skeleton, an annotation its clip, an evaluation its clips. Jobs follow such references while they run,
-so an attempt may read the items that the references lead to, in its project, and no others. Of deleted items, it may
-read only the revisions that are inputs of its job, since these may come from an earlier version of a dataset.
+A clip names its skeleton, an annotation its clip, an evaluation its clips. Jobs follow such references while they run.
+So an attempt may read the items of its project to which the references lead, and no others. Of a deleted item, it may
+read only revisions that are inputs of its job. Such inputs may come from an earlier version of a dataset.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Pins(NamedTuple):
 
 
 def unreachable_items(tx: Transaction, wanted: Iterable[str]) -> set[str]:
-    """Return those of the wanted items that the caller may not read; none if the caller is not an attempt."""
+    """Return those of the wanted items that the caller may not read; empty unless the caller is an attempt."""
     if tx.principal.kind != "attempt":
         return set()
     pins = _pins_of(tx)
@@ -55,12 +55,12 @@ def unreachable_items(tx: Transaction, wanted: Iterable[str]) -> set[str]:
 
 
 def pinned_places(tx: Transaction) -> frozenset[PinnedPlace]:
-    """Return the revisions that are inputs of the attempt's job; none if the caller is not an attempt."""
+    """Return the revisions that are inputs of the attempt's job; empty unless the caller is an attempt."""
     return _pins_of(tx).places if tx.principal.kind == "attempt" else frozenset()
 
 
 def unreachable_places(tx: Transaction, wanted: Iterable[PinnedPlace]) -> set[PinnedPlace]:
-    """Return those of the wanted revisions that the caller may not read; none if the caller is not an attempt."""
+    """Return those of the wanted revisions that the caller may not read; empty unless the caller is an attempt."""
     if tx.principal.kind != "attempt":
         return set()
     pins = _pins_of(tx)
@@ -74,7 +74,7 @@ def unreachable_places(tx: Transaction, wanted: Iterable[PinnedPlace]) -> set[Pi
 def reachable_blobs(tx: Transaction, digests: Collection[str]) -> set[str]:
     """Return those of the given blobs that the attempt may read.
 
-    It may read blobs of its job, of the tasks of this job, and of the documents that it may read.
+    These are the blobs of its job, of the tasks of this job, and of the documents that the attempt may read.
     """
     principal = tx.principal
     of_job = (

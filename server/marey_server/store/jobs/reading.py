@@ -69,7 +69,7 @@ def list_jobs(
     limit: int = listing.DEFAULT_LIMIT,
     count: bool = False,
 ) -> Page:
-    """Return one page of a project's jobs, without tasks unless the filters name their parent job."""
+    """Return one page of a project's jobs; tasks are included only if the filters name their parent job."""
     project_row = projects.require(tx, project)
     order = listing.parse_order(sort, SORT_KEYS)
     identity = [project_row.id, asdict(filters)]

@@ -70,9 +70,9 @@ def reap_page(
 ) -> ReapedPage:
     """Reclaim up to `limit` jobs whose leases have expired, the longest overdue first, after the position `after`.
 
-    Each job has its own UPDATE with the condition that the fence is unchanged and the lease has expired. So a heartbeat
-    or a result at the same time is either accepted, or refused because the lease is lost. A job that cannot be
-    reclaimed does not prevent the others from being reclaimed.
+    Each job has its own UPDATE with the condition that no other attempt has claimed the job and the lease has expired.
+    So a heartbeat or a result at the same time is either accepted, or refused because the lease is lost. If a job
+    cannot be reclaimed, the others are reclaimed nevertheless.
     """
     overdue = and_(job.c.state == RUNNING, job.c.lease_expires_us <= tx.now_us)
     statement = select(*ENDING_COLUMNS).where(overdue).order_by(job.c.lease_expires_us, job.c.id).limit(limit)

@@ -1,11 +1,11 @@
 """Result cache: identical jobs share one computation, finished or still running.
 
 Jobs are identical if kind, version of the kind, parameters, seed and inputs are equal. Inputs are equal if the item,
-its name, its path, and the content of the documents that the kind reads are equal, because results are named after
-inputs and refer to them. A kind can also require that the collection of the results is equal, or the newest revision of
-an item that the parameters name. Jobs whose result depends on data that is read while they run have no cache key. For
-each job, shared results are published again, into the job's own collection. Jobs of different projects share no
-results. An exported archive is not shared after the consent for one of its clips has ended.
+its name, its path, and the content of the documents that the kind reads are equal. Name and path count because results
+are named after inputs and refer to them. A kind can also require that the collection of the results is equal, or the
+newest revision of an item that the parameters name. Jobs whose result depends on data that is read while they run have
+no cache key. For each job, shared results are published again, into the job's own collection. Jobs of different
+projects share no results. An exported archive is not shared after the consent for one of its clips has ended.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SHARED_AT_ONCE = 64
 """Greatest number of jobs that get a cached result at submission; the leading process serves the others later."""
 
 MOST_SHARED_OUTPUTS = 256
-"""Greatest number of outputs published from the cache in one transaction; a single job may exceed it."""
+"""Greatest number of outputs published from the cache in one transaction; a single job may publish more."""
 
 MEASURED_PER_OUTPUT = 5
 """Number of revisions whose facets count as one output, because publishing these facets takes about as long."""
@@ -126,8 +126,8 @@ def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult
 
     A candidate is a row with `id`, `project_id`, `cache_key` and `cache_mode`. Candidates that cannot share a result
     are omitted. Of several identical candidates, the first computes the result and the others share it. In each
-    project, this function runs for one transaction at a time. It locks the jobs that it finds, so that none of them
-    ends before the transaction has recorded who shares its result.
+    project, this function runs for one transaction at a time. The found jobs are locked: none of them ends before the
+    transaction has recorded which jobs share its result.
     """
     asking = [one for one in candidates if one.cache_key is not None and one.cache_mode in ("use", "refresh")]
     if not asking:
@@ -180,7 +180,8 @@ def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, st
 def join(tx: Transaction, joining: Sequence[tuple[Any, SharedResult]]) -> list[Ended]:
     """Let waiting jobs share the results of other jobs, now or as soon as these have finished; return the ended jobs.
 
-    `joining` pairs the row of each waiting job, of which only `id` is read, with the job that has the result.
+    `joining` contains pairs: the row of a waiting job, of which only `id` is read, and the job that has or computes the
+    result.
     """
     if not joining:
         return []
@@ -232,7 +233,7 @@ def share_waiting(tx: Transaction) -> list[Ended]:
 def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     """Give one job the result it waits for, or queue it if that is impossible; return the jobs that have ended.
 
-    A refusal that concerns this job must not affect the job that computed the result, or others that wait for it.
+    A refusal of this job must not affect the job that computed the result, nor other jobs that wait for the result.
     """
     try:
         with tx.connection.begin_nested():
@@ -247,8 +248,9 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
 def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     """Publish the shared result as the result of a waiting job; return the jobs that ended as a result.
 
-    The waiting job does not end if the shared result is no longer stored. It does not end either if the two jobs export
-    clips, and the clips whose consent has ended are not the same for both jobs. Raises the errors of `publish`.
+    The waiting job does not end if the shared result is no longer stored. For jobs that export clips, the clips whose
+    consent has ended must be the same for both jobs; otherwise, the waiting job does not end either. Raises the errors
+    of `publish`.
     """
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")

@@ -31,10 +31,10 @@ UNSUCCESSFUL = ("failed", "cancelled")
 def retry_job(tx: Transaction, job_id: str) -> Job:
     """Submit a failed or cancelled job again, and return the new job; results of the old job's tasks are used again.
 
-    The new job has the same inputs; inputs that were never available are late inputs again. Unsuccessful dependencies
-    are retried before it, and dependants that ended only because of this job are retried after it, so that the rest of
-    a pipeline continues. Jobs that the caller may not retry are left out. Raises `ConflictProblem` for a task, and for
-    a job that has not ended or has succeeded.
+    The new job has the same inputs. Inputs that were never available, because other jobs should have created them, are
+    created by the retries of these jobs. Unsuccessful dependencies are retried before the job. Dependants that ended
+    only because of this job are retried after it, so that the rest of a pipeline continues. Jobs that the caller may
+    not retry are left out. Raises `ConflictProblem` for a task, and for a job that has not ended or has succeeded.
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "retry")
@@ -154,7 +154,7 @@ def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_
         ) from error
     pins = _late_pins(row, stand_ins) if row.unbound else _pins_of(tx, row, kind.fan_out)
     if purged := [pin["item"] for many in pins.values() for pin in many if "purged" in pin]:
-        detail = f"The job cannot run again: its input {purged[0]} was purged, so that its content is gone."
+        detail = f"The job cannot run again: its input {purged[0]} was purged, and the content of this input is gone."
         raise ConflictProblem(detail, code="input-purged")
     return Submission(
         kind,
@@ -173,7 +173,7 @@ def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_
 
 
 def _late_pins(row: Row[Any], stand_ins: Mapping[str, str]) -> PinnedInputs:
-    """Return the inputs for the retry of a job that ended before its late inputs were pinned.
+    """Return the inputs for the retry of a job that ended before outputs of other jobs were pinned as its inputs.
 
     Inputs that refer to the results of another job then refer to the results of the retry of that job. `stand_ins` maps
     the ids of jobs to the ids of their retries.

@@ -41,7 +41,7 @@ _FACETS = ""
 
 @dataclass(frozen=True, slots=True)
 class PreparedOutput:
-    """Staged output with checked and encoded documents."""
+    """Output that is ready to be staged: its documents are checked and encoded."""
 
     output: StagedOutput
     parts: Mapping[str, PreparedDocument]
@@ -66,8 +66,8 @@ def stage(
     """Store outputs until the attempt completes; they replace staged outputs of the same names. Return their number.
 
     `facets`, unless empty, replace all facets that the attempt staged before. Raises `LeaseLostProblem` if the attempt
-    does not hold the job, `InvalidProblem` for sources that are not inputs of the job, and the errors of
-    `stored_facets`.
+    does not hold the job, and `InvalidProblem` for sources that are not inputs of the job. Raises the errors of
+    `stored_facets`, too.
     """
     require_attempt(tx.principal, job_id, fence)
     held = hold(tx, job_id, fence, job.c.inputs, job.c.kind, job.c.project_id)
@@ -170,7 +170,10 @@ _DROP_STAGED = Prepared(delete(staged_output).where(_BY_ATTEMPTS))
 def staged_drafts(
     tx: Transaction, attempts: Collection[tuple[str, int]]
 ) -> dict[tuple[str, int], dict[str, StagedDraft]]:
-    """Return the drafts that attempts (job id and fence) staged, by name, in the order of staging."""
+    """Return the drafts that attempts staged, by name, in the order of staging.
+
+    An attempt is given by the id of its job, and by its fence (the number of the claim that started it).
+    """
     drafts: dict[tuple[str, int], dict[str, StagedDraft]] = {}
     for row in tx.run(_STAGED, _of_attempts(attempts)):
         drafts.setdefault((row.job_id, row.fence), {})[row.name] = row.draft
@@ -191,7 +194,7 @@ def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> boo
 
 
 def drop_staged(tx: Transaction, attempts: Collection[tuple[str, int]]) -> None:
-    """Delete the drafts of the given attempts (job id and fence).
+    """Delete the drafts of attempts, each given by the id of its job and its fence (number of the claim).
 
     Called for attempts that did not succeed, and for attempts whose results no other job can share.
     """
@@ -205,16 +208,19 @@ def drop_staged_facets(tx: Transaction, job_ids: Sequence[str]) -> None:
 
 
 def _of_attempts(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
-    """Return the parameters with which `_BY_ATTEMPTS` selects the outputs of attempts (job id and fence)."""
+    """Return the parameters with which `_BY_ATTEMPTS` selects the outputs of attempts.
+
+    An attempt is given by the id of its job and its fence (number of the claim).
+    """
     return {"jobs": [job_id for job_id, _ in attempts], "attempts": list(attempts)}
 
 
 def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: PinnedInputs) -> dict[str, StagedDraft]:
     """Return drafts that an identical job has staged, rewritten as drafts of this job.
 
-    The two jobs may have read different revisions with the same content. In the sources and facets of each draft, the
-    revision that the other job read (from `theirs`) is replaced by the revision at the same position in the inputs of
-    this job (`ours`).
+    The two jobs may have read different revisions with the same content: `theirs` are the inputs of the other job,
+    `ours` those of this job. In the sources and facets of each draft, a revision from `theirs` is replaced by the
+    revision at the same position in `ours`.
     """
     revisions = {
         (role, their["item"], their["revision"]): our["revision"]
@@ -303,7 +309,7 @@ def named_blobs(tree: Any) -> Iterator[str]:
 
 
 def keep_named_blobs(tx: Transaction, job_id: str, digests: set[str]) -> None:
-    """Protect the blobs that a job names from garbage collection.
+    """Keep garbage collection from deleting the blobs that a job names.
 
     Raises `ConflictProblem` (`missing-blobs`) for blobs that the caller has not sent and may not read.
     """

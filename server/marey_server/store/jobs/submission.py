@@ -95,9 +95,9 @@ def submit_checked(
     """Insert the rows of checked jobs and queue those without unfinished dependencies.
 
     `upstream` maps the ids of existing jobs, on which the new jobs depend, to their states; these existing jobs must be
-    locked. If a new job depends on another new job, this dependency counts as unfinished. Raises `ForbiddenProblem` for
-    an export for which the role of the caller is too low, and for results in a folder to which the caller may not
-    write.
+    locked. If a new job depends on another new job, this dependency counts as unfinished. Raises `ForbiddenProblem` if
+    the role of the caller is too low for an export. Also raises `ForbiddenProblem` if the caller may not write to the
+    folder of the results.
     """
     rights = rights_of_caller(tx, project)
     for submitted in submissions:

@@ -1,7 +1,7 @@
 """Purges: deleted items are erased for good, so that garbage collection can free the bytes of their content.
 
-Of a purged item, an empty row remains, with a row for each of its revisions: lineage and jobs refer to them. An item
-that something still needs is not purged; `holders` says what holds it.
+An empty row remains of a purged item, and one of each of its revisions, because lineage and jobs refer to these rows.
+An item that something still needs is not purged; the module `holders` finds what needs it.
 """
 
 from marey_server.store.purging.candidates import PreparedPurge, prepare_purge

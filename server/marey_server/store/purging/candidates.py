@@ -1,4 +1,4 @@
-"""Choice of the deleted items that a request for a purge names, and of what must be searched before the purge."""
+"""Choice of the deleted items that a request for a purge names, and the searches that precede the purge."""
 
 from __future__ import annotations
 
@@ -99,9 +99,10 @@ def _kind_of(last: str) -> Kind:
 
 
 def contents_of(tx: Transaction, ids: Sequence[str]) -> tuple[dict[str, frozenset[str]], dict[str, frozenset[str]]]:
-    """Return the content digests of the revisions of each item, and, by these, the content digests of their parts.
+    """Return the content digests of each item's revisions, and the content digests of the parts of each revision.
 
-    Content digests are computed when a commit first needs them; revisions that have none yet are left out.
+    The first mapping has the ids of the items as keys, the second the content digests of the revisions. A content
+    digest is computed when a commit first needs it; revisions without one are left out.
     """
     of_revision = and_(revision_part.c.item_id == revision.c.item_id, revision_part.c.number == revision.c.number)
     statement = (

@@ -1,7 +1,7 @@
 """Erasure of items: their content, names and tags, and the traces of these in jobs and events.
 
-What remains of an item is a row with its id, its kind, the times of its creation, deletion and purge, and one row for
-each revision, with its number, its time and the job that made it. Rows of `lineage` refer to the rows that remain.
+One row of each item remains, with its id, its kind, and the times of its creation, deletion and purge. One row of each
+revision remains, with its number, its time and the job that made it. Rows of `lineage` refer to the rows that remain.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ def erase(tx: Transaction, project_row: ProjectRow, rows: Sequence[Row[Any]], jo
 
 
 def _drop_empty_folders(tx: Transaction, project_id: str, paths: Collection[str]) -> None:
-    """Delete the deleted folders, at `paths` and above, that no longer contain items; remove their names from events.
+    """Erase deleted folders that no longer contain items, and remove their names from events.
 
-    Folders that contain a dataset remain.
+    Examined are the folders at `paths`, and the folders above these. Folders that contain a dataset remain.
     """
     deleted = (collection.c.project_id == project_id, collection.c.deleted_us.is_not(None))
     used = exists().where(dataset.c.collection_id == collection.c.id)
@@ -97,8 +97,8 @@ def _is_within(ordered: Sequence[str], folder: str) -> bool:
 def freed_by(tx: Transaction, project_id: str, items: Collection[str], jobs: Collection[str]) -> int:
     """Return the total bytes of the documents, arrays and files of `items` that nothing else in the project refers to.
 
-    References of `jobs` do not count, nor do documents that no revision refers to, such as those of a running job.
-    References of other projects do not count either: their content is not shown to the caller.
+    References of `jobs` do not count. References of documents that no revision contains, such as staged documents of a
+    running job, do not count either. The same holds for other projects, whose content is not shown to the caller.
     """
     if not items:
         return 0

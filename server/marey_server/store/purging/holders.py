@@ -37,8 +37,8 @@ def find_holders(
 ) -> dict[str, FoundHolders]:
     """Return what holds each item, by its id; `rows` are the items that are to be purged together.
 
-    Items that nothing holds are left out. If a document of one item in `rows` refers to another item in `rows`, the
-    first item holds the other one only if the first item is itself held. `versions` are the holders that a
+    Items that nothing holds are left out. A document of an item in `rows` may refer to another item in `rows`. Such a
+    reference holds the other item only if something holds the first item. `versions` are the holders that a
     `VersionSearch` has found.
     """
     held: dict[str, FoundHolders] = {}
@@ -74,7 +74,7 @@ def _references(items: Collection[str]) -> Select[Any]:
 
 
 def _add_referring(tx: Transaction, project_id: str, items: Collection[str], held: dict[str, FoundHolders]) -> None:
-    """Add the other items of the project whose documents refer to one of `items`, as holders."""
+    """Add, as holders, the other items of the project whose documents refer to one of `items`."""
     referring = (
         _references(items)
         .join(item, item.c.id == revision_part.c.item_id)

@@ -28,7 +28,7 @@ class JobNaming:
 def jobs_naming(
     tx: Transaction, project_id: str, items: Collection[str], *, unfinished: bool = False
 ) -> list[JobNaming]:
-    """Return the jobs of a project that name one of `items`, by id.
+    """Return the jobs of a project that name one of `items`, which are ids of items; the jobs are sorted by id.
 
     With `unfinished`, only jobs are returned that have not ended, or whose parent job has not ended.
     """

@@ -43,9 +43,9 @@ def preview_purge(tx: Transaction, project: str, request: PurgeRequest) -> Purge
 def record_purge(tx: Transaction, project: str, request: PurgeRequest, prepared: PreparedPurge) -> PurgeAnswer:
     """Purge the prepared items that nothing holds, all in this transaction.
 
-    Items that were restored since they were chosen are left out. For a request that names a single item, raises
-    `ConflictProblem` if something holds the item or the item is not deleted, `GoneProblem` if it was purged already,
-    and `NotFoundProblem` if it does not exist.
+    Items that were restored since they were chosen are left out. If the request names a single item, raises
+    `NotFoundProblem` if the item does not exist, and `GoneProblem` if it was purged already. Raises `ConflictProblem`
+    if this item is not deleted, or if something holds it.
     """
     assert not request.preview, "a preview is a read"
     project_row = projects.require(tx, project)
@@ -86,7 +86,7 @@ def _examine(tx: Transaction, project_row: ProjectRow, request: PurgeRequest, pr
 def _answer(
     tx: Transaction, project_row: ProjectRow, request: PurgeRequest, prepared: PreparedPurge, found: _Examined
 ) -> PurgeAnswer:
-    """Return the answer to a request, before anything is deleted."""
+    """Return what a purge deletes and what it does not delete, as found before anything is deleted."""
     return PurgeAnswer(
         preview=request.preview,
         purged=tuple(_purged(row, named=request.preview) for row in found.free),

@@ -1,4 +1,4 @@
-"""Search for contents in all versions of the datasets of a project."""
+"""Search for the contents of revisions in all versions of the datasets of a project."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ class PreparedDatasetPurge:
 
 
 def preview_dataset_purge(tx: Transaction, project: str, request: DatasetPurgeRequest) -> DatasetPurgeAnswer:
-    """Return what the purge of a deleted dataset would delete, and what holds the dataset; this only reads.
+    """Return what the purge of a deleted dataset would delete, and what holds the dataset; nothing is changed.
 
     Raises the errors of `prepare_dataset_purge`.
     """
@@ -77,8 +77,8 @@ def preview_dataset_purge(tx: Transaction, project: str, request: DatasetPurgeRe
 def prepare_dataset_purge(tx: Transaction, project: str, request: DatasetPurgeRequest) -> PreparedDatasetPurge:
     """Find a deleted dataset, the jobs that read its versions, and the chunks that only its versions have.
 
-    This reads all jobs of the project and all trees of the server once. Raises `NotFoundProblem`, `ConflictProblem` if
-    the dataset is not deleted, and `ForbiddenProblem` if the caller lacks the scope `read`.
+    The search reads all jobs of the project and all trees of the server once. Raises `NotFoundProblem` if there is no
+    such dataset, `ConflictProblem` if it is not deleted, and `ForbiddenProblem` if the caller lacks the scope `read`.
     """
     project_row = projects.require(tx, project)
     projects.require_scope(tx, project, "read")  # because the answer shows names
@@ -197,7 +197,10 @@ def _with_retries(tx: Transaction, citing: Iterable[str]) -> set[str]:
 
 
 def _holders(tx: Transaction, citing: Collection[str]) -> FoundHolders:
-    """Return the citing jobs that have not ended, and the items that citing jobs made and that were not purged."""
+    """Return what holds the dataset: citing jobs that have not ended, and items that citing jobs made.
+
+    Purged items do not count.
+    """
     held = FoundHolders()
     ordered = sorted(citing)
     items: set[str] = set()
@@ -254,9 +257,9 @@ def _below(store: StoredChunks, roots: Collection[str], known: Collection[str]) 
 def _delete_chunks(tx: Transaction, chunks: Mapping[str, int]) -> None:
     """Delete chunks, apart from those that another write has stored again since the purge was prepared.
 
-    A write that makes a tree stores its new chunks, even those that are stored already; this changes the times of these
-    chunks, so they are not deleted. All other chunks of the new tree belong to an older tree, too, and so they are not
-    deleted either.
+    A write that makes a tree stores its new chunks, even if they exist already. Storing a chunk again changes its time,
+    so the chunk is not deleted. All other chunks of the new tree belong to an older tree, too, so they are not deleted
+    either.
     """
     digests = sorted(chunks)
     for some in in_lists(digests):

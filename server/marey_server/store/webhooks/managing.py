@@ -83,8 +83,8 @@ def _shown(project: str, row: Row[Any]) -> Webhook:
 def create_webhook(tx: Transaction, project: str, request: WebhookCreate, networks: Sequence[Network]) -> NewWebhook:
     """Create a webhook, which is notified of later events, and return it with its secret.
 
-    Raises `QuotaExceededProblem` if the project has too many, and `InvalidProblem` if the URL has the address of a
-    private network that is not among `networks`.
+    Raises `QuotaExceededProblem` if the project has too many webhooks. Raises `InvalidProblem` if the URL has the
+    address of a private network that is not among `networks`.
     """
     project_row = projects.require(tx, project)
     _require_public(request.url, networks)
@@ -116,7 +116,10 @@ def _require_free_place(tx: Transaction, project_row: ProjectRow) -> None:
 
 
 def host_of(url: str) -> str:
-    """Return the host of a URL. The rest of the URL may contain secrets, so the audit log does not contain it."""
+    """Return the host of a URL, which the audit log contains in place of the URL.
+
+    The rest of the URL may contain secrets.
+    """
     return urlsplit(url).hostname or ""
 
 

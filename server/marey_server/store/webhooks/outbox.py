@@ -1,9 +1,9 @@
 """Work of the process that sends deliveries: what to send next, and the outcomes.
 
 The position of a webhook is the number of the last event that was delivered or given up, so events are sent in their
-order. The transaction that records an outcome also moves the position. So a process that dies loses no delivery, and
-its successor repeats at most the deliveries whose outcome was not recorded. Only the leading process sends deliveries;
-if it loses the lead before it records an outcome, it does not record the outcome.
+order. The transaction that records an outcome also moves the position. So if a process dies, no delivery is lost. The
+next process repeats at most the deliveries whose outcome was not recorded. Only the leading process sends deliveries.
+If it loses the lead before it records an outcome, the outcome is not recorded.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class Work(NamedTuple):
 def find_work(tx: Transaction, after: int | None) -> Work:
     """Return the webhooks that may have something to send.
 
-    These are the webhooks whose projects have events after the one numbered `after`, or whose retry is due. If `after`
-    is None, all webhooks that are not paused are returned.
+    A webhook may have something to send if its retry is due, or if its project has events after the one numbered
+    `after`. If `after` is None, all webhooks that are not paused are returned.
     """
     newest = events.newest_number(tx)
     active = webhook.c.paused.is_(False)

@@ -52,7 +52,7 @@ WAITING_MERGE = ProposalMerge()
 
 @dataclass(frozen=True)
 class PreparedAcceptance:
-    """Merge of a proposal that was computed, but not recorded; or the error if the merge could not be computed."""
+    """Computed, but not recorded merge of a proposal; or the error if the merge could not be computed."""
 
     request: MergeRequest
     merge: PreparedMerge | None
@@ -132,7 +132,10 @@ def _target(tx: Transaction, row: Row[Any], *, lock: bool = False) -> Row[Any]:
 
 
 def _obstacles(prepared: PreparedAcceptance, rule: Protection | None) -> Iterator[Missing]:
-    """Yield why the two versions cannot be merged: an error, conflicts, or a source that is not up to date."""
+    """Yield the reasons why the two versions cannot be merged: an error, conflicts, or missing commits.
+
+    Commits of the target that the source lacks are a reason only if `rule` requires that the source is up to date.
+    """
     if prepared.refusal is not None and prepared.refusal.error_code != LARGE_MERGE:
         yield Missing(code=prepared.refusal.error_code, detail=prepared.refusal.detail)
     if prepared.merge is None:
@@ -188,8 +191,8 @@ def merge_proposal(
 ) -> Proposal:
     """Merge a proposal. With `when_green`, merge it later if approvals, checks or other requirements are missing.
 
-    Raises `ConflictProblem` if the proposal has ended, if a requirement is missing and `when_green` is not set, or if a
-    branch has moved since the merge was prepared. Raises the errors of `require_move`, too.
+    Raises `ConflictProblem` if the proposal has ended, or if a branch has moved since the merge was prepared. Without
+    `when_green`, also raises `ConflictProblem` if a requirement is missing. Raises the errors of `require_move`, too.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
@@ -287,8 +290,8 @@ def merge_if_possible(
 ) -> None:
     """Call `merge_if_green`; if it refuses the merge, for example because of a quota, housekeeping tries again later.
 
-    The merge is only a side effect of the caller's request, so a refusal must not undo what the request has stored in
-    this transaction. Raises `ConflictProblem` if a branch has moved since the merge was prepared.
+    The caller's request, such as a review, must be stored even if the merge is refused. Raises `ConflictProblem` if a
+    branch has moved since the merge was prepared.
     """
     try:
         with tx.connection.begin_nested():
@@ -303,8 +306,8 @@ def merge_basis(tx: Transaction, project_row: ProjectRow, row: Row[Any]) -> Merg
     """Return the commits and the protection rule on which the result of a proposal's automatic merge depends.
 
     An automatic merge (`when_green`) is a merge that a user has requested to happen as soon as it is allowed. Returns
-    None if no automatic merge is requested, or if it is not allowed yet: approvals or checks are missing, a reviewer
-    has requested changes, or the user may no longer move the branch.
+    None if no automatic merge is requested. Also returns None if the merge is not allowed yet: approvals or checks are
+    missing, a reviewer has requested changes, or the user may no longer move the branch.
     """
     if not is_waiting(row):
         return None
@@ -317,8 +320,8 @@ def merge_basis(tx: Transaction, project_row: ProjectRow, row: Row[Any]) -> Merg
 def _ready_mover(tx: Transaction, project_row: ProjectRow, row: Row[Any], target: Row[Any]) -> Mover | None:
     """Return the user who requested the merge, if the proposal has all required approvals and checks.
 
-    Returns None if one of them is missing, if a reviewer has requested changes, or if the user who requested the merge
-    may no longer move the branch.
+    Returns None if an approval or a check is missing, or if a reviewer has requested changes. Also returns None if the
+    user who requested the merge may no longer move the branch.
     """
     if any(find_missing(tx, project_row.id, row, rule_of(target))):
         return None

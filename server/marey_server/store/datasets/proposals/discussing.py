@@ -29,8 +29,8 @@ MOST_OF_EACH = 1000
 def add_comment(tx: Transaction, project: str, name: str, number: int, request: CommentCreate) -> Comment:
     """Comment on an open proposal.
 
-    Raises `NotFoundProblem` if the request names an entry that neither the proposed version nor the target has, and
-    `ConflictProblem` if the proposal has ended or has too many comments.
+    Raises `ConflictProblem` if the proposal has ended or has too many comments. Raises `NotFoundProblem` if the request
+    names an entry that neither the proposed version nor the target has.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)

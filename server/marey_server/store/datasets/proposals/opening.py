@@ -62,7 +62,7 @@ def require_newest(tx: Transaction, row: Row[Any], version: str | None) -> None:
     """Raise `ConflictProblem` if `version` is given and is not the newest commit of the proposal."""
     if version is not None and resolve(tx, row.dataset_id, version) != row.head_now:
         raise ConflictProblem(
-            "The proposal has a newer commit than the one that you name; review the newer one first.",
+            "The proposal has a newer commit than the one in the request; review the newest commit first.",
             code="proposal-moved",
             context={"commit": row.head_now},
         )
@@ -122,7 +122,7 @@ def shown_proposal(row: Row[Any]) -> Proposal:
 def open_proposal(tx: Transaction, project: str, name: str, request: ProposalCreate) -> Proposal:
     """Open a proposal to merge a version into a branch.
 
-    Raises `NotFoundProblem` for an unknown version or branch, `InvalidProblem` if both are the same branch, and
+    Raises `NotFoundProblem` for an unknown version or branch, and `InvalidProblem` if both are the same branch. Raises
     `ConflictProblem` if the dataset has too many open proposals.
     """
     project_row = projects.require(tx, project)

@@ -98,6 +98,6 @@ def _missing_checks(rule: Protection, checks: Mapping[str, ProposalCheck]) -> It
     for name in rule.checks:
         state = checks[name].state if name in checks else None
         if state is None:
-            yield Missing(code="check-missing", detail=f"No result of the check {name!r} of the newest commit yet.")
+            yield Missing(code="check-missing", detail=f"The check {name!r} of the newest commit has no result yet.")
         elif state is not CheckState.SUCCEEDED:
             yield Missing(code=f"check-{state}", detail=f"The check {name!r} of the newest commit is {state}.")

@@ -53,7 +53,10 @@ class _PendingMerge(NamedTuple):
 
 
 class _InVain(NamedTuple):
-    """Merge computed in vain: its basis, and the monotonic time in seconds before which it is not tried again."""
+    """Merge that was computed, but could not be performed: the commits and the rule on which its result depends.
+
+    `again_s` is the monotonic time in seconds before which the merge is not tried again.
+    """
 
     basis: MergeBasis
     again_s: float
