@@ -32,11 +32,11 @@ from marey_schemas.access import (
 from marey_schemas.items import Collection
 
 ANY_STATE = {"If-Match": "*"}
-"""Header with which the server makes a change even if the resource has changed since it was read."""
+"""Header that makes the server accept a change even if the resource has changed since the caller read it."""
 
 
 def change_quotas(transport: Transport, path: str, change: QuotaChange) -> QuotasInUse:
-    """Change quotas of the project or user at `path`; return all quotas of this project or user, with their use."""
+    """Change quotas of the project or user at `path`; return all its quotas, and how much of each is used."""
     return read_model(QuotasInUse, transport.send("PATCH", path, content=as_json(change), repeatable=True))
 
 
@@ -198,7 +198,7 @@ class FolderRoles:
         )
 
     def remove(self, folder: Collection, user: str) -> None:
-        """Remove the role of a member in a folder; then the role from a folder above, or from the project, applies."""
+        """Remove a member's role in a folder; then the member's role in a folder above, or in the project, applies."""
         self.transport.send("DELETE", self._url(folder, user), headers=ANY_STATE, repeatable=False)
 
     def _url(self, folder: Collection, user: str) -> str:

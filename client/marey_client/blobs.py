@@ -38,7 +38,7 @@ def digest_of_file(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Blobs:
-    """Blobs that the user of the token may read or has uploaded."""
+    """Blobs (bytes identified by their digest) that the user of the token may read or has uploaded."""
 
     transport: Transport
 
@@ -138,7 +138,7 @@ def send_in_pieces(transport: Transport, path: Path, digest: str) -> str:
     """Send a file as a resumable upload; return the digest of its blob.
 
     Raises `Unreachable` if all retries fail, `FileChanged` if the file becomes shorter while it is sent, and `Invalid`
-    if the digest of the bytes that the server received is not `digest`.
+    if the bytes that arrived do not have the digest `digest`.
     """
     announced = UploadCreate(length=path.stat().st_size, digest=digest)
     upload = read_model(Upload, transport.send("POST", "/uploads", content=as_json(announced)))

@@ -63,7 +63,7 @@ class TokenFile:
 
 @dataclass(frozen=True)
 class Credential:
-    """Server and the token for it."""
+    """Address of a server, the token for this server, and the place of the token."""
 
     url: str
     token: str | None = field(repr=False)

@@ -64,7 +64,7 @@ def draw_lineage(graph: LineageGraph, file_type: str) -> bytes:
 
 @contextmanager
 def server_in_thread(data: Path, *, workers: int) -> Iterator[str]:
-    """Run a server with workers on a free local port inside the block; yield its address."""
+    """Run a server with workers on a free local port until the `with` block ends; yield the server's address."""
     app = room("marey_server.app", "all")
     settings = room("marey_server.process.settings", "all").Settings(
         data=data, host="127.0.0.1", port=0, local_workers=workers, log_form="text"

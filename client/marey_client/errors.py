@@ -155,7 +155,7 @@ class RequestFailed(MareyError):
 
     @property
     def code(self) -> str:
-        """The stable slug of the error."""
+        """The short name of the error, for programs."""
         return self.problem.code
 
     @property

@@ -67,11 +67,11 @@ class FoundFiles:
 
 
 def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
-    """Find the motion files in folders and below, except hidden ones; files among `places` are always included.
+    """Find the motion files in folders and below, except hidden files; files among `places` are always included.
 
     Files in a folder that an export of a dataset wrote are named by the paths of their clips. Raises `NothingToUpload`
-    if a place does not exist or no motion file is found, `SameName` if two files would get the same name, `BadSidecar`
-    if the sidecar of an export is damaged, and `OSError` if a folder cannot be read.
+    if a place does not exist or no motion file is found; `SameName` if two files would get the same name; `BadSidecar`
+    if the sidecar of an export is damaged; and `OSError` if a folder cannot be read.
     """
     from marey_client.bridges.returning import ReturningFolder
 
@@ -218,7 +218,7 @@ class Imports:
         return changed
 
     def run(self, files: tuple[ImportFile, ...], options: ImportOptions | None = None) -> tuple[ImportEntry, ...]:
-        """Import up to 1000 files whose bytes the server has; if the server does so in a job, wait for it."""
+        """Import up to 1000 files whose bytes the server has; if the server imports them in a job, wait for the job."""
         given = options.model_dump(exclude_unset=True) if options else {}
         request = ImportRequest(files=files, **given)
         response = self.transport.send(

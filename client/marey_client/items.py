@@ -79,7 +79,7 @@ class ItemHandle:
         return self._renewed(read_model(Item, response))
 
     def change(self, change: ItemChange) -> Item:
-        """Rename, move or tag the item. Raises `PreconditionFailed` if it was changed since it was read."""
+        """Rename, move or tag the item. Raises `PreconditionFailed` if the item was changed since it was read."""
         response = self.transport.send("PATCH", self.url, content=as_json(change), headers=self._if_match())
         return self._renewed(read_model(Item, response))
 

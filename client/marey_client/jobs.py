@@ -42,7 +42,7 @@ class Jobs:
         return self.transport.post(Job, f"/projects/{project}/jobs", job)
 
     def run(self, project: str, job: JobCreate, *, on_progress: OnProgress | None = None) -> Job:
-        """Submit a job and wait until it has ended. Raises `JobUnsuccessful` if it failed or was cancelled."""
+        """Submit a job and wait until it has ended. Raises `JobUnsuccessful` if the job failed or was cancelled."""
         return self.wait(self.submit(project, job).id, on_progress=on_progress)
 
     def list(self, project: str, *, limit: int = 100, filters: Params | None = None) -> Iterator[Job]:

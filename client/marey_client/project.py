@@ -272,11 +272,11 @@ class ProjectHandle(ProjectItems):
         commit: CommitTo = None,
         **options: Any,
     ) -> Job:
-        """Submit a job that evaluates clips of one skeleton, or folders of them given by path.
+        """Submit a job that evaluates clips of one skeleton, or folders of clips given by path.
 
         `options` are those of `EvaluateParams`, for example `name="walks-eval"` or `database={"mirroring": "add"}`;
-        `normaliser` is another evaluation, or the id of one: its scaling of features is used, so that both results can
-        be compared.
+        `normaliser` is another evaluation, or the id of one: its scaling of features is used, so that the results of
+        both evaluations can be compared.
         """
         request = evaluate_request(self, clips, EvaluateParams.model_validate(options), normaliser)
         chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
@@ -312,9 +312,9 @@ class ProjectHandle(ProjectItems):
         evaluations are stored in the folder `into`, by default the dataset's name with `-bisect` at its end. If the
         search is interrupted, the same call continues it, because existing evaluations are reused.
 
-        `options` are those of `EvaluateParams`. Raises `CannotBisect` if there is no such metric, if `good` is not
-        among the versions before `bad`, if one of these two versions cannot be evaluated, if `good` turns out to be bad
-        or `bad` to be good, or if no `limit` is given and both versions have the same value.
+        `options` are those of `EvaluateParams`. Raises `CannotBisect` in these cases: there is no such metric; `good`
+        is not among the versions before `bad`; one of these two versions cannot be evaluated; `good` turns out to be
+        bad, or `bad` to be good; no `limit` is given, and both versions have the same value.
         """
         handle = self.datasets.at(dataset)
         evaluations = VersionEvaluations(

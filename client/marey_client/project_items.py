@@ -99,7 +99,7 @@ class ProjectItems:
         """Delete a deleted dataset for good: versions, branches, tags and proposals. For owners of the project.
 
         `name` is the name or the id of the dataset. With `preview`, nothing changes, and the answer says what cites the
-        versions. Raises `Conflict` if something cites them.
+        versions. Raises `Conflict` if something cites a version.
         """
         request = DatasetPurgeRequest(dataset=name, preview=preview)
         return self.transport.post(DatasetPurgeAnswer, f"/projects/{self.name}/dataset-purges", request)

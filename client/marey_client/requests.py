@@ -171,7 +171,7 @@ def _of_clips(project: ProjectItems, clips: Clips, layer: str | None) -> dict[st
 
 
 def _annotations_of(project: ProjectItems, clips: Mapping[str, Item], layer: str | None) -> tuple[ItemInput, ...]:
-    """Return the annotations of these clips, given by id; if `layer` is not None, only annotations in this layer."""
+    """Return the annotations of clips, which are given by id; with a `layer`, only the annotations in this layer."""
     listed: Iterable[AnnotationHandle] = project.annotations.list(sort="id")
     return tuple(
         one.as_input()

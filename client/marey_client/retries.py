@@ -15,7 +15,7 @@ NEVER_ARRIVED = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
 """Failures after which the server cannot have seen the request."""
 
 BUSY_STATUSES = frozenset({429, 502, 503, 504})
-"""Answers that mean "not now": nothing was done."""
+"""HTTP statuses that mean "not now": the server has done nothing."""
 
 
 @dataclass(frozen=True)

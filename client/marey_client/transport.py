@@ -97,13 +97,13 @@ class Transport:
         return self._auth is None
 
     def with_token(self, token: str, *, retries: Retries | None = None) -> Transport:
-        """Return a transport that sends another token over the same connections; closing one also closes the other."""
+        """Return a transport that sends another token over the same connections, which close with either transport."""
         other = self.with_retries(retries or self.retries)
         other._auth = BearerToken(token)
         return other
 
     def with_present_token(self) -> Transport:
-        """Return a transport with the same connections that keeps sending the token that is current now.
+        """Return a transport with the same connections that always sends the present token.
 
         If the token was read from a file, later changes of this file have no effect on the new transport.
         """

@@ -48,8 +48,8 @@ def write_clip_file(
     clip : Clip    the motion
     file_format : str    name of the format
     unit : str or float    unit of length, by name or in metres; used by formats without a fixed unit
-    info : mapping, optional    the clip's `info` document; from it, Euler angles get the rotation orders of the file
-        from which the clip was imported
+    info : mapping, optional    the clip's `info` document, which contains the rotation orders of the imported file;
+        Euler angles get these orders
 
     Returns
     -------

@@ -58,8 +58,8 @@ class FollowedBones:
 def follow_moved_bones(clip: Clip, joints: Mapping[str, int]) -> FollowedBones:
     """Turn joints so that bones keep their directions when the translations of the clip are removed.
 
-    Each joint is turned by the shortest rotation from the direction that its bone has without the translations to the
-    direction that the bone has with the translations.
+    Each joint is turned by the shortest rotation from the bone's direction without the translations to the bone's
+    direction with the translations.
 
     Parameters
     ----------

@@ -6,10 +6,10 @@ same standard name (Herrmann et al. 2019, Algorithm 1, after Monzani et al. 2000
 
 The paper rotates twist onto twist, then swing onto swing, for every pose. As both axes are fixed in their joints, this
 is the same as one constant rotation per joint: with the axes of source and target as the columns of orthonormal
-matrices S and T, the target's global orientation is G·S·Tᵀ if the source's global orientation is G. There are two
-differences from the printed algorithm. The second rotation turns only about the twist axis, so it does not undo the
-first rotation. The second rotation is also applied after the first one, whereas line 12 prints the product in the
-opposite order.
+matrices S and T, the target's global orientation is G·S·Tᵀ if the source's global orientation is G. This module differs
+from the printed algorithm in two ways. Here, the second rotation turns only about the twist axis, so it does not undo
+the first rotation. And the second rotation is applied after the first one, whereas line 12 of the printed algorithm has
+the opposite order.
 """
 
 from __future__ import annotations

@@ -222,14 +222,14 @@ class QuotaChange(Request):
 
 
 class QuotaUse(Answer):
-    """Use and limit of one quota."""
+    """Amount used of one quota, and its limit."""
 
     used: int
     allowed: int
 
 
 class QuotasInUse(Answer):
-    """Use and limits of the quotas of a project or a user. Deleted items do not count."""
+    """Used amounts and limits of the quotas of a project or a user. Deleted items do not count."""
 
     items: QuotaUse
     stored_bytes: QuotaUse
@@ -261,7 +261,7 @@ class FolderRoleChange(Request):
 
 
 class FolderRole(Answer):
-    """Role of a member in a folder and everything below it; it replaces the member's role in the project there."""
+    """Role of a member in a folder and everything below it, where it replaces the member's role in the project."""
 
     user: str = Field(
         description="The name of the member; `*` stands for all members without a role of their own in this folder, "

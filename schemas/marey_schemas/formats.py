@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 ORIGINAL = "original"
-"""Export format that returns the imported file itself, independent of its format."""
+"""Export format that stands for the imported file itself, whatever the format of this file is."""
 OCTETS = "application/octet-stream"
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""The earliest time that a ZIP archive can store. Every file gets it, so that equal content gives equal bytes."""
+"""The earliest time that a ZIP archive can store. Every file gets this time, so that equal content gives equal bytes.
+"""
 
 MOST_UNPACKED_BYTES = 1 << 29
 """Greatest unpacked size in bytes of a compressed file; readers stop unpacking there."""

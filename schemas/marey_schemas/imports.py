@@ -23,7 +23,7 @@ class ImportFile(Request):
 
 
 class ImportRequest(ImportOptions):
-    """Request to import files by digest. Imports above the server's synchronous limit become jobs (202)."""
+    """Request to import files by digest. If the files are too many or too large, a job imports them (status 202)."""
 
     files: tuple[ImportFile, ...] = Field(min_length=1, max_length=1000)
 

@@ -54,7 +54,9 @@ class Invitation(Answer):
     prefix: str = Field(description="The text between the two `_` of the code.")
     project: str | None
     role: Role | None
-    creates_account: bool = Field(description="Whether people without an account can use it to create one.")
+    creates_account: bool = Field(
+        description="Whether people without an account can create an account with this invitation."
+    )
     note: str
     inviter: str
     created_at: datetime

@@ -197,7 +197,10 @@ class Page(Answer):
 
 
 class BlobsQuery(Request):
-    """Question which of the given blobs are missing: the server does not have them, or the caller may not read them."""
+    """Request that asks which of the given blobs are missing.
+
+    A blob is missing if the server does not have it, or if the caller may not read it.
+    """
 
     digests: tuple[str, ...] = Field(max_length=10_000)
 

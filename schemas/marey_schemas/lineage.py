@@ -128,7 +128,7 @@ class GroupLink(NamedTuple):
 def grouped(graph: LineageGraph) -> tuple[list[LineageGroup], list[GroupLink]]:
     """Gather the revisions of a graph in groups, so that the lineage of hundreds of clips can be read.
 
-    The start is a group of its own, and the first one.
+    The first group contains only the revision that the graph starts from.
     """
     used_by: list[set[tuple[str, str | None]]] = [set() for _ in graph.revisions]
     for link in graph.links:

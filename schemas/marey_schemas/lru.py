@@ -67,8 +67,8 @@ class LruCache(Generic[Key, Value]):
     def get_or_make(self, key: Key, make: Callable[[], Value]) -> Value:
         """Return the value of `key`; if there is none, call `make` and store its result.
 
-        `make` runs without the lock: two threads that miss at the same time both call it. Room for one entry is freed
-        before `make` runs, because values may be large.
+        `make` runs without the lock: if two threads find no value at the same time, both call `make`. Room for one
+        entry is freed before `make` runs, because values may be large.
         """
         found = self.get(key)
         if found is not None:

@@ -15,7 +15,7 @@ def in_centimetres(name: str) -> Any:
         None,
         exclude=True,
         json_schema_extra={"deprecated": True},
-        description=f"Deprecated: `{name}` in centimetres, as release 0.1 spelt it.",
+        description=f"Deprecated: `{name}` in centimetres, as in release 0.1.",
     )
 
 

@@ -1,4 +1,4 @@
-"""Purges: deletion of deleted items for good, and the holders of items that are still needed."""
+"""Purges: deletion of deleted items for good, and the holders, which are the objects that still need an item."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class ItemHolder(Answer):
 
 
 class JobHolder(Answer):
-    """Job that has not ended, and that reads the item or has created it."""
+    """Job because of which an item is not purged: it has not ended, and reads the item or has created it."""
 
     type: Literal["job"] = "job"
     job: str
@@ -117,7 +117,9 @@ class PurgeAnswer(Answer):
         "which nothing else in the project refers. This is an estimate: content that other projects also have is not "
         "freed, and the database rows that refer to the content are not counted."
     )
-    next: str | None = Field(None, description="Send it as `after` to examine further items; null: there are none.")
+    next: str | None = Field(
+        None, description="Value of `after` in the request for further items; null: no items are left."
+    )
 
 
 class DatasetPurgeRequest(Request):

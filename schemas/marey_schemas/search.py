@@ -29,7 +29,7 @@ SearchConstraints = Annotated[tuple[SearchConstraint, ...], Field(max_length=MOS
 
 
 class StartPlacement(Request):
-    """Start of a motion: position and heading, in the world, of the coordinate frame of the model."""
+    """Position and heading in the world at which a motion starts: those of the model's coordinate frame."""
 
     x: Coordinate = Field(0.0, description="Position along x, in metres.")
     z: Coordinate = Field(0.0, description="Position along z, in metres.")

@@ -31,7 +31,7 @@ def request_contents(
 def first_documents(
     transport: Transport, project_url: str, places: Sequence[PartOfContent], *, keep_blocks: bool = False
 ) -> list[Any]:
-    """Request documents by address, and return those that the server put into one answer: the first ones, at least one.
+    """Request documents by address; return the first of them, as many as fit into one answer, but at least one.
 
     The result has the order of `places`, but may be shorter.
 

@@ -106,7 +106,7 @@ class _Import:
     held: set[str] = field(default_factory=set)
     """Content digests of the revisions that the project has."""
     homes: dict[str, str] = field(default_factory=dict)
-    """For the digest of each document: the content digest of a revision that contains the document."""
+    """Content digest of a revision that contains the document, by the digest of the document."""
 
     def run(self, begins: str | None) -> Commit:
         require_base(self.archive, self.dataset.has)
@@ -235,7 +235,7 @@ class _Import:
     def _part(self, digest: str) -> Any:
         """Return a part of a revision for a request: the document, or a reference to a revision that contains it.
 
-        It is a reference if the project has the document already.
+        The result is a reference if the project already has the document.
         """
         if self._is_stored(digest):
             return {"content": self.homes[digest]}

@@ -21,7 +21,7 @@ MOST_DAYS_KEPT = 7
 
 
 class MissingCommits(NamedTuple):
-    """Commits that another dataset lacks; `bases` are their newest ancestors in that other dataset."""
+    """Commits that another dataset lacks; `bases` are the newest of their ancestors that the other dataset has."""
 
     commits: tuple[str, ...]
     bases: tuple[str, ...]
@@ -56,8 +56,8 @@ def fetched_versions(
 
     The archive's file is deleted after the `with` block, but kept if the block ends with an error. If the program is
     interrupted while it writes the file, the next call continues writing. Consents are not checked here: take records
-    are copied with their clips, so that the other server checks them. Raises `LargeCommit` if the other server would
-    refuse one of the commits.
+    are copied with their clips, so that the other server checks the consents. Raises `LargeCommit` if the other server
+    would refuse one of the commits.
     """
     path = transfers_folder() / f"{short_name(head.digest, bases)}.tar"
     if not path.exists():
@@ -68,7 +68,7 @@ def fetched_versions(
 
 
 def _accept(_contents: Sequence[str]) -> None:
-    """Allow the copy of any revisions."""
+    """Accept all revisions, without a check of consents."""
 
 
 def transfers_folder() -> Path:

@@ -92,8 +92,8 @@ def write_archive(
     Before the documents of revisions are read, `check` is called with the content digests of these revisions, and may
     raise an error. An interrupted call leaves a file whose name ends in `.part`; the next call with the same arguments
     continues it. Raises `ArchiveInUse` if another process is writing the file, and `NothingToArchive` if no version is
-    left. With `to_send`, also raises `LargeCommit`, before documents are read, if no server would receive one of the
-    commits.
+    left. With `to_send`, also raises `LargeCommit`, before documents are read, if one of the commits has more changes
+    than servers accept.
     """
     head = dataset.at(version)
     bases = [dataset.at(one) for one in since]
@@ -170,11 +170,11 @@ class _Making:
     on_progress: OnProgress
     check: CheckContents
     to_send: bool
-    """Whether the archive is useless if it cannot be imported."""
+    """Whether the archive must be importable; then a commit with more changes than servers accept is an error."""
     known: set[str] = field(default_factory=set)
     """Content digests of the revisions that the archive has, or will have."""
     documents: dict[str, PartOfContent] = field(default_factory=dict)
-    """Addresses on the server of the documents of entries, by the digest of the document."""
+    """Address on the server of each document of an entry, by the digest of the document."""
     earlier: dict[str, PartOfContent] = field(default_factory=dict)
     """Address of the earlier document, by the digest of the document that replaced it."""
 
@@ -235,7 +235,7 @@ class _Making:
     def _note(self, entry: Entry, earlier: Entry | None) -> None:
         """Record the revision of an entry, and the addresses of its documents.
 
-        Documents that the entry also has in its state `earlier` are left out.
+        Documents that are also in `earlier`, the entry before the commit, are left out.
         """
         content = _content(entry)
         self.known.add(content)
@@ -354,7 +354,7 @@ class _EntryPair(NamedTuple):
 
     @property
     def unchanged(self) -> dict[str, str]:
-        """For each part that the commit did not change: content digest of the entry's revision before the commit."""
+        """The content digest of the entry's revision before the commit, by the name of each unchanged part."""
         if self.after is None or self.before is None:
             return {}
         parts = self.after.parts.items() & self.before.parts.items()

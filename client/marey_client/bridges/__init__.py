@@ -1,1 +1,1 @@
-"""Bridges: exports of dataset versions to folders that other programs read; some of them can be imported again."""
+"""Bridges: exports of dataset versions to folders for other programs; some of these folders can be imported again."""

@@ -120,8 +120,8 @@ def prepare_files(
 ) -> MotionFiles:
     """Check whether a version can be exported to files, and read its entries below `path`.
 
-    Raises `CannotExport` if files in the format do not contain both motion and skeleton, because such files cannot be
-    imported again without other files. Also raises the errors of `require_free` and `version_to_export`.
+    Raises `CannotExport` if a file in the format lacks the motion or the skeleton: such a file cannot be imported again
+    alone. Also raises the errors of `require_free` and `version_to_export`.
     """
     if format not in WHOLE_FORMATS:
         raise CannotExport(

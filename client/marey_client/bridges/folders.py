@@ -38,7 +38,7 @@ def new_folder(target: Path) -> Iterator[Path]:
 
 
 def require_free(target: Path) -> None:
-    """Raise `FolderNotEmpty` unless `target` does not exist or is an empty folder."""
+    """Raise `FolderNotEmpty` if `target` exists and is not an empty folder."""
     if not target.exists():
         return
     if not target.is_dir():

@@ -37,18 +37,19 @@ LICENCES = frozenset(
         "osl-3.0", "pddl", "unlicense", "wtfpl", "zlib",
     }
 )  # fmt: skip
-"""Licences of data and software that the metadata of a card can name; any other licence becomes `other`."""
+"""Licences of data and software that the metadata of a dataset card can name; any other licence becomes `other`."""
 
 _SIZES = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M")
 
 
 @dataclass
 class _Summary:
-    """Facts about the exported clips that the card states."""
+    """Facts about the exported clips that the dataset card states."""
 
     licences: Counter[str | None] = field(default_factory=Counter)
     jobs: Counter[tuple[str, tuple[str, ...]] | None] = field(default_factory=Counter)
-    """Number of clips by the kind and the input commits of the job that made them; the key None: made by no job."""
+    """Number of clips, by kind and input commits of the job that made them; key None: clips that no job made.
+    """
 
     def add(self, clip: ExportedClip) -> None:
         self.licences[clip.record.licence] += 1
@@ -87,7 +88,7 @@ def dataset_card(
     jobs: Mapping[tuple[str, tuple[str, ...]] | None, int],
     format: str,  # noqa: A002
 ) -> str:
-    """Return the card of a version: YAML metadata, and a text with the commit, the licences and the lineage.
+    """Return the dataset card of a version: YAML metadata, and a text with the commit, the licences and the lineage.
 
     `licences` is the number of clips by licence. `jobs` is the number of clips by the job that made them.
     """
@@ -137,7 +138,7 @@ def _metadata(
 
 
 def _identifier(licence: str | None) -> str:
-    """Return the identifier of a licence in the metadata of cards."""
+    """Return the identifier of a licence in the metadata of dataset cards."""
     if licence is None:
         return "unknown"
     wanted = "-".join(licence.strip().casefold().split())

@@ -1,8 +1,8 @@
 """Export of a version as a LeRobotDataset v3.0: one episode for each clip, many episodes in each file.
 
 A state is the root's position in metres, then the local rotation of each joint as a quaternion w, x, y, z, then the
-position of each joint that has one. The action of a frame is the state of the next frame; the last frame has its own
-state as action.
+position of each joint that has a position in each frame. The action of a frame is the state of the next frame; the last
+frame has its own state as action.
 """
 
 from __future__ import annotations
@@ -251,7 +251,7 @@ def _info(rig: CommonRig) -> dict[str, Any]:
 
 
 def _write_tasks(path: Path, tasks: Mapping[str, int]) -> None:
-    """Write the table of tasks as LeRobot reads it: with pandas, where the text of a task is the index."""
+    """Write the table of tasks as LeRobot reads it: a pandas table whose index is the text of the task."""
     pyarrow = import_pyarrow()
     columns = [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}

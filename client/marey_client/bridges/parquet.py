@@ -37,7 +37,7 @@ class FilePlace(NamedTuple):
 
 
 def import_pyarrow() -> Any:
-    """Return the module `pyarrow`, with `pyarrow.parquet`. Raises `MissingPackage` if it is not installed."""
+    """Return the module `pyarrow`, with `pyarrow.parquet`. Raises `MissingPackage` if pyarrow is not installed."""
     try:
         import pyarrow
         import pyarrow.parquet

@@ -62,7 +62,7 @@ class DescribedClip(NamedTuple):
 
 
 class _Located(NamedTuple):
-    """Entry of a clip, and the revision of an item that has the content of this entry."""
+    """Entry of a clip, and the item and revision that have the same content."""
 
     entry: Entry
     item: str
@@ -160,8 +160,8 @@ def version_to_export(
 ) -> VersionToExport:
     """Read all entries of a version, or only the entries below a folder; check that the clips may be exported.
 
-    Raises `CannotExport` if there is no clip, and `Conflict` if the consent for a clip has ended and
-    `allow_expired_consent` gives no reason to export the clip nevertheless.
+    Raises `CannotExport` if there is no clip. Raises `Conflict` if the consent for a clip has ended, unless
+    `allow_expired_consent` gives a reason to export the clip.
     """
     commit, named = dataset.at(version), dataset.find_ref(version)
     folder = folder.strip("/")

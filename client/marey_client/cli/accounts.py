@@ -45,7 +45,7 @@ def login(
     ] = False,
     days: Annotated[int, typer.Option(min=1, max=90, help="Number of days for which the login is valid.")] = 7,
 ) -> None:
-    """Log in to a server, and store its address and a token for it in a file that only you can read."""
+    """Log in to a server, and store the server's address and a token in a file that only you can read."""
     from marey_client.credentials import logins_path, store_login
     from marey_client.marey import Marey
     from marey_schemas.access import Login

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from marey_schemas.event_kinds import AuditKind
 
 NAMES_IN_BODY = frozenset({"name", "user", "path"})
-"""Keys of details that are left out if their value is the name that the entry is about."""
+"""Details with these keys are left out if their value is the name of the object that the entry is about."""
 
 ONLY_AS_JSON = frozenset({"clips"})
 """Keys of details that are too long for a table."""
@@ -81,7 +81,7 @@ def _cells(entry: AuditEntry) -> tuple[str, str, str, str]:
 
 
 def _details(entry: AuditEntry) -> Iterator[str]:
-    """Yield the details of an entry as `key=value`, without the name that the entry is about."""
+    """Yield the details of an entry as `key=value`, without the name of the object that the entry is about."""
     for key, value in sorted(entry.body.items()):
         if value in (None, [], {}) or (key in NAMES_IN_BODY and value == entry.about):
             continue

@@ -138,7 +138,7 @@ def preview_edit(
     ] = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Show the result of commands on a clip without storing it. With --json, the output also contains its motion."""
+    """Show the result of commands on a clip without storing it. With --json, the output includes the new motion."""
     from marey_schemas.kinds import Kind
 
     place = Address.parse(address)

@@ -45,7 +45,8 @@ Trims = Annotated[
 Normaliser = Annotated[
     str | None,
     typer.Option(
-        help="Evaluation whose scaling of features is used, so that both results can be compared: project/folder/name."
+        help="Evaluation whose scaling of features is used, so that the results of both evaluations can be compared: "
+        "project/folder/name."
     ),
 ]
 
@@ -132,10 +133,14 @@ def report(
         Path | None, typer.Option(help="Write every figure to this folder: PNG, SVG, JSON, CSV.")
     ] = None,
     walk_graph: Annotated[
-        Path | None, typer.Option(help="Write the walk graph of an evaluation to this file: .graphml or .json.")
+        Path | None,
+        typer.Option(
+            help="Write the displayed frames of an evaluation and the jumps between them, as a graph, to this file: "
+            ".graphml or .json."
+        ),
     ] = None,
     trial: Annotated[
-        str | None, typer.Option(help="Name of the trial whose walk graph is written; default: all trials together.")
+        str | None, typer.Option(help="Name of the trial that --walk-graph writes; default: all trials together.")
     ] = None,
     open_it: Annotated[bool, typer.Option("--open", help="Open the report in a browser.")] = False,
 ) -> None:

@@ -112,7 +112,7 @@ def suggest(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Find clips of an evaluated set that can be removed, and other clips that would fill its gaps."""
+    """Find clips that can be removed from an evaluated set, and other clips that would fill gaps in its coverage."""
     if remove_out is not None and not wait:
         raise WrongUsage(
             "--remove-out writes a part of the result, but --no-wait does not wait for the result; leave out "

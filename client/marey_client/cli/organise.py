@@ -109,8 +109,8 @@ def rm(
 ) -> None:
     """Remove items, and folders with their contents; `marey restore` restores them.
 
-    Each item or folder is removed by a request of its own. If the server refuses to remove one of them, for example
-    because somebody has changed it since it was selected, the others are still removed, and the exit status is 1.
+    Each item or folder is removed by a request of its own. If the server refuses a request, for example because
+    somebody has changed the item since it was selected, the other requests are still sent, and the exit status is 1.
     """
     with connect(context) as marey:
         things = _named_or_selected(marey, places, kind, query)
@@ -142,8 +142,8 @@ def restore(
     """Restore removed items, and folders with the contents removed along with them; `marey ls --deleted` lists them.
 
     If several removed items had the same path, the one that was removed last is restored. With --query, each item is
-    restored by a request of its own. If the server refuses to restore one of them, for example because another item has
-    its path now, the others are still restored, and the exit status is 1.
+    restored by a request of its own. If the server refuses a request, for example because another item has the path
+    now, the other requests are still sent, and the exit status is 1.
     """
     from marey_client.errors import Conflict
 
@@ -224,8 +224,8 @@ def tag(
 ) -> None:
     """Add tags to items, and remove others; `marey ls --tag` lists items by tag.
 
-    Each item is changed by a request of its own. If the server refuses to change one of them, for example because
-    somebody has changed it since it was selected, the others are still changed, and the exit status is 1.
+    Each item is changed by a request of its own. If the server refuses a request, for example because somebody has
+    changed the item since it was selected, the other requests are still sent, and the exit status is 1.
     """
     from marey_schemas.items import ItemChange
 

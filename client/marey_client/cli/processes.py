@@ -50,7 +50,7 @@ def serve(
         LogForm | None, typer.Option(help="Format of the log: text (the default at a terminal) or json.")
     ] = None,
 ) -> None:
-    """Run a server with its database and a local worker until it is stopped."""
+    """Run a server, with its database and a local worker, until the server is stopped."""
     from marey_client import embedded
 
     embedded.serve(data=data, host=host, port=port, local_workers=workers, database_url=database_url, log_form=log_form)
@@ -79,7 +79,7 @@ def worker(
         LogForm | None, typer.Option(help="Format of the log: text (the default at a terminal) or json.")
     ] = None,
 ) -> None:
-    """Run a worker: it runs jobs of a server until it is stopped. The token must have the scope `work`."""
+    """Run a worker, which runs the jobs of a server until you stop the worker. The token must have the scope `work`."""
     from marey_client import embedded
     from marey_client.cli.terminal.invocation import credential_of
     from marey_client.cli.terminal.typed_values import assignment
@@ -177,9 +177,9 @@ def set_clock(
     """Compare the time that an SQLite database stores with the clock of this machine. The server must be stopped.
 
     The stored clock never goes back by itself. If a server has run with a clock that was years ahead, its tokens have
-    expired and its leases do not end for a long time. --set corrects this: it sets every stored time that is later than
-    now to the present time, and ends all leases. Tokens and time limits that were created with the wrong clock keep
-    their durations.
+    expired and its leases (the rights of workers to work on jobs) do not end for a long time. --set corrects this: it
+    sets every stored time that is later than now to the present time, and ends all leases. Tokens and time limits that
+    were created with the wrong clock keep their durations.
     """
     if set_now and not yes:
         _database("clock", data, None)
@@ -195,7 +195,7 @@ def make_admin_token(
     data: DataFolder = None,
     database_url: DatabaseUrl = None,
 ) -> None:
-    """Write a new administrator's token to admin.token in the data folder, for example if the old one is lost."""
+    """Write a new token for an administrator to admin.token in the data folder, for example if the token was lost."""
     _database("admin_token", data, database_url, user=user)
 
 

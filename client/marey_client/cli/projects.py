@@ -194,8 +194,8 @@ def put_member(
     folder: Annotated[
         str | None,
         typer.Option(
-            help="Give the role only in this folder and everything below it: reader, contributor or maintainer. It may "
-            "be higher or lower than the role in the project."
+            help="Give the role only in this folder and everything below it. The role may be reader, contributor or "
+            "maintainer, and higher or lower than the role in the project."
         ),
     ] = None,
 ) -> None:

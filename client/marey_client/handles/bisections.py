@@ -59,7 +59,7 @@ class VersionRange:
 
 @dataclass(frozen=True)
 class VersionTest:
-    """Tested version and the result; None means that it could not be tested."""
+    """Tested version, and whether it is bad; None means that it could not be tested."""
 
     commit: Commit
     bad: bool | None
@@ -145,7 +145,7 @@ def bisect(among: VersionRange, is_bad: IsBad, on_step: OnStep | None = None) ->
 
 
 def _plain(listed: Commit) -> Commit:
-    """Return a commit without the fields that commits have only in lists of commits."""
+    """Return a listed commit without the fields that only lists of commits contain."""
     return Commit.model_validate(listed.model_dump(include=set(Commit.model_fields)))
 
 

@@ -26,7 +26,7 @@ NAME_DIGITS = 12
 
 @dataclass(frozen=True)
 class Limit:
-    """Limit of a metric. Versions with a value above the limit are bad, or below the limit if `above` is false."""
+    """Limit of a metric. Values above the limit are bad; if `above` is false, values below the limit are bad."""
 
     value: float
     above: bool = True
@@ -203,8 +203,9 @@ def find_crossing(
 ) -> Crossing:
     """Evaluate both ends of a range of versions, then versions between them until the first bad one is found.
 
-    Without `limit`, the limit is half-way between the values at the ends. Raises `CannotBisect` if the ends cannot be
-    evaluated, or if the good end is not good or the bad end not bad.
+    Without `limit`, the limit is half-way between the values at the ends. Raises `CannotBisect` if an end cannot be
+    evaluated, if the good end is bad, if the bad end is good, or if both ends have the same value and no limit is
+    given.
     """
     limit = _checked_limit(among, evaluations, limit)
 

@@ -92,10 +92,10 @@ class Datasets:
     ) -> ImportedVersion:
         """Copy a version of another dataset, and all versions before it, into the dataset `name` of this project.
 
-        `source` may be on another server. The dataset `name` is created if it does not exist, and only what it lacks is
-        copied. The next call continues an interrupted copy. The branch `into`, by default the branch that `version`
-        names or `main`, moves as in `import_archive`. If `version` is a tag, the tag is created too, unless a branch or
-        tag of this name exists.
+        `source` may be on another server. The dataset `name` is created if it does not exist, and only what this
+        dataset lacks is copied. The next call continues an interrupted copy. The branch `into` moves as in
+        `import_archive`; by default, it is the branch that `version` names, or `main` if `version` is not a branch. If
+        `version` is a tag, the tag is created too, unless a branch or tag of this name exists.
         """
         from marey_client.archives.transfers import fetched_versions, find_missing
 
@@ -127,7 +127,7 @@ class Datasets:
 
 
 def _receive(dataset: DatasetHandle, archive: Archive, into: str, on_progress: OnProgress) -> ImportedVersion:
-    """Record the versions of an archive, which is not checked, and move the branch `into` to the newest version.
+    """Record the versions of an archive without checking the archive; move the branch `into` to the newest version.
 
     The branch does not move if its newest commit is not an ancestor of the newest version.
     """

@@ -25,7 +25,7 @@ class EvaluationHandle(ReportedHandle):
     """Handle of an evaluation."""
 
     def document(self, *, revision: int | None = None) -> dict[str, Any]:
-        """Return the evaluation without the records of single ticks: options, provenance, metrics, usage, coverage.
+        """Return options, provenance, metrics, usage and coverage of the evaluation, without the record of each tick.
 
         Arrays are numpy arrays.
         """
@@ -81,7 +81,7 @@ class EvaluationHandle(ReportedHandle):
     def suggest(
         self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
     ) -> Findings:
-        """Find clips that can be removed, and clips among `candidates` (clips and folders of clips) that fill gaps.
+        """Find clips that can be removed, and `candidates` (clips or folders of clips) that fill gaps in the coverage.
 
         `options` are those of `SuggestParams`.
         """
@@ -90,7 +90,7 @@ class EvaluationHandle(ReportedHandle):
     def optimise(
         self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
     ) -> Findings:
-        """Find removals of clips and additions of candidates, as long as each step lowers the objective function.
+        """Find clips to remove and candidates to add, step by step, as long as each step lowers the objective function.
 
         `options` are those of `OptimiseParams`.
         """

@@ -47,8 +47,8 @@ class PipelineRun:
     def wait(self, *, timeout_s: float | None = None, on_progress: OnProgress | None = None) -> Mapping[str, Job]:
         """Wait until every job has ended; `on_progress` is called with all jobs about once a second.
 
-        Raises `JobUnsuccessful` for the first step that did not succeed, preferably one that did not fail merely
-        because another step failed. Raises `WaitedTooLong` after `timeout_s`; the jobs then continue on the server.
+        Raises `JobUnsuccessful` for the first unsuccessful step; steps that failed only because another step failed
+        come last. Raises `WaitedTooLong` after `timeout_s`; the jobs then continue on the server.
         """
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while True:

@@ -25,7 +25,7 @@ def purge_items(transport: Transport, project: str, request: PurgeRequest) -> Pu
 
 
 def without_contained(previews: Sequence[PurgeAnswer]) -> list[int]:
-    """Return, in order, the places of the previews that are needed for all items.
+    """Return the indices of the previews that together contain all items, in ascending order.
 
     Left out are previews whose items all occur in larger ones: the same bytes would count twice, and the purge of these
     items would be requested twice.
@@ -44,7 +44,7 @@ def combined(answers: Sequence[PurgeAnswer]) -> PurgeAnswer:
     """Combine the answers of a purge into one answer.
 
     An item that occurs in several answers is listed once, but its bytes count in each. Bytes that items of different
-    answers have in common are not counted in previews, so the purge may free more than they state.
+    answers have in common are not counted in previews, so the purge may free more bytes than the previews state.
     """
     return PurgeAnswer(
         preview=answers[0].preview,

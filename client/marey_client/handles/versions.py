@@ -209,13 +209,13 @@ class DatasetHandle:
         version is bad, or None if the version cannot be tested. With `first_parent`, only the first parent of each
         merge is followed. `ProjectHandle.bisect` tests a metric of the evaluation of each version.
 
-        Raises `CannotBisect` if `good` is not among the versions before `bad`, or if the tests of the two ends do not
-        show that `good` is good and `bad` is bad.
+        Raises `CannotBisect` if `good` is not among the versions before `bad`, if `is_bad` does not return False for
+        `good`, or if it does not return True for `bad`.
         """
         return bisect(read_range(self, good, bad, first_parent=first_parent), is_bad, on_step)
 
     def check_out(self, version: str = MAIN, *, discard: bool = False) -> CheckoutAnswer:
-        """Bring the folder of the dataset to the state of a version.
+        """Change the folder of the dataset to the content of a version.
 
         Raises `Conflict` if the folder has changes that no commit has recorded, unless `discard` is true.
         """
@@ -259,8 +259,9 @@ class DatasetHandle:
 
         The files have the paths of their entries. The sidecar `marey.json` names the version and the origin of each
         clip, so that an upload of the folder restores paths and take records. The folder exists only when it is
-        complete. Raises `FolderNotEmpty` if it exists and is not empty, `CannotExport` if the version has no clips or
-        the path of a clip cannot be a file name, and `Conflict` if the consent for a clip has ended, as `archive` does.
+        complete. Raises `FolderNotEmpty` if the folder exists and is not empty. Raises `CannotExport` if the version
+        has no clips, or if the path of a clip cannot be a file name. Raises `Conflict` if the consent for a clip has
+        ended, as `archive` does.
         """
         from marey_client.bridges.files import prepare_files, write_files
 

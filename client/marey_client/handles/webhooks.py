@@ -66,7 +66,7 @@ class WebhookHandle:
         return read_model(Webhook, self.transport.send("PATCH", self.url, content=as_json(change)))
 
     def rotate(self, *, grace: timedelta = timedelta(days=1)) -> NewWebhook:
-        """Replace the secret; only the answer contains the new one.
+        """Replace the secret, and return the webhook with the new secret, which cannot be read later.
 
         For the duration `grace`, deliveries are also signed with the old secret.
         """
@@ -87,11 +87,11 @@ class WebhookHandle:
         return self.transport.get(WebhookDelivery, f"{self.url}/deliveries/{delivery_id}")
 
     def redeliver(self, delivery_id: str) -> WebhookDelivery:
-        """Request that a delivery is sent once more; `wait` waits for the result."""
+        """Request that a delivery is sent once more; the method `wait` returns its result."""
         return self.transport.post(WebhookDelivery, f"{self.url}/deliveries/{delivery_id}/redeliver", repeatable=False)
 
     def test(self) -> WebhookDelivery:
-        """Request a delivery of the kind `webhook.test`; `wait` waits for the result."""
+        """Request a delivery of the kind `webhook.test`; the method `wait` returns its result."""
         return self.transport.post(WebhookDelivery, f"{self.url}/test", repeatable=False)
 
     def wait(self, delivery_id: str, *, timeout_s: float = 30.0) -> WebhookDelivery:

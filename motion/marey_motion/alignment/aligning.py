@@ -321,8 +321,8 @@ def joint_weights(body: MatchingBody, given: Mapping[str, float]) -> Floats:
 
     Returns
     -------
-    (J,) float64    weight of each joint. Without a given weight, it is 1 for the carrier (the joint that carries the
-        body) and for the descendants of the carrier, and 0 for all other joints
+    (J,) float64    weight of each joint. Joints without a given weight get 1 if they are the carrier (the joint that
+        carries the body) or descend from it, otherwise 0
 
     Raises
     ------

@@ -17,10 +17,10 @@ from marey_motion.skeleton import Skeleton
 def to_canonical(motion: Motion, body: MatchingBody, *, keep_height: bool = True) -> tuple[Motion, Placement]:
     """Rotate and move a motion as a whole so that its first frame is at x = z = 0 and faces +z.
 
-    The joint placed at the origin is the one that carries the body: the root, unless it is a static reference on the
-    floor. Such a root keeps its rotations and moves with the body; translations of the joints between the root and the
-    carrying joint are merged into the root's translation. The facing direction is computed from hips and shoulders, in
-    the first frame in which it is defined.
+    The joint placed at the origin is the one that carries the body: the root, unless the root is a static reference on
+    the floor. Such a root keeps its rotations and moves with the body; translations of the joints between the root and
+    the carrying joint are merged into the root's translation. The facing direction is computed from hips and shoulders,
+    in the first frame in which it is defined.
 
     Parameters
     ----------

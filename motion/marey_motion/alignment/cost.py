@@ -108,7 +108,7 @@ def cost_points(points: Floats, options: CostOptions, weights: ArrayLike | None 
 
 
 def costs_between(a: CostPoints, b: CostPoints, options: CostOptions) -> Floats:
-    """Compute `frame_costs` for prepared points.
+    """Compute the cost of each pair of frames, as `frame_costs` does, for points that are already prepared.
 
     Parameters
     ----------

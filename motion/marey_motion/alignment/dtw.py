@@ -1,7 +1,8 @@
 """Dynamic time warping: the cheapest path through a matrix of costs from its first cell to its last.
 
 A path has steps of one frame in both motions (1-1), in the first alone (1-0) or in the second alone (0-1). Its cost is
-the sum of the costs of all its cells (Sakoe and Chiba 1978, without weights). All results are exact; there is no band.
+the sum of the costs of all its cells (Sakoe and Chiba 1978, without weights). All results are exact: the path is not
+limited to a band around the diagonal.
 """
 
 from __future__ import annotations

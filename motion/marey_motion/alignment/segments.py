@@ -53,7 +53,8 @@ def cuts_of(layer: Layer) -> tuple[Cut, ...]:
     """List the cuts that an annotation makes: keyframes, and starts and ends of segments.
 
     The cut at the start of a segment has the segment's label. The cut at its end has the label `end of <label>`; there
-    is none if another segment begins there or the clip ends. A repeated label is numbered: `step`, `step 2`, `step 3`.
+    is no such cut if another segment begins at this frame, or if the clip ends there. A repeated label is numbered:
+    `step`, `step 2`, `step 3`.
 
     Parameters
     ----------

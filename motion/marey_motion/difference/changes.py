@@ -23,7 +23,7 @@ POINT_M = 0.01
 UNEXPLAINED = 0.1
 """A movement of a whole path is reported only if at most this share of the path's mean change remains afterwards."""
 MOST_SPANS = 100
-"""Maximum number of ranges in a list; if there are more, the ranges with the smallest gaps are joined, too."""
+"""Maximum number of ranges in a list; if there are more, ranges are joined over the smallest gaps between them."""
 
 
 class Course(NamedTuple):

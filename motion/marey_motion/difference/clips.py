@@ -156,9 +156,9 @@ def _translated(clip: Clip) -> tuple[str, ...]:
 def _translation_changes(
     before: Clip, after: Clip, joints: JointPairs, timing: Timing, course: Course, threshold_cm: float
 ) -> tuple[JointChange, ...]:
-    """Compare the translations of the joints that either clip translates.
+    """Compare the translations of the joints that at least one of the clips translates.
 
-    In a clip that does not translate the joint, the joint's offset is compared instead.
+    If only one of the clips translates a joint, its translation is compared with the joint's offset in the other clip.
     """
     moved = [
         (old, new)

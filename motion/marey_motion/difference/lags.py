@@ -16,7 +16,7 @@ WINDOWS = 12
 """Number of windows of the old clip that are searched for in the whole new clip."""
 SHORTEST_WINDOW = 8
 SIMILAR = 4.0
-"""The second-best place of a window is a candidate if its squared distance is at most this multiple of the best."""
+"""Multiple of the least squared distance up to which the second-best place of a window is a candidate, too."""
 NEGLIGIBLE = 1e-3
 """Squared distance of two frames that is attributed to noise."""
 GREATEST_PACE = 4.0

@@ -15,7 +15,7 @@ from marey_schemas.documents.differences import AnnotationDifference, KeyframeCh
 ALONE = 0.6
 """Cost of an added or removed segment."""
 OTHER_LABEL = 0.7
-"""Cost of different labels, added to the cost of the ranges: 0 for equal ranges, 1 for ranges that do not overlap."""
+"""Cost of different labels, in a pair of segments; the cost of the ranges, from 0 to 1, is added to it."""
 SHIFTED = 0.05
 """Cost added to a pair of segments if the ranges are compared after the shift that most segments have in common."""
 MOST_PAIRS = 16_000_000

@@ -17,7 +17,7 @@ PER_RIG = 10_000_000
 """Work of finding the limbs of a skeleton and the axes they bend about, in nanoseconds."""
 PER_PLANTED_NUMBER = 600
 PER_TAP, MOST_OF_TAPS = 0.35, 200.0
-"""Work of a moving mean per number of the motion, in nanoseconds: for each frame of the window, and the maximum."""
+"""Work of a moving mean for each number of the motion, in nanoseconds: per frame of the window, and at most."""
 PER_MEETING, PER_MET_NUMBER = 1_000_000, 10
 """Work of applying a group of constraints without the solver, and additional work for each number of the rotations.
 

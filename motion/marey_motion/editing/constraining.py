@@ -1,7 +1,7 @@
 """Constraints on ranges of frames, met by inverse kinematics and blended into their surroundings.
 
-Two constraints are solved together if one of them turns a joint that the other turns or depends on. Otherwise,
-they are solved separately.
+Two constraints are solved together if one constraint turns a joint, and the other constraint turns or depends on the
+same joint. All other constraints are solved separately.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ _LOOKING = ("pelvis", "spine", "spine_1", "spine_2", "neck", "head")
 
 
 def constrain(take: Take, command: Constrain) -> Take:
-    """Meet constraints in ranges of frames, and record their errors before and after.
+    """Change a motion to meet constraints in ranges of frames, and record their errors before and after the change.
 
     Parameters
     ----------

@@ -243,7 +243,7 @@ def _at_distance(points: Floats, centres: Floats, lengths: Floats) -> Floats:
 
 
 def _turn_between(before: Floats, after: Floats) -> Floats:
-    """Compute the shortest rotations (F, 4) between vectors (F, 3); identity if one has no length."""
+    """Compute the shortest rotations (F, 4) between vectors (F, 3); the identity if one of the vectors is zero."""
     known = np.minimum(np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)) > 1e-6
     turns = quaternions.identity(len(before))
     turns[known] = quaternions.between_vectors(before[known], after[known])

@@ -17,7 +17,7 @@ from marey_schemas.options.annotations import ContactOptions
 
 FEET = ("left_foot", "right_foot")
 LOWEST_SHARE = 0.05
-"""The ground is this quantile of the heights of the lower sole if the lower foot is never in stance."""
+"""Quantile of the heights of the lower sole that counts as the ground if the lower foot is never in stance."""
 
 
 class Ground(NamedTuple):

@@ -26,9 +26,9 @@ SAME_AXES_RAD = 0.02
 def paste(take: Take, command: Paste) -> Take:
     """Replace the motion of joints with a range of another clip (Herrmann et al. 2019, section 4.1.4).
 
-    The source range is resampled with cubic splines to the length of the range to fill; if both have equal lengths, it
-    is copied exactly. Within the borders, rotations are blended along the shorter arc, and translations along straight
-    lines.
+    The source range is resampled with cubic splines to the length of the range to fill; if both ranges have equal
+    lengths, the source range is copied exactly. Within the borders, rotations are blended along the shorter arc, and
+    translations along straight lines.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def _with_more_translations(take: Take, targets: Sequence[int], origins: Sequenc
 
 
 def _translations_of(motion: Motion, joint: int, offset: Floats) -> Floats:
-    """Return the translations (n, 3) of a joint, or its offset (3,) if it has none."""
+    """Return the translations (n, 3) of a joint, or `offset` (3,) if the motion has no translations of this joint."""
     if joint not in motion.translated_joints:
         return offset
     return motion.translations[:, motion.translated_joints.index(joint)]

@@ -19,7 +19,7 @@ from marey_motion.looping import about_vertical
 from marey_motion.motion import Motion
 
 VELOCITY_S = 0.15
-"""A difference of velocities decays to zero within these seconds, so that long blends do not overshoot."""
+"""Seconds within which a difference of velocities decays to zero, so that long blends do not overshoot."""
 
 
 class PoseOffset(NamedTuple):

@@ -37,7 +37,7 @@ LESS_IS_BETTER = (
 
 @dataclass(frozen=True)
 class MetricChange:
-    """Change of one metric of the suite.
+    """Change of one metric, as a mean over trials.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class MetricChange:
     def verdict(self) -> str:
         """Verdict: same, better, worse, changed or unclear.
 
-        "changed" is for metrics of which neither a lower nor a higher value is better; "unclear" means that the
+        "changed" is used if neither lower nor higher values of the metric are better; "unclear" means that the
         interval contains 0, or that there is only one trial.
         """
         if self.low == self.high == 0.0:
@@ -87,7 +87,7 @@ class TrialChange:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Differences between two evaluations of sets of clips by the same trials.
+    """Differences between the evaluations of two sets of clips by the same trials.
 
     Parameters
     ----------

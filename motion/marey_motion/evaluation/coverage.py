@@ -231,7 +231,7 @@ class Hole:
 
 
 def _sums(values: Floats, span: int) -> Floats:
-    """Return the sum of each `span` consecutive values; empty if there are fewer values."""
+    """Return the sums of all runs of `span` consecutive values; empty if there are fewer values."""
     if len(values) < span:
         return np.empty(0)
     totals = np.concatenate(([0.0], np.cumsum(values)))

@@ -24,7 +24,7 @@ from marey_schemas.options.evaluation import EvaluationOptions, Grid
 
 REGIMES = ("approach", "base", "switched")
 RESPONSE_SHARE = 0.1
-"""A desired speed counts as reached if the error of the speed is below this share of it for `RESPONSE_HOLD_S`."""
+"""A desired speed counts as reached if the error stays below this share of the desired speed for `RESPONSE_HOLD_S`."""
 RESPONSE_HOLD_S = 0.5
 """Seconds for which the error must stay below `RESPONSE_SHARE` for the speed to count as reached."""
 LEAST_TRAVEL_M_S = 0.05
@@ -213,7 +213,7 @@ def _offset_metrics(series: TrialSeries, window: Flags) -> dict[str, float | Non
 
 
 def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None]:
-    """Compute the mean response time to speed switches (None without any), and count switches without response."""
+    """Compute the mean response time to speed switches, None without responses; count switches without response."""
     times = [
         _response_s(series, first, stop)
         for first, stop in _stretches(series.pieces)
@@ -328,9 +328,9 @@ SUMMED = ("transitions", "clip_ends", "response_missed")
 def pooled_metrics(results: Sequence[TrialResult]) -> dict[str, float | None]:
     """Pool the metrics of several trials; metrics of a regime get the prefix `<regime>.`.
 
-    The pooled value of a maximum is the largest value of all trials; that of a root mean square is the root mean square
-    of the trials' values; that of a count is the sum. For every other metric, it is the mean over the trials in which
-    the metric is defined. `dse_…_pooled` is the root mean square of the standard deviations of the trials.
+    A maximum is pooled as the largest value of all trials, a root mean square as the root mean square of the trials'
+    values, and a count as the sum. Every other metric is pooled as the mean over the trials in which it is defined.
+    `dse_…_pooled` is the root mean square of the standard deviations of the trials.
 
     Parameters
     ----------

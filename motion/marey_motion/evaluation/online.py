@@ -36,7 +36,7 @@ FARTHEST_M = 1e6
 
 PATH_RATE_HZ = 5.0
 AWAY_DECIMALS = 1
-"""Decimals to which distances between cells are compared.
+"""Number of decimals to which distances between cells are compared.
 
 Of two equally distant cells, the cell that lacks more seconds comes first.
 """

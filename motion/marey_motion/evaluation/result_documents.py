@@ -63,7 +63,7 @@ def _result_body(result: EvaluationResult) -> Tree:
 
 
 def result_from_tree(tree: Mapping[str, Any], records: Sequence[TrialRecord] = ()) -> EvaluationResult:
-    """Read an evaluation.
+    """Make an evaluation from the content of its document, with or without records.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> 
 
 
 def records_from_tree(tree: Mapping[str, Any]) -> dict[str, TrialRecord]:
-    """Read records.
+    """Make the records of trials from the content of their document.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ class Trial:
     """One trajectory to follow: straight for `approach_s`, then a circle, or arcs with alternating speeds.
 
     Speeds are in m/s; `turn_rate_rad_s` is positive to the left. `switch_speed_m_s` and `switch_every_s` are used by
-    the switching family only; the first interval begins at the end of the approach.
+    the switching family only; its first period of constant speed begins at the end of the approach.
     """
 
     family: Family

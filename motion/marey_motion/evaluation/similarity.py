@@ -30,7 +30,7 @@ nearest frame is searched for among all frames of the cell.
 
 @dataclass(frozen=True, eq=False)
 class PoseSimilarity:
-    """Distances, in each cell (V, O) of the coverage map, between frames and the nearest frame of another source.
+    """Distances, in each cell (V, O) of the coverage map, between frames and the nearest frame of another source clip.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def measure_similarity(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> PoseSimilarity:
-    """Compare the frames in each cell of the coverage map with the frames of other sources in the same cell.
+    """Compare the frames in each cell of the coverage map with the frames of other source clips in the same cell.
 
     Distances are exact. Progress counts cells with frames.
 
@@ -162,7 +162,7 @@ def window_rows(database: MatchingDatabase, coverage: Coverage) -> NDArray[np.in
 
 
 def window_cells(coverage: Coverage) -> NDArray[np.int64]:
-    """Find the cell of each window.
+    """Find the cell of the coverage map in which each window lies.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def window_cells(coverage: Coverage) -> NDArray[np.int64]:
 
 
 def source_of_rows(database: MatchingDatabase) -> NDArray[np.int64]:
-    """Number the sources, and find the number of each row's source.
+    """Number the source clips, and find the number of each row's source clip.
 
     Parameters
     ----------

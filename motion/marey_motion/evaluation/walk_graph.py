@@ -1,7 +1,7 @@
 """Directed graph of the frames that characters display and of the jumps between them.
 
-The terms follow Kovar et al. (2002): clips from which jumps lead to each other and back form a strongly connected
-component; a dead end is a component that is entered, but never left.
+The terms follow Kovar et al. (2002): clips that can all be reached from each other by jumps form a strongly connected
+component; a dead end is a component that jumps enter, but never leave.
 """
 
 from __future__ import annotations

@@ -155,7 +155,7 @@ def write_motion(clip: Clip, file_format: str, **options: Any) -> bytes:
 
 
 def reader_of(row: FileFormat) -> Callable[..., SourceMotion | SourceDocument]:
-    """Find the function that reads files of a format, which must be a format that can be imported.
+    """Find the function that reads files of a format; the format must be one that can be imported.
 
     Parameters
     ----------

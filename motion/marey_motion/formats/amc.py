@@ -77,7 +77,7 @@ def _read_amc_header(lines: TextLines, degrees: bool) -> tuple[bool, float | Non
     """Read the header, up to the first frame.
 
     Returns whether angles are in degrees, and the frame rate or None. `degrees` says whether the ASF uses degrees; an
-    AMC that does not state the unit is assumed to use the same unit.
+    AMC that does not state the unit is assumed to use the unit of the ASF.
     """
     rate_hz = None
     while True:

@@ -26,7 +26,7 @@ _LONG_TOKENS_PER_CALL = 1 << 14
 
 @dataclass(frozen=True)
 class BoneTable:
-    """Bones of the skeleton as arrays for the scanner: concatenated names, ends of names, columns of bones."""
+    """Bones as arrays for compiled code: concatenated names, end of each name, first column of each bone."""
 
     names: NDArray[np.uint8]
     name_ends: NDArray[np.int64]
@@ -34,7 +34,7 @@ class BoneTable:
 
     @classmethod
     def of(cls, bones: list[Bone]) -> BoneTable:
-        """Lay out the bones for the scanner.
+        """Make the table of the bones of a skeleton.
 
         Parameters
         ----------

@@ -112,7 +112,7 @@ def read_asf(data: bytes, file: str) -> SourceMotion:
 
 
 def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
-    """Make a source without motion from a parsed skeleton.
+    """Make a `SourceMotion` without motion from a parsed skeleton.
 
     Parameters
     ----------

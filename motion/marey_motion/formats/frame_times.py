@@ -24,9 +24,9 @@ def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWar
     """Compute the rate of a file from its frame time.
 
     Files round frame times: .0083333 means 120 Hz. So the reciprocal of the frame time is compared with the nearest
-    common rate. If the two differ by a share of at most 1e-4, the common rate is used, with a warning above 2e-5. If
-    they differ more, the reciprocal is used; up to 2 %, as for .0333 and 30 Hz, a warning names the common rate,
-    because it may be meant.
+    common rate. If their relative difference is at most 1e-4, the common rate is used; a difference above 2e-5 gives a
+    warning. If the difference is greater, the reciprocal is used; up to 2 %, as for .0333 and 30 Hz, a warning names
+    the common rate, which may be the intended one.
 
     Parameters
     ----------

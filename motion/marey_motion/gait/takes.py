@@ -139,7 +139,7 @@ def foot_motions(
 
 
 def _at_studio_size(path: RootPath, times_s: AnyFloats, size: float) -> tuple[RootPath, AnyFloats]:
-    """Scale the path and times of a walker who is `size` times as tall as the studio skeleton to the studio skeleton.
+    """Scale a walker's path and times to the studio skeleton; the walker is `size` times as tall as this skeleton.
 
     Bodies of all sizes move alike if times scale with the square root of lengths (equal Froude numbers, Alexander and
     Jayes 1983).
@@ -218,7 +218,7 @@ def _programme() -> list[tuple[str, RootPath, tuple[str, ...]]]:
 def _slalom(speed_m_s: float, turn_rate_rad_s: float, bend_s: float, bends: int) -> RootPath:
     """Make a path of `bends` bends to alternating sides, each of `bend_s` seconds.
 
-    Half a bend is added before and after them, so that the initial heading is restored.
+    Half a bend is added before and after these bends, so that the path ends with the initial heading.
     """
     durations: Sequence[float] = [0.5 * bend_s, *[bend_s] * bends, 0.5 * bend_s]
     return RootPath(

@@ -41,7 +41,7 @@ CODES = {
     "up-axis-converted": "The upward axis of the file is not y; the motion was rotated.",
     "left-handed": "Left and right joints seem to be exchanged: the axes of the file may be left-handed.",
     # What the motion shows.
-    "rest-pose-frame": "The motion begins or ends with a rest pose, which falsifies averages; it can be trimmed.",
+    "rest-pose-frame": "A rest pose at the beginning or end of the motion falsifies averages; it can be trimmed.",
     "floor-offset": "The floor under the feet is above or below height zero.",
     "floor-penetration": "Feet go below the height of the ground in the rest of the motion.",
     "foot-skate": "Feet slide while they are on the ground.",
@@ -70,7 +70,7 @@ class CheckWarning:
 
     Parameters
     ----------
-    code : str    stable slug
+    code : str    short name of the kind of finding, for programs
     message : str    the finding, as a sentence with its numbers
     joints : tuple of str    names of the joints concerned
     frames : (int, int), optional    half-open range of the frames concerned, None for all of them

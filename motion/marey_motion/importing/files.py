@@ -37,7 +37,7 @@ _LONGEST_COLLECTION = 1024
 
 
 def planned_entry(planned: PlannedFile) -> ImportEntry | None:
-    """Make the entry for a file that is not read on its own, for the result of the import.
+    """Make the entry, in the result of the import, for a file that is not read on its own.
 
     Such a file is the companion of another file, or is refused by the plan.
 

@@ -36,7 +36,7 @@ from marey_schemas.options.modelling import TreeOptions
 
 
 def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
-    """Import a model and, if the file has one as a companion, its cluster tree; or import a graph.
+    """Import a model, with its cluster tree if the file has one as a companion; or import a graph.
 
     Parameters
     ----------

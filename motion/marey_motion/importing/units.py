@@ -175,7 +175,9 @@ def _choose_up_axis(source: SourceMotion, body: _Measurements, options: ImportOp
 
 
 def _settle_up_axis(body: _Measurements, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
-    """Choose the upward axis if the body is not upright along y; it may lie or climb, or another axis may point up.
+    """Choose the upward axis if the body is not upright along y.
+
+    The body may lie or climb, or another axis may point up.
 
     `axis` is the axis nearest to the direction from feet to head, and `cosine` is the cosine of the angle between this
     axis and the direction. `flat` is the result of `_flat_axis`.
@@ -244,7 +246,7 @@ def _mean_directions(ways: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _mean_point(positions: NDArray[np.float64], joints: Sequence[int]) -> NDArray[np.float64]:
-    """Compute the mean positions (F, 3) of some joints of (J, F, 3)."""
+    """Compute the mean positions (F, 3) of `joints`, whose positions are rows of `positions` (J, F, 3)."""
     mean: NDArray[np.float64] = np.add.reduce(positions.take(joints, axis=0), axis=0) / len(joints)
     return mean
 
@@ -263,7 +265,9 @@ def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _flat_axis(body: _Measurements) -> tuple[UpAxis, str] | None:
-    """Find the axis along which the lowest point of feet and hands hardly moves, while it moves along the other axes.
+    """Find the axis along which the lowest point of feet and hands hardly moves.
+
+    Along the other axes, this point must move.
 
     Returns the axis, and the evidence for it in words; returns None if there is no such axis.
     """

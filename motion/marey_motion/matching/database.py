@@ -141,12 +141,13 @@ class DatabaseNote:
 class MatchingDatabase:
     """A database of N rows, D feature dimensions, P pose joints and C clips; the clips are in ascending order of uid.
 
-    The pose of a row is relative to its root. If the root is placed at position p with heading theta, and R(theta) is
-    the rotation about +Y, joint 0 is at R(theta)·poses[:3] + (p.x, 0, p.z) with the rotation R(theta)·poses[3:7]. All
-    other joints follow by their local rotations, offsets and translations. If p and theta are the position and heading
-    of the root in the clip, the joint `MatchingBody.carrier` and all joints below it have the same pose as in the clip.
-    Joints above the carrier have their rest pose relative to the root instead, because in some clips they stay in one
-    place while the body moves away.
+    The pose of a row is relative to the row's simulation root: the position and heading of the body on the ground. If
+    the root is placed at position p with heading theta, and R(theta) is the rotation about +Y, joint 0 is at
+    R(theta)·poses[:3] + (p.x, 0, p.z) with the rotation R(theta)·poses[3:7]. All other joints follow by their local
+    rotations, offsets and translations. If p and theta are the position and heading of the root in the clip, the joint
+    `MatchingBody.carrier` and all joints below it have the same pose as in the clip. Joints above the carrier have
+    their rest pose relative to the root instead, because in some clips they stay in one place while the body moves
+    away.
 
     Parameters
     ----------

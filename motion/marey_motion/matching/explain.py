@@ -37,7 +37,7 @@ class Candidate:
     """A row of the database with its cost at a tick: frame `frame` of clip `clip` (an index into the database's clips).
 
     `groups` is the cost of each group of features; these costs add up to `cost`. `barred` is the reason why the search
-    at this tick may not choose the row, "not selectable" or "too near"; None if it may.
+    at this tick may not choose the row, "not selectable" or "too near"; None if the search may choose the row.
     """
 
     row: int

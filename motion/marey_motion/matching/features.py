@@ -172,7 +172,7 @@ def look_ahead(root: SimulationRoot, ticks: NDArray[np.int64], *, wraps: bool) -
 def extract_features(
     layout: FeatureLayout, positions: Floats, velocities: Floats, root: SimulationRoot, future: SimulationRoot
 ) -> Floats:
-    """Compute the features of frames.
+    """Compute the features of each frame from the motion of joints and root.
 
     Parameters
     ----------

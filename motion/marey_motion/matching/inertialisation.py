@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 
 def decay_matrix(half_life_s: float, elapsed_s: float) -> NDArray[np.float64]:
-    """Compute the matrix that advances an offset and its velocity in time.
+    """Compute the matrix that advances a decaying offset and its velocity in time.
 
     Parameters
     ----------

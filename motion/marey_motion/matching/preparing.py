@@ -117,7 +117,7 @@ def _wanted_frames(
 ) -> tuple[Clip, int, bool]:
     """Cut a clip to the requested range, without rest poses at the ends.
 
-    Returns the cut clip, the index of its first frame in the source, and whether it walks in place.
+    Returns the cut clip, the index of its first frame in the source, and whether the body walks in place.
     """
     clip, first = source.clip, 0
     if not _moves(clip, body.skeleton):

@@ -94,7 +94,7 @@ def guess_axes(skeleton: Skeleton, mapping: JointMapping, motion: Clip | None = 
     ----------
     skeleton : Skeleton    the joints
     mapping : JointMapping    standard names of the skeleton's joints; hips or shoulders of both sides are needed
-    motion : Clip, optional    a clip of the skeleton in which the body moves. It is read only for the parts that
+    motion : Clip, optional    a clip of the skeleton in which the body moves. The clip is used only for the parts that
         `rest_pose_doubts` names; without a motion, the swing axes of these parts are guesses on which retargeting
         should not rely.
 

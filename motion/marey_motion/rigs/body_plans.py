@@ -98,7 +98,7 @@ class LimbReading:
 
 @dataclass(frozen=True)
 class BodyPlan:
-    """Legs and arms, and a score of how common their proportions are; for most people, it is at least 0."""
+    """Legs and arms, and a score of how common their proportions are; for most people, the score is at least 0."""
 
     legs: LimbReading
     arms: LimbReading

@@ -158,8 +158,9 @@ def require_trust(mapping: JointMapping) -> JointMapping:
 def symmetric_joints(skeleton: Skeleton, mapping: JointMapping) -> NDArray[np.int32]:
     """Pair each joint with its partner on the other side of the body.
 
-    Partners come from the mapping if it contains both of them. Otherwise they are joints whose names differ only in the
-    side. Joints that still have no partner become partners if they are the parents of two partners.
+    Partners come from the mapping if the mapping contains both joints. Otherwise, two joints are partners if their
+    names differ only in the side. Joints that still have no partner become partners if they are the parents of two
+    partners.
 
     Parameters
     ----------

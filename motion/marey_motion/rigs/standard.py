@@ -44,7 +44,7 @@ CHAINS = (
 
 
 def mirrored(name: str) -> str:
-    """Name the standard joint on the other side of the body.
+    """Return the name of the standard joint on the other side of the body.
 
     Parameters
     ----------

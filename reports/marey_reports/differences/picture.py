@@ -1,7 +1,7 @@
 """Picture of the difference between two revisions of a motion or of an annotation.
 
-For motions, it shows corresponding frames, changed rotations over time, and the paths of the root. For annotations, it
-shows the segments and keyframes.
+The picture of motions shows corresponding frames, changed rotations over time, and the paths of the root. The picture
+of annotations shows the segments and keyframes.
 """
 
 from __future__ import annotations

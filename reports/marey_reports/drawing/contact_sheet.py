@@ -146,7 +146,7 @@ class _SheetCell:
     ground: str
 
     def placed(self, seen: AnyFloats) -> AnyFloats:
-        """Project points (..., 3) to points (..., 2) on the page, as a camera sees them."""
+        """Convert points (..., 3), as a camera sees them, to points (..., 2) on the page."""
         return seen[..., :2] * self.scale + self.centre
 
 

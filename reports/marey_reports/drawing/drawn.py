@@ -105,7 +105,7 @@ def _plain(value: Any) -> Any:
 
 
 def as_csv(columns: Mapping[str, Column]) -> str:
-    """Write a table as CSV with a header and LF at line ends; each number has the shortest form that parses to it."""
+    """Write a table as CSV with a header and LF at line ends; numbers are as short as possible, but exact."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(columns)

@@ -1,7 +1,7 @@
 """Style that all figures share, and writing of figures as PNG and SVG.
 
-Only matplotlib's object interface is used, so several threads can draw at the same time. Its global settings are
-changed only while an SVG is written, because the SVG writer of matplotlib reads some of them; one SVG is written at a
+Only matplotlib's object interface is used, so several threads can draw at the same time. The global settings of
+matplotlib are changed only while an SVG is written, because its SVG writer reads some of them; one SVG is written at a
 time.
 """
 
@@ -218,7 +218,7 @@ def square_root_ticks(ceiling: float) -> NDArray[np.float64]:
 
 
 def nice_levels(largest: float) -> NDArray[np.float64]:
-    """Choose at most 11 levels from 0 to the first at or above `largest`, in steps of 1, 2 or 5 times 10^n."""
+    """Choose at most 11 levels in steps of 1, 2 or 5 times 10^n; the first is 0, the last is not below `largest`."""
     reach = largest if largest > 0.0 and np.isfinite(largest) else 1.0
     scale = 10.0 ** np.floor(np.log10(reach / 10.0))
     step = next(factor * scale for factor in (1, 2, 5, 10, 20) if reach <= 10 * factor * scale * (1 + 1e-9))

@@ -164,9 +164,9 @@ def recording_chapter(result: EvaluationResult, figures: Figures) -> Section:
 
 
 def baseline_chapter(result: EvaluationResult) -> Section:
-    """Write the chapter on the suite's numbers, compared with the baseline.
+    """Write the chapter on the metrics over all trials, compared with the baseline.
 
-    The baseline is the same suite with generated clips, one for each speed and turn rate.
+    The baseline consists of the same trials with generated clips, one for each speed and turn rate.
     """
     base = result.baseline
     heads = ["measure", "this dataset", *(["generated baseline"] if base is not None else []), "unit"]

@@ -77,7 +77,7 @@ def headline_of_two(before: EvaluationResult, after: EvaluationResult, labels: t
 def metric_chapter(
     before: EvaluationResult, after: EvaluationResult, comparison: Comparison | None, labels: tuple[str, str]
 ) -> Section:
-    """Write the chapter on the changes of the suite's numbers, with intervals where they were computed."""
+    """Write the chapter on the changes of the metrics over all trials, with confidence intervals if computed."""
     changes = {change.metric: change for change in comparison.metrics} if comparison is not None else {}
     heads = ["measure", *labels, "change", *(["95 % interval", "verdict"] if comparison else []), "unit"]
     rows: list[Sequence[Cell]] = []

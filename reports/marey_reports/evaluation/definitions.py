@@ -10,7 +10,7 @@ from marey_reports.drawing.tables import table
 
 
 class Metric(NamedTuple):
-    """Metric of the suite in a report: name, unit, decimals and meaning."""
+    """Metric over all trials in a report: name, unit, decimals and meaning."""
 
     label: str
     unit: str

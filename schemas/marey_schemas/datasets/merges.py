@@ -32,9 +32,10 @@ class Side(StrEnum):
 class Resolution(Request):
     """Decision about a conflict: the side whose version of an entry is kept.
 
-    If two entries want one path, the other entry goes back to its own path on the branch or in the base. An entry that
-    one side has added has no such path, and is dropped. Several conflicts can have the same path and kind. The first
-    resolution decides the first of them, the second resolution the second one, and so on.
+    If the two sides have different entries at one path, the entry that is not kept goes back to its own path on the
+    branch or in the base. An entry that one side has added has no such path, and is dropped. Several conflicts can have
+    the same path and kind. The first resolution for this path and kind decides the first conflict, the second
+    resolution decides the second conflict, and so on.
     """
 
     path: EntryPath
@@ -66,7 +67,7 @@ class MergeRequest(CombineRequest):
 
 
 class PickRequest(CombineRequest):
-    """Request to apply the changes of one commit to a branch (cherry-pick), or to undo them on it (revert)."""
+    """Request to apply the changes of one commit to a branch (cherry-pick), or to undo these changes there (revert)."""
 
     version: Version = Field(description="Commit whose changes are applied or undone.")
     parent: Literal[1, 2] | None = Field(
@@ -137,7 +138,7 @@ class MergeAnswer(Answer):
 
 
 class CheckoutRequest(Request):
-    """Request to bring the folder of a dataset to the state of a version."""
+    """Request to change the folder of a dataset to the content of a version."""
 
     version: Version = MAIN
     discard: bool = Field(False, description="Discard changes in the folder that no commit has recorded.")

@@ -12,7 +12,7 @@ class ProposalState(StrEnum):
 
 
 class Verdict(StrEnum):
-    """Verdict of a review."""
+    """Verdict of a review of a proposal."""
 
     APPROVE = "approve"
     REQUEST_CHANGES = "request-changes"
@@ -20,7 +20,7 @@ class Verdict(StrEnum):
 
 
 class CheckState(StrEnum):
-    """State of a check."""
+    """State of a check of a proposal."""
 
     PENDING = "pending"
     SUCCEEDED = "succeeded"

@@ -105,7 +105,7 @@ class ProposalMerge(Request):
     when_green: bool = Field(
         False,
         description="If approvals, checks or other requirements are still missing, merge as soon as all are met. A "
-        "later commit of the proposal cancels this.",
+        "later commit of the proposal cancels this request.",
     )
 
     @model_validator(mode="after")
@@ -129,12 +129,12 @@ class Proposal(Answer):
     source: str = Field(description="Version whose changes are proposed, as the author named it.")
     target: str = Field(description="Branch that gets the changes.")
     head: str = Field(
-        description="Digest of the newest proposed commit; in a proposal that has ended, the one that was the newest "
-        "at that time."
+        description="Digest of the newest proposed commit; after the end of the proposal, of the commit that was the "
+        "newest at the end."
     )
     target_commit: str | None = Field(
-        description="Digest of the newest commit of the target; in a proposal that has ended, the one that was the "
-        "newest just before that time."
+        description="Digest of the newest commit of the target; after the end of the proposal, of the commit that was "
+        "the newest just before the end."
     )
     merged: str | None = Field(
         description="Digest of the commit that the merge made; null if the proposal is not merged."
@@ -215,4 +215,4 @@ class ProposalDetail(Proposal):
     comments: int = Field(description="Number of comments.")
     reviews: tuple[Review, ...] = Field(description="The newest approval or request for changes of each reviewer.")
     checks: tuple[ProposalCheck, ...] = Field(description="Checks of the newest proposed commit, by name.")
-    mergeability: Mergeability | None = Field(description="Null after the end of the proposal.")
+    mergeability: Mergeability | None = Field(description="Result of a merge now; null after the end of the proposal.")

@@ -145,7 +145,9 @@ class MotionDifference(Answer):
     frames: tuple[int, int]
     frame_rate_hz: tuple[float, float]
     duration_s: tuple[float, float]
-    skeleton: SkeletonDifference | None = Field(None, description="Absent if the skeletons are equal.")
+    skeleton: SkeletonDifference | None = Field(
+        None, description="Differences between the skeletons; absent if there are none."
+    )
     runs: tuple[FrameRun, ...] = Field(description="All frames of both revisions, in order.")
     frames_per_frame: float = Field(
         1.0,
@@ -158,7 +160,7 @@ class MotionDifference(Answer):
         "1 unless the motion was re-timed.",
     )
     rotations: tuple[JointChange, ...] = Field((), description="Changed local rotations in degrees, largest first.")
-    path: PathChange | None = Field(None, description="Absent if the path of the body is equal.")
+    path: PathChange | None = Field(None, description="Change of the path of the body; absent if there is none.")
     translations: tuple[JointChange, ...] = Field(
         (),
         description="Changed translations in centimetres, largest first, of all joints other than the one whose path "

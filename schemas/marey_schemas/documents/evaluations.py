@@ -25,7 +25,7 @@ class HeadlineMetric(NamedTuple):
 
     meaning: str
     of_trials: str | None = None
-    """Metric of a single trial. Its mean over the trials is this metric; None if this metric is not a mean over trials.
+    """Name of the metric of single trials whose mean is this metric; None if this metric is not a mean over trials.
 
     Trials in which the metric is not defined are left out of the mean.
     """
@@ -58,14 +58,14 @@ USAGE_FACETS: Mapping[str, str] = MappingProxyType(
         "counted.",
     }
 )
-"""Facets (published numbers) of the clips of an evaluation, by name of the facet."""
+"""Meaning of each facet (published number) that an evaluation gives to its clips, by name of the facet."""
 REMOVAL_FACETS: Mapping[str, str] = MappingProxyType(
     {
         "removal_harm": "Harm of removing the clip from the evaluated set, in metres, by the newest suggestions that "
         "assessed the clip; 0 if no trial needs the clip, negative if the removal helps."
     }
 )
-"""Facets (published numbers) of the clips of an evaluated set from jobs of the kind `suggest`, by name of the facet."""
+"""Meaning of each facet (published number) that a job of the kind `suggest` gives to clips, by name of the facet."""
 
 
 class EvaluationDocument(Request):

@@ -18,7 +18,7 @@ NodeName = Annotated[str, StringConstraints(min_length=1, max_length=255)]
 
 
 class GraphPlace(Request):
-    """Reference to a primitive of an action."""
+    """Reference to a motion primitive of an action."""
 
     action: NodeName
     primitive: NodeName

@@ -21,7 +21,7 @@ CONTENT = {
     "tree": ("samples", "sizes", "children"),
     "graph": ("actions", "start"),
 }  # fmt: skip
-"""For each part, names of the members whose values come from the imported file."""
+"""Names of the members whose values come from the imported file, by part."""
 
 
 class StoredOriginal(Request):

@@ -17,7 +17,7 @@ class RevisionRef(Request):
 
 
 class OutputRef(Request):
-    """Reference to another output of the same request; the store replaces it by a reference to the stored item."""
+    """Reference to another output of the same request; the store replaces this reference by one to the stored item."""
 
     output: str
 
@@ -25,7 +25,7 @@ class OutputRef(Request):
 class PartDigestRef(Request):
     """Placeholder for the digest of the part `model` that the same request stores for the same item.
 
-    The store replaces it by the digest.
+    The store replaces the placeholder by the digest.
     """
 
     digest_of: Literal["model"]

@@ -51,4 +51,4 @@ SCHEMAS: dict[str, type[Request]] = {
         OpenDocument,
     )
 }
-"""Models by the name of their schema."""
+"""Pydantic models by the name of their schema."""

@@ -110,8 +110,8 @@ class Concatenate(NamedCommand):
     source: ItemId = Field(description="The clip to append.")
     place: Literal["seam", "keep"] = Field(
         "seam",
-        description="seam: turned and shifted on the ground so that it continues the motion where it ends; "
-        "keep: unchanged.",
+        description="seam: the appended clip is turned and shifted on the ground, so that the motion continues where "
+        "it ends; keep: the appended clip is not moved.",
     )
     blend: Literal["inertialise", "slerp"] = Field(
         "inertialise",

@@ -70,7 +70,7 @@ class _Constraint(Tagged):
 
 
 class PositionConstraint(_Constraint):
-    """Position of a joint, or of a point fixed to a joint; by default, its position in the first frame is kept."""
+    """Position of a joint, or of a point fixed to a joint; by default, the position in the first frame is kept."""
 
     kind: Literal["position"] = "position"
     point_m: Shift | None = Field(None, description="Target position in the world, in metres.")

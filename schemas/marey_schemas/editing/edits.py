@@ -16,7 +16,7 @@ EditCommand = Annotated[AnyCommand, Field(discriminator="command")]
 COMMAND_MODELS: dict[str, type[AnyCommand]] = {
     get_args(model.model_fields["command"].annotation)[0]: model for model in get_args(AnyCommand)
 }
-"""Model by the name of the command."""
+"""Pydantic model of each command, by the name of the command."""
 
 
 class EditDocument(Request):

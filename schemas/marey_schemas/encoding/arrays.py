@@ -56,7 +56,7 @@ class EncodedArray:
         return cls(spec.dtype, spec.shape, blocks.encode(array, predict=predict))
 
     def cut_frames(self, start: int, stop: int) -> "EncodedArray":
-        """Return frames `start` to `stop`. Raises `ArrayError` if the bytes are corrupt."""
+        """Return the frames [start, stop). Raises `ArrayError` if the bytes are corrupt."""
         try:
             return EncodedArray(self.dtype, (stop - start, *self.shape[1:]), blocks.cut_frames(self.data, start, stop))
         except blocks.BlockError as error:

@@ -30,9 +30,9 @@ _LEAVES = (str, float, int, bool, type(None))
 def canonical_json(tree: Any) -> bytes:
     """Return the canonical JSON text of a tree without arrays: sorted keys, no spaces, UTF-8.
 
-    JSON has only one type of number: a whole number below 2**63 is written without a point whether it is 1 or 1.0 (and
-    -0.0 as 0), any other as the shortest text of its double. Raises `ValueError` for NaN and infinities, `TypeError`
-    for a key that is not a string.
+    JSON has only one type of number. A whole number below 2**63 is written without a point: 1.0 as 1, and -0.0 as 0.
+    Any other number is written as the shortest text of its double. Raises `ValueError` for NaN and infinities,
+    `TypeError` for a key that is not a string.
     """
     return json.dumps(
         _canonical(tree), sort_keys=True, ensure_ascii=False, separators=(",", ":"), allow_nan=False

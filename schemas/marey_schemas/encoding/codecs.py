@@ -42,7 +42,10 @@ ArrayForm = Literal["plain", "blocks"]
 
 
 class CodecError(ValueError):
-    """A document cannot be encoded or decoded; `pointer` (RFC 6901) is the place, `code` a stable slug."""
+    """A document cannot be encoded or decoded.
+
+    `code` names the error for programs; `pointer` (RFC 6901) is the place of the error in the document.
+    """
 
     def __init__(self, code: str, pointer: str, detail: str) -> None:
         super().__init__(code, pointer, detail)

@@ -33,7 +33,7 @@ def pack(tile: NDArray[Any], lead: int | None) -> bytes:
     """Compress a (frames, columns) little-endian array.
 
     `lead` is the number of columns before the first quaternion; None if there are no quaternions. A form with
-    prediction is tried first. If its result is hardly smaller than the plain bytes, `RAW` is tried, too, and the
+    prediction is tried first. If the result is hardly smaller than the plain bytes, `RAW` is tried, too, and the
     smaller result is returned.
     """
     packed = _compress(_predict(tile, lead))
@@ -67,7 +67,7 @@ def unpack(data: bytes | memoryview, dtype: np.dtype[Any], frames: int, columns:
 
 
 def form_of(data: bytes) -> int:
-    """Return the form of a valid tile: `RAW`, `DIFFERENCES` or `QUATERNIONS`. Only its start is decompressed."""
+    """Return the form of a valid tile: `RAW`, `DIFFERENCES` or `QUATERNIONS`. Only the tile's start is decompressed."""
     return zstandard.ZstdDecompressor().stream_reader(data).read(1)[0]
 
 

@@ -80,7 +80,7 @@ class EvaluationOptions(Grid):
         gt=0,
         le=3600,
         allow_inf_nan=False,
-        description="Seconds of data that a cell needs to count as covered.",
+        description="Seconds of data that a cell of speed and turn rate needs to count as covered.",
     )
     literal_formulas: bool = Field(
         False, description="Also compute the measures by the published formulas, taken literally."

@@ -31,7 +31,9 @@ class ObjectiveOptions(Options):
 class ObjectiveChoice(Options):
     """Objective that a computation minimises."""
 
-    objective: ObjectiveOptions = Field(ObjectiveOptions(), description="Weights of the objective.")
+    objective: ObjectiveOptions = Field(
+        ObjectiveOptions(), description="Weights of the objective: the cost of a set of clips."
+    )
 
 
 class SuggestionOptions(ObjectiveChoice):
@@ -86,7 +88,8 @@ class OptimisationOptions(ObjectiveChoice):
         gt=0,
         le=1e7,
         allow_inf_nan=False,
-        description="Greatest duration of the set in seconds; no clip is added beyond it; null: no limit.",
+        description="Greatest duration of the set in seconds; no clip is added that would exceed this duration; "
+        "null: no limit.",
     )
     consider: int | None = Field(
         20,

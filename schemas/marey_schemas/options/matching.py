@@ -52,8 +52,8 @@ class DatabaseOptions(Options):
     )
     root_mode: RootMode = Field(
         "simulated",
-        description="Source of the character's motion. bone: the root joint, for data whose root joint moves "
-        "on the ground as the character does.",
+        description="Source of the character's motion on the ground. simulated: the smoothed position and heading of "
+        "the body; bone: the root joint, for data whose root joint moves as the character does.",
     )
     weights: FeatureWeights = Field(FeatureWeights(), description="Weight of each group of features.")
     horizons_s: tuple[Annotated[float, Field(gt=0, le=3, allow_inf_nan=False)], ...] = Field(
@@ -126,7 +126,7 @@ class ControllerOptions(Options):
         ge=0,
         le=1000,
         allow_inf_nan=False,
-        description="Least reduction of the cost that makes the controller switch.",
+        description="Least reduction of the cost for which the character switches to another clip or frame.",
     )
     reselect_window_s: float = Field(
         0.0,

@@ -31,7 +31,7 @@ WAIT_EVERY_S = 0.005
 """Seconds between two checks whether the child process has ended, while the parent waits for its end."""
 MOST_MESSAGE_BYTES = 1 << 30
 ONE_DESCRIPTOR = b"\x01"
-"""Message that says that one descriptor is passed, in the form that `multiprocessing.reduction.recv_handle` expects."""
+"""Message that announces one passed descriptor, in the form that `multiprocessing.reduction.recv_handle` expects."""
 
 
 class ChildBroken(Exception):

@@ -209,7 +209,7 @@ class ForkedChild(ConnectedChild):
             super().kill(grace_s=grace_s)
 
     def _signal(self, number: signal.Signals) -> None:
-        """Send a signal to the session of the process, or, as long as it has none, to the process."""
+        """Send a signal to the session of the process, or to the process alone if it has no session yet."""
         if self._released or self._server.has_ended:
             return
         try:

@@ -227,7 +227,8 @@ EVALUATE = KindDeclaration(
         "normaliser": InputSpec(
             kind=Kind.EVALUATION,
             required=False,
-            description="The evaluation whose normaliser is used, which makes the results comparable.",
+            description="The evaluation whose normaliser (scaling of features) is used, so that the results of "
+            "both evaluations can be compared.",
         ),
     },
     outputs={"evaluation": Kind.EVALUATION},
@@ -262,7 +263,8 @@ _CANDIDATES = InputSpec(
 
 SUGGEST = KindDeclaration(
     name="suggest",
-    description="Finds the clips of an evaluated set that can be removed, and other clips that would fill its gaps.",
+    description="Finds the clips of an evaluated set that can be removed, and other clips that would fill gaps in its "
+    "coverage.",
     params=job_params.SuggestParams,
     implementation="marey_worker.kinds.suggest:run",
     version=2,

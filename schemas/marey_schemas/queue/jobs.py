@@ -269,7 +269,9 @@ class Attempt(Answer):
     worker: str = Field(description="Name of the worker; `a worker` for callers who are not contributors.")
     started_at: datetime
     ended_at: datetime | None
-    outcome: str | None = Field(None, description="succeeded, failed, interrupted, lost, cancelled or timeout.")
+    outcome: str | None = Field(
+        None, description="How the attempt ended: succeeded, failed, interrupted, lost, cancelled or timeout."
+    )
     detail: str | None = None
 
 

@@ -75,7 +75,10 @@ class Pipeline(Answer):
 
 
 class PipelineError(ValueError):
-    """The steps of a pipeline are not valid together. `pointer` is the place in the pipeline, `code` a stable slug."""
+    """The steps of a pipeline are not valid together.
+
+    `code` names the error for programs; `pointer` is the place of the error in the request.
+    """
 
     def __init__(self, pointer: str, code: str, detail: str) -> None:
         super().__init__(detail)

@@ -116,7 +116,7 @@ class LeaseList(Answer):
 
 
 class Heartbeat(Request):
-    """Renewal of a lease, with the job's progress."""
+    """Renewal of a worker's lease of a job, with the job's progress."""
 
     progress: Progress | None = None
 
@@ -152,7 +152,7 @@ class StagedOutput(Request):
 
 
 class StageRequest(Request):
-    """Request to stage results, and facets (numbers about inputs of the job)."""
+    """Request to stage results (they stay invisible until the attempt completes), and facets (numbers about inputs)."""
 
     outputs: tuple[StagedOutput, ...] = Field((), max_length=256)
     facets: tuple[ItemFacets, ...] = Field(

@@ -123,7 +123,7 @@ def import_archive(
 
     The versions keep their digests, authors and times. Only data that the server lacks is sent. The import changes no
     folder: check out the version to get its clips. If the branch has versions that the archive lacks, the branch does
-    not move; then merge the imported version into it.
+    not move: merge the imported version into the branch.
     """
     at = parse(place)
     with connect(context) as marey, _opened(file), progress() as advance:

@@ -52,8 +52,12 @@ def bisect(
     bad: Annotated[
         str, typer.Option(help="Later version that is known to be bad: a branch, a tag or a commit.")
     ] = "main",
-    above: Annotated[float | None, typer.Option(help="Versions with a value above this one are bad.")] = None,
-    below: Annotated[float | None, typer.Option(help="Versions with a value below this one are bad.")] = None,
+    above: Annotated[
+        float | None, typer.Option(help="Limit of the metric: versions with a value above the limit are bad.")
+    ] = None,
+    below: Annotated[
+        float | None, typer.Option(help="Limit of the metric: versions with a value below the limit are bad.")
+    ] = None,
     half_way: Annotated[
         bool,
         typer.Option("--half-way", help="Set the limit half-way between the values of the good and the bad version."),
@@ -84,11 +88,12 @@ def bisect(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find the first bad version after a good one: a metric of its evaluation has crossed the limit.
+    """Find the first bad version after a good one. A version is bad if a metric of its evaluation has crossed a limit.
 
-    Evaluates the good and the bad version, then versions between them. Each evaluation roughly halves the candidates
-    for the first bad version. Versions that cannot be evaluated are skipped; if this leaves several candidates, all of
-    them are listed, and the exit status is 1. The same command continues an interrupted search.
+    The command evaluates the good and the bad version, then versions between them. Each evaluation roughly halves the
+    number of candidates for the first bad version. Versions that cannot be evaluated are skipped; if this leaves
+    several candidates, all of them are listed, and the exit status is 1. The same command continues an interrupted
+    search.
     """
     from marey_client.handles.bisections import read_range
     from marey_client.handles.crossings import VersionEvaluations, find_crossing

@@ -143,7 +143,7 @@ def _pick_options(
 def _combine(
     context: typer.Context, at: NamedVersion, into: str, as_json: bool, change: Callable[[DatasetHandle], MergeAnswer]
 ) -> None:
-    """Send a change of a branch and print its result; exit with 1 if there are conflicts."""
+    """Send a request that changes a branch, and print the result; exit with status 1 if there are conflicts."""
     with connect(context) as marey, conflicts_printed(into=into, as_json=as_json):
         found = change(at.on(marey))
     _print(found, into, as_json=as_json)

@@ -98,7 +98,7 @@ def _copy(
     *,
     server: str | None = None,
 ) -> None:
-    """Copy a version and print the result; `server` is the address of the target if another server was named."""
+    """Copy a version and print the result; `server` is the address of the target server, None if none was named."""
     at = parse(place, version=True)
     to = at if into is None else parse(into)
     if source is target and (at.project, at.dataset) == (to.project, to.dataset):

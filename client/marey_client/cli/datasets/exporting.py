@@ -49,7 +49,7 @@ def export(
     allow_expired_consent: AllowExpiredConsent = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write the clips of a version to a folder that names the commit, the licence and the origin of each clip.
+    """Write the clips of a version to a folder, with the digest of the commit, and the licence and origin of each clip.
 
     The folder exists only when it is complete. `marey upload` reads a folder of motion files back, with the paths of
     the clips and their take records.

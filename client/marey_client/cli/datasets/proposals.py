@@ -247,7 +247,7 @@ def merge(
     when_green: Annotated[
         bool,
         typer.Option(
-            "--when-green", help="If approvals or checks are missing, let the server merge as soon as all are present."
+            "--when-green", help="If approvals or checks are missing, let the server merge as soon as none is missing."
         ),
     ] = False,
     withdraw: Annotated[
@@ -255,7 +255,7 @@ def merge(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Merge a proposal into its target. If it cannot be merged yet, the command lists the reasons.
+    """Merge a proposal into its target. If the proposal cannot be merged yet, the command lists the reasons.
 
     If both sides have changed the same part of an entry, nothing is merged until each such conflict is decided by
     --ours, --theirs or --base, or resolved by a commit to the source. The exit status is 1 while a conflict is left.

@@ -223,7 +223,7 @@ def blame(
     kind: Annotated[str, typer.Option(help="Kind of the entry.")] = "clip",
     as_json: AsJson = False,
 ) -> None:
-    """For each part of an entry, its tags and its path, show the last commit that changed it, with author and time."""
+    """Show the last commit that changed each part of an entry, its tags and its path, with author and time."""
     at = parse(place, version=True)
     with connect(context) as marey:
         found = at.on(marey).blame(path.strip("/"), kind_named(kind), at.version)
@@ -250,7 +250,7 @@ def checkout(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Bring the folder of a dataset to the state of a version. Items removed by the command can be restored."""
+    """Change the folder of a dataset to the content of a version. Items that the command removes can be restored."""
     at = parse(place, version=True)
     with connect(context) as marey:
         found = at.on(marey).check_out(at.version, discard=discard)

@@ -16,7 +16,8 @@ from marey_client.project import ProjectHandle
 
 NAME = "evaluation"
 TRAVEL_M = 0.5
-"""Least median horizontal displacement of the root of a locomotion clip over `TRAVEL_WINDOW_S`, in metres."""
+"""Least horizontal displacement, in metres, of the root of a locomotion clip within `TRAVEL_WINDOW_S` (median).
+"""
 TRAVEL_WINDOW_S = 1.0
 """Time in seconds over which the displacement of the root is measured."""
 OPTIONS: dict[str, Any] = {
@@ -61,8 +62,8 @@ def evaluate_locomotion(
 ) -> DemoEvaluation:
     """Evaluate the locomotion clips among `clips`, with their content in `version`; write the report to `folder`.
 
-    `clips` maps the paths of entries in the version to clips; `root` is the name of the root joint of all clips. If no
-    clip is locomotion, or if there is no version because there are no clips, nothing is evaluated.
+    `clips` maps the paths of entries in the version to clips; `root` is the name of the root joint of all clips.
+    Nothing is evaluated if no clip is locomotion, or if `version` is None.
     """
     chosen = []
     for done, (path, clip) in enumerate(clips.items()):

@@ -117,7 +117,7 @@ def _smooth_on_branch(project: ProjectHandle, dataset: DatasetHandle, path: str)
 
 
 def _merge_branch(dataset: DatasetHandle) -> None:
-    """Merge the branch, unless it has no commit of its own."""
+    """Merge the branch if it has a commit of its own."""
     try:
         dataset.merge(BRANCH)
     except (NotFound, Invalid) as error:

@@ -29,7 +29,7 @@ MOST_SPANS = 3
 LEAST_TURN_DEG = 0.05
 LEAST_SHIFT_CM = 0.05
 THROUGHOUT = 0.95
-"""Least share of the matched frames whose change must exceed the threshold for the text to say `throughout`."""
+"""The text says `throughout` if the change exceeds the threshold in at least this share of the matched frames."""
 
 
 def described(difference: Difference) -> Iterator[str]:
@@ -254,7 +254,7 @@ def _annotation(annotation: AnnotationDifference) -> Iterator[str]:
 
 
 def _shift(change: SegmentChange) -> int | None:
-    """Return the number of frames by which a segment moved without another change, or None."""
+    """Return the number of frames by which a segment moved; None if the segment changed in any other way."""
     old, new = change.before, change.after
     if old is None or new is None or old.label != new.label or new.start - old.start != new.end - old.end:
         return None

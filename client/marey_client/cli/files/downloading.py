@@ -77,7 +77,7 @@ def download(
 
 
 class _Exported(NamedTuple):
-    """Item to write to a file, and its revision to write; None means the newest revision."""
+    """Item and revision to write to a file; the revision None means the newest one."""
 
     item: ItemHandle
     revision: int | None

@@ -44,7 +44,7 @@ COLUMNS: dict[str, Callable[[Item], object]] = {
     "updated": lambda item: item.updated_at,
     "id": lambda item: item.id,
 }
-"""Columns of a list of items after the name."""
+"""Columns that follow the name in a list of items."""
 DEFAULT_COLUMNS = "kind,revision,joints,frames,Hz,tags"
 FIGURES = ("revision", "joints", "frames", "Hz", "seconds")
 """Columns with numbers."""
@@ -272,7 +272,7 @@ def show(
     history: Annotated[bool, typer.Option("--history", help="Show every revision and its inputs.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show an item: its parts, its path, and the findings of its import."""
+    """Show an item: its path, tags and parts, and, for a clip, the warnings of its import."""
     from marey_schemas.kinds import Kind
 
     with connect(context) as marey:

@@ -64,7 +64,7 @@ def record(
 ) -> None:
     """Set the take records of clips: performer, action, take, day, choice, licence, capture system, consent.
 
-    Nothing is changed if any value or row is wrong.
+    If a value, or a row of the table, is wrong, no clip is changed.
     """
     address = Address.parse(place)
     if (values is None) == (table is None):

@@ -45,8 +45,8 @@ def upload(
     """Import motion files. Refused files are listed with a reason.
 
     Importing the same file again changes nothing; a changed file of the same name becomes a new revision of its clip.
-    If `marey dataset export` wrote a folder, its clips get the paths, take records and tags that they had when they
-    were exported.
+    Clips from a folder that `marey dataset export` wrote get the paths, take records and tags that they had in the
+    export.
     """
     from marey_client.imports import find_files, left_out_text
     from marey_schemas.options.imports import ImportOptions

@@ -11,9 +11,9 @@ from marey_client.cli.terminal.output import print_message
 
 
 def ask(question: str, *, otherwise: str) -> None:
-    """Ask for confirmation, and print `otherwise` if the answer is not yes.
+    """Ask for confirmation; if the answer is not yes, print `otherwise` and raise `Refused`.
 
-    Raises `Refused` unless the answer is yes, and `WrongUsage` without a terminal.
+    Raises `WrongUsage` if standard input is not a terminal.
     """
     if not sys.stdin.isatty():
         raise WrongUsage(

@@ -34,7 +34,7 @@ class _CommittingJob(OptionsOf):
         return (*self._job.options, *_COMMIT.options)
 
     def read(self, typed: Mapping[str, Any]) -> Chosen:
-        """Return the fields of `JobCreate` that the typed options give. Raises `WrongUsage` for invalid options."""
+        """Return the fields of `JobCreate` that the given options set. Raises `WrongUsage` for invalid options."""
         from pydantic import ValidationError
 
         from marey_schemas.queue.commits import CommitOptions
@@ -77,8 +77,8 @@ def clips_at(marey: Marey, address: Address) -> ExistingInput:
 def input_at(marey: Marey, address: Address, kind: Kind, *, pinned: bool = True) -> ExistingInput:
     """Return the input of a job at an address: an item, its revision after `@`, a version of a dataset, or a folder.
 
-    An item without `@` means its newest revision: with `pinned`, the newest one now; otherwise, the newest one when the
-    job is submitted.
+    For an item without `@`, the input is the newest revision: the newest one now if `pinned` is true, otherwise the
+    newest one when the job is submitted.
     """
     from marey_schemas.queue.jobs import CollectionInput, ItemInput
 
@@ -133,7 +133,7 @@ def show_progress(now: Job, advance: Advance, count: int | None = None, unit: st
 
 
 def print_ended(ended: Job, as_json: bool, show: Callable[[dict[str, Any]], None] | None = None) -> None:
-    """Print the refused inputs of a job, then call `show` with its result; without `show`, print the counts in it.
+    """Print the refused inputs of a job, then call `show` with its result; without `show`, print the result's counts.
 
     Raises `Refused` if inputs were refused, or if the results could not be committed to the requested branch.
     """

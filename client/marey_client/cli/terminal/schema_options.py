@@ -53,7 +53,7 @@ class OptionsOf:
     short : further spellings of an option, by the name of its field
     without : fields that get no option, because the command sets them
     only : fields that get an option; all fields if empty
-    nulls : for fields that may be null, by name: a text that means null, in addition to `none`
+    nulls : a further text that means null, besides `none`, by the name of the field
     """
 
     model: str

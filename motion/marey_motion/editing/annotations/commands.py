@@ -296,7 +296,7 @@ COMMANDS: Mapping[str, Callable[..., Layer]] = {
 
 
 def piece_of(layer: Layer, segment: Segment, start: int, end: int) -> Layer:
-    """Make the layer for a clip that is cut to the frames [start, end); it keeps one segment and its keyframes.
+    """Make the layer for a clip that is cut to the frames [start, end): one segment, and the keyframes in this segment.
 
     Parameters
     ----------

@@ -142,8 +142,8 @@ def solve(
     limb : TwoBoneLimb, optional    a limb that may turn
     solver : str    "auto", "ccd", "two_bone" or "least_squares". "auto" uses the two-bone solver if a limb is given,
         joints have no limits, and the targets are a position of the limb's end in all axes and, optionally, an
-        orientation of this end. Otherwise, "auto" uses least squares. It also uses least squares if the limb is too
-        short in any frame, and other joints or the root may move.
+        orientation of this end. Otherwise, "auto" uses least squares. If the limb is too short in any frame, and other
+        joints or the root may move, "auto" uses least squares, too.
     options : SolverOptions    tolerances and iterations
 
     Returns
@@ -272,7 +272,7 @@ def solve_two_bone(
     damping_zone_rad: float = 0.0,
     options: SolverOptions = _OPTIONS,
 ) -> SolvedPoses:
-    """Bring the end of a limb to a position in closed form; a limb that is too short is straightened towards it.
+    """Bring a limb's end to a position in closed form; a limb that is too short is straightened towards the position.
 
     The middle joint opens or closes in the plane of the limb; then the limb is aimed (Lee and Shin 1999, 5.3).
 

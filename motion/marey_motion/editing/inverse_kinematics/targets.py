@@ -99,7 +99,7 @@ Target = PositionTarget | OrientationTarget | LookAtTarget
 
 @dataclass(frozen=True, eq=False)
 class JointLimit:
-    """Limits of a joint's rotation from a reference rotation: of a twist about an axis, then of a swing of this axis.
+    """Limits of a joint's rotation from a reference rotation: first a twist about an axis, then a swing of this axis.
 
     Parameters
     ----------

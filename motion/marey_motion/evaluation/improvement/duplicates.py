@@ -48,7 +48,7 @@ class NearDuplicate:
 
 @dataclass(frozen=True)
 class NearDuplicates:
-    """Pairs within the threshold, nearest first, with the number of aligned pairs and the number of all pairs."""
+    """Pairs of clips within the threshold, nearest first; numbers of pairs that were aligned, and of all pairs."""
 
     pairs: tuple[NearDuplicate, ...]
     threshold_cm: float
@@ -107,7 +107,7 @@ def find_near_duplicates(
 
 
 class _Families:
-    """The clips of a database, grouped by source."""
+    """The clips of a database, grouped by source: a clip and its mirrored copy have the same source."""
 
     def __init__(self, database: MatchingDatabase) -> None:
         families = clips_by_source(database.clips).values()

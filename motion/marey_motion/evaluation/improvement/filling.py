@@ -1,4 +1,4 @@
-"""Clips of other collections that would fill the holes of a set of clips."""
+"""Clips of other collections that would fill the holes in the coverage of a set of clips."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ProgressCallback = Callable[[int, int, str], None]
 MOST_FRAMES = 200
 """Maximum number of frames of a candidate clip that are compared with the set.
 
-If more frames of the candidate lie in holes, every k-th of these frames is compared.
+If more frames of the candidate lie in cells that lack data, every k-th of these frames is compared.
 """
 
 
@@ -38,7 +38,7 @@ class FilledCell:
 
 @dataclass(frozen=True)
 class Filling:
-    """A source clip that would fill holes, together with its mirrored copy if its collection contains one.
+    """A source clip with data for cells that lack data, together with its mirrored copy if its collection contains one.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def plan_fillings(
 ) -> tuple[Addition, ...]:
     """Order candidate clips: each step adds the clip that supplies the most seconds of data that are still missing.
 
-    The seconds that a candidate supplies are multiplied by its blendable share; a candidate with a share of 0 is left
+    The seconds that a candidate supplies are multiplied by its `blendable_share`; a candidate with a share of 0 is left
     out. Candidates of another skeleton come after all others. The list ends when no candidate supplies missing data any
     more.
 

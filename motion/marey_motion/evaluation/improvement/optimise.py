@@ -29,8 +29,8 @@ class OptimisationStep:
 
     Parameters
     ----------
-    sources : the removed or added source; if all sources that no trial needs are removed in one step, all of these
-    absent : the sources that are not in the set after the step, in ascending order
+    sources : the removed or added source clip; or all source clips that no trial needs, if one step removes them
+    absent : the source clips that are not in the set after the step, in ascending order
     objective : objective after the step, metres
     metrics : headline metrics after the step
     data_s : seconds of data after the step

@@ -15,7 +15,7 @@ ProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Removal:
-    """Effect of leaving out one source (a clip and its mirrored copy).
+    """Effect of leaving out one source clip and its mirrored copy.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Removal:
 
 @dataclass(frozen=True)
 class PlannedRemoval:
-    """One step of a plan: the removal of one more source of clips from the set, and the result.
+    """One step of a plan: the removal of one more source clip and its mirrored copy from the set, and the result.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def leave_one_out(
     consider: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> tuple[Removal, ...]:
-    """Measure the effect of leaving out each source that a trial needs; sort by harm per second of data, lowest first.
+    """Measure the effect of leaving out each source clip that a trial needs; the least harm per second comes first.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def plan_removals(
     consider: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> tuple[PlannedRemoval, ...]:
-    """Plan removals: each step removes the source that harms least per second of data saved.
+    """Plan removals: each step removes the source clip whose removal harms least per second of data saved.
 
     Every step is simulated, so the metrics of a step equal the metrics of an evaluation of the remaining clips. The
     plan ends early if nothing more can be removed. Progress counts steps.
@@ -136,7 +136,7 @@ def plan_removals(
 
 
 def name_of(simulation: Resimulation, source: str) -> str:
-    """Look up the name of a source.
+    """Look up the name of a source clip.
 
     Parameters
     ----------

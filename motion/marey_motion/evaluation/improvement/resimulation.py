@@ -7,11 +7,11 @@ clips, for three reasons:
 * A trial depends only on the displayed and chosen rows and on the least cost among selectable rows.
 * The order of the rows does not change, so ties are decided the same way.
 
-A trial needs a clip if it displays or chooses one of the clip's rows. Removing clips that a trial does not need leaves
-the trial bit-identical. By induction, the trial is unchanged up to each search; at the search, the cheapest row is
-still available, and still the first among equally cheap rows. So after a removal, only the trials that need a removed
-clip are simulated again. The same is true if other clips were removed before: the result of a trial is reused after
-further removals, as long as all clips that the trial needs remain.
+A trial needs a clip if the trial displays or chooses one of the clip's rows. Removing clips that a trial does not need
+leaves the trial bit-identical. By induction, the trial is unchanged up to each search; at the search, the cheapest row
+is still available, and still the first among equally cheap rows. So after a removal, only the trials that need a
+removed clip are simulated again. The same is true if other clips were removed before: the result of a trial is reused
+after further removals, as long as all clips that the trial needs remain.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ NONE: Sources = frozenset()
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a trial over some clips, and the sources whose rows were displayed or chosen in the trial."""
+    """Result of a trial over some clips, and the source clips whose rows were displayed or chosen in the trial."""
 
     result: TrialResult
     needed: Sources
@@ -54,8 +54,8 @@ class Resimulation:
     records : records of these trials over the whole database, if they exist already
     threads, cancelled : as in `suite.run_suite`
 
-    The attribute `simulated` is the number of trials that were run; `sources` maps each source to the indices of its
-    clips.
+    The attribute `simulated` is the number of trials that were run; `sources` maps the uid of each source clip to the
+    indices of this clip and its mirrored copy.
     """
 
     def __init__(
@@ -80,11 +80,11 @@ class Resimulation:
             self._keep(NONE, range(len(self.trials)), records, self.index)
 
     def outcomes(self, removed: Collection[str] = NONE) -> tuple[Outcome, ...]:
-        """Simulate the trials without some sources.
+        """Simulate the trials without some source clips and their mirrored copies.
 
         Parameters
         ----------
-        removed : collection of str    uids of these sources
+        removed : collection of str    uids of these clips
 
         Returns
         -------
@@ -115,11 +115,11 @@ class Resimulation:
         return tuple(outcome for outcome in found if outcome is not None)
 
     def results(self, removed: Collection[str] = NONE) -> tuple[TrialResult, ...]:
-        """Simulate the trials without some sources, and return their metrics.
+        """Simulate the trials without some source clips, and return the metrics of the trials.
 
         Parameters
         ----------
-        removed : collection of str    uids of these sources
+        removed : collection of str    uids of these clips
 
         Returns
         -------
@@ -128,7 +128,7 @@ class Resimulation:
         return tuple(outcome.result for outcome in self.outcomes(removed))
 
     def needed(self, removed: Collection[str] = NONE) -> Sources:
-        """Find the sources that at least one trial needs.
+        """Find the source clips that at least one trial needs.
 
         Parameters
         ----------
@@ -141,11 +141,11 @@ class Resimulation:
         return NONE.union(*(outcome.needed for outcome in self.outcomes(removed)))
 
     def leaves_rows(self, removed: Collection[str]) -> bool:
-        """Check whether a selectable row remains after some sources are removed.
+        """Check whether a selectable row remains after some source clips are removed.
 
         Parameters
         ----------
-        removed : collection of str    uids of these sources
+        removed : collection of str    uids of these clips
 
         Returns
         -------
@@ -167,7 +167,7 @@ class Resimulation:
         return sum(self._frames(source) for source in self.sources if source not in removed) / self._rate_hz
 
     def seconds_of(self, source: str) -> float:
-        """Compute the duration of one source, without its mirrored copy.
+        """Compute the duration of one source clip, without its mirrored copy.
 
         Parameters
         ----------

@@ -33,7 +33,7 @@ def source_of(clip: DatabaseClip) -> str:
 
 
 def clips_by_source(clips: Sequence[DatabaseClip]) -> dict[str, tuple[int, ...]]:
-    """Group clips by source.
+    """Group clips by source: a clip and its mirrored copy have the same source.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def clips_by_source(clips: Sequence[DatabaseClip]) -> dict[str, tuple[int, ...]]
 
 
 def require_sources(known: Collection[str], wanted: Collection[str]) -> None:
-    """Check that sources exist.
+    """Check that source clips exist.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def require_sources(known: Collection[str], wanted: Collection[str]) -> None:
 
 
 def rows_of_sources(clips: Sequence[DatabaseClip], sources: Collection[str]) -> Flags:
-    """Mark the rows of some sources.
+    """Mark the rows of some source clips and their mirrored copies.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def rows_of_sources(clips: Sequence[DatabaseClip], sources: Collection[str]) -> 
 
 
 def _by_row(database: MatchingDatabase) -> dict[str, Any]:
-    """Return, by field name, the arrays that have one entry per row."""
+    """Return the arrays of a database that have one entry per row, by field name."""
     values = {field.name: getattr(database, field.name) for field in fields(database)}
     return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 

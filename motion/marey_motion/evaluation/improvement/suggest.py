@@ -134,7 +134,7 @@ def _redundancy(
 ) -> tuple[tuple[Removal, ...], tuple[PlannedRemoval, ...]]:
     """Rank the clips by the harm of their removal, and plan several removals.
 
-    Both computations start from the set without the unused clips, whose sources are `gone`.
+    Both computations start from the set without the unused clips; `gone` contains the uids of these clips.
     """
     found = leave_one_out(
         simulation, how.objective, removed=gone, consider=how.consider, progress=stages.within("leaving out")

@@ -172,7 +172,7 @@ def group_influences(rows: Sequence[SweepRow]) -> tuple[Influence, ...]:
 
     Parameters
     ----------
-    rows : sequence of SweepRow    results of a sweep, the baseline first
+    rows : sequence of SweepRow    results of a sweep, the unchanged weights first
 
     Returns
     -------

@@ -71,7 +71,7 @@ class UnusedRange:
 
 @dataclass(frozen=True, eq=False)
 class Unused:
-    """Data whose removal changes no trial: whole sources, ranges of other sources, and a mask (N,) of these rows."""
+    """Data whose removal changes no trial: whole source clips, ranges of other clips, and a mask (N,) of these rows."""
 
     clips: tuple[UnusedClip, ...]
     ranges: tuple[UnusedRange, ...]
@@ -91,7 +91,7 @@ def find_unused(
     *,
     index: SearchIndex | None = None,
 ) -> Unused:
-    """Find the sources and ranges of frames that no trial needs, the longest first.
+    """Find the source clips, and ranges of frames of other clips, that no trial needs, the longest first.
 
     A loop whose playback wraps from its end to its start is removed either as a whole or not at all.
 

@@ -156,8 +156,8 @@ def _time_part(time: Document | None, layout: Layout, file: str) -> tuple[Docume
 
     The returned part has one component per row; it is None if the model has no time part.
 
-    Layout 2 was written by two training programs. The first stores components as columns and uses the form
-    `increments`; the later one stores them as rows and uses the form `coefficients`, as layout 3 does.
+    Layout 2 was written by two training programs. The first program stores components as columns and uses the form
+    `increments`; the later program stores components as rows and uses the form `coefficients`, as layout 3 does.
     """
     if time is None or not time.get("mean"):
         return None, "coefficients"

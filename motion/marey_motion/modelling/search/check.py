@@ -1,4 +1,4 @@
-"""Check of searches: the errors with which they reach hand and foot positions of examples left out of training."""
+"""Check of searches: the errors in reaching hand and foot positions of examples that were left out of training."""
 
 from __future__ import annotations
 
@@ -99,6 +99,6 @@ def check_search(
 
 
 def _most_varied(aligned: AlignedSet, joints: tuple[int, ...]) -> NDArray[np.int64]:
-    """Find, for each of k joints, the canonical frame (k,) in which its positions in the examples vary most."""
+    """Find, for each of k joints, the canonical frame (k,) in which the joint's positions in the examples vary most."""
     places = toe_positions(aligned.skeleton, aligned.poses, joints)
     return np.asarray(places.var(axis=0).sum(axis=-1).argmax(axis=0), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Selection of the joints and canonical frames of a primitive's motions that constraints need.
+"""Selection of the joints and canonical frames that constraints need, in the motions of a primitive.
 
 The value of a spline at a fixed time is linear in the scores, so each channel of a joint costs one product with
 precomputed numbers.

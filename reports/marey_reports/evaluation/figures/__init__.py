@@ -44,7 +44,7 @@ class FigureKind(NamedTuple):
     Parameters
     ----------
     number : number of the figure in Abichequer Sangalli et al. (2022), or "" if that paper does not have the figure
-    trials : "one" if it shows one trial, "any" if it shows the suite or one trial, "none" if it always shows the suite
+    trials : "one" if it shows one trial, "any" if it shows one or all trials, "none" if it always shows all trials
     families : families of trials that it can show
     draw : function that draws the figure for one or two subjects
     """
@@ -94,14 +94,14 @@ def draw_figure(
     ----------
     name : one of `FIGURES`
     trial : name of the trial to show, such as "switching v=1.5 w=-50". Default: the trial
-        that the character follows worst, for figures that show only one trial; otherwise the whole suite
+        that the character follows worst, for figures that show only one trial; otherwise all trials
     other : second result, drawn beside the first for comparison
     labels : names of the two results in a comparison
 
     Raises
     ------
     MotionError    if the figure or the trial is unknown, if the record of the trial is missing, or if a trial is given
-        for a figure that always shows the suite
+        for a figure that always shows all trials
     """
     kind = FIGURES.get(name)
     if kind is None:

@@ -37,7 +37,7 @@ DIRECTION_CELL_M_S = 0.25
 
 
 class _Plane(NamedTuple):
-    """Axes of a density map: two quantities of windows of clips, their names, and the area to which a value refers."""
+    """Axes of a density map: two measured quantities, their names, and the area to which a value of the map refers."""
 
     x: Callable[[Coverage], Floats]
     y: Callable[[Coverage], Floats]
@@ -138,7 +138,7 @@ def _edges(subjects: Sequence[Subject], plane: _Plane) -> tuple[Floats, Floats]:
 
 
 def _least_ranges(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the ranges of x and y that the figure must at least show so that it contains all trials."""
+    """Return the least ranges of x and y that the figure must show in order to contain all trials."""
     fastest = float(coverage.speed_edges_m_s[-1])
     if plane is DIRECTIONS:
         return (-1.0, 1.0), (-1.0, fastest)

@@ -37,8 +37,8 @@ def fit_two(values: AnyFloats, second: NDArray[np.bool_]) -> Normals:
     """Fit a mixture of two normal distributions with scikit-learn.
 
     The mask `second` selects the values from which the second distribution starts; the first one starts from the other
-    values. A given start makes the fit repeatable. If one of these groups is empty, the values are split at their mean.
-    Values that are all equal give two equal components.
+    values. Because the start is given, the fit is repeatable. If one of these groups is empty, the values are split at
+    their mean. Values that are all equal give two equal components.
     """
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.mixture import GaussianMixture

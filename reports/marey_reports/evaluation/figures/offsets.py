@@ -43,7 +43,7 @@ class _Field(NamedTuple):
 
 
 def draw_offsets(subjects: Sequence[Subject], _trial: str | None, _options: FigureOptions) -> Sketch:
-    """Draw the mean offsets: a row per family of trials, a column per subject, and for two subjects, one of changes."""
+    """Draw the mean offsets: a row per family of trials, a column per subject; two subjects get a column of changes."""
     families = [family for family in subjects[0].result.options.families if family in FAMILY_TITLES]
     fields = [[_field(subject, family) for subject in subjects] for family in families]
     levels = nice_levels(max(_largest(field) for row in fields for field in row))

@@ -131,7 +131,7 @@ def ellipse(mean: Floats, covariance: Floats) -> Floats:
 
 
 def draw_likelihood(subject: ModelSubject) -> Sketch:
-    """Compare the likelihoods of the examples, the least likely first."""
+    """Draw the likelihoods of the examples, the least likely first."""
     examples = subject.report.examples
     order = sorted(range(len(examples)), key=lambda place: (_judged(examples[place]), examples[place].uid))
     below = _deviations(np.array([_judged(example) for example in examples]))
