@@ -55,7 +55,7 @@ def test_metrics_that_a_page_names_exist_with_these_labels() -> None:
 
 
 def told_commands() -> list[tuple[str, str]]:
-    """Return each `marey` command in a shell block of the pages, as pairs of page name and command."""
+    """Return (page name, command) for each `marey` command in a shell block of the pages."""
     found = []
     for page in WRITTEN:
         for block in re.findall(r"```sh\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):

@@ -1,4 +1,4 @@
-"""Commands of annotations: each command that documents may contain can be applied, and the reverse."""
+"""Commands of annotations: documents may contain exactly the commands that can be applied."""
 
 import inspect
 from typing import get_args

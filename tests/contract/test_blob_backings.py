@@ -1,4 +1,4 @@
-"""Contract of blob backings, checked for every backing on every database."""
+"""Rules for blob backings (places where blobs are stored), checked for every backing on every database."""
 
 import os
 import threading
@@ -137,7 +137,7 @@ class BlobBackingContract:
         assert store.read(blobs.read_blob, digest) == b"still here"
 
     def test_bytes_sent_again_while_strays_are_swept_survive(self, store: Lab, clock: AdjustableClock) -> None:
-        """The blob exists at the end, in whichever order the garbage collection and the second upload run."""
+        """The garbage collection and the second upload run in both orders; the blob must exist at the end."""
         data = b"swept and sent"
         for _ in range(5):
             store.write(blobs.put_blob, data)

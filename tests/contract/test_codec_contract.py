@@ -1,4 +1,4 @@
-"""Contract of media types, checked for every codec."""
+"""Rules that the codec of every media type must follow."""
 
 import datetime
 import math

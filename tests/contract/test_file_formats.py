@@ -1,4 +1,4 @@
-"""Every format in the table of file formats has a reader, a writer and its own file name endings, as the table says."""
+"""Table of file formats: every format has the reader, the writer and the file name endings that the table states."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Jobs that commit their outputs while processes are killed: all outputs of a job are visible, each once, or none."""
+"""Jobs that commit their outputs while processes are killed: all outputs of a job are visible, or none is."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def seen(gaits: CommittingDesk, job_id: str, branch: str = "main") -> Seen:
 
 
 def dies(desk: Desk, url: str, work: str, fault: str) -> bool:
-    """Do some work in a process that is killed at a fault point; return whether it was killed there."""
+    """Do some work in a process that is killed at a fault point; return whether the process was killed there."""
     return StoreWriter(url, desk.user.user_id, "ann").run(work, f"{fault}:kill") != 0
 
 
@@ -148,7 +148,7 @@ def complete_each(gaits: CommittingDesk, leases: list[Lease], database: Database
 
 
 def submitted(gaits: CommittingDesk, count: int) -> tuple[list[str], list[Lease]]:
-    """Submit jobs that all start from the present commit, and stage outputs of each job; return job ids and leases."""
+    """Submit jobs that all start from the present commit, and upload outputs of each; return job ids and leases."""
     jobs = [gaits.submit(into=f"made{number}", cache="off", params={"number": number}) for number in range(count)]
     leases = gaits.desk.claim_many()
     for number, lease in enumerate(leases):

@@ -31,7 +31,7 @@ def server(tmp_path: Path, database_url: str) -> Iterator[ServerProcess]:
 
 
 def performance(seconds: float) -> np.ndarray:
-    """Return x, z (m) and heading (rad) of a body in each frame, (n, 3); its speed and its turns grow with time."""
+    """Return x, z (m) and heading (rad) of a body for each frame, (n, 3). Speed and turn rate grow with time."""
     times = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     headings = math.radians(40.0) * np.sin(0.3 * times) * times / 5.0
     steps = (1.0 + 0.05 * times)[:, None] / RATE_HZ * np.stack((np.sin(headings), np.cos(headings)), axis=-1)

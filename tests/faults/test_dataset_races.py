@@ -1,4 +1,4 @@
-"""Writes to one dataset while another request writes to it: nothing is lost, repeated or answered with 500."""
+"""Two requests that write to one dataset at the same time: nothing is lost, repeated or answered with 500."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_commit_that_is_repeated_while_it_is_recorded_is_made_once(
 
 
 def received(path: str | None = None) -> ReceivedRevision:
-    """Return a revision of another server; without a path, no entry has it."""
+    """Return a revision as another server sends it; without a path, it belongs to no entry."""
     tree = skeleton_tree(2)
     content = revision_content("skeleton", {"hierarchy": document_digest(tree)})
     return ReceivedRevision(content=content, kind=Kind.SKELETON, path=path, parts={"hierarchy": tree})

@@ -154,7 +154,7 @@ def change_folder(kind: str, folder: str) -> Callable[[Transaction], object]:
 def test_a_member_creates_an_item_with_the_role_in_the_folder_that_gets_it(
     lab: Lab, other: Database, kind: str
 ) -> None:
-    """An owner moves, deletes or restores a folder with roles, while a member creates an item at the folder's path."""
+    """While a member creates an item at the folder's path, an owner moves, deletes or restores the folder."""
     folders = make(lab, "a", "b", "a/x")
     member = lab.contributor
     if kind == "delete":

@@ -1,4 +1,4 @@
-"""Attacks on every route, as every kind of caller: the server refuses all attacks, keeps running, changes nothing."""
+"""Attacks on every route by every kind of caller: the server refuses all attacks, keeps running and changes nothing."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ class Attacked:
     cost: ProcessCost
 
     def faults(self, outcomes: Iterable[Outcome]) -> list[str]:
-        """Return the outcomes with a fault as text, each with the last lines of the server's log."""
+        """Return a text for each outcome that has a fault, with the last lines of the server's log."""
         log = self.process.log.read_text()[-5000:]
         return [f"{one.fault}; the server's log: {log}" for one in outcomes if one.fault]
 
     def fingerprint(self) -> dict[str, str]:
-        """Return a digest of the rows of each table, except for what the server writes by itself."""
+        """Return a digest of the rows of each table, without the rows that the server writes without a request."""
         found = {}
         engine = self.house.people.database.engine
         with engine.connect() as connection:

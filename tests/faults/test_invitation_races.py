@@ -1,4 +1,4 @@
-"""Concurrent uses of invitations: only one person gets the last use, and an inviter's lost right counts at once."""
+"""Concurrent uses of invitations: only one person gets the last use. If the inviter loses the right, nobody does."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def invite(lab: Lab, role: Role = Role.CONTRIBUTOR, *, uses: int = 1, who: Princ
 
 
 def invite_person(lab: Lab, chief: Principal) -> NewInvitation:
-    """Invite a person to create an account. No project takes part, so transactions can lock only the invitation."""
+    """Invite a person to create an account, without a project; so transactions can lock only the invitation."""
     request = AccountInvitationCreate()
     made: NewInvitation = lab.write(issuing.create_account_invitation, request, who=chief, required=OWN)
     return made

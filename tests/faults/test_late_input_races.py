@@ -1,4 +1,4 @@
-"""Concurrent transactions on late inputs (outputs of other jobs): a job gets all its inputs once, or ends before."""
+"""Concurrent transactions on late inputs (outputs of other jobs): a job gets all its inputs once, or it ends."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def completes(desk: Desk, database: Database, lease: Lease) -> Step:
 
 
 def claimed_maker(desk: Desk, number: int = 0, made: int = 3) -> Lease:
-    """Claim a job of the kind `sum` and stage results of the job; return the lease."""
+    """Claim a job of the kind `sum`, and upload its results without publishing them; return the lease."""
     lease = desk.claim(job=desk.submit("sum", params={"number": number}, into=f"made{number}"))
     desk.stage(lease, *(f"thing{n}" for n in range(made)))
     return lease
@@ -89,7 +89,10 @@ def test_a_job_submitted_while_its_maker_completes_gets_its_inputs(desk: Desk, o
 
 
 def test_identical_jobs_that_get_their_inputs_side_by_side_are_computed_once(desk: Desk, other: Database) -> None:
-    """Two jobs complete side by side; two identical jobs wait for the items of both, and only one is computed."""
+    """Two source jobs complete at the same time.
+
+    Two identical jobs wait for their items, and only one of the two is computed.
+    """
     first, second = claimed_maker(desk, 0, made=1), claimed_maker(desk, 1, made=1)
     (one,) = desk.submit_many(squares_of(first.job))
     (two,) = desk.submit_many(squares_of(second.job))

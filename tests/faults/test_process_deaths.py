@@ -1,4 +1,4 @@
-"""Processes that are killed at every fault point: nothing is lost or duplicated, and the store is consistent."""
+"""Processes that are killed at every fault point: nothing is lost or stored twice, and the store is consistent."""
 
 from __future__ import annotations
 

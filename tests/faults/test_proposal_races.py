@@ -31,7 +31,10 @@ Act = Callable[..., Any]
 
 
 class Team:
-    """Users of the dataset `gaits`, who have two connections. The branch `trial` has one commit more than `main`."""
+    """Users of the dataset `gaits`, with two database connections.
+
+    The branch `trial` has one commit more than `main`.
+    """
 
     def __init__(self, lab: Lab, other: Database) -> None:
         self.lab, self.other = lab, other
@@ -117,7 +120,7 @@ def test_an_approval_and_a_check_at_once_merge_a_waiting_proposal(team: Team) ->
 
 @on_postgres
 def test_a_commit_locks_its_branch_before_it_stores_chunks(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A job that commits takes its locks in the same order, so that it and a user's commit never form a deadlock."""
+    """Commits of jobs take their locks in the same order as commits of users, so that they never form a deadlock."""
     free: list[list[str]] = []
 
     def store(tx: Transaction, chunks: Mapping[str, bytes]) -> None:

@@ -1,6 +1,6 @@
-"""Purges at the same time as other writes: in any order of commits, nothing refers afterwards to what was purged.
+"""Purges at the same time as other writes: in any order of commits, nothing refers to a purged item afterwards.
 
-Either the purge is refused and names what holds the item, or the other write is refused with an error that says why.
+Either the purge is refused and names what holds the item, or the other write is refused with a reason.
 """
 
 from __future__ import annotations
@@ -80,17 +80,17 @@ class Scene:
         self.write(items.delete_item, "lab", kind, item, expected_rev=None)
 
     def of_user(self, function: Any, *args: Any, **kwargs: Any) -> Act:
-        """Return an act that calls a function with these arguments, with the right to write."""
+        """Return a function that calls `function` with these arguments, as a user who may write."""
         return lambda tx: requiring(WRITE, function)(tx, *args, **kwargs)
 
     def purge_of(self, item: str) -> Act:
-        """Prepare the purge of a deleted item, and return an act that records the purge."""
+        """Prepare the purge of a deleted item; return a function that records the purge in a transaction."""
         request = PurgeRequest(item=item)
         prepared = self.desk.database.read(self.desk.user, requiring(WRITE, purging.prepare_purge), "lab", request)
         return self.of_user(purging.record_purge, "lab", request, prepared)
 
     def race(self, order: str, act: Act, purge: Act, who: Principal | None = None) -> tuple[Any, Any]:
-        """Interleave an act and a purge; return the result or error of the act, then that of the purge.
+        """Interleave the write `act` and a purge; return the result or error of `act`, then that of the purge.
 
         Fails if a transaction runs twice, which happens after a deadlock.
         """
@@ -155,9 +155,9 @@ class Scene:
     ) -> tuple[Any, Any]:
         """Delete `item` and begin its purge after `act` has read it, but before `act` commits; return both results.
 
-        On SQLite, where transactions do not overlap, the item is deleted and purged after `act`. With
-        `while_publishing`, the item is deleted just before `act` counts what it has added to the project; after this
-        count, a deletion would wait for `act`.
+        On SQLite, transactions do not overlap, so the item is deleted and purged after `act`. With `while_publishing`,
+        the item is deleted just before `act` counts what it has added to the project. After this count, a deletion
+        would wait for `act`.
         """
 
         def delete_and_hold(*args: Any) -> None:
@@ -247,7 +247,7 @@ def test_a_folder_is_not_restored_while_half_of_a_purge_is_done(scene: Scene) ->
 
 
 def test_a_folder_that_is_deleted_during_a_purge_keeps_its_items_and_roles(scene: Scene) -> None:
-    """Deletions do not wait for purges. The kept folder is new and has the path of the folder that is purged."""
+    """Deletions do not wait for purges. The folder that is kept is new, and has the path of the purged folder."""
     thing = scene.add("thing")
     (raw,) = scene.folders("raw")
     scene.write(collections.delete_collection, "lab", raw, expected_rev=None)
@@ -443,7 +443,7 @@ def test_a_job_that_awaits_a_purged_result_is_queued_once(scene: Scene, monkeypa
 @ORDERS
 @pytest.mark.parametrize("ends", ["cancel", "fail", "reap", "share"])
 def test_a_job_whose_result_others_await_ends_beside_a_purge(scene: Scene, order: str, ends: str) -> None:
-    """However a job ends, it may publish items or pin inputs of other jobs. This must form no deadlock with a purge."""
+    """The end of a job may publish items or fix the inputs of other jobs; it must form no deadlock with a purge."""
     thing, kept = scene.add("thing"), scene.add("kept", n=2)
     (job,) = scene.desk.submit_many(square_of(kept, max_attempts=1))
     lease = scene.desk.claim()

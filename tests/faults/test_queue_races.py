@@ -1,4 +1,4 @@
-"""Two concurrent transactions at every step of a job: in any order of commits, the job ends once."""
+"""Two concurrent transactions on one job, at every step of the job: in any order of commits, the job ends once."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Bout:
         return self.lease.job, self.lease.fence
 
     def assert_sound(self) -> None:
-        """Check that the job has ended at most once, with one event and with the consequences of ending in this way."""
+        """Check that the job has ended at most once, with one event, and that this end has had all of its effects."""
         job = self.desk.job(self.job)
         told = self.desk.database.read(SYSTEM, _ends_told, self.job)
         assert told == (1 if job.state.terminal else 0)
@@ -302,7 +302,7 @@ def test_two_that_want_to_lead_at_once_make_one_leader(desk: Desk, other: Databa
 
 
 def stale_worker_story(desk: Desk, act: Callable[[Desk, Lease], object]) -> None:
-    """Let a worker lose its lease to another worker; check that the first one can no longer `act` for the job."""
+    """Let a worker lose its lease to another worker; check that the request `act` of the first worker is refused."""
     job = desk.submit()
     slept = desk.claim()
     desk.clock.advance(61)
@@ -334,7 +334,7 @@ def test_a_worker_that_slept_through_its_lease_is_refused_everywhere(desk: Desk,
 
 @pytest.mark.parametrize("act", STALE_ACTS)
 def test_without_the_fence_the_stale_worker_gets_through(desk: Desk, act: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Check that the test above would fail if statements did not compare the fence, and for no other reason."""
+    """Check that the test above would fail if statements did not compare the fence."""
 
     def no_fence(_fence: int) -> ColumnElement[bool]:
         return true()

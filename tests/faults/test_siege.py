@@ -1,7 +1,8 @@
-"""Servers and workers that are killed again and again under load: no acknowledged write is lost or doubled.
+"""Servers and workers that are killed again and again under load: no confirmed write is lost or stored twice.
 
-The tier `test` runs short forms. The tier `soak` kills a server 77 times under 8 writers, kills or stops two servers
-and four workers 206 times under 1,800 jobs, and cancels 10,000 jobs at the moment at which they complete.
+The tier `test` runs short forms. In the tier `soak`, a server is killed 77 times while 8 clients write. Two servers and
+four workers are killed or stopped 206 times while 1,800 jobs run. 10,000 jobs are cancelled at the moment at which they
+complete.
 """
 
 from __future__ import annotations
@@ -280,7 +281,7 @@ def test_a_job_whose_cancellation_is_acknowledged_never_succeeds(
     outcomes: Counter[str] = Counter()
 
     def cancel(job_id: str) -> bool:
-        """Return whether the cancellation was acknowledged."""
+        """Cancel the job; return whether the server confirmed the cancellation."""
         try:
             desk.cancel(job_id)
         except ConflictProblem:
@@ -288,7 +289,7 @@ def test_a_job_whose_cancellation_is_acknowledged_never_succeeds(
         return True
 
     def complete(lease: Lease) -> bool:
-        """Complete the job unless it was cancelled; return False, because no cancellation was acknowledged."""
+        """Complete the job if it was not cancelled; return False, because this call cancels nothing."""
         with contextlib.suppress(ConflictProblem):
             worker.complete(lease)
         return False

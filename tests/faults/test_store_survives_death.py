@@ -1,4 +1,4 @@
-"""Processes that are killed while they write: all of the write is stored or nothing, and a repeated write succeeds."""
+"""Processes that are killed while they write: the write is stored whole or not at all, and can be repeated."""
 
 import signal
 from pathlib import Path

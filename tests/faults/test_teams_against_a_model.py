@@ -102,7 +102,7 @@ def purge_what_versions_contain(patch: pytest.MonkeyPatch) -> None:
 
 
 def revert_only_one_entry(patch: pytest.MonkeyPatch) -> None:
-    """Let merges, reverts and cherry-picks forget all changed entries but the first."""
+    """Let merges, reverts and cherry-picks change only the first of the entries that they should change."""
 
     def merge(ours: Iterable[Any], theirs: Iterable[Any], *options: Any) -> MergedEntries:
         return merge_entries(ours, list(theirs)[:1], *options)
@@ -111,7 +111,7 @@ def revert_only_one_entry(patch: pytest.MonkeyPatch) -> None:
 
 
 def forget_write_ids(patch: pytest.MonkeyPatch) -> None:
-    """Let repeated writes be recorded again."""
+    """Let the server execute repeated writes again, instead of recognising their `write_id`."""
     patch.setattr(committing, "recorded_as", lambda _tx, _dataset, _write_id: None)
 
 

@@ -1,4 +1,4 @@
-"""Servers that are killed while they deliver to webhooks: no delivery is lost, and few are repeated."""
+"""Servers that are killed while they send to webhooks: no delivery is lost, and few are repeated."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def add_folders(lab: ProjectHandle, *names: str) -> None:
 
 
 def first_arrivals(receiver: Receiver) -> list[int]:
-    """Return the number of each received event once, in the order in which the events first arrived."""
+    """Return the numbers of the received events without repetitions, in the order in which the events first arrived."""
     return list(dict.fromkeys(one.message["seq"] for one in receiver.received))
 
 

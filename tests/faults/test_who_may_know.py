@@ -1,4 +1,7 @@
-"""Random calls by callers of every kind, compared with a model of their rights; planted defects must be found."""
+"""Random calls by callers of every kind, compared with a model of their rights.
+
+Defects that tests plant must be found.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Roles in folders: random calls compared with a model, planted defects to find, and races with changes of roles."""
+"""Roles in folders: random calls compared with a model, and concurrent changes of roles.
+
+Planted defects must be found.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +62,7 @@ def _roles_of_all_members_are_forgotten(rows: Any) -> Mapping[Any, Any]:
 def _the_target_is_forgotten(tx: Transaction, project_row: Any) -> Any:
     class Careless(FolderRights):
         def require(self, path: str, needed: Role, deleted_us: int | None = None) -> None:
-            """Allow everything."""
+            """Replace the check of roles by one that allows everything."""
 
     return Careless(project_row.name, Role.OWNER)
 
@@ -159,7 +162,7 @@ def test_a_member_whose_role_ends_before_the_rights_are_read_writes_nothing(
 ) -> None:
     """The role ends after the request has found the member in the project, and before the request reads the rights.
 
-    On SQLite, where nobody else can write during the request, the role ends before.
+    On SQLite, nobody else can write during the request, so the role ends before the request.
     """
     lab.write(collections.create_collection, "lab", CollectionCreate(path="delivered"))
     user = str(lab.contributor.user_name)

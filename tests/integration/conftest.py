@@ -13,7 +13,7 @@ __all__ = ["open_receiver", "owner", "server", "worker"]
 
 @pytest.fixture
 def decoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """List to which the size of each body is added that the server decodes."""
+    """List of the sizes of all request bodies that the server has decoded."""
     sizes: list[int] = []
 
     def note(data: bytes, media_type: str, **options: Any) -> Any:

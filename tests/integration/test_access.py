@@ -1,4 +1,7 @@
-"""Every route as every kind of caller, generated from the table of routes: rights, and no leaks of content."""
+"""Requests to every route by every kind of caller: rights, and no leaks of content.
+
+The table of routes gives the requests.
+"""
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -52,7 +55,7 @@ def send(house: House, route: Route, role: str) -> httpx.Response:
 
 
 def find_wrong_answers(house: House, routes: tuple[Route, ...]) -> list[str]:
-    """Send the request of every route as every role; return the answers that differ from the declaration."""
+    """Send the request of every route as every kind of caller; return answers that contradict the declarations."""
     wrong = []
     for route in routes:
         operation = route.operation
@@ -88,7 +91,7 @@ def test_every_route_lets_in_whom_it_declares_and_nobody_else(house: House) -> N
 
 
 def test_a_store_that_checks_no_role_is_found(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Check that the test above fails if members can be changed without a check of the caller's role."""
+    """Check that the test above fails if the server changes members without a check of the caller's role."""
     routes = tuple(route for route in ROUTES if route.resource.path == "/projects/{project}/members/{user}")
     assert not find_wrong_answers(house, routes)
 
@@ -102,7 +105,7 @@ def test_a_store_that_checks_no_role_is_found(house: House, monkeypatch: pytest.
 
 
 def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
-    """The list repeats declarations of the routes, so that a role that is lowered there must also be changed here."""
+    """The list repeats the declarations of the routes. Whoever lowers a role there must also change it here."""
     high = {
         f"{route.operation.method} {route.resource.path}": route.operation.access.value
         for route in ROUTES
@@ -162,7 +165,7 @@ def test_a_change_cannot_be_declared_for_readers() -> None:
 
 
 def is_about_nobody(person: Person, route: Route) -> bool:
-    """Return whether a refusal is not about rights, but about a wrong password or an unneeded credential."""
+    """Return whether the reason of a refusal is a wrong password or an unneeded credential, not the caller's rights."""
     operation = route.operation
     useless = person.standing == "refused" or not person.has(operation.scope)
     return operation.access is Access.ANYONE and (useless or route.template.endswith("/login"))

@@ -1,4 +1,4 @@
-"""Examples of real actions, aligned."""
+"""Alignment of examples of real actions."""
 
 from pathlib import Path
 

@@ -45,7 +45,10 @@ class Story:
     def send(
         self, client: httpx.Client, method: str, path: str, body: Any, *made: Made, headers: dict[str, str] = ANY_STATE
     ) -> Any:
-        """Send a request that must succeed, and return its answer; record the secret in the answer, and `made`."""
+        """Send a request that must succeed, and return its answer.
+
+        Record the secret in the answer, and the expected entry `made`.
+        """
         answer = client.request(method, path, json=body, headers=headers)
         assert answer.is_success, (method, path, answer.text)
         self.expected += made
@@ -216,7 +219,7 @@ CHAPTERS = (
 
 
 def tell(story: Story) -> list[dict[str, Any]]:
-    """Send all requests, check that none changes an existing entry, and return the entries from before."""
+    """Send all requests, and check that none changes an existing entry; return the entries that existed before."""
     before = known = story.entries()
     for chapter in CHAPTERS:
         chapter(story)

@@ -1,4 +1,7 @@
-"""Copies of versions to another project: documents may refer to content of other entries, or of later versions."""
+"""Copies of versions to another project.
+
+Their documents may refer to content of other entries, or of later versions.
+"""
 
 from __future__ import annotations
 

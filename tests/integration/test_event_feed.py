@@ -1,4 +1,4 @@
-"""The feed of events on copies of a database in another place, and the wake-ups of requests that wait for events."""
+"""The feed of events after a database was restored elsewhere, and the wake-ups of requests that wait for events."""
 
 import asyncio
 import contextlib
@@ -106,7 +106,7 @@ def test_a_follower_continues_on_a_copy_of_the_database_elsewhere(lab: Lab, tmp_
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """Number of calls, by name, of the functions that waiting requests and the feed call."""
+    """Number of calls of each function that waiting requests and the feed call."""
     counted: Counter[str] = Counter()
 
     def count(module: Any, name: str) -> None:
@@ -222,7 +222,7 @@ def test_a_follower_that_disconnects_no_longer_counts(database: Database, tmp_pa
 
 
 def test_changes_of_another_process_wake_who_waits(server: Server, database: Database) -> None:
-    """A second connection plays the other process: its writes wake no request of this process directly."""
+    """A second connection simulates the other process. Its writes wake no request of this process directly."""
     token = server.make_project()
     owner = server.client(token)
     last = owner.get("/projects/lab/events").json()["items"][-1]["seq"]

@@ -149,9 +149,9 @@ def test_written_bvh_puts_every_joint_where_another_loader_saw_it_in_the_origina
 
 
 def test_a_take_in_both_formats_is_the_same_take(collection: Collection) -> None:
-    """The BVH file of the take 11_01 has another skeleton and smoothed motion, and one more frame at the start.
+    """The BVH file of the take 11_01 has another skeleton, smoothed motion, and one more frame at the start.
 
-    The root turns exactly as in the AMC file, and the hips travel the same path after scaling by the size of the body.
+    But the root turns exactly as in the AMC file. Scaled by the size of the body, the hips travel the same path.
     """
     motions = collection.motions()
     amc, bvh = motions["cmu-amc/11/11_01.amc"], motions["cmu-bvh/11_01.bvh"]

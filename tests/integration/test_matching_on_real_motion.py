@@ -1,4 +1,4 @@
-"""Matching databases of real takes: some takes are at 120 Hz, in some the hips move relative to a static root."""
+"""Motion matching databases of real takes. Some takes have 120 Hz; in some, the hips move relative to a static root."""
 
 import csv
 from pathlib import Path
@@ -93,7 +93,7 @@ def test_feet_stand_about_as_long_as_feet_do(database: MatchingDatabase) -> None
 
 
 def test_mirrored_takes_are_the_takes_in_a_mirror(takes: list[SourceClip]) -> None:
-    """Measured bodies are not exactly symmetric, but a take and its mirrored copy have the same roots to 1 cm."""
+    """Real bodies are not exactly symmetric, so the roots of a take and of its mirrored copy may differ by 1 cm."""
     body = body_of(takes[0].clip)
     plain = build_database(takes[:6], body)
     mirrored = build_database(takes[:6], body, DatabaseOptions(mirroring="only"))
@@ -113,7 +113,10 @@ NAMED = {
 
 @pytest.mark.parametrize("collection", SETS)
 def test_takes_go_where_their_names_and_turn_as_far_as_the_manifest_say(mocap: Path, collection: str) -> None:
-    """The manifest has net turns in degrees, positive to the right. The names of some takes confuse left and right."""
+    """The manifest states the net turn of each take in degrees, positive to the right.
+
+    Some names confuse left and right.
+    """
     with (mocap / "MANIFEST.csv").open(newline="") as table:
         net_turns = {
             row["path"]: -float(row["note"].split("net turn ")[1].split(";")[0])
@@ -134,7 +137,10 @@ def test_takes_go_where_their_names_and_turn_as_far_as_the_manifest_say(mocap: P
 
 
 def test_poses_hung_from_their_roots_are_the_takes(takes: list[SourceClip]) -> None:
-    """Pose points, moved to the root of their row, equal the joint positions of the clip for every hierarchy."""
+    """The stored pose points are relative to the root.
+
+    Placed at the root, they equal the joint positions of the clip.
+    """
     body = body_of(takes[0].clip)
     for take in takes[:4]:
         database = build_database([take], body)

@@ -1,4 +1,4 @@
-"""Random work of several users on proposals, compared with a model of the rules of branches in memory."""
+"""Random actions of several users on proposals, compared with a model in memory of the rules of branches."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ class Program:
         self.settle(who, number, proposals.report_check, report, lambda: one.checks.__setitem__(head, state))
 
     def settle(self, who: str, number: int, act: Any, request: Any, note: Callable[[], None]) -> None:
-        """Send a review or a check; if the proposal waits to be merged, this may merge it."""
+        """Send a review or a check, which may merge a proposal that waits to be merged."""
         one, before = self.models[number], self.head(MAIN)
         prepared = self.look_up(who, proposals.prepare_waiting, number)
         code = self.attempt(who, act, number, request, prepared)
@@ -200,14 +200,14 @@ class Program:
             self.compare(number, before, ready)
 
     def is_impossible(self, prepared: Any) -> bool:
-        """Return whether the history of the two versions makes a merge impossible."""
+        """Return whether two versions cannot be merged because of their history."""
         if prepared.merge is None:
             return prepared.refusal.error_code in UNMERGEABLE
         old = prepared.merge.answer.base != prepared.merge.answer.ours
         return old and self.rule is not None and self.rule.up_to_date
 
     def compare(self, number: int, before: str, ready: bool) -> None:
-        """Check that the proposal was merged only if the model allows it, and that `main` moved only by this merge."""
+        """Check that a proposal was merged only if the model allows it, and that only this merge moved `main`."""
         one, found = self.models[number], self.lab.read(proposals.read_proposal, *self.gaits, number)
         merged = found.state == "merged"
         assert ready or not merged

@@ -138,7 +138,7 @@ def test_a_token_that_was_revoked_writes_nothing_though_its_body_is_decoded_for_
 )
 @pytest.mark.parametrize("path", ["/login", "/projects/lab/clips", "/nowhere"])
 def test_a_refused_request_leaves_nothing_for_the_garbage_collector(server: Server, path: str, body: bytes) -> None:
-    """The garbage collector stops all threads, the longer the more refused requests it must free."""
+    """The garbage collector stops all threads. The more refused requests it must free, the longer this takes."""
     client = server.client(server.make_project())
     gc.collect()
     gc.disable()

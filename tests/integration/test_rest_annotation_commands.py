@@ -59,7 +59,7 @@ def segments(client: httpx.Client, annotation: str) -> list[str]:
 
 
 def meanwhile(monkeypatch: pytest.MonkeyPatch, name: str, action: Callable[[], None]) -> None:
-    """Run `action` once, while commands are being applied by the server's function with this name."""
+    """Run `action` once, while the server's function with this name applies commands."""
     carry_out, left = commands.COMMANDS[name], [action]
 
     def interrupted(layer: layers.Layer, **arguments: Any) -> layers.Layer:

@@ -1,4 +1,4 @@
-"""Tokens of attempts, and tokens bound to a project, over HTTP: what they may read and publish, when they end."""
+"""Tokens of attempts, and tokens limited to a project, over HTTP: what they allow, and when they end."""
 
 import hashlib
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Computations on stored data in child processes: answers after a child is killed, and the end of unneeded work."""
+"""Computations in child processes: answers after a child was killed, and the end of work that nobody waits for."""
 
 import http.client
 import json
@@ -58,7 +58,7 @@ def preview(owner: httpx.Client) -> str:
 
 @pytest.fixture
 def noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file; a child process that computes a preview writes its own process id to this file, and then waits."""
+    """A file to which a child process that computes a preview writes its process id. The child then waits."""
     monkeypatch.setattr(previewing, "MAKE_PREVIEW", WAITING)
     monkeypatch.setattr(previewing, "preview_order", lambda *_: str(tmp_path / "noted").encode())
     return tmp_path / "noted"
@@ -108,6 +108,6 @@ def test_all_clients_without_a_user_together_have_the_share_of_one_user(
 
 
 def stopped(server: Server, reason: str) -> float:
-    """Return how many runs of `wait_for` in child processes were stopped for this reason, from the metrics."""
+    """Return from the metrics how many runs of `wait_for` in child processes were stopped for this reason."""
     lines = dict(line.rsplit(" ", 1) for line in httpx.get(f"{server.address}/metrics").text.splitlines())
     return float(lines.get(f'marey_children_stopped_total{{reason="{reason}",work="wait_for"}}', 0))

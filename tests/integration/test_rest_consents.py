@@ -248,7 +248,10 @@ def test_a_permission_without_a_reason_is_refused(studio: Studio, export: Export
 
 @pytest.fixture
 def check(studio: Studio) -> Callable[..., httpx.Response]:
-    """Function that sends an export check, by default for all entries of the new dataset `raw`; returns the answer."""
+    """Function that asks whether contents may be exported, and returns the answer.
+
+    By default, these are all entries of the new dataset `raw`.
+    """
     ok(studio.owner.post(f"{LAB}/datasets", json={"name": "raw", "collection": "raw"}), 201)
 
     def send(client: httpx.Client | None = None, contents: list[str] | None = None, **fields: Any) -> httpx.Response:
@@ -314,7 +317,7 @@ def test_a_check_is_bounded_and_of_a_dataset(studio: Studio, check: Export) -> N
 
 
 def test_the_day_of_a_record_has_one_form(studio: Studio) -> None:
-    """Days are compared as texts, so another form would compare wrongly."""
+    """The server compares days as texts, so a day in another form would be compared wrongly."""
     walk = studio.clip("walk", None)
     for until in ("2026-01-31T00:00:00", 1769817600, "31.1.2026", "20260131", "2026-02-30"):
         body = {"schema": "marey/clip-info@1", "consent_until": until}

@@ -49,7 +49,7 @@ def hierarchy(joint: str) -> dict[str, Any]:
 
 
 def clip(used: str, place: float) -> dict[str, Any]:
-    """Return the parts of a clip with one frame, on the skeleton with the id `used`, at x = `place` metres."""
+    """Return the parts of a clip with one frame at x = `place` metres; `used` is the id of its skeleton."""
     motion = {
         "schema": "marey/motion@1", "frame_rate_hz": 30, "joints": ["Hips"],
         "skeleton": {"item": used, "revision": 1},
@@ -296,7 +296,7 @@ def test_a_checkout_swaps_names(owner: httpx.Client, gaits: Callable[..., Any]) 
 def two_branches(
     owner: httpx.Client, gaits: Callable[..., Any]
 ) -> Callable[[Callable[[], Any], Callable[[], Any]], None]:
-    """Function that commits one change to the branch `trial` and one to `main`; in the end, `main` is checked out."""
+    """Function that commits one change to the branch `trial` and one to `main`, and leaves `main` checked out."""
 
     def diverge(on_trial: Callable[[], Any], on_main: Callable[[], Any]) -> None:
         ok(owner.post(f"{GAITS}/refs", json={"name": "trial", "kind": "branch"}), 201)
@@ -336,7 +336,7 @@ def put_mapping(owner: httpx.Client, path: str, joint: str) -> None:
 def test_an_entry_with_parts_of_both_sides_can_be_checked_out(
     owner: httpx.Client, two_branches: Callable[..., None], database: Database
 ) -> None:
-    """No item has both parts before the merge stores them together."""
+    """Each part comes from another side, so no item has both parts before the merge stores them together."""
     two_branches(lambda: put_mapping(owner, "gaits/a", "Pelvis"), lambda: put(owner, "gaits/a", "Pelvis"))
     before = ok(owner.get(f"{LAB}/skeletons"))
     request = {"version": "trial", "write_id": "12345678"}
@@ -424,7 +424,7 @@ def test_two_conflicts_at_one_path_are_decided_one_after_the_other(
 def test_an_entry_that_cannot_go_back_to_its_place_stays_in_conflict(
     owner: httpx.Client, two_branches: Callable[..., None]
 ) -> None:
-    """Both sides have moved an entry to `z`; their side has another one at the former path of its entry."""
+    """Each side has moved an entry to `z`. On their side, another entry is at the former path of the moved entry."""
 
     def shift() -> None:
         change(owner, "gaits/b", name="z")
@@ -769,7 +769,7 @@ def test_contents_of_other_projects_and_unknown_ones_are_null(owner: httpx.Clien
 def test_references_to_other_projects_tell_nothing(
     owner: httpx.Client, gaits: Callable[..., Any], server: Server, database: Database
 ) -> None:
-    """A stranger's documents refer to a revision of a private project, and to one that does not exist."""
+    """A stranger's documents refer to a revision of a private project, and to a revision that does not exist."""
     real = {"item": item_at(owner, "gaits/a")["id"], "revision": 1}
     absent = {**real, "revision": 2}
     stranger = server.client(server.make_user("stranger"))

@@ -1,4 +1,4 @@
-"""Previews of edits over HTTP: equal to the result of a job, or a precise error."""
+"""Previews of edits over HTTP: each equals the result of a job, or is a precise error."""
 
 from math import degrees
 from typing import Any

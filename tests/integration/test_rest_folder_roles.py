@@ -1,4 +1,4 @@
-"""Roles in folders over REST: every operation that a role in a folder allows or forbids, and the roles themselves."""
+"""Roles in folders over REST: operations that they allow or forbid, and requests that set them."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ ANY = {"If-Match": "*"}
 
 @dataclass
 class Studio:
-    """Project with the folders `team` and `other`, and two members, each of whom may write in `team` only.
+    """Project with the folders `team` and `other`, and two members, who may write in `team` only.
 
-    `raised` is a reader with the role maintainer in `team`, `lowered` is a maintainer with the role reader in `other`.
+    `raised` is a reader with the role maintainer in `team`; `lowered` is a maintainer with the role reader in `other`.
     """
 
     server: Server
@@ -227,7 +227,7 @@ def test_folders_show_the_role_of_the_caller(house: Studio) -> None:
 
 
 def test_an_answer_with_another_role_of_the_caller_has_another_etag(house: Studio) -> None:
-    """The role in the project or in a folder changes without the `rev` of the project or the folder."""
+    """A role in the project or in a folder changes, but the `rev` of the project or folder stays the same."""
     raised, folder = house.members["raised"], f"{FOLDERS}/{house.folders['team']}"
 
     def read(path: str, known: httpx.Response | None = None) -> httpx.Response:

@@ -1,4 +1,4 @@
-"""A server whose disk is full: it reads and deletes, stores nothing, and reports the full disk to its operator."""
+"""A server whose disk is full: it still reads and deletes, stores nothing, and reports the full disk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Invitations over HTTP: codes that nobody sees twice, limits on guesses, and accounts that people create."""
+"""Invitations over HTTP: codes are shown only once, guesses are limited, and people create accounts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lanes of requests: requests on which servers and workers depend never wait behind long requests of others."""
+"""Lanes, groups of threads with a queue: urgent requests, such as heartbeats, never wait behind long ones."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def refused(response: httpx.Response, status: int, code: str) -> Any:
 
 @dataclass(frozen=True)
 class Team:
-    """Clients of the members, one or more for each role, and of a stranger (`eve`); also items for commits."""
+    """Clients of members with every role and of a stranger (`eve`), and items for commits."""
 
     olga: httpx.Client
     mia: httpx.Client
@@ -291,7 +291,7 @@ def test_a_proposal_is_merged_when_the_last_thing_arrives(team: Team, server: Se
 
 
 def test_a_waiting_proposal_is_merged_when_its_rule_changes(team: Team, server: Server) -> None:
-    """Housekeeping, not a request about the proposal, then makes the merge, for the user who requested the merge."""
+    """The server's periodic housekeeping then makes the merge, in the name of the user who requested it."""
     team.protect(approvals=2)
     team.propose()
     approve(team.ben, 1)
@@ -358,7 +358,10 @@ def test_more_proposals_wait_than_one_attempt_examines(
 
 
 def wait_on_branches(team: Team, *branches: str) -> None:
-    """Propose new branches and request merges that wait for an approval; then require approvals no longer."""
+    """Propose new branches, and request merges that wait for an approval.
+
+    Then change the rule so that it requires no approval.
+    """
     team.protect(approvals=1)
     for branch in branches:
         ok(team.ada.post(f"{GAITS}/refs", json={"name": branch, "kind": "branch"}), 201)
@@ -389,7 +392,7 @@ def test_a_proposal_that_cannot_be_computed_does_not_delay_the_others(
 def test_a_merge_that_was_refused_is_computed_again_after_a_pause(
     team: Team, server: Server, monkeypatch: pytest.MonkeyPatch, code: str, computed: int
 ) -> None:
-    """After a purge, there is no pause."""
+    """After a purge, the merge is computed again without the pause."""
     wait_on_branches(team, "one")
     prepare, prepared = proposals.prepare_waiting, list[Any]()
 
@@ -415,7 +418,7 @@ def test_a_merge_that_was_refused_is_computed_again_after_a_pause(
 def test_a_right_that_is_lost_for_a_moment_is_no_lasting_obstacle(
     team: Team, server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The user who requested the merge has no right to write just when the merge would be recorded."""
+    """At the moment when the merge would be recorded, the user who requested it has no right to write."""
     wait_on_branches(team, "one")
     prepare = proposals.prepare_waiting
 
@@ -435,7 +438,7 @@ def test_a_right_that_is_lost_for_a_moment_is_no_lasting_obstacle(
 def test_a_refused_merge_does_not_refuse_the_review_or_check(
     team: Team, server: Server, monkeypatch: pytest.MonkeyPatch, last: str
 ) -> None:
-    """Another user requested the merge, and it exceeds the quota of that user; nothing of the merge is stored."""
+    """The merge exceeds the quota of another user, who requested it. Nothing of the merge is stored."""
     team.protect(**({"approvals": 1} if last == "review" else {"checks": ["evaluation"]}))
     team.propose()
     ok(team.ada.post(f"{PROPOSALS}/1/merge", json={"when_green": True}))
@@ -468,7 +471,7 @@ def test_a_merge_that_waits_is_prepared_again_if_a_branch_moves(
     prepare, earlier = proposals.prepare_waiting, list[Any]()
 
     def prepare_late(*arguments: Any) -> Any:
-        """Return the result of the first call at the second call, too, as if the branch moved after the preparation."""
+        """Return at the second call the result of the first, as if the branch moved after the preparation."""
         earlier.append(prepare(*arguments))
         return earlier[0 if len(earlier) == 2 else -1]
 

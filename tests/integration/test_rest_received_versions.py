@@ -51,7 +51,7 @@ def skeleton(joint: str, path: str | None = "rig") -> dict[str, Any]:
 
 
 def clip(joint: str, used: str) -> dict[str, Any]:
-    """Return a clip with one frame, as it is received, on the skeleton with the content digest `used`."""
+    """Return a clip with one frame, as another server sends it; `used` is the content digest of its skeleton."""
     motion: dict[str, Any] = {
         "schema": "marey/motion@1", "frame_rate_hz": 30, "joints": [joint], "skeleton": {"content": used},
         "poses": {"dtype": "<f4", "shape": [1, 7], "data": POSES.tolist()},
@@ -122,7 +122,7 @@ def test_commits_from_elsewhere_keep_digest_author_and_time(client: httpx.Client
 def test_a_commit_is_not_recorded_in_another_dataset_of_the_same_name(
     client: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The dataset is replaced after the preparation has found the commit there, and before the commit is recorded."""
+    """After the preparation of the commit, and before its recording, another dataset takes the place and the name."""
     one = skeleton("Hips")
     send(client, one)
     body, digest = commit({"rig": one})
@@ -146,7 +146,7 @@ def test_a_commit_is_not_recorded_in_another_dataset_of_the_same_name(
 def test_a_received_commit_locks_its_branch_before_it_stores_chunks(
     client: httpx.Client, open_database: Callable[[], Database], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Other commits do the same, so that the two never wait for each other."""
+    """Other commits lock in the same order, so that two commits never wait for each other."""
     one, other = skeleton("Hips"), open_database()
     send(client, one)
     free: list[list[str]] = []

@@ -68,7 +68,10 @@ def commit(client: httpx.Client, branch: str, path: str) -> None:
 
 @pytest.fixture
 def head(owner: httpx.Client) -> str:
-    """Newest commit of `main` in the dataset `gaits`; this branch and `trial` have one commit since a common one."""
+    """Newest commit of `main` in the dataset `gaits`.
+
+    `main` and `trial` each have one commit after their common commit.
+    """
     assert owner.post(f"{LAB}/datasets", json={"name": "gaits"}).status_code == 201
     commit(owner, "main", "a")
     assert owner.post(f"{GAITS}/refs", json={"name": "trial", "kind": "branch"}).status_code == 201

@@ -1,4 +1,4 @@
-"""Samples of models over HTTP, and the entity tags that show a client whether its samples are current."""
+"""Samples of models over HTTP, and the entity tags by which a client recognises outdated samples."""
 
 import hashlib
 from typing import Any

@@ -1,4 +1,4 @@
-"""Searches of models over HTTP: which tree is used, and the refusal of searches that are too large."""
+"""Searches of models over HTTP: the tree that a search uses, and the refusal of searches that are too large."""
 
 from __future__ import annotations
 

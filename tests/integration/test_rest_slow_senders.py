@@ -1,4 +1,4 @@
-"""Clients that send streamed bodies slowly: memory counts for them, and only those who send nothing are cut off."""
+"""Clients that send streamed bodies slowly: they count towards the memory limit, and silent ones are cut off."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class World:
 
 
 class ItemsMachine(RuleBasedStateMachine):
-    """State machine that makes the same change in the store and in the model, and expects the same result."""
+    """State machine that makes each change in the store and in the model, and compares the results."""
 
     ids = Bundle("ids")
     database = None
@@ -74,9 +74,9 @@ class ItemsMachine(RuleBasedStateMachine):
         return self.lab.write(function, self.lab.name, Kind.STUDY, item_id, *args, **kwargs)
 
     def attempt(self, item_id: str, expected: str, change: Callable[..., Any], *, blocked: bool = False) -> bool:
-        """Run `change(expected_rev)`, and return whether it succeeds; the test fails if the model says otherwise.
+        """Run `change(expected_rev)`, and return whether it succeeds; fail if the model expects another outcome.
 
-        `expected` selects the `rev` of the item that the change expects: "any", "right" or "wrong". `blocked` is
+        `expected` selects the `rev` of the item that the change expects: "any", "right" or "wrong". `blocked` states
         whether the change conflicts with another item.
         """
         model = self.world.items[item_id]

@@ -338,7 +338,7 @@ def test_deliveries_continue_after_the_server_could_not_renew_its_lead(
 def test_a_delivery_that_is_interrupted_during_a_search_for_work_is_sent(
     owner: httpx.Client, open_receiver: Open, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The search has read the database before the interruption, so the work that it finds lacks the webhook."""
+    """The search has read the database before the interruption, so it does not find the interrupted delivery."""
     monkeypatch.setattr(delivering, "RENEW_EVERY_S", 0.2)
     receiver = open_receiver()
     make_webhook(owner, receiver.url)

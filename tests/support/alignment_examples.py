@@ -45,15 +45,15 @@ def moved(clip: Clip, heading_rad: float, x: float, z: float) -> Clip:
 
 
 def sine_warp(source_frames: int, frames: int, depth: float = 0.06) -> Floats:
-    """Return a warp (frames,): source frames that rise unevenly from the first to the last."""
+    """Return a warp (frames,): source frames that increase at a varying rate, from the first frame to the last."""
     share = np.linspace(0.0, 1.0, frames)
     return (share + depth * np.sin(2.0 * np.pi * share)) * (source_frames - 1)
 
 
 def warped_walks(count: int = 6, seed: int = 3, frames: int = 60) -> tuple[list[SourceExample], dict[str, Floats]]:
-    """Return examples of one walk with different timing, and the warp of each by uid.
+    """Return examples of one walk with different timing, and the warp of each example by uid.
 
-    A warp is the frame of the walk at each frame of the example.
+    A warp states the frame of the walk for each frame of the example.
     """
     random = np.random.default_rng(seed)
     base = walk(frames)

@@ -27,8 +27,8 @@ def positions_by_another_loader(path: Path) -> NDArray[np.float64]:
 def files_to_compare(names: list[str]) -> list[str]:
     """Return those files of the collection that tests read with this loader, which is slow.
 
-    Files of the folders `bandai-namco-*` differ in the motion alone, so every sixth of them is enough outside of the
-    tier `soak`.
+    The files of each folder `bandai-namco-*` have the same skeleton, so every sixth file is enough, except in the tier
+    `soak`.
     """
     alike = [name for name in names if "bandai-namco-" in name]
     left_out = set() if is_soak() else set(alike) - set(alike[::6])

@@ -1,6 +1,6 @@
 """Comparison of the branch coverage of each package with a minimum, from the data of the last run with `--cov`.
 
-`python -m tests.support.branch_coverage` exits with 1 if a package is below its floor. Branches in compiled functions
+`python -m tests.support.branch_coverage` exits with 1 if a package is below its minimum. Branches in compiled functions
 and in processes that tests start are not measured.
 """
 
@@ -31,7 +31,7 @@ not measured.
 
 
 def branch_coverage() -> dict[str, float]:
-    """Return the percentage of branches that were taken, by package; 0 for a package that no test has imported."""
+    """Return the percentage of taken branches by package; 0 for a package that no test has imported."""
     measured = coverage.Coverage()
     measured.load()
     with tempfile.TemporaryDirectory() as folder:
@@ -48,7 +48,7 @@ def branch_coverage() -> dict[str, float]:
 
 
 def main() -> int:
-    """Print a line for each package; return 1 if the coverage of a package is below its floor."""
+    """Print a line for each package; return 1 if the coverage of a package is below its minimum."""
     found = branch_coverage()
     for package, percent in found.items():
         floor = FLOORS[package]

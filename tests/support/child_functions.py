@@ -58,14 +58,14 @@ def wait_for(payload: bytes) -> bytes:
 
 
 def wait_in_import(order: bytes) -> bytes:
-    """Do as `wait_for` does for an import, with the content of the imported file as the path."""
+    """Read an imported file that contains a path, and do what `wait_for` does with this path."""
     from marey_server.motions.reading import FileOrder  # which loads far more than the other functions need
 
     return wait_for(FileOrder.unpack(order).content)
 
 
 def stop(payload: bytes) -> bytes:
-    """Write the process id to the file named by `payload`, and suspend the process, which neither answers nor ends."""
+    """Write the process id to the file named by `payload`; then suspend the process, so that it never answers."""
     Path(payload.decode()).write_text(str(os.getpid()))
     os.kill(os.getpid(), signal.SIGSTOP)
     return b""

@@ -24,7 +24,7 @@ WIDTH = "80"
 
 @dataclass(frozen=True)
 class CommandLine:
-    """The command `marey`, run in `folder`; environment variables name the address of `server`."""
+    """The command `marey`, run in `folder`; an environment variable contains the address of `server`."""
 
     server: ServerProcess
     folder: Path
@@ -87,5 +87,5 @@ def _logging_restored() -> Iterator[None]:
 
 
 def _hear_interrupts() -> None:
-    """Let Ctrl-C end this process, also if the parent process ignored Ctrl-C, which child processes inherit."""
+    """Let Ctrl-C end this process. If the parent process ignores Ctrl-C, this process has inherited that."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -1,4 +1,4 @@
-"""Errors of constraints and derivatives of these errors, as the least-squares solver computes them, for checks."""
+"""Errors of constraints and their derivatives, computed as in the least-squares solver, for tests."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def constraint_jacobian(
 ) -> tuple[Floats, Floats, tuple[int, ...]]:
     """Return scaled errors (3·C,) of the first frame, their derivatives (3·C, 3·V + 3), and the V joints that vary.
 
-    Columns belong to displacements d of local rotations, q·exp(d), joint by joint in the order returned, and then to
-    the translation of the root. The columns of the translation are zero if `freedom` does not let the root move.
+    The first 3·V columns belong to displacements d of local rotations, q·exp(d), in the order of the returned joints.
+    The last three columns belong to the translation of the root. They are zero if `freedom` does not let the root move.
     """
     problem = pose_problem(skeleton, motion, targets, freedom)
     room = problem.stepping(0.0)

@@ -55,7 +55,7 @@ def drawn_both() -> Mapping[str, DrawnFigure]:
 def tiny(
     clips: tuple[DatabaseClip, ...], options: EvaluationOptions = SMALL, seed: int = 0, covered: bool = True
 ) -> EvaluationResult:
-    """Return an evaluation of these clips; only if `covered`, its coverage contains windows of the clips."""
+    """Return an evaluation of these clips. Its coverage contains windows of the clips if `covered`, else none."""
     random = np.random.default_rng(seed)
     trials = suite_trials(options)
     records = tuple(wandering(trial, clips, 0.1, random) for trial in trials)
@@ -84,7 +84,7 @@ def _of(**options: Any) -> Callable[[], EvaluationResult]:
 
 
 def _unmeasured(every: int) -> EvaluationResult:
-    """Return the usual evaluation, in which one in `every` trials has no measured values."""
+    """Return the usual evaluation, but without measured values in every n-th trial (n = `every`)."""
     trials = tuple(
         each if index % every else replace(each, metrics=dict.fromkeys(each.metrics))
         for index, each in enumerate(usual().trials)
@@ -137,7 +137,7 @@ def little(name: str) -> EvaluationResult:
 
 @functools.cache
 def drawn_of_little(name: str) -> Mapping[str, DrawnFigure]:
-    """Return those figures of the evaluation `little(name)` that differ from the usual ones; in soak, all figures."""
+    """Return the figures of `little(name)` that differ from the usual ones; in the tier `soak`, all its figures."""
     if name not in SHOWS or is_soak():
         return draw_figures(little(name))
     return {figure: draw_figure(figure, little(name)) for figure in SHOWS[name]}

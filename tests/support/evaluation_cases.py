@@ -20,7 +20,7 @@ RATE_HZ = 60.0
 
 
 def closed_reference(trial: Trial) -> Reference:
-    """Return the trial's reference path with one more tick at the end, so that the circle lasts its full duration."""
+    """Return the trial's reference path with one more tick at the end, so that the circle is complete."""
     asked = reference(trial, RATE_HZ)
     return replace(asked, tick_count=asked.tick_count + 1)
 
@@ -53,7 +53,7 @@ def straight_record(asked: Reference, speeds_m_s: NDArray[np.float64]) -> TrialR
 
 
 def walked_record(rows: Sequence[int], status: Sequence[Status] | None = None) -> TrialRecord:
-    """Return a record in which only the displayed rows matter; by default, searches have chosen all jumps."""
+    """Return a record whose only content is the displayed rows; by default, searches have chosen all jumps."""
     shown = np.array(rows, dtype=np.int32)
     jumped = np.concatenate(([False], np.diff(shown) != 1))
     chosen = np.where(jumped, Status.REPLACING, Status.KEPT) if status is None else np.array(status)
@@ -88,7 +88,10 @@ def arc(speed_m_s: float, turn_rate_deg_s: float, duration_s: float) -> tuple[ND
 
 
 def trajectory_database(*roots: tuple[NDArray[np.float64], NDArray[np.float64]]) -> MatchingDatabase:
-    """Return a database whose rows differ only in root paths; trajectories ahead stop at the clip's last frame."""
+    """Return a database whose rows differ only in root paths.
+
+    The future trajectory of a row stops at the clip's last frame.
+    """
     database = root_database(*roots)
     ahead = np.round(np.array(database.options.horizons_s) * RATE_HZ).astype(np.int64)
     features = [np.concatenate([_futures(*root, ahead) for root in roots])]
@@ -107,7 +110,7 @@ def trajectory_database(*roots: tuple[NDArray[np.float64], NDArray[np.float64]])
 def _futures(
     positions: NDArray[np.float64], headings: NDArray[np.float64], ahead: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return (F, 12): positions at three future times, then directions, both relative to the root of each row."""
+    """Return (F, 12): positions at three future times, then directions. All are relative to the root of the row."""
     frames = len(headings)
     later = np.minimum(np.arange(frames)[:, None] + ahead, frames - 1)
     step = positions[later] - positions[:, None]

@@ -1,4 +1,4 @@
-"""Synthetic evaluations for tests: made without searches and without motion, but measured like real evaluations."""
+"""Synthetic evaluations for tests: records that are computed without motion and searches, measured like real ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -116,7 +116,7 @@ def wandering(trial: Trial, clips: tuple[Any, ...], sway_m: float, random: Gener
 
 
 def _stretches(ticks: int, clips: tuple[Any, ...], random: Generator) -> tuple[Ints32, Ints]:
-    """Return the row of each tick, and the ticks at which the character starts to play another range of a clip."""
+    """Return the displayed row of each tick, and the ticks at which another range of a clip begins."""
     favour = 1.0 / np.arange(1, len(clips) + 1)
     rows, tick = np.empty(ticks, dtype=np.int32), 0
     entered: list[int] = []
@@ -131,7 +131,10 @@ def _stretches(ticks: int, clips: tuple[Any, ...], random: Generator) -> tuple[I
 
 
 def some_coverage(options: EvaluationOptions, clips: tuple[Any, ...], how: Making, random: Generator) -> Coverage:
-    """Return the coverage by clips that each have about one speed and turn rate; about a tenth goes backwards."""
+    """Return the coverage by clips, each with about one speed and turn rate.
+
+    About a tenth of the clips goes backwards.
+    """
     counts = [max(0, clip.frame_count - round(RATE_HZ)) for clip in clips]
     owner = np.repeat(np.arange(len(clips)), counts).astype(np.int32)
     speed = random.uniform(0.6, 3.0, len(clips))[owner] + 0.15 * random.normal(size=len(owner))

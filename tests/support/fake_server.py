@@ -51,8 +51,8 @@ class FakeServer:
 
     Tests add names of jobs to sets that change the answers. A job in `lost` has lost its lease. Requests about a job in
     `silent` are answered as if the server were unavailable, and counted in `refused`. Results of a job in `slow` are
-    answered only after the job is removed from `slow`. Results of a job in `unwelcome` are refused. The completion of a
-    job in `refusals` gets this status and code.
+    answered only after the job is removed from `slow`. Results of a job in `unwelcome` are refused. `refusals`
+    contains, by job, the status and code of the answer to its completion.
 
     `order` lists claims and ends of jobs. `claimants` contains, for each claim, the tokens with which it was sent. If
     `valid_tokens` is set, claims with other tokens are refused.
@@ -126,12 +126,15 @@ class FakeServer:
         return []
 
     def read(self, places: list[dict[str, Any]]) -> bytes:
-        """Return documents as the server sends them: at most three at once, so that workers have to ask again."""
+        """Return documents as the server sends them.
+
+        It sends at most three at once, so workers need several requests.
+        """
         keys = [(place["item"], place["revision"], place["part"]) for place in places[:3]]
         return encode_tree({"documents": [self.documents.get(key) for key in keys]}, MSGPACK, arrays="blocks")
 
     def until(self, condition: Callable[[], object]) -> None:
-        """Wait until a condition is true, with much patience, because the machine may be busy."""
+        """Wait until a condition is true; the time limit is long, because the machine may be busy."""
         deadline = time.monotonic() + 120
         while not condition():
             assert time.monotonic() < deadline, f"waited in vain; failed: {self.failed}, completed: {self.completed}"

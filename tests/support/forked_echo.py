@@ -18,7 +18,8 @@ LOADED = os.getpid()
 def answer(pipe: Connection) -> None:
     """Answer each message with four ids, until the pipe closes; the messages `fail` and `exit N` end the process.
 
-    The ids are those of the process that loaded this module, the parent, this process, and its session.
+    The ids are those of the process that loaded this module, the parent process, this process, and this process's
+    session.
     """
     while True:
         try:

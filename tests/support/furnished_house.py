@@ -142,7 +142,7 @@ _QUERIES = {
 
 @dataclass(frozen=True)
 class Planned:
-    """Request of a route that is valid in every respect; only the caller may lack the right to send it."""
+    """Valid request of a route: if it is refused, the reason is that the caller lacks the right to send it."""
 
     method: str
     path: str
@@ -216,7 +216,7 @@ def build_house(people: People) -> House:
 
 
 def start_attempt(people: People, tokens: Mapping[str, str | None], clip: str) -> dict[str, Any]:
-    """Submit a job as the contributor that exports a clip of `lab`; claim an export job, and return its lease."""
+    """As the contributor, submit a job that exports a clip of `lab`; claim an export job, and return its lease."""
     body = {"kind": "export", "inputs": {"clips": [{"item": clip}]}, "cache": "refresh", "priority": 5}
     job = people.client(tokens["contributor"]).post("/projects/lab/jobs", json=body)
     assert job.status_code == 202, job.text

@@ -63,7 +63,7 @@ class FuzzedServer:
         return answer.status_code, answer.elapsed - _requested_wait_s(case)
 
     def _headers(self, name: str, case: AnyCase) -> dict[str, str]:
-        """Return the headers with the caller's credential; a request that signs out gets a new token."""
+        """Return headers with the caller's credential; for a request that signs out, the credential is a new token."""
         token = self.house.tokens[name]
         if case.operation.label.endswith("/logout"):
             wanted = {"name": "fuzz", "scopes": ["read"]}
@@ -72,7 +72,7 @@ class FuzzedServer:
         return {"Authorization": f"Bearer {token}"} if token else {}
 
     def requests(self, operation: AnyOperation, mode: GenerationMode) -> Iterator[Any]:
-        """Yield two strategies: one generates requests for contents of the project, one for random ids."""
+        """Yield two strategies: the first generates requests for existing contents, the second for random ids."""
         names = {parameter.name for parameter in operation.path_parameters}
         nothing: dict[str, str] = {}
         for known in (self.house.variables, nothing):
@@ -109,7 +109,10 @@ def operations() -> list[AnyOperation]:
 
 
 def probes() -> Iterator[tuple[AnyOperation, GenerationMode, str]]:
-    """Yield each operation for valid requests, and again for invalid ones if it has a query or a body; with a name."""
+    """Yield (operation, mode, name) for valid requests to each operation.
+
+    If the operation has a query or a body, also yield it for invalid requests.
+    """
     for operation in operations():
         yield operation, GenerationMode.POSITIVE, f"{operation.label} fitting"
         if operation.query or operation.body:

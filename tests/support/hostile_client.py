@@ -1,6 +1,7 @@
-"""A malicious client: to every route, as every kind of caller, it sends requests that cost much or confuse the server.
+"""A malicious client: it sends requests that cost much or confuse the server to every route, as every kind of caller.
 
-The routes come from the server's table of routes. A shot is a request as bytes, with the manner of sending these bytes.
+The routes come from the server's table of routes. A *shot* is a malicious request as bytes, with the manner of sending
+it.
 """
 
 from __future__ import annotations
@@ -145,7 +146,7 @@ _BIG = b'{"name":"' + b"x" * 3_000_000 + b'"}'
 
 
 def _shapes(route: Route, plan: Planned) -> Iterator[tuple[str, Shape]]:
-    """Yield the attacks on a route, with their names."""
+    """Yield (name, shape) for each attack on a route."""
     right = Shape(plan.content)
     yield "the right request, twice", replace(right, manner=Manner.TWICE)
     yield "the right request, half closed", replace(right, manner=Manner.HALF_CLOSED)
@@ -193,7 +194,10 @@ def _bytes_of(plan: Planned, shape: Shape, token: str | None) -> bytes:
 def shots(
     house: House, people: Iterable[str] = tuple(PEOPLE), *, routes: Callable[[Route], bool] = lambda _route: True
 ) -> list[Shot]:
-    """Return every attack on every route by each of the callers; attacks that may end a credential are last."""
+    """Return every attack on every route by each of the callers.
+
+    Attacks that may make a credential invalid are last.
+    """
     found = []
     for route in sorted(filter(routes, ROUTES), key=lambda route: route.template.endswith(ENDS_CREDENTIALS)):
         plan = house.plan(route)
@@ -207,7 +211,10 @@ def shots(
 
 
 def some(every: list[Shot], count: int, seed: int) -> list[Shot]:
-    """Return about `count` attacks in the given order; at most one, by a random caller, for each route and attack."""
+    """Return about `count` of the attacks, in their order.
+
+    For each route and attack, at most one caller is drawn at random.
+    """
     chance = random.Random(seed)
     by_attack: dict[tuple[str, str], list[int]] = {}
     for number, shot in enumerate(every):

@@ -24,7 +24,7 @@ HEAD_START_S = 0.1
 
 @dataclass(frozen=True)
 class Step:
-    """A transaction of one side: its function, its connection and its principal."""
+    """One of the two transactions: its function, its database connection and its principal."""
 
     database: Database
     principal: Principal
@@ -36,7 +36,7 @@ class Abandoned(Exception):
 
 
 def interleave(first: Step, second: Step, *, commit: bool = True) -> tuple[Any, Any]:
-    """Interleave two transactions; return the result or error of each. Without `commit`, the first rolls back."""
+    """Interleave two transactions; return the result or error of each. Without `commit`, the first is rolled back."""
     wrote, may_end = threading.Event(), threading.Event()
 
     def held_open(tx: Transaction) -> Any:

@@ -1,7 +1,7 @@
 """Fuzzing of readers: randomly broken motion files must give a motion or an error of the reader, in bounded time.
 
-As a program, `python -m tests.support.motion_fuzz SECONDS [SEED]` runs for this many seconds of processor time. A file
-for which a reader does anything else is kept in the current folder.
+As a program, `python -m tests.support.motion_fuzz SECONDS [SEED]` runs for this many seconds of processor time. If a
+reader does anything else, the file is kept in the current folder.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def _stop(number: int, frame: FrameType | None) -> None:
 def main(seconds: float, seed: int) -> None:
     """Break files for the given processor time, and print the number of each outcome.
 
-    Processor time is measured because wall time says nothing about the reader on a busy machine.
+    Processor time is measured, because on a busy machine, the elapsed time says nothing about the reader.
     """
     source, files, outcomes = random.Random(seed), seeds(), Counter[str]()
     signal.signal(signal.SIGPROF, _stop)

@@ -91,7 +91,7 @@ def flat(seed: int = 1, joints: tuple[str, ...] = ANIMATED) -> dict[str, Any]:
 
 
 def layout_2(seed: int = 1, *, by_columns: bool = True) -> dict[str, Any]:
-    """Return a document of layout 2. With `by_columns`, components of time are columns, as from the first trainer."""
+    """Return a document of layout 2. With `by_columns`, components of time are columns, as in the oldest files."""
     mean, vectors = time(np.random.default_rng(seed + 100))
     if by_columns:
         mean = (0.02 * np.random.default_rng(seed).normal(size=TIME_COEFFICIENTS)).tolist()

@@ -167,7 +167,7 @@ class Desk:
         return list(self.database.read(self.user, reading.list_outputs, job_id).items)
 
     def things(self, count: int, collection: str = "raw") -> list[str]:
-        """Create `count` items that can be inputs of jobs, and return their ids."""
+        """Create `count` items for use as inputs of jobs; return their ids."""
         drafts = [
             Draft(f"thing{n}", Kind.STUDY, f"thing{n}", {"study": document(number=n)}, collection) for n in range(count)
         ]
@@ -196,7 +196,7 @@ class Desk:
         return lease
 
     def attempt(self, lease: Lease) -> Principal:
-        """Return the principal to which the token of an attempt belongs now."""
+        """Return the principal that the server finds now for the token of an attempt."""
         return self.database.read(SYSTEM, tokens.resolve_token, lease.attempt_token)
 
     def heartbeat(self, lease: Lease, progress: Progress | None = None) -> HeartbeatAnswer:
@@ -206,7 +206,7 @@ class Desk:
         )
 
     def stage(self, lease: Lease, *names: str, **fields: Any) -> int:
-        """Stage a small document under each name; return the number of outputs that the attempt has staged."""
+        """Upload a small document under each name; return how many outputs the attempt has uploaded so far."""
         return self.stage_outputs(lease, *(output(name, **fields) for name in names))
 
     def stage_outputs(self, lease: Lease, *staged: StagedOutput, facets: Sequence[ItemFacets] = ()) -> int:
@@ -227,7 +227,7 @@ class Desk:
         )
 
     def reap(self) -> int:
-        """Reclaim the jobs whose leases have expired; return their number."""
+        """Return jobs with expired leases to the queue or end them; return the number of these jobs."""
         return self.database.write(SYSTEM, reap_page, self.policy).taken
 
     def write_id(self) -> str:
@@ -259,7 +259,7 @@ def document(**facts: Any) -> dict[str, Any]:
 def output(
     name: str, *, collection: str = "", facts: Mapping[str, Any] = MappingProxyType({}), **fields: Any
 ) -> StagedOutput:
-    """Return a small document as a staged output."""
+    """Return a small document as an output that can be staged."""
     parts = {"study": document(name=name, **facts)}
     return StagedOutput(name=name, kind=Kind.STUDY, item_name=name, collection=collection, parts=parts, **fields)
 

@@ -1,4 +1,4 @@
-"""Model of the queue in memory, with which property tests compare the real queue."""
+"""Model in memory of the queue of jobs; property tests compare the real queue with this model."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class ModelQueue:
             job.state = "waiting"
 
     def claim(self, now_us: int, most: int) -> list[str]:
-        """Return the ids of the jobs that a claim gets, in order."""
+        """Return the ids of the jobs that a claim gets, in the order in which it gets them."""
         taken: list[str] = []
         busy = {job.key for job in self.jobs.values() if job.state == "running" and job.key is not None}
         queued = [job for job in self.jobs.values() if job.state == "queued" and job.run_at_us <= now_us]
@@ -142,7 +142,7 @@ class ModelQueue:
         return "queued"
 
     def reap(self, now_us: int) -> None:
-        """Reclaim the jobs whose leases have expired."""
+        """Return jobs with expired leases to the queue, or end them."""
         for job in list(self.jobs.values()):
             if job.state != "running" or job.lease_expires_us > now_us:
                 continue

@@ -18,7 +18,7 @@ RATE_HZ = 30.0
 
 
 def functions(basis: SplineBasis, examples: Floats, count: int) -> tuple[FunctionalComponents, Floats]:
-    """Return principal functions of examples (m, N, D), scaled to scores of unit variance, and the scores."""
+    """Return the principal functions of examples (m, N, D), scaled to scores of unit variance, and these scores."""
     coefficients = basis.fit(examples)
     mean = coefficients.mean(axis=0)
     flat = (coefficients - mean).reshape(len(examples), -1)

@@ -163,8 +163,8 @@ _RESERVED: list[socket.socket] = []
 def reserved_port() -> int:
     """Return a port for a server that is restarted on the same port; no other test gets it while this process runs.
 
-    The port is in a range from which the system chooses no port for sockets that ask for any free port. A datagram
-    socket that is bound to the port reserves it among the processes that run tests, and does not disturb the server.
+    The system never gives ports of this range to sockets that ask for any free port. A datagram socket that is bound to
+    the port reserves the port among test processes, and does not disturb the server.
     """
     for port in random.SystemRandom().sample(PORTS, 100):
         reserving, probe = socket.socket(type=socket.SOCK_DGRAM), socket.socket()

@@ -1,4 +1,4 @@
-"""Databases without some clips or rows, to check results that predict the effect of removing clips or rows."""
+"""Databases without some clips or rows, to check predictions of what the removal of clips or rows does."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def requiring(required: RequiredRole, function: Callable[..., Any]) -> Any:
 
 
 def declared(method: str, path: str) -> RequiredRole:
-    """Return the role that the operation with this method and path declares."""
+    """Return the role that the REST operation with this method and path requires."""
     (found,) = (resource for resource in RESOURCES if resource.path == path)
     return found.operations[method].required_role
 

@@ -49,9 +49,10 @@ def purge(database: Database, who: Principal) -> None:
 
 
 class StoreWriter:
-    """Does work in processes, each of which may have a fault; blobs are in `folder`, or in the database if it is empty.
+    """Does work in processes, each of which may have a fault.
 
-    The processes are forked from one that has loaded the server, because loading it takes longer than most of the work.
+    Blobs are in `folder`, or in the database if `folder` is empty. The processes are forked from one that has loaded
+    the server, because loading it takes longer than most of the work.
     """
 
     def __init__(self, url: str, user_id: str, user_name: str, folder: str = "") -> None:

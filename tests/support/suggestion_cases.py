@@ -25,7 +25,7 @@ def named(tracks: list[Track], prefix: str = "clip") -> list[Track]:
 
 
 def wandering_tracks(count: int = 8, seed: int = 3) -> list[Track]:
-    """Return useful tracks, and two that are faster than every trial."""
+    """Return tracks (paths of a root) that trials need, and two tracks that are faster than every trial."""
     fast = [arc_track(9.0 + number, 0.0, 4.0, uid=uid) for number, uid in enumerate(UNWANTED)]
     return [*named(random_tracks(count, seed)), *fast]
 
@@ -71,7 +71,10 @@ def same_to_the_bit(
 
 
 def places(database: MatchingDatabase, rows: Ints32) -> list[tuple[str, int]]:
-    """Return the uid of the clip and the frame of each row; parts of a clip count as the clip, with its frames."""
+    """Return the uid of the clip and the frame of each row.
+
+    For a part of a clip, these are uid and frame of the whole clip.
+    """
     found = []
     for index, row in zip(database.clip_of_row[rows].tolist(), rows.tolist(), strict=True):
         clip = database.clips[index]

@@ -1,4 +1,4 @@
-"""Matching databases of exact root paths and poses of a few sines, for which exact results are known."""
+"""Motion matching databases with known exact results: root paths are exact, and poses are sums of a few sines."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -59,7 +59,7 @@ def arc_track(speed_m_s: float, turn_rate_deg_s: float, seconds: float, phase: f
 
 
 def path_track(trial: Trial, **options: Any) -> Track:
-    """Return a root on the path of a trial and its continuation by one second, to which the last rows look ahead."""
+    """Return a root on the path of a trial, continued by one second, because the last rows look ahead."""
     path = reference(trial)
     return Track(path.positions, path.headings, gait_pose(len(path.headings), trial.speed_m_s), **options)
 
@@ -140,7 +140,7 @@ def index_of(database: MatchingDatabase) -> SearchIndex:
 
 
 def fitted(features: NDArray[np.float64]) -> Normaliser:
-    """Return a normaliser with the means and one scale per group, computed by their definitions, without weights."""
+    """Return a normaliser without weights: means, and one scale per group, computed from their definitions."""
     spread = features.std(axis=0)
     groups = ((0, 15), (15, 21), (21, 27))
     scale = np.concatenate([np.full(stop - start, max(spread[start:stop].mean(), 1e-3)) for start, stop in groups])
@@ -169,7 +169,7 @@ def _features(track: Track, wraps: bool) -> NDArray[np.float64]:
 
 
 def _unwound(track: Track) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return headings and positions of a loop that is played on past its end, as far as features look ahead.
+    """Return headings and positions of a loop that continues past its end, as far as features look ahead.
 
     The step from the last frame to the first frame is the mean of the last step and the first step.
     """

@@ -1,4 +1,4 @@
-"""Tiers of tests: which tests `--tier` runs, how many examples property tests draw, and which tests share a process.
+"""Tiers of tests: the tests that `--tier` runs, the number of examples of property tests, and groups of tests.
 
 Run the tier `check` while you work, `test` before you merge a change, and `soak` before you call an issue resolved. At
 the end of a run, the tests that the tier left out are counted by reason.
@@ -81,10 +81,10 @@ def _soak_only(item: pytest.Item) -> bool:
 
 
 def _on_other_database(item: pytest.Item) -> bool:
-    """Return whether the tier `test` leaves out a fault case or a workflow because it runs on the other database.
+    """Return whether the tier `test` runs this test only on the other database.
 
-    A hash of the name of the fault case, or of the workflow's module, chooses the database; so about half of these
-    tests run on each database.
+    This concerns fault cases and workflows. A hash of the name of the fault case, or of the workflow's module, chooses
+    the database, so about half of these tests run on each.
     """
     backend = backend_of(item)
     if backend is None or item.get_closest_marker("every_database") or not (_fault(item) or _whole_way(item)):
@@ -196,7 +196,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Stop if pytest-xdist has not read the groups, because each process would then create all shared data."""
+    """Stop if pytest-xdist has not read the groups: each process would then create all shared data."""
     if session.config.getoption("loadgroup", False) and not all("@" in item.nodeid for item in session.items):
         raise pytest.UsageError("pytest-xdist has not seen the groups of tests, see tests/support/tiers.py")
 
@@ -204,9 +204,9 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 def _group(item: pytest.Item) -> str:
     """Return the name of a test's group. One process runs all tests of a group.
 
-    The tests of a file are a group, and so are all workflows with one kind of database. Files that share data which
-    takes long to create name their group themselves. Each fault case is a group of its own: fault cases share nothing,
-    and they take long but mostly wait.
+    The tests of a file are a group, and so are all workflows with one kind of database. Some files share data that
+    takes long to create; they name their group themselves. Each fault case is a group of its own, because fault cases
+    share nothing and mostly wait.
     """
     folder = _folder(item)
     if folder.startswith("integration/ways/"):

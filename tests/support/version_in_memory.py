@@ -78,5 +78,5 @@ class VersionInMemory(VersionToExport):
 
 
 def tree(folder: Path) -> dict[str, bytes]:
-    """Return the bytes of all files in a folder and below, by path."""
+    """Return the bytes of all files in a folder and its subfolders, by path."""
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}

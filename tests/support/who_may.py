@@ -1,7 +1,7 @@
 """Model of the rights of callers: the kinds of callers, and how each operation answers each of them.
 
-The model repeats the rules of the server on purpose, in a second form, so that tests can compare the two forms. The
-table in docs/explanation/threat-model.md is compared with the model, too.
+The model repeats the rules of the server in a second form, so that tests can compare both forms. The table in
+docs/explanation/threat-model.md is compared with the model, too.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ _SCOPES = {Access.ADMINISTRATOR: "admin", Access.WORKER: "work", Access.ATTEMPT:
 
 
 def _sample(access: Access) -> Operation:
-    """Return an operation with this `Access` and the usual scope, which guests may perform in public projects."""
+    """Return an operation with this `Access` and its usual scope; guests may perform it in public projects."""
     usual = "read" if access in (Access.READER, Access.SIGNED_IN, Access.USER) else "write"
     return Operation(
         "GET", "", "", access, _SCOPES.get(access, usual), None, None, None, 200, paged=False, etag=False,

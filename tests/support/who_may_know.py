@@ -74,7 +74,7 @@ class World:
     items: dict[str, dict[str, int | None]] = field(default_factory=lambda: {name: {} for name in PROJECTS})
 
     def refusal(self, caller: Caller) -> int:
-        """Return the status with which every operation refuses a credential, or 0."""
+        """Return the status with which every operation refuses a credential; 0 if the credential is valid."""
         if caller.user in self.disabled or caller == EXPIRED:
             return 401
         return 409 if caller == ATTEMPTS["ended"] else 0
@@ -94,7 +94,7 @@ class World:
         return project in self.public or self.role(caller, project) is not None
 
     def status(self, caller: Caller, project: str, least: Role, scope: str, *, guests: bool = True) -> int:
-        """Return the status with which an operation of a project refuses a caller, or 0."""
+        """Return the status with which an operation of a project refuses a caller; 0 if it does not."""
         if refusal := self.refusal(caller):
             return refusal
         reads = least is Role.READER and guests
@@ -121,7 +121,7 @@ class World:
         return any(self.sees_contents(caller, project) and blob in self.items[project].values() for project in PROJECTS)
 
     def may_refer(self, caller: Caller, blob: int) -> bool:
-        """Return whether the caller may read a blob and refer to it; a bound token may do so only in its project."""
+        """Return whether the caller may read a blob and refer to it; with a bound token, only in its project."""
         places = (caller.bound,) if caller.bound else (None, *PROJECTS)
         held = any((caller.user, place, blob) in self.held for place in places)
         if caller in ATTEMPTS.values():  # whose inputs name no blob
@@ -197,7 +197,7 @@ class Program:
 
     @property
     def kinds(self) -> tuple[Call, ...]:
-        """The kinds of calls; a kind that is listed twice is called twice as often."""
+        """The kinds of calls; a kind that is listed twice is chosen twice as often."""
         return (
             self.read_project, self.list_projects, self.list_items, self.list_items, self.create_item, self.create_item,
             self.send_blob, self.read_blob, self.read_blob, self.ask_missing, self.put_member, self.remove_member,
@@ -379,7 +379,7 @@ class Program:
         return self.world.refusal(caller) or (0 if scope in caller.scopes else 403)
 
     def _sends(self, caller: Caller) -> int:
-        """Return the status with which uploaded bytes are refused, or 0; a bound token uploads bytes to its project."""
+        """Return the status with which uploaded bytes are refused, or 0. A bound token uploads bytes to its project."""
         if caller == ATTEMPTS["running"]:
             return 0
         role = self.world.role(caller, caller.bound) if caller.bound else Role.OWNER

@@ -1,7 +1,7 @@
 """Model of who may write where: folders, items and roles in memory, and random calls whose outcomes it predicts.
 
-The model repeats the rules of roles in folders in a second form: at each call, it looks for the nearest role from the
-folder upwards, in a dictionary of each folder.
+The model repeats the rules of roles in folders in a simpler form: at each call, it goes from the folder upwards to the
+nearest role.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Thing:
 class WritingProgram:
     """Random calls of the members of a lab; `differences` collects the calls whose outcomes the model did not expect.
 
-    No call can fail for another reason than a role: names are never used twice, and only what exists is changed.
+    Calls can fail only because of a role: names are never used twice, and only what exists is changed.
     """
 
     def __init__(self, lab: Lab, seed: int) -> None:
@@ -235,7 +235,7 @@ class WritingProgram:
             folder.deleted, folder.above = False, self._made(above)
 
     def _is_free(self, folder: Folder) -> bool:
-        """Return whether a deleted folder can be restored at its path, to which no other folder has a claim."""
+        """Return whether a deleted folder can be restored at its path, which no other folder has or could get back."""
         alive = {id(one) for one in self._alive()}
         line = {one.path: one for one in folder.line}
         others = [one for one in self.folders if line.get(one.path, one) is not one]
@@ -252,7 +252,10 @@ class WritingProgram:
         return self.top
 
     def _made(self, path: str) -> Folder:
-        """Return the folder at a path. If the model lacks it, a restoration below has created it, and it is added."""
+        """Return the folder at a path.
+
+        If the model lacks it, the restoration of something below has created it; add it.
+        """
         found = self._nearest(path)
         if found.path == path:
             return found

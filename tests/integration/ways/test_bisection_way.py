@@ -1,4 +1,4 @@
-"""Search for the first version of a dataset that spoiled a metric, with command line and SDK, on a real server."""
+"""Search for the first version of a dataset with a bad metric, with command line and SDK, on a real server."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def moved(place: str, to: str) -> list[EntryChange]:
 
 
 def spoil(gaits: DatasetHandle) -> Commit:
-    """Record six more versions; return the third of these, which removes the left turns."""
+    """Record six more versions; return the third of them, which removes the left turns and so makes the metric bad."""
     gaits.commit("Rename a walk", changes=moved("raw/walk 1 0", "raw/slow"))
     gaits.commit("Rename it again", changes=moved("raw/slow", "raw/slowest"))
     spoiled = gaits.commit("Drop the left turns", changes=removed(*LEFT_TURNS))

@@ -65,7 +65,7 @@ def test_the_commands_of_the_page_commit_results(run: CommandLine, project: Proj
 def submit_after_others(project: ProjectHandle) -> Job:
     """Submit a job that commits its results, and return the job.
 
-    The job starts after several other jobs, so that another user has time to commit first.
+    It starts after several other jobs, so another user has time to commit before it.
     """
     (rig,) = (one for one in project.skeletons.list() if one.name == "target")
     inputs = {"clips": (CollectionInput(collection="gaits/raw"),), "skeleton": ItemInput(item=rig.id)}

@@ -59,7 +59,7 @@ def set_consent(project: ProjectHandle, name: str, days: int) -> None:
 
 
 def overrides(project: ProjectHandle) -> list[tuple[str, int]]:
-    """Return the reason and the number of clips of each recorded use of clips without a valid consent."""
+    """Return, for each export that was allowed without a valid consent, the reason and the number of clips."""
     page = project.transport.send("GET", f"{project.url}/events", params={"limit": 1000}).json()["items"]
     return [(one["body"]["reason"], one["body"]["count"]) for one in page if one["kind"] == "consent.overridden"]
 

@@ -56,7 +56,7 @@ class Walker:
         clip.put_info(clip.info().model_copy(update={"comment": text}))
 
     def commit(self, message: str, branch: str, comment: str) -> None:
-        """Check out a branch, change the descriptions of both clips, and commit."""
+        """Check out a branch, change the descriptions of the clips `walk` and `turn`, and commit."""
         self.run("dataset", "checkout", f"lab/gaits@{branch}")
         for name in ("walk", "turn"):
             self.comment(name, comment)

@@ -26,7 +26,7 @@ PASSWORD = "correct horse battery"
 
 
 def commands() -> list[list[str]]:
-    """Return the words of the commands of the section, without `marey`, in their order."""
+    """Return the arguments of each command in the section, without `marey`, in the order of the page."""
     (block,) = re.findall(r"```sh\n(.*?)```", SECTION, re.DOTALL)
     return [shlex.split(line, comments=True)[1:] for line in block.splitlines() if line.strip()]
 

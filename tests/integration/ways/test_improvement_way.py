@@ -117,7 +117,7 @@ def test_weights_are_swept_over_tasks(lab: ProjectHandle, run: CommandLine) -> N
 def test_who_may_read_the_project_may_read_the_files_that_its_results_name(
     lab: ProjectHandle, marey: Marey, server: ServerProcess
 ) -> None:
-    """Results of jobs refer to the files, so a reader may read them without having uploaded their bytes."""
+    """Results of jobs refer to the files, so a reader may read files that others have uploaded."""
     first = evaluated(lab, name="first")
     exported = lab.submit(JobCreate(kind="export", inputs={"clips": (CollectionInput(collection="walks"),)}))
     archive = marey.jobs.wait(exported.id).result

@@ -28,7 +28,7 @@ PASSWORD = "correct horse battery"
 
 
 def commands() -> list[list[str]]:
-    """Return the words of the commands of the page, without `marey`, in their order."""
+    """Return the arguments of each command on the page, without `marey`, in the order of the page."""
     lines = [line.strip() for block in re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL) for line in block.splitlines()]
     return [shlex.split(line, comments=True)[1:] for line in lines if line]
 

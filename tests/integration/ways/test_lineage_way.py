@@ -1,4 +1,4 @@
-"""Workflow of a user who traces a result: the commands of the how-to page, on a real server."""
+"""Workflow of a user who traces what a result was made from: the commands of the how-to page, on a real server."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def lab(new_lab: Callable[[], ProjectHandle], run: CommandLine) -> ProjectHandle
 
 
 def words_of(printed: str) -> list[list[str]]:
-    """Return the cells of each row of a printed table, without the rules between rows."""
+    """Return the cells of each row of a printed table, without the lines between rows."""
     rows = [re.split(r"\s{2,}", line.strip()) for line in printed.splitlines()]
     return [row for row in rows if row != [""] and not row[0].startswith("─")]
 

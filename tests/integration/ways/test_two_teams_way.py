@@ -52,7 +52,10 @@ def studio(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandl
 
 @pytest.fixture
 def told(run: CommandLine, server: ServerProcess, other_server: ServerProcess) -> Callable[..., str]:
-    """Function that runs `marey` as a user with logins for both servers but no token, and returns the output."""
+    """Function that runs `marey` and returns its output.
+
+    The user has logged in to both servers, and has no other token.
+    """
     stored = run.folder / "marey" / "credentials.json"
     for process in (other_server, server):
         store_login(stored, process.url, process.token)

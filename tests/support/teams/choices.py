@@ -59,7 +59,10 @@ class Chooser:
         return self.model.projects[self.lab]
 
     def operation(self, kind: str) -> Operation | None:
-        """Return an operation; `kind` is the name of one of the methods below. None if nothing exists to operate on."""
+        """Return an operation, or None if nothing exists to operate on.
+
+        `kind` is the name of one of the methods below.
+        """
         chosen: Callable[[], Operation | None] = getattr(self, kind)
         return chosen()
 
@@ -143,7 +146,10 @@ class Chooser:
         return None if name is None else self.commit_to(name, self._branch(name), right=right)
 
     def commit_to(self, name: str, branch: str, *, right: bool = False) -> CommitChanges | None:
-        """Return a commit of up to three changes; unless `right`, it may expect a wrong newest commit of the branch."""
+        """Return a commit of up to three changes.
+
+        If `right` is false, it may expect a wrong newest commit of the branch.
+        """
         dataset = self.project.datasets[name]
         changes = [self._change(name, branch) for _ in range(self.chance.randint(1, 3))]
         given = tuple(one for one in changes if one is not None)
@@ -262,7 +268,7 @@ class Chooser:
         return self.chance.choice(chosen)
 
     def _commit_for(self, name: str, branch: str, *, contained: bool) -> str:
-        """Return a commit, mostly one that is in the branch, or with `contained=False` one that is not."""
+        """Return a commit, mostly one that is in the branch; with `contained=False`, mostly one that is not."""
         dataset = self.project.datasets[name]
         head = dataset.refs.get(branch)
         before = set() if head is None else self.model.ancestors([head])
@@ -270,7 +276,10 @@ class Chooser:
         return self.chance.choice(fitting) if fitting and self.chance.random() < 0.9 else self._commit(name)
 
     def _change(self, name: str, branch: str) -> EntryChange | None:
-        """Return a change for a commit: mostly a put, else a removal or a move. Its entry mostly exists."""
+        """Return a change for a commit: mostly a put, sometimes a removal or a move.
+
+        The changed entry mostly exists.
+        """
         state = self.model.state(self.project.datasets[name].refs.get(branch))
         path, kind = self.chance.choice(PATHS), self.chance.choice(list(_KINDS))
         exists = bool(state) and self.chance.random() < 0.8

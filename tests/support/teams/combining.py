@@ -15,7 +15,7 @@ from marey_schemas.datasets.merges import MergeAnswer, MergeRequest, PickRequest
 
 @dataclass(frozen=True)
 class Combine(OnDataset):
-    """Base of merges, cherry-picks and reverts."""
+    """Base class of merges, cherry-picks and reverts."""
 
     into: str
     version: str
@@ -48,7 +48,7 @@ class Combine(OnDataset):
         return None if self.into in dataset.tags else dataset.refs.get(self.into)
 
     def refusal(self, model: Model) -> str | None:
-        """Return the code of the expected error if nothing can be merged into the branch, or else None."""
+        """Return the code of the expected error if nothing can be merged into the branch, else None."""
         dataset = self.dataset(model)
         if self.into not in dataset.refs:
             return "no-version"
@@ -57,7 +57,7 @@ class Combine(OnDataset):
         return "no-commits" if dataset.refs[self.into] is None else None
 
     def settle(self, model: Model, outcome: Outcome, base: str | None, theirs: str | None) -> Merged | None:
-        """Compare the outcome with the expected merge; return this merge if the model must record it, or else None."""
+        """Compare the outcome with the expected merge; return the merge if the model must record it, else None."""
         head = self.head(model)
         merged = merge_states(model.state(base), model.state(head), model.state(theirs), self.resolutions)
         if self.resolutions.keys() - merged.decided:

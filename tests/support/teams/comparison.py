@@ -46,7 +46,7 @@ class Comparison:
             assert {one.name for one in found if one.kind is RefKind.TAG} == dataset.tags
 
     def version(self, name: str, digest: str) -> None:
-        """Compare the commit, the entries and the log of a version; an item must have the content of each entry."""
+        """Compare the commit, the entries and the log of a version; each entry's content must be that of an item."""
         handle, made = self._handle(name), self._model.commits[digest]
         commit = handle.at(digest)
         assert (commit.digest, commit.parents, commit.author) == (digest, made.parents, made.author)
@@ -107,9 +107,9 @@ class Comparison:
                 self._clients.servers[self._lab].blobs.fetch(value.file)  # compares the digest
 
     def files(self, database: Database, *, collected: bool) -> None:
-        """Check that needed files are stored and, if `collected`, that files of purged items are not.
+        """Check that needed files are stored.
 
-        With `collected`, all garbage was collected before this check.
+        `collected` states that all garbage was collected before; then files of purged items must be deleted.
         """
         every = [content for one in self._project.items.values() for content in one.revisions]
         kept = [content for one in self._project.items.values() if one.status != "purged" for content in one.revisions]

@@ -1,4 +1,4 @@
-"""Servers for the programs of several users: in this process, or in processes that die at a chosen step."""
+"""Servers for the random programs of `machine`: in this process, or in processes that die at a chosen step."""
 
 from __future__ import annotations
 
@@ -32,10 +32,13 @@ class Host:
         self.database = database
 
     def arm(self, steps: int) -> None:
-        """Let the server die `steps` steps from now. Does nothing for a server in this process, which cannot die."""
+        """Let the server die `steps` steps from now. Do nothing for a server in this process, which cannot die."""
 
     def disarm(self) -> bool:
-        """Withdraw the order to die; if the server has died, start it again. Return whether the server had died."""
+        """Cancel the planned death of the server.
+
+        If it has died already, start it again; return whether it had died.
+        """
         return False
 
     def client(self, token: str) -> tuple[Marey, Line]:

@@ -76,7 +76,10 @@ class OnItem(Operation):
     kind: Kind
 
     def forbidden(self, model: Model, outcome: Outcome) -> None:
-        """Fail unless the outcome says that the user lacks the role, or that the item (read first) is absent."""
+        """Fail if the outcome is not a refusal because of the user's role, or because the item is absent.
+
+        The server looks up the item before it checks the role.
+        """
         refuse(outcome, 403, *(() if self.found(model).status == "present" else (404, 410)))
 
     def read(self, clients: Clients) -> ItemHandle:
@@ -88,7 +91,7 @@ class OnItem(Operation):
         return self.project(model).items[self.item]
 
     def absent(self, model: Model, outcome: Outcome) -> bool:
-        """Return whether the item is deleted or purged in the model; if so, check that the outcome says this."""
+        """Return whether the item is deleted or purged in the model; if so, check that the outcome says so."""
         status = self.found(model).status
         if status != "present":
             refuse(outcome, 404 if status == "deleted" else 410)
@@ -233,7 +236,7 @@ class Purge(Operation):
             project.update(item_id, status="purged")
 
     def _check(self, model: Model, wanted: set[str], purged: set[str]) -> None:
-        """Fail if an item was purged although something needs it, or not purged although certainly nothing needs it."""
+        """Fail if an item was purged although something needs it, or was kept although certainly nothing needs it."""
         known = purged & self.project(model).items.keys()
         assert known <= wanted
         held = {one for one in wanted if model.is_held(self.lab, one)}

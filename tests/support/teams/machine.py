@@ -122,7 +122,7 @@ class TeamsMachine(RuleBasedStateMachine):
         return outcome
 
     def _combine(self, operation: Combine, who: str, chance: random.Random) -> None:
-        """Preview a merge, then do the merge, either with resolutions of its conflicts or without."""
+        """Preview a merge, then do the merge, with or without resolutions of its conflicts."""
         preview = self.session.do(replace(operation, preview=True), who)
         chosen: dict[tuple[str, Kind], Side] = {}
         if chance.random() < 0.7 and not isinstance(preview, Refused):
@@ -164,7 +164,7 @@ class TeamsMachine(RuleBasedStateMachine):
         self.world.counts["Look"] += 1
 
     def _race(self, choose: Chooser, chance: random.Random) -> None:
-        """Let two users change the same branch, or let one user delete or purge an item that the other user commits."""
+        """Let two users change the same branch at once; or let one delete or purge an item that the other commits."""
         mine = choose.commit(right=True)
         if mine is None:
             return
@@ -199,12 +199,12 @@ def _fate(chance: random.Random) -> Fate:
 
 
 def _without_loss(fate: Fate) -> Fate:
-    """Return the same fate, or `FINE` if answers would be lost."""
+    """Return the same fate; if this fate loses answers, return `FINE`."""
     return FINE if fate.lost else fate
 
 
 def _removal(choose: Chooser, commit: CommitChanges) -> Operation | None:
-    """Return the deletion of an item that a commit puts, or the purge if the item is deleted already."""
+    """Return the deletion of an item that a commit puts. If the item is deleted already, return its purge."""
     for one in commit.changes or ():
         if isinstance(one, PutEntry):
             item = choose.project.items[one.item]

@@ -143,7 +143,7 @@ class Model:
         return shared - self.ancestors(parent for one in shared for parent in self.commits[one].parents)
 
     def first_parents(self, digest: str) -> list[str]:
-        """Return a commit, then its first parent, the first parent of that parent, and so on."""
+        """Return a commit, its first parent, the first parent of this parent, and so on."""
         found = [digest]
         while parents := self.commits[found[-1]].parents:
             found.append(parents[0])
@@ -157,7 +157,7 @@ class Model:
         return set(contents_of(self.commits[digest].state for digest in digests))
 
     def certainly_free(self, lab: str, going: Iterable[str]) -> bool:
-        """Return whether it is certain that nothing needs the items `going`, apart from other items of `going`.
+        """Return whether it is certain that only items of `going` need the items `going`.
 
         The server may have items that the model does not know, because merges and copies have created them. The content
         of such an item is in a version, or content in a version refers to it.
@@ -173,7 +173,7 @@ class Model:
     def is_held(self, lab: str, item_id: str) -> bool:
         """Return whether another present item refers to an item.
 
-        Versions may also need the item, which the model cannot know, because another item may have the same content.
+        Versions may also need the item. The model cannot know this, because another item may have the same content.
         """
         others = [one for one in self.projects[lab].items.values() if one.id != item_id and one.status == "present"]
         return any(item_id in one.refers for one in others)
@@ -189,5 +189,5 @@ class Model:
 
 
 def contents_of(states: Iterable[State]) -> Iterator[Content]:
-    """Yield the contents of entries; many are yielded several times."""
+    """Yield the contents of entries; many contents are yielded several times."""
     return (Content(key[1], entry.parts) for state in states for key, entry in state.items())

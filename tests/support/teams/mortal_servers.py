@@ -1,9 +1,8 @@
 """Process that forks servers which die at a chosen step: `mortal_servers.py`, with orders as JSON lines on its input.
 
 A step of a server is an SQL statement, a commit, or a point of `marey_server.faults`. An order names a file with a
-counter of eight bytes, which the server shares with the test. While the counter is positive, each step decreases it.
-The step that would decrease it to zero sets it to `FIRED` instead, and the server kills itself (SIGKILL) before it does
-this step.
+counter of eight bytes, which the server shares with the test. Each step decreases a positive counter by one. Before the
+step that would decrease it to zero, the server sets it to `FIRED`, and kills itself (SIGKILL).
 
 An order for a server that already runs kills this server first, and then starts it again. When the input ends, all
 servers are killed. Forking takes a hundredth of the time that starting a new process takes.

@@ -1,4 +1,4 @@
-"""What users do: the base of all operations, and commits, branches and tags.
+"""What users do: the base class of all operations, and operations on commits, branches and tags.
 
 An operation sends its request, compares the outcome with the expectation of the model, and then changes the model.
 """
@@ -56,7 +56,7 @@ def attempt(operation: Operation, clients: Clients) -> Outcome:
 
 @dataclass(frozen=True)
 class Clients:
-    """Connections of one user to both servers, and the name of the project there."""
+    """Connections of one user to both servers, and the name of the project on them."""
 
     user: str
     role: Role
@@ -97,27 +97,27 @@ class Operation(ABC):
         """Check that the outcome is as the model expects, and then apply the effect of the operation to the model."""
 
     def forbidden(self, model: Model, outcome: Outcome) -> None:
-        """Fail unless the outcome says that the user lacks the role."""
+        """Fail if the outcome is not a refusal because of the user's role."""
         refuse(outcome, 403)
 
     def assume(self, model: Model) -> None:  # noqa: B027 - most operations are repeated
-        """Apply the effect to the model although no answer has arrived. Needed if a repetition gets another answer."""
+        """Apply the effect to the model although no answer arrived; needed if a repetition gets another answer."""
 
     def again(self, outcome: Outcome, second: Outcome) -> None:  # noqa: B027 - most have nothing to check
-        """Check the outcome `second` of the operation when it was sent again after it had succeeded with `outcome`."""
+        """Check the outcome `second` of the repeated operation, which had succeeded with `outcome` the first time."""
 
     def project(self, model: Model) -> ModelProject:
         return model.projects[self.lab]
 
 
 def refuse(outcome: Outcome, *expected: str | int) -> None:
-    """Fail unless the outcome is a refusal with one of these codes, or HTTP statuses."""
+    """Fail if the outcome is not a refusal with one of these error codes or HTTP statuses."""
     assert isinstance(outcome, Refused), f"{outcome} in place of {expected}"
     assert outcome.code in expected or outcome.status in expected, f"{outcome} in place of {expected}"
 
 
 def accepted(outcome: Outcome) -> Any:
-    """Fail unless the outcome is an answer; return it."""
+    """Return the answer; fail if the outcome is an error."""
     assert not isinstance(outcome, Refused | Failed), outcome
     return outcome
 
@@ -151,7 +151,7 @@ def new_write_id() -> str:
 
 @dataclass(frozen=True)
 class CommitChanges(OnDataset):
-    """Commit of explicit changes, or of the dataset's folder if there are none."""
+    """Commit of explicit changes; without changes, commit of the dataset's folder."""
 
     branch: str
     changes: tuple[EntryChange, ...] | None

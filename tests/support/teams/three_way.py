@@ -27,7 +27,7 @@ State = Mapping[Key, Entry]
 
 
 def by_path(key: Key) -> tuple[str, str]:
-    """Return the sort key of an entry: the path, ended by a tab because no character of a path sorts before a tab."""
+    """Return the sort key of an entry: its path and a tab, because no character of a path sorts before a tab."""
     return f"{key[0]}\t", key[1].value
 
 
@@ -136,9 +136,9 @@ Origin = tuple[Key | None, Key | None]
 def _settle(
     waiting: Iterable[tuple[Origin, Located]], origins: dict[Key, Origin], take: Mapping[Key, Side], merged: Merged
 ) -> None:
-    """Give each key that two entries want to one of them; the other one goes back to its own place, if it has one.
+    """Give each key that two entries want to one of them; the loser goes back to its own place, if it has one.
 
-    `origins` contains the origin of each entry in `merged.state` by its key there.
+    `origins` contains, by key, the origin of each entry in `merged.state`.
     """
     for origin, (key, entry) in waiting:
         choice = None if key in merged.decided else take.get(key)
@@ -167,7 +167,7 @@ def _changes(
 ) -> list[Three]:
     """Return each entry that differs between `base` and `theirs`, as (base, ours, theirs), in the order of paths.
 
-    If their side has removed an entry and has another one at its path, the removed entry comes first.
+    If their side has replaced an entry by another one at the same path, the removed entry comes first.
     """
     found: list[Three] = [
         (_at(base, old), _at(ours, mine[old]), _at(theirs, now))
@@ -209,7 +209,7 @@ def _decide(
 def _clashes(
     base: Located | None, ours: Located | None, theirs: Located | None
 ) -> tuple[dict[str, Hashable], tuple[str, ...]]:
-    """Return merged content by part, where both sides could be merged, and the names of parts in conflict."""
+    """Return the content of each part that could be merged, and the names of the parts in conflict."""
     if ours is None or theirs is None:
         return {}, ("entry",)
     merged: dict[str, Hashable] = {}
@@ -241,7 +241,7 @@ def _combined(
     clashes: tuple[str, ...],
     choice: Side,
 ) -> Located:
-    """Return the entry with the changes of both sides; `choice` is the side to take where they are in conflict."""
+    """Return the entry with the changes of both sides; for parts in conflict, take the side `choice`."""
     assert ours is not None
     assert theirs is not None
     first, second = (ours, theirs) if choice is Side.OURS else (theirs, ours)
@@ -266,7 +266,7 @@ def _combined(
 
 
 def merge_labels(base: Labels, ours: Labels, theirs: Labels) -> Labels | None:
-    """Merge the labels of a clip one by one; return None if the two sides have made conflicting changes."""
+    """Merge the labels of a clip one by one; return None if the changes of the two sides conflict."""
     clips = base.clip, ours.clip, theirs.clip
     if len({dict(one.parts)["motion"] for one in clips}) > 1 or _excludes(*clips):
         return None

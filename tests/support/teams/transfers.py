@@ -23,7 +23,7 @@ LISTED = (Kind.SKELETON, Kind.CLIP, Kind.ANNOTATION)
 
 @dataclass(frozen=True)
 class Transfer(Operation):
-    """Base of copies of a version from the dataset `source` on the server `lab` to another dataset."""
+    """Base class of copies of a version from the dataset `source` on the server `lab` to another dataset."""
 
     role = Role.MAINTAINER
     source: str
@@ -108,8 +108,8 @@ class ArchiveAndImport(Transfer):
 class CheckOut(OnDataset):
     """Checkout of a version into the folder of a dataset.
 
-    The server chooses which items it changes, restores and creates. So, after a check that the folder has the entries
-    of the version, the model takes over all items of the folder from the server.
+    The server chooses which items it changes, restores and creates. So the model first checks that the folder has the
+    entries of the version. Then it copies all items of the folder from the server.
     """
 
     role = Role.MAINTAINER

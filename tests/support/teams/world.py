@@ -124,7 +124,7 @@ class Session:
         return outcome
 
     def _do_again(self, operation: Operation, clients: Clients) -> Outcome:
-        """Repeat an operation that got no answer; its first run must have had all of its effect, or none."""
+        """Repeat an operation that got no answer; its first run must have had its whole effect or none."""
         self.world.counts["(repeated without knowing)"] += 1
         outcome = attempt(operation, clients)
         self.log.append(f"{clients.user}: repeated -> {outcome}")
@@ -160,8 +160,8 @@ class Session:
     def race(self, operations: Mapping[str, Operation], fate: Fate = FINE) -> None:
         """Let users do one operation each at the same time.
 
-        The outcomes must be possible for some order of the operations. In addition, an operation may be refused because
-        another operation has overtaken it; the refused operation then has no effect.
+        The outcomes must be possible for some order of the operations. An operation may also be refused because another
+        one came first; it then has no effect.
         """
         host = self.world.hosts[next(iter(operations.values())).lab]
         outcomes: dict[str, Outcome] = {}
@@ -212,7 +212,10 @@ class Session:
     def _orders(
         operations: Mapping[str, Operation], outcomes: Mapping[str, Outcome], overtaken: Sequence[str]
     ) -> Iterator[tuple[str, ...]]:
-        """Yield the orders in which operations can have had effects. Operations without an answer may have had none."""
+        """Yield the orders in which operations can have had effects.
+
+        An operation without an answer may have had no effect.
+        """
         certain = [who for who in operations if who not in overtaken and not _unanswered(outcomes[who])]
         uncertain = [who for who in operations if _unanswered(outcomes[who])]
         for count in range(len(uncertain) + 1):

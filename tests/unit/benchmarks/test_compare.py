@@ -18,7 +18,7 @@ SMALL, LARGE = (Row("DTW", f"{frames} x {frames}", f"{ms} ms") for frames, ms in
 
 
 def cells(table: str) -> list[list[str]]:
-    """Return the cells of each line of a table below its headings."""
+    """Return the cells of each row of a table, without its headings."""
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
 
 

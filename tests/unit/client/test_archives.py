@@ -35,7 +35,7 @@ MOST_CHARACTERS = 255
 
 
 class ListedDataset:
-    """Dataset with a line of versions, each given as the list of its entries; the newest version is the last."""
+    """Dataset without branches: each version is given as the list of its entries; the last version is the newest."""
 
     transport = cast(Transport, None)
     project_url = "/projects/lab"
@@ -96,7 +96,7 @@ def transfers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def make_old(path: Path) -> None:
-    """Set the time of a file's last change to a time after which the file is no longer kept."""
+    """Set the time of a file's last change so far back that the file is deleted."""
     old = time.time() - (MOST_DAYS_KEPT + 1) * 86_400
     os.utime(path, (old, old))
 

@@ -1,4 +1,4 @@
-"""Range of versions between a good and a bad version, and the search in this range, without a server."""
+"""Search for the first bad version in the range between a good and a bad version, without a server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Command line, as far as it can be tested without a server."""
+"""Command line: everything that can be tested without a server."""
 
 import contextlib
 import json
@@ -76,7 +76,7 @@ def nowhere(tmp_path: Path) -> dict[str, str]:
 
 
 def a_job(**fields: Any) -> Job:
-    """Return a job with these fields; other fields are missing."""
+    """Return a job that has only these fields."""
     return Job.model_construct(**fields)
 
 

@@ -1,4 +1,4 @@
-"""Recordings that the SDK sends to coverage streams: each frame once; the last answer's offset is where to continue."""
+"""Recordings that the SDK sends to coverage streams: each frame once, and on from the offset of the last answer."""
 
 from datetime import UTC, datetime
 from typing import Any

@@ -1,4 +1,4 @@
-"""Search for the version at which a metric crossed a value, with tabled values instead of evaluations."""
+"""Search for the version at which a metric crossed a limit; a table of values replaces evaluations."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def tabled(values: Mapping[str, float], dataset: Any = NOTHING) -> TabledValues:
 def searched(
     parents: Sequence[Sequence[int]], values: Mapping[str, float], limit: Limit | None = None, good: str = "0"
 ) -> tuple[Crossing, list[str]]:
-    """Search in the versions from `good` to the last; return the result, and the versions that were evaluated."""
+    """Search in the versions from `good` to the last version; return the result and the evaluated versions."""
     versions = ListedVersions(parents)
     evaluations = tabled(values, versions)
     return find_crossing(read_range(versions, good, str(len(parents) - 1)), evaluations, limit), evaluations.read

@@ -1,4 +1,4 @@
-"""Differences in words: one line for each change, which can be understood without the document."""
+"""Differences in words: one line for each change. Readers understand the line without the document."""
 
 from typing import Any
 

@@ -41,9 +41,9 @@ def job(**fields: Any) -> dict[str, Any]:
 
 
 def answer(request: httpx.Request) -> httpx.Response:
-    """Answer as a server whose project has three clips of one skeleton; one clip is tagged as a loop.
+    """Answer as a server whose project has three clips of one skeleton.
 
-    The mapping of the skeleton was edited.
+    One clip is tagged as a loop, and the mapping of the skeleton was edited.
     """
     path, query = request.url.path, dict(request.url.params)
     if path.endswith("/jobs"):

@@ -1,4 +1,4 @@
-"""Folders of exports: names of files, cards of the Hub, sidecars, and folders that are imported again."""
+"""Exported folders: names of files, cards of the Hugging Face Hub, sidecars (`marey.json`), and a later import."""
 
 from __future__ import annotations
 

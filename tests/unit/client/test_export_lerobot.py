@@ -46,7 +46,7 @@ def gaits() -> VersionInMemory:
 
 
 class Reading:
-    """Independent reading of a LeRobotDataset: paths by the templates of `meta/info.json`, rows by pyarrow."""
+    """Independent reader of a LeRobotDataset. Paths follow the templates in `meta/info.json`; pyarrow reads rows."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -65,7 +65,7 @@ class Reading:
         return rows.to_numpy()
 
     def rows_of(self, episode: dict[str, Any]) -> list[dict[str, Any]]:
-        """The rows of an episode, looked up as LeRobot does: in the file that the table of episodes names."""
+        """Return the rows of an episode from the file that the table of episodes names, as LeRobot does."""
         chunk, file = episode["data/chunk_index"], episode["data/file_index"]
         path = self.root / self.info["data_path"].format(chunk_index=chunk, file_index=file)
         rows = parquet.read_table(path, filters=[("episode_index", "=", episode["episode_index"])])

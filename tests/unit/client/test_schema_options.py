@@ -123,7 +123,7 @@ def test_every_command_can_make_its_options_and_explains_each() -> None:
 
 
 def test_the_parameters_of_a_job_are_the_options_of_its_command() -> None:
-    """A field that is added to a model becomes an option without a change of the command."""
+    """A new field of a model becomes an option without a change of the command."""
     set_by_the_command = {"loops", "trims"}
     context = typer.Context(COMMANDS.commands["evaluate"])
     options = {one for option in COMMANDS.commands["evaluate"].get_params(context) for one in option.opts}

@@ -18,7 +18,7 @@ DATA = bytes(range(251)) * 100
 class UploadServer:
     """Simulated server that stores the bytes of one upload.
 
-    A number n in `faults` breaks the connection of one request, after n bytes of its piece were stored.
+    Each number n in `faults` breaks the connection of one request, after the server has stored n bytes of the piece.
     """
 
     def __init__(self) -> None:

@@ -46,7 +46,7 @@ def test_a_layer_pins_what_its_extra_requires(layer: str) -> None:
 
 
 def test_a_pin_names_the_extras_that_other_packages_require() -> None:
-    """Otherwise, pip finds no pin for `coverage[toml]` as soon as a version newer than the pinned one is published."""
+    """Without the extra in the pin, pip finds no pin for `coverage[toml]` when a newer version is published."""
     pinned = {name: text for pins in PINS.values() for name, text in pins.items()}
     missing = []
     for package in filter(lambda one: name_of(one.name) in pinned, distributions()):

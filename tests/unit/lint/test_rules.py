@@ -1,4 +1,4 @@
-"""Rules of `lint`: each reports a planted offence with its place."""
+"""Rules of `lint`: each finds a planted violation and reports its place."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +16,7 @@ LONG = "\n".join("x = 1" for _ in range(70)) + "\n"
 
 
 def house(modules: dict[str, str], pages: dict[str, str] | None = None) -> House:
-    """Return the modules with these names and texts as a `House`; paths follow from the names."""
+    """Return modules with these names and texts as a `House` (all modules that `lint` checks); names give the paths."""
     found = {name: Module(name, ROOT / f"{name.replace('.', '/')}.py", text) for name, text in modules.items()}
     return House(found, {ROOT / name: text for name, text in (pages or {}).items()})
 

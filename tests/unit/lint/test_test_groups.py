@@ -1,4 +1,4 @@
-"""The check that pytest-xdist has seen the groups of tests."""
+"""The check that pytest-xdist runs the tests of a group in one process."""
 
 from types import SimpleNamespace
 from typing import Any

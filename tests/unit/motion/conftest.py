@@ -59,7 +59,7 @@ def body() -> Skeleton:
 
 @pytest.fixture
 def tumbling() -> Callable[..., Clip]:
-    """Function that returns a clip of a skeleton in which all joints rotate at random, and some move."""
+    """Function that returns a clip of a skeleton: all joints rotate at random, and some also move."""
 
     def make(skeleton: Skeleton, frames: int = 70, translated: tuple[int, ...] = (), seed: int = 0) -> Clip:
         random = np.random.default_rng(seed)

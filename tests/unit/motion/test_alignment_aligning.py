@@ -1,4 +1,4 @@
-"""Examples of an action, aligned as a whole."""
+"""Alignment of the examples of an action, each as a whole clip."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -90,7 +90,7 @@ def test_every_quaternion_is_continuous_in_time_and_on_the_side_of_the_reference
 
 
 def test_more_than_half_a_turn_does_not_break_the_signs() -> None:
-    """A predecessor compared every frame with the first one, so that rotations by more than half a turn jumped."""
+    """An earlier program compared every frame with the first one, so rotations by more than half a turn jumped."""
     spin = generate_gait(1.0, 2.6, 2.0)
     faster = played(spin, sine_warp(120, 101))
     aligned = align_clips([SourceExample("a@1", "a", spin), SourceExample("b@1", "b", faster)], BODY)

@@ -50,8 +50,8 @@ def cheapest_way(costs: Floats, max_run: int | None = None) -> float | None:
 def links_between_layers(max_run: int | None) -> list[tuple[int, tuple[int, int], int]]:
     """Return (layer, step, layer to which the step leads) for each step; each layer contains every cell once.
 
-    The layer of a path depends on its last steps. In layer 0, the last step was in both motions. In the next `max_run`
-    layers, the last 1 to `max_run` steps were in the first motion alone; in the last `max_run` layers, they were in the
+    The layer of a path depends on its last steps. In layer 0, the last step advanced in both motions. In the next
+    `max_run` layers, the last 1 to `max_run` steps advanced in the first motion alone; in the remaining layers, in the
     second motion alone. Without a limit there is one layer.
     """
     if max_run is None:

@@ -17,7 +17,7 @@ def test_the_medoid_has_the_least_sum_of_costs() -> None:
 
 
 def test_the_best_candidate_is_kept_and_not_the_last_one() -> None:
-    """A predecessor never updated the best cost so far, and therefore chose the last candidate."""
+    """An earlier program never updated the best cost so far, and therefore chose the last candidate."""
     totals = np.array([[0.0, 1.0, 9.0], [1.0, 0.0, 8.0], [9.0, 8.0, 0.0]])
     assert medoid(totals) == 1
     assert medoid(totals[::-1, ::-1]) == 1

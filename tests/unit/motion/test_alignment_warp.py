@@ -1,4 +1,4 @@
-"""Time functions (time warps): computed from alignment paths, inverted, and applied to motions."""
+"""Time functions (time warps), which are computed from alignment paths, inverted, and applied to motions."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Matching of frames, compared with an exhaustive search over all sequences of runs."""
+"""Matching of the frames of two clips, compared with an exhaustive search over all sequences of runs."""
 
 from functools import cache
 
@@ -87,7 +87,7 @@ def test_frames_that_differ_entirely_for_long_are_replaced() -> None:
 
 
 def far_away(start: int, stop: int, count: int) -> Poses:
-    """Return frames that are all equal, except that joint and root have other values in one range."""
+    """Return equal frames, apart from one range in which joint and root have other values."""
     poses = poses_of([0] * count)
     poses.roots[start:stop] = 5.0
     poses.rotations[start:stop] = poses_of([3]).rotations[0]

@@ -1,4 +1,4 @@
-"""Changes of single frames spread over windows."""
+"""Changes of single frames, which are spread over the frames around them."""
 
 import numpy as np
 import pytest

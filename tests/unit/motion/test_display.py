@@ -1,4 +1,4 @@
-"""Displayed motion of a trial."""
+"""The motion that the character shows in a trial of motion matching."""
 
 from dataclasses import replace
 
@@ -58,7 +58,7 @@ def record(database: MatchingDatabase) -> TrialRecord:
 
 
 def undisturbed(database: MatchingDatabase, first: int, ticks: int) -> TrialRecord:
-    """Return the record of a trial that plays consecutive rows, with the root path of these rows in the database."""
+    """Return the record of a trial that plays consecutive rows of the database, with the root path of these rows."""
     rows = np.arange(first, first + ticks, dtype=np.int32)
     nothing = np.full(ticks, np.nan)
     return TrialRecord(
@@ -107,7 +107,7 @@ def test_the_root_is_where_the_record_has_it(database: MatchingDatabase) -> None
 
 
 def test_poses_do_not_jump_where_rows_do(database: MatchingDatabase, record: TrialRecord) -> None:
-    """At a switch, joint angles change from tick to tick hardly more than within the data."""
+    """At a switch, joint angles change from tick to tick hardly more than within a clip."""
     shown = displayed_clip(database, record, OPTIONS)
 
     step = quaternions.angle_between(shown.rotations[1:, 1:], shown.rotations[:-1, 1:]).max(axis=1)

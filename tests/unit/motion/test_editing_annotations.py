@@ -186,7 +186,7 @@ def segment_at(layer: Layer, frame: int) -> Segment:
 
 
 def expected(before: Layer, command: str, given_: dict[str, Any]) -> list[str | None]:
-    """Return the expected label of every frame after an accepted command, computed frame by frame."""
+    """Compute frame by frame the expected label of every frame after an accepted command."""
     labels_ = labelled(before)
     if command == "create_segment":
         labels_[given_["start"] : given_["end"]] = [given_["label"]] * (given_["end"] - given_["start"])

@@ -98,7 +98,7 @@ def outcome_of(commands: list[AnyCommand]) -> tuple[EditedClip, ...] | MotionErr
 
 
 def frames_after(clip: Clip, commands: list[AnyCommand]) -> int | None:
-    """Return the number of frames after a list of commands, or None if it is not easy to compute."""
+    """Return the number of frames after a list of commands, or None if the number is not easy to compute."""
     frames = clip.frame_count
     for command in commands:
         if isinstance(command, Trim):

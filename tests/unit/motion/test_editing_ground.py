@@ -1,4 +1,4 @@
-"""The ground, and the position of feet on it. The soles of the generated body are 2 cm below its lowest points."""
+"""The ground, and the position of feet on it. The soles of the generated body are 2 cm below its lowest joints."""
 
 from dataclasses import replace
 from math import degrees

@@ -150,7 +150,7 @@ def turning_and_jolting(clip: Clip) -> np.ndarray:
     ("blend", "start"), [("inertialise", 100), ("inertialise", 97), ("inertialise", 82), ("slerp", 82)]
 )
 def test_feet_and_heading_go_on_at_the_seam(blend: str, start: int) -> None:
-    """A straight walk is followed by a bend. A fade overlaps 18 frames; without overlap, the clips are out of step."""
+    """A curved walk follows a straight walk. A fade overlaps 18 frames; without overlap, the clips are out of step."""
     first = generate_gait(1.3, 0.0, 4.0).sliced(0, 100)
     second = generate_gait(1.3, 0.3, 4.0).sliced(start, 240)
     joined = join(first, second, blend=blend)

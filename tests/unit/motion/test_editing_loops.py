@@ -1,4 +1,4 @@
-"""Conversion of clips to loops without a visible seam."""
+"""Conversion of clips to loops, without a visible jump from the last frame to the first."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def seam_of(clip: Clip) -> LoopSeam:
 
 
 def accelerations_around_the_seam(clip: Clip, seam: LoopSeam) -> np.ndarray:
-    """Return the change of the steps of any joint around the seam, in metres per frame."""
+    """Return, for each frame around the seam, the largest change of a joint's step, in metres."""
     rounds = continue_motion(Motion.of(clip), seam, 3, 3)
     both = rounds.positions(clip.skeleton)[: 3 + 3]
     return np.linalg.norm(np.diff(both, n=2, axis=0), axis=-1).max(axis=1)

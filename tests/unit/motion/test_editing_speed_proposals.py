@@ -1,4 +1,4 @@
-"""Annotation of pauses, and of movements in which a hand reaches for something."""
+"""Proposed annotations of pauses, and of movements in which a hand reaches for something."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,7 @@
-"""Ranking of clips from other collections by the coverage gaps that they fill, if the set can blend with them."""
+"""Ranking of clips from other collections by the coverage gaps that they fill.
+
+The set must be able to blend with them.
+"""
 
 from dataclasses import replace
 from typing import Any

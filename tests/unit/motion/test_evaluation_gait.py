@@ -1,4 +1,4 @@
-"""Whole suites of trials with generated walks and runs, from clips to the measures."""
+"""Whole evaluations of generated walks and runs, from clips to measured values."""
 
 from itertools import product
 from math import radians

@@ -25,7 +25,7 @@ def measured(
 
 
 def answering(asked: Reference, delay_s: float) -> Floats:
-    """Return the speed of each step of a character that follows each change of the wanted speed `delay_s` late."""
+    """Return the speed of each step of a character that follows changes of the wanted speed with a delay."""
     wanted = asked.speeds_m_s[: asked.tick_count - 1]
     late = round(delay_s * RATE_HZ)
     return np.concatenate((np.full(late, wanted[0]), wanted))[: len(wanted)]

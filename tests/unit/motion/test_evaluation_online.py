@@ -1,4 +1,4 @@
-"""Coverage during a recording: frames in pieces of any length give the same windows as a whole clip; next targets."""
+"""Coverage during a recording, and targets to perform next. Pieces of any length give the windows of a whole clip."""
 
 import math
 from collections.abc import Iterator

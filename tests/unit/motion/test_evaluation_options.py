@@ -1,4 +1,4 @@
-"""Parameters of evaluation jobs: the options of the computation and a few more; options of old documents."""
+"""Parameters of evaluation jobs: the options of the computation, a few others, and options in old documents."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Omission of clips: the prediction equals an evaluation of the remaining clips."""
+"""Predicted effect of leaving out clips: it equals an evaluation of the remaining clips."""
 
 import pytest
 from pydantic import ValidationError

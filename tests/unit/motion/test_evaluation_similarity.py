@@ -30,7 +30,7 @@ def straight_walks(count: int = 3, seconds: float = 5.0, **given: Any) -> list[T
 
 
 def brute_force(database: MatchingDatabase, rows: Ints) -> Floats:
-    """Return the distance of each of these rows from the nearest of these rows that has another source."""
+    """Return for each of these rows the distance to the nearest row from another source."""
     points = database.pose_points[rows].astype(np.float64)
     apart = np.linalg.norm(points[:, None] - points[None], axis=-1).sum(axis=-1)
     sources = source_of_rows(database)[rows]

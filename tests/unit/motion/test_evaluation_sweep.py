@@ -1,4 +1,7 @@
-"""Sweeps of weights: results equal those of a database built with the weights; groups are ranked by effect."""
+"""Evaluations with varied weights: results equal those of a database with these weights.
+
+Groups are ranked by effect.
+"""
 
 from math import radians
 from typing import Any

@@ -1,4 +1,4 @@
-"""ASF/AMC reader, compared with joint positions that the test computes, with matrices, as the format defines them."""
+"""ASF/AMC reader, compared with joint positions that tests compute from the definition of the format."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Detection of the format of a file by its bytes, or else by its name."""
+"""Detection of the format of a file by its bytes; if these are not sufficient, by its name."""
 
 from __future__ import annotations
 

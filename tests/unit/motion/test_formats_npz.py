@@ -24,7 +24,7 @@ def archive(body: Skeleton, tumbling: Callable[..., Clip]) -> dict[str, bytes]:
 
 
 def unrolled(clip: Clip) -> Clip:
-    """Return the clip with the signs of its rotations made continuous."""
+    """Return the clip with the signs of its quaternions made continuous in time."""
     rotations = quaternions.unroll(clip.rotations).reshape(clip.frame_count, -1)
     return replace(clip, poses=np.concatenate([clip.root_translations, rotations], axis=1).astype(np.float32))
 

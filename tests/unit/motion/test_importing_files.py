@@ -1,4 +1,4 @@
-"""Import of one file, in which no work is done twice."""
+"""Import of one file, which computes nothing twice."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_a_skeleton_is_made_for_the_first_of_equal_files_only(count: Count, monk
 
 
 def test_what_is_kept_of_one_file_changes_nothing_about_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Data that is cached by skeleton changes no import: documents equal those from a process with an empty cache."""
+    """The cache by skeleton changes no result: documents equal those from a process with an empty cache."""
     takes = [write_bvh(generate_gait(speed, 0.0, 1.0, 30.0)) for speed in (1.0, 1.4)]
 
     def documents_of(data: bytes) -> Any:

@@ -94,7 +94,7 @@ def _spins(skeleton: Skeleton, motion: Motion, joint: int) -> np.ndarray:
 
 
 def _targets_everywhere(skeleton: Skeleton, motion: Motion) -> list[Target]:
-    """Return targets of every kind near the present poses, some of them with offsets or only for some axes."""
+    """Return targets of every kind near the present poses. Some have offsets, or concern only some axes."""
     random = np.random.default_rng(5)
     places = motion.positions(skeleton)
     wrist, ankle, head = (_joint(skeleton, name) for name in ("left_wrist", "right_ankle", "head"))
@@ -430,9 +430,9 @@ def test_a_limb_that_is_straight_or_folded_bends_about_its_hinge(body: Skeleton)
 
 
 def _bending_leg(body: Skeleton, bends_rad: np.ndarray, aside_rad: float) -> tuple[Motion, TwoBoneLimb]:
-    """Return a motion in which the hanging left leg bends the knee forwards by these angles, and the limb of this leg.
+    """Return a motion in which the hanging left leg bends its knee forwards by these angles, and the limb of this leg.
 
-    The axis of the knee is turned aside by `aside_rad`.
+    The axis of the knee is turned to the side by `aside_rad`.
     """
     frames = len(bends_rad)
     rotations = np.repeat(body.rest_rotations[None], frames, axis=0)

@@ -1,4 +1,4 @@
-"""Forward kinematics, compared with a simple reference and with chains computed by hand; headings and contacts."""
+"""Forward kinematics, compared with a simple reference and chains computed by hand. Also headings and contacts."""
 
 import subprocess
 import sys

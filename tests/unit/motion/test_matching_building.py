@@ -33,7 +33,7 @@ def built(
 
 
 def stood(database: MatchingDatabase) -> NDArray[np.float32]:
-    """Return the joint positions (N, J, 3) of all rows in the world, computed as the docstring of the database says."""
+    """Return the joint positions (N, J, 3) of all rows in the world, computed by the definition of the database."""
     poses = database.poses.astype(np.float64)
     poses[:, [0, 2]] = rotated(poses[:, [0, 2]], database.root_headings) + database.root_positions
     poses[:, 3:7] = quaternions.multiply(about_vertical(database.root_headings), poses[:, 3:7])
@@ -144,7 +144,7 @@ class TestWhatMustNotMatter:
 
     @pytest.mark.parametrize("turn_rad", [0.3, 1.9, -2.6])
     def test_any_turn_and_shift_change_no_more_than_clips_can_hold(self, turn_rad: float) -> None:
-        """Clips have single precision: errors of 5e-7 m at 8 m from the origin, so of 2e-5 m/s over 1/30 s."""
+        """Clips have single precision. At 8 m from the origin, errors are 5e-7 m, which is 2e-5 m/s over 1/30 s."""
         there = built(on_the_ground(WALK, turn_rad, (4.0, -7.0)))
         np.testing.assert_allclose(there.features, built(WALK).features, atol=5e-5)
 

@@ -228,7 +228,10 @@ def test_rows_near_the_current_one_are_left_out_of_the_search_on_request() -> No
 def test_the_window_bars_as_many_frames_on_either_side_and_none_of_another_clip(
     choosable: tuple[Any, ...], chosen: int
 ) -> None:
-    """Ten frames before and after row 206 may not be chosen. All rows cost the same, so the first allowed one is."""
+    """Rows up to ten frames before and after row 206 may not be chosen.
+
+    All rows cost the same, so the first allowed row is chosen.
+    """
     first = 199 if chosen == 196 else 190
     database = synthetic_database([arc_track(2.0, 0.0, frames / 60) for frames in (first, 600 - first)])
     features = np.ones_like(database.features)
@@ -351,7 +354,7 @@ def test_following_the_path_a_slow_character_is_not_hurried_along() -> None:
 
 
 def test_the_path_is_looked_at_from_the_nearest_point_also_where_that_lies_between_two_ticks() -> None:
-    """The root moves at 0.9 m/s parallel to a straight path that is followed at 2 m/s.
+    """The root moves at 0.9 m/s parallel to a straight path; the requested speed is 2 m/s.
 
     So the trajectory ahead must be the same at every tick.
     """

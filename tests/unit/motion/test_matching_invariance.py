@@ -1,4 +1,4 @@
-"""Databases with known results: values for exact roots, and changes that must not affect a result."""
+"""Motion matching databases of exact roots: known results, and changes that must not affect a result."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Loops: rows look ahead and filters run across the seam; each round continues where the one before ended."""
+"""Loops: rows look ahead across the seam, and so do filters. Each round continues where the previous one ended."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ def test_a_round_of_a_walk_is_like_that_part_of_the_walk(long_walk: Clip) -> Non
 
 
 def test_rows_look_ahead_to_where_playing_on_leads(long_walk: Clip) -> None:
-    """The trajectory of each row is the sum of the root's steps when the loop is played across its seam."""
+    """The trajectory of each row is the sum of the root's steps in a loop that continues across its seam."""
     database = built(long_walk.sliced(120, 120 + stride_frames(long_walk)))
     motion = database.root_motion
     for first in range(0, database.row_count, 7):

@@ -1,8 +1,7 @@
 """Motion matching on whole bodies: generated gaits are converted to a database and then played.
 
 The torso sways with the steps and leans into a curve. So the root is centimetres away from the path for which the gait
-was generated, and it moves on slightly smaller circles at a slightly lower speed. Tolerances that are larger than
-rounding errors allow for this.
+was generated. It moves on slightly smaller circles, at a slightly lower speed. Tolerances take this into account.
 """
 
 from collections.abc import Sequence
@@ -200,7 +199,7 @@ def places(database: MatchingDatabase, record: TrialRecord) -> list[tuple[str, i
 def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(
     takes: list[SourceClip], follow: str
 ) -> None:
-    """Trials have no straight approach before the circle, because both trials would begin it with the same row."""
+    """Trials have no straight approach, which the left and the right trial would begin in the same row."""
     closed = database_of(takes, DatabaseOptions(mirroring="add"))
     options = ControllerOptions(follow=follow)
     for speed, turn_rate_deg in ((1.3, 40.0), (2.0, 60.0), (1.0, 100.0)):

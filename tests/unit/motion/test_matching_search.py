@@ -1,4 +1,4 @@
-"""Exact search, compared with a comparison of all rows in float64, one dimension after another."""
+"""Exact search, compared with the distances of all rows in float64, summed one dimension after another."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -91,7 +91,7 @@ DATABASES = (gait_like, gaussian, quantised, constant, denormal, tiny_squares, f
 
 
 def queries_for(rows: Floats, count: int, rng: Generator) -> Floats:
-    """Return queries: rows, rows changed slightly or by one step of float32, and mixtures of two rows."""
+    """Return queries: rows, rows with a small change or a change by one step of float32, and mixtures of two rows."""
     first, second = rng.integers(0, len(rows), (2, count))
     queries = rows[first].copy()
     half = rows.shape[1] // 2
@@ -150,7 +150,8 @@ def test_differences_that_float32_cannot_show_still_decide(data: DataObject) -> 
 def test_distances_whose_squares_float32_barely_holds_still_decide() -> None:
     """Each squared difference is about ten times the smallest positive float32, and is rounded to a multiple of it.
 
-    In float32, the sum is 270 of these steps for half of the rows and 256 for the others; the true sums differ little.
+    In float32, the sum is 270 of these multiples for half of the rows, and 256 for the others. The true sums differ
+    little.
     """
     rng = np.random.default_rng(2)
     step = 2.0**-149

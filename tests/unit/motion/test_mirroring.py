@@ -90,7 +90,7 @@ def test_all_joints_are_where_the_mirror_shows_their_partners(make: Callable[...
 
 
 def test_joints_whose_names_tell_no_side_are_found_by_what_they_carry() -> None:
-    """The hip joints are between root and thighs, as in files with the names lhipjoint and rhipjoint."""
+    """Between root and thighs, the skeleton has hip joints, as in files with the names lhipjoint and rhipjoint."""
     plain = studio_skeleton()
     names = [{"LeftShoulder": "lyoke", "RightShoulder": "ryoke"}.get(name, name) for name in plain.joint_names]
     skeleton = replace(plain, joint_names=tuple(names), display_names=())

@@ -1,4 +1,4 @@
-"""Principal functions, signs of quaternions, scalings."""
+"""Principal component analysis of motions: principal functions, signs of quaternions, and weights of channels."""
 
 import numpy as np
 import pytest
@@ -72,7 +72,7 @@ def test_components_are_those_of_an_independent_library() -> None:
 
 
 def test_the_share_of_variance_counts_every_component() -> None:
-    """A truncated decomposition lacks the last components, so it would state a share of variance that is too high."""
+    """A truncated decomposition lacks the last components, so its share of variance would be too high."""
     coefficients = some(9, 5)
     deviations = np.linalg.svd((coefficients - coefficients.mean(axis=0)).reshape(9, -1), compute_uv=False)
     share = np.cumsum(deviations**2) / np.sum(deviations**2)
@@ -148,7 +148,7 @@ def turning(turns: float, frames: int = 60) -> Floats:
 
 
 def test_a_turn_beyond_half_a_turn_stays_in_one_piece() -> None:
-    """If each frame were compared with one fixed pose, the signs of quaternions would change during the turn."""
+    """A comparison of each frame with one fixed pose would change the signs of quaternions during the turn."""
     rotations = turning(0.9)
     jumping = rotations * np.where(rotations @ rotations[0, 0] < 0.0, -1.0, 1.0)[..., None]
     assert np.abs(np.diff(jumping, axis=0)).max() > 1.0

@@ -104,7 +104,7 @@ def test_one_kind_in_many_dimensions_is_one_component() -> None:
 
 @pytest.mark.slow
 def test_identical_examples_give_identical_mixtures_every_time() -> None:
-    """Formerly the fit had no seed, and the number of components differed from run to run."""
+    """An earlier version had no seed, so the number of components differed from run to run."""
     random = np.random.default_rng(4)
     examples = np.concatenate([random.standard_normal((25, 2)) + 3.0 * random.standard_normal(2) for _ in range(4)])
     first, second = (fit_mixture(examples, seed=3) for _ in range(2))

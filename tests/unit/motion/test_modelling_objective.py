@@ -107,7 +107,7 @@ def test_errors_are_those_of_the_whole_motions() -> None:
 
 
 def kept_within(count: int) -> tuple[MotionPrimitive, Floats]:
-    """Return a model that limits durations to 0.9 to 1.1 s, and latent vectors, many of them beyond these limits."""
+    """Return a model that limits durations to 0.9 to 1.1 s, and latent vectors. Many of these exceed the limits."""
     free, _ = walking()
     latents = free.sample(count, 1)
     lasting = free.durations_s(latents)
@@ -135,9 +135,9 @@ def test_times_are_those_of_motions_that_are_kept_within_their_range() -> None:
 
 
 def cut_off(count: int) -> tuple[MotionPrimitive, Floats]:
-    """Return latent vectors, and a model that limits time steps to the middle half of those of the vectors.
+    """Return a model and latent vectors.
 
-    The model comes first in the result.
+    The model limits time steps to the middle half of the vectors' time steps.
     """
     free, _ = walking()
     latents = free.sample(count, 1)

@@ -1,4 +1,4 @@
-"""Refinement of motions, compared with closed forms where these exist, and else checked for general properties."""
+"""Refinement of motions, compared with closed forms if these exist, otherwise checked for general properties."""
 
 from collections.abc import Callable
 from dataclasses import replace

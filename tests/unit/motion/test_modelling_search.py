@@ -192,8 +192,8 @@ def test_what_lies_between_samples_is_told_from_samples_and_costs_what_it_says()
 def own_keyframes(**options: Any) -> tuple[list[Objective], SampleTree, list[tuple[JointPositionConstraint]], Floats]:
     """Return a search for each example of a model of walks: the target is the example's own left wrist at a keyframe.
 
-    Returns the objectives by example, the tree of the model, the constraints by example, and the latent vectors (m, L)
-    of the examples.
+    The result consists of the objectives by example, the tree of the model, the constraints by example, and the
+    examples' latent vectors (m, L).
     """
     aligned, joints = walks(24), standard_joints()
     primitive = train_primitive(aligned, ModelOptions(leave_one_out=False, report_samples=0, **options)).primitive

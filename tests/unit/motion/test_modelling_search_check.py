@@ -48,7 +48,7 @@ def test_the_same_seed_finds_the_same(aligned: AlignedSet, check: SearchCheck) -
 
 
 def test_places_where_the_other_examples_never_go_are_missed(aligned: AlignedSet) -> None:
-    """The example that is left out is far away from all other examples, so no motion of the model comes near it."""
+    """The example that is left out is far away from all others, so no motion of the model comes near this example."""
     odd = aligned.clips[1]
     away = odd.motion._replace(root_translations=np.add(odd.motion.root_translations, (5.0, 0.0, 0.0)))
     clips = (aligned.clips[0], replace(odd, motion=away), *aligned.clips[2:])

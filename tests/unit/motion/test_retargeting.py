@@ -126,7 +126,7 @@ def assert_bones_point_alike(
 
 
 def assert_no_flips_of_its_own(source: Actor, result: Clip, plan: RetargetPlan) -> None:
-    """Check that mapped joints rotate between frames as in the source, and that no quaternion changes its sign."""
+    """Check that mapped joints rotate from frame to frame as in the source, and that no quaternion changes its sign."""
     before = kinematics.global_rotations(source.clip).astype(np.float64)
     after = kinematics.global_rotations(result).astype(np.float64)
     for pair in plan.pairs:

@@ -29,7 +29,7 @@ def at_rest(skeleton: Skeleton, axes: dict[str, JointAxes], name: str) -> tuple[
 
 
 def with_arms(body: Skeleton, direction_left: tuple[float, float, float]) -> Skeleton:
-    """Return the body with straight arms in another direction; the right arm mirrors the left one."""
+    """Return the body with straight arms that point in another direction; the right arm mirrors the left arm."""
     offsets = body.offsets.copy()
     for name in ("LeftForeArm", "LeftHand"):
         length = np.linalg.norm(offsets[body.index_of(name)])

@@ -80,7 +80,7 @@ def test_a_walker_tells_which_axis_points_up(walk: Clip, up_axis: str) -> None:
 
 
 def test_a_rest_pose_that_lies_does_not_mislead(walk: Clip) -> None:
-    """Exporters rotate a Z-up rest pose upright with the root's rotation, so the motion decides, not the rest pose."""
+    """Some exporters rotate a Z-up rest pose upright by the root's rotation. So the import must use the motion."""
     skeleton = game_skeleton()
     poses = np.zeros((30, 3 + 4 * skeleton.joint_count), np.float32)
     poses[:, 3:] = skeleton.rest_rotations.reshape(-1)

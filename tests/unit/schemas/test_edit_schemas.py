@@ -1,4 +1,4 @@
-"""Documents of edits."""
+"""Documents of edits: lists of commands that change clips."""
 
 import json
 from typing import Any

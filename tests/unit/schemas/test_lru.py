@@ -1,4 +1,4 @@
-"""Cache of recently used values: which values stay in the cache, and which are removed first."""
+"""Cache of recently used values: values that stay, and values that are removed first."""
 
 import threading
 

@@ -1,4 +1,4 @@
-"""Records about the training of a model: members that Marey uses later are validated, others are only stored."""
+"""Records of a model's training: members that Marey uses later are validated; others are only stored."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Facts about a recording that a new revision of a clip keeps."""
+"""Fields of a take record that a new revision of a clip keeps."""
 
 from __future__ import annotations
 

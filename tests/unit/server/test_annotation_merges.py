@@ -1,4 +1,4 @@
-"""Versions in which two people have labelled one clip: merges, cherry-picks, reverts, and commits by jobs."""
+"""Versions with a clip that two people have labelled: merges, cherry-picks, reverts, and commits of jobs."""
 
 from __future__ import annotations
 

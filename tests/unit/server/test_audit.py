@@ -1,4 +1,4 @@
-"""Audit log in the store: which functions change events, how long entries are kept, indexes, and upgrades."""
+"""Audit log in the store: functions that change events, the time for which entries are kept, indexes, and upgrades."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_old_events_are_deleted_and_audit_entries_stay(lab: Lab, clock: Adjustab
 def test_the_feed_shows_no_audit_entries_from_before_the_events_that_remain(lab: Lab, clock: AdjustableClock) -> None:
     """A follower who begins at 0 gets only events from periods that are still complete.
 
-    So the follower gets no event number after which it could not continue.
+    So it can continue after each event that it gets.
     """
     set_role(lab, Role.CONTRIBUTOR)
     last = lab.events()[-1].seq

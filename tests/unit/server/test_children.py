@@ -1,4 +1,4 @@
-"""Child processes that read untrusted files: limits, fair sharing among callers, and how children end."""
+"""Child processes that read untrusted files: their limits, how callers share them, and how they end."""
 
 import os
 import signal
@@ -69,7 +69,7 @@ def note(ended: list[str], caller: str, _future: object) -> None:
 
 
 def process_id(pool: Children) -> int:
-    """Run a short function in a child process; return the id of this process, which is then idle again."""
+    """Run a short function in a child process, and return the id of this process, which is idle afterwards."""
     found = int(run(pool, "echo").split()[-1])
     until(lambda: pool.sizes == (0, 0))  # otherwise, the next order would get another process
     return found

@@ -1,4 +1,4 @@
-"""Maintenance of a database by commands: backup, restore and check; the event loop of a server."""
+"""Commands that maintain a database (backup, restore, check), and the choice of a server's event loop."""
 
 import asyncio
 import sqlite3

@@ -1,4 +1,4 @@
-"""Consents in the queue: which clips a worker must leave out, who may allow them, and which results are shared."""
+"""Consents in the queue: clips that a worker must leave out, users who may allow them, and results that are shared."""
 
 from dataclasses import replace
 from typing import Any

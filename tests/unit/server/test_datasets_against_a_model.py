@@ -298,7 +298,7 @@ class DatasetMachine(RuleBasedStateMachine):
 
     @contextmanager
     def _unless_impossible(self, branch: str, path: str, number: int | None) -> Iterator[bool]:
-        """Yield whether the model can change the path; if not, expect an error in the `with` block."""
+        """Yield whether the model can change the path; if it cannot, the `with` block must raise an error."""
         if branch in self.model.tags or branch not in self.model.refs:
             codes = ("is-tag", "no-version")
         elif self.model.state(self.model.refs[branch]).get(path) == number:

@@ -40,9 +40,9 @@ def few_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], object]], list[str]]:
-    """Function that lets an action run once, after a commit is planned and before it is recorded.
+    """Function that runs an action once, between the plan of a commit and its recording.
 
-    It returns a list to which each plan is added.
+    It returns a list that collects the plans.
     """
 
     def arrange(action: Callable[[], object]) -> list[str]:
@@ -237,7 +237,7 @@ def test_a_commit_is_planned_again_after_a_purge(
 def test_chunks_that_a_purged_dataset_had_too_are_stored_again(
     gaits: CommittingDesk, meanwhile: Callable[[Callable[[], object]], list[str]]
 ) -> None:
-    """The branch also moves meanwhile, so that the last write builds a new tree from the chunks of the plan."""
+    """The branch also moves meanwhile, so the server builds a new tree from the chunks that it has planned."""
     (thing,) = gaits.desk.things(1, "far")
     for one in (CommittingDesk(gaits.desk, "other"), gaits):
         one.change(PutEntry(path="own", item=thing))

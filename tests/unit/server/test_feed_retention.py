@@ -66,9 +66,10 @@ class World:
         self.follower = Follower(lab, lab.database.read(SYSTEM, events.newest_number))
 
     def do(self, turn: str) -> None:
-        """Write an event (`ordinary`, `audited`), read a page (`read`), or let six days pass.
+        """Do one step:
 
-        With `retire`, old events are deleted after the six days.
+        write an event (`ordinary`, `audited`), read a page (`read`), or let six days pass. With `retire`, the server
+        then also deletes old events.
         """
         if turn in ("ordinary", "audited"):
             self._write(turn)
@@ -115,7 +116,7 @@ class World:
         assert [one.subject for one in reversed(page.items) if one.subject in self.numbers] == self.audited
 
     def _check_beginner(self) -> None:
-        """Check that a client that begins at 0 is never refused, and gets all events after some event."""
+        """Check that a client that begins at 0 is never refused, and gets all events after its first event."""
         beginner = Follower(self.lab, 0)
         while beginner.last < max(self.numbers.values(), default=0):
             beginner.read()
@@ -124,7 +125,7 @@ class World:
         assert own == list(self.numbers)[len(self.numbers) - len(own) :]
 
     def _check_webhook(self) -> None:
-        """Check that the events to deliver and the number of events reported as missed add up to all events."""
+        """Check that the webhook gets every event, either to deliver or in the number of missed events."""
         batch = self.lab.database.read(SYSTEM, outbox.next_batch, self.hook, 0)
         assert batch is not None
         waiting = [one for one in batch.deliveries if one.kind != outbox.MISSED_KIND]

@@ -370,7 +370,7 @@ def test_a_reader_runs_jobs_that_write_to_the_readers_folder(studio: Studio) -> 
 def test_rights_are_read_before_items_are_read_and_jobs_are_locked(
     studio: Studio, monkeypatch: pytest.MonkeyPatch, operation: str
 ) -> None:
-    """Otherwise a submission could miss the move of a folder, or lock jobs while it waits for a change of roles."""
+    """In another order, a submission could miss the move of a folder, or hold locks of jobs while it waits."""
     studio.put("contributor")
     first = studio.submit(studio.rob, "errand", into="team")
     last = studio.submit(studio.rob, "errand", into="team", after=(first,))
@@ -432,7 +432,7 @@ def test_the_folders_of_results_are_those_that_are_known_before_the_job(
 ) -> None:
     """The folder of an input is None if the input is a future result of another job.
 
-    Inputs in `team/below` are pinned results of a job that wrote to the subfolder `below`.
+    Inputs in `team/below` are known results of a job that wrote to the subfolder `below`.
     """
 
     def pin(folder: str | None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The check of the store finds every kind of damage, and no damage in an intact store."""
+"""The check of the store (`marey db fsck`) finds every kind of damage, and no damage in an intact store."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Which jobs get the result of an earlier job, and which jobs are refused because of where their results would go."""
+"""Jobs that get the result of an earlier job, and jobs that are refused because of the place of their results."""
 
 from typing import Any
 

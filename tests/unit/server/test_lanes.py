@@ -117,7 +117,7 @@ class Tree:
 
 
 def test_a_refused_call_keeps_nothing_that_its_functions_used() -> None:
-    """Otherwise, only the garbage collector would free the bodies of refused requests, and it stops all threads."""
+    """Only the garbage collector could free bodies of refused requests that a call keeps, and it stops all threads."""
     trees: list[weakref.ref[Tree]] = []
 
     def check(tree: Tree) -> None:

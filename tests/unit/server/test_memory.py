@@ -1,4 +1,4 @@
-"""Memory of requests: shared among clients."""
+"""Limited memory for requests, which clients share."""
 
 from __future__ import annotations
 

@@ -725,7 +725,7 @@ def test_blobs_of_jobs_are_not_counted_as_freed(house: House) -> None:
 
 
 def test_files_that_jobs_imported_or_made_of_a_purged_item_are_released(house: House) -> None:
-    """Neither the job that imported a file, nor the job that exported the item, keeps a copy of the content."""
+    """The job that imported the file, and the job that exported the item, keep no copy of the content."""
     source, archive = b"s" * 3000, b"a" * 4000
     made = house.desk.submit("sum")
     lease = house.desk.claim()

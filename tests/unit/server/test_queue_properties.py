@@ -1,4 +1,4 @@
-"""The queue, compared with a model, under random actions of submitters, workers and the reaper in any order."""
+"""The queue, compared with a model. Submitters, workers and the check for expired leases act in random order."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _forget_jobs(tx: Transaction) -> None:
 
 
 class QueueMachine(RuleBasedStateMachine):
-    """State machine: single jobs must be as in the model, and connected jobs must meet general conditions."""
+    """State machine: single jobs must equal those of the model; connected jobs must meet general conditions."""
 
     def __init__(self, desk: Desk, clock: StillClock) -> None:
         super().__init__()
@@ -132,7 +132,7 @@ class QueueMachine(RuleBasedStateMachine):
 
     @rule(data=st.data())
     def try_again(self, data: st.DataObject) -> None:
-        """Retry a connected job; the model of single jobs has no retries."""
+        """Retry a job that is connected to others; the model contains only single jobs without retries."""
         self._tick()
         lost = {row.id for row in self._rows() if row.kind in CHAINED and row.state in ("failed", "cancelled")}
         again = sorted(job for job in lost if self._is_head(job) and not self._needs_an_errand(job))
@@ -357,7 +357,7 @@ class QueueMachine(RuleBasedStateMachine):
         return any(row.id == job_id and row.parent_id is None for row in self._rows())
 
     def _needs_an_errand(self, job_id: str) -> bool:
-        """Return whether a job depends on a job of the kind `errand`, directly or through other jobs or retries."""
+        """Return whether a job depends on a job of the kind `errand`: directly, or through jobs and retries."""
         after = self.desk.job(job_id).after
         return any(other in self.model.jobs or self._needs_an_errand(other) for other in after)
 

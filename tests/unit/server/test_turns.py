@@ -1,4 +1,4 @@
-"""Turns: few requests begin in each round of the event loop, and clients take turns."""
+"""Turns of clients: few requests begin in each round of the event loop, and clients take turns."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class Desk:
         return [] if batch is None else [one.id for one in batch.deliveries]
 
     def record(self, result: DeliveryResult, *, place: int = 0, lead: Lead | None = None) -> Outcome | None:
-        """Record the result of an attempt to send the delivery at a place of the batch."""
+        """Record the result of an attempt to send one delivery of the batch, given by its index."""
         batch = self.batch()
         assert batch is not None
         before = (batch.position, batch.attempts)
@@ -278,7 +278,7 @@ def test_a_position_moves_past_events_that_do_not_concern_the_webhook(desk: Desk
 
 
 class Silence:
-    """Sender whose receivers do not answer; it records the webhooks to which requests are under way."""
+    """Sender whose receivers never answer; it records the webhooks with an unanswered request."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []

@@ -1,4 +1,4 @@
-"""Writes that wait for each other, and then share a commit."""
+"""Writes that wait at the same time, and then share one commit."""
 
 import threading
 from collections.abc import Callable

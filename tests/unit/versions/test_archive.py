@@ -1,4 +1,4 @@
-"""Archives: they can be read after writing, an interrupted one is continued, and every change is detected."""
+"""Archives: they can be read after writing, an interrupted archive is continued, and every change is detected."""
 
 from __future__ import annotations
 

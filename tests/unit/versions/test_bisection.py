@@ -37,9 +37,9 @@ def search(commits: History, bad: str, is_bad: Callable[[str], bool | None]) -> 
 def most_tests(commits: int) -> int:
     """Return how many tests are enough for n commits if a test leaves at most 2 n / 3 + 1/2 commits.
 
-    Why such a test exists: go from the newest commit to the parent with more ancestors, again and again, until a commit
-    has at most 2 n / 3 ancestors, itself included. Its child has more than 2 n / 3, so this commit has more than
-    n / 3 - 1/2. A test of this commit leaves either its ancestors or all other commits.
+    Why such a test exists: start at the newest commit, and go to the parent with more ancestors until a commit has at
+    most 2 n / 3 ancestors (itself included). Its child has more than 2 n / 3 ancestors, so this commit has more than n
+    / 3 - 1/2. A test of this commit leaves either its ancestors or all other commits.
     """
     return 0 if commits == 1 else 1 + most_tests((4 * commits + 3) // 6)
 
@@ -100,7 +100,7 @@ def test_with_commits_that_cannot_be_tested_the_fault_is_among_the_suspects(
 def consistent_culprits(
     commits: History, newest: str, tested: Collection[str], skipped: Collection[str], culprit: str
 ) -> set[str]:
-    """Return every commit that, as the only fault, would have given the same results of all tests."""
+    """Return every commit that explains the results of all tests if it is the only fault."""
 
     def results(fault: str) -> list[bool]:
         return [fault in ancestors(commits, one) for one in tested if one not in skipped]

@@ -138,7 +138,7 @@ def motions(entries: Iterable[Value]) -> set[str]:
 def test_no_entry_disappears_by_a_resolution_of_other_entries(
     versions: tuple[State, State, State], choices: list[Side]
 ) -> None:
-    """A person answers the listed conflicts one by one, and those that the answers bring up."""
+    """A person answers the listed conflicts one by one, and also new conflicts that the answers cause."""
     base, ours, theirs = versions
     kept_by_both = motions(ours.values()) & motions(theirs.values())
     resolutions: list[tuple[str, Side]] = []

@@ -114,7 +114,10 @@ def test_a_merge_is_the_origin_of_what_differs_from_both_sides() -> None:
 
 
 def test_a_search_that_has_compared_too_many_entries_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each commit moves the entry, so each is compared with the one before: two changed entries."""
+    """Each commit moves the entry.
+
+    So the search compares each commit with its parent, and reads two changed entries.
+    """
     history = History()
     keys = [key_of(f"a{place}", "clip") for place in range(6)]
     last = history.add({keys[0]: entry("1", "1")})

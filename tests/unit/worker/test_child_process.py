@@ -34,7 +34,7 @@ def test_killing_a_child_ends_the_sending_of_a_message_that_it_does_not_read(chi
 
 @pytest.fixture
 def in_use(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
-    """List with one value per signal sent: whether the signal's process id still belonged to a child process."""
+    """List with one value for each sent signal: whether its process id still belonged to a child process."""
     found: list[bool] = []
     send = os.killpg
 

@@ -1,4 +1,4 @@
-"""The log of a job arrives once and in order, in spite of failures on the way."""
+"""The log of a job arrives once and in order, even if requests fail."""
 
 from pathlib import Path
 from typing import cast
@@ -15,7 +15,7 @@ ARRIVES, NEVER_ARRIVES, ANSWER_IS_LOST = "arrives", "never arrives", "answer is 
 
 
 class Api:
-    """Simulated server that stores a log; `fates` lists what happens to the next pieces of the log, one by one."""
+    """Simulated server that stores a log; `fates` lists what happens to each of the next pieces of the log."""
 
     def __init__(self, limit: int = 1000) -> None:
         self.log = b""

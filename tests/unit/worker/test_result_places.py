@@ -1,4 +1,4 @@
-"""Paths of the results of jobs with many clips, and effects of a clip that cannot be used."""
+"""Paths of the results of jobs with many clips, and what happens if one clip cannot be used."""
 
 import io
 import zipfile
@@ -47,7 +47,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ProjectInMemory:
 
 
 def move(project: ProjectInMemory, into: str, **of_all: Any) -> None:
-    """Set the folder of the results to `into`, and fields of all input clips to the values of `of_all`."""
+    """Set the folder of the results to `into`, and fields of all input clips to the values in `of_all`."""
     project.into = into
     project.inputs["clips"] = tuple(pin.model_copy(update=of_all) for pin in project.inputs["clips"])
 
