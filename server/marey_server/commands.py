@@ -192,7 +192,7 @@ def _shrink(file: Path) -> None:
 
 
 def admin_token(*, user: str | None = None, **settings: Any) -> None:
-    """Create a new administrator's token, and write it to `admin.token` in the data folder."""
+    """Create a new token for an administrator, and write it to `admin.token` in the data folder."""
     from marey_server.access.principal import SYSTEM
     from marey_server.app import connect_database
     from marey_server.errors import NotFoundProblem
