@@ -36,7 +36,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Drop the table and the indexes; the next evaluation of a clip publishes its facets again."""
+    """Drop the table, with the facets of all clips, and the indexes."""
     op.drop_table("item_facet")
     for name in FACTS:
         op.drop_index(f"ix_item_by_{name}", "item")

@@ -67,8 +67,8 @@ class RetargetPlan:
     at_rest : tuple of str    target joints that are neither paired nor carried; they keep their rest rotation
     missing : tuple of str    standard joints that only one of the skeletons has
     sources : (K,) int32    source joint that each of the K target joints follows, -1 for none
-    corrections : (K, 4) float64    constant rotation S·Tᵀ of each mapped joint (see the description of this module) as
-        (w, x, y, z), identity for the other joints
+    corrections : (K, 4) float64    constant rotation of each mapped joint as (w, x, y, z), identity for the other
+        joints; the target's global orientation is the source's global orientation times this rotation
 
     Examples
     --------

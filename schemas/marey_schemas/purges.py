@@ -91,8 +91,8 @@ class PurgedItem(Answer):
     item: str
     kind: Kind
     path: str = Field(
-        description="Folder and name that the item had; empty after the purge, because the answer is stored for "
-        "repeated requests and must not keep the name."
+        description="Folder and name of the item, in a preview. Empty in the answer to a purge: this answer is stored "
+        "for repetitions of the request, and must not keep the name."
     )
 
 

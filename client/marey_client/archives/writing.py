@@ -213,7 +213,8 @@ class _Making:
     def _add_commit(self, commit: Commit, *, unchanged: bool) -> None:
         """Add a commit and its changes to the archive, and note the revisions of the changed entries.
 
-        With `unchanged`, documents that an entry already had in the first parent of the commit are left out.
+        If `unchanged` is true, documents that an entry already had in the first parent of the commit are not added; the
+        list of changes names them as unchanged.
         """
         at = commit.at.strftime(TIME_OF_COMMIT)
         record = CommitRecord(commit.tree, commit.parents, commit.author, commit.message, at)

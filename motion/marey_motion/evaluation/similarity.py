@@ -30,11 +30,14 @@ nearest frame is searched for among all frames of the cell.
 
 @dataclass(frozen=True, eq=False)
 class PoseSimilarity:
-    """Distances, in each cell (V, O) of the coverage map, between frames and the nearest frame of another source clip.
+    """Distances from frames to the nearest frame of another source clip in the same cell of the coverage map.
+
+    The map has V speeds and O turn rates.
 
     Parameters
     ----------
-    threshold_m : largest distance at which frames can be blended: sum over the pose joints, metres
+    threshold_m : largest distance of two frames that can be blended: the sum of the distances between their pose
+        joints, in metres
     frames, sources : (V, O) int64    numbers of frames and of sources in the cell; a clip and its mirrored copy are one
         source
     measured : (V, O) int64    number of frames compared; if a cell has more than `MOST_FRAMES`, evenly spaced frames

@@ -76,7 +76,7 @@ def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: Con
 
 
 def switched_rows(database: MatchingDatabase, rows: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Find, for each tick, the row that a search chose instead of the displayed row.
+    """Find, for each tick, the row to which a search switched.
 
     The successor of the chosen row is displayed at the next tick.
 
@@ -87,7 +87,7 @@ def switched_rows(database: MatchingDatabase, rows: NDArray[np.int32]) -> NDArra
 
     Returns
     -------
-    (T,) int64    -1 where the clip was continued
+    (T,) int64    -1 for ticks at which the clip was continued
     """
     successors = database.root_motion.successors
     following = rows[1:].astype(np.int64)

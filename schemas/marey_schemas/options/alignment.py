@@ -30,7 +30,8 @@ class CostOptions(Options):
         1,
         ge=1,
         le=61,
-        description="Number of frames, centred on each of two poses, that are compared with each other; odd.",
+        description="Number of frames in the window around a pose, an odd number. Two poses are compared by all frames "
+        "of their windows; 1: by the poses alone.",
     )
 
     @field_validator("window")

@@ -68,7 +68,10 @@ class EvaluationOptions(Grid):
     duration_s: float = Field(
         30.0, ge=1, le=600, allow_inf_nan=False, description="Duration of the circle in seconds, after the approach."
     )
-    switch_speed_m_s: Speed = Field(4.0, description="The other speed of switching trials, in metres per second.")
+    switch_speed_m_s: Speed = Field(
+        4.0,
+        description="Second speed of switching trials, in metres per second; the first is one of `speeds_m_s`.",
+    )
     switch_every_s: float = Field(
         5.0, ge=0.5, le=600, allow_inf_nan=False, description="Seconds that each speed of a switching trial lasts."
     )

@@ -74,7 +74,8 @@ def target_error(targets, c, frame, tip, turn):  # type: ignore[no-untyped-def]
 
     The error of a position is `tip` minus the target, in metres, and 0 along the axes that the target leaves free. The
     error of an orientation is the rotation vector, in radians, from the target's rotation to `turn`. The error of a
-    look-at target is the rotation vector from the direction of the target to the look-at axis, rotated by `turn`.
+    look-at target is the rotation vector, in radians, from the direction towards the target to the direction that the
+    look-at axis has after the rotation `turn`.
     """
     values = targets.values[frame]
     if targets.kinds[c] == POSITION:

@@ -1,6 +1,6 @@
 """Graphs of models of Marey's predecessor: nodes with transitions, and the node where sequences start.
 
-A document contains the nodes by action and by the id that the model has in the predecessor's data base. The form is
+A document contains the nodes by action and by the id that the model has in the predecessor's database. The form is
 `{"nodes": {action: {model id: {"name", "type", "transitions": {"action:model": {"action_name", "model_name",
 "model_id"}}}}}, "start_node": [action, model]}`; some programs write `startNode`. Transitions and the start node refer
 to a model by its id or by its name.
@@ -29,7 +29,7 @@ class GraphNode:
 
     Parameters
     ----------
-    model_id : id of the model in the data base of Marey's predecessor
+    model_id : id of the model in the database of Marey's predecessor
     type : type of the node, one of `TYPES`
     transitions : nodes that may follow
     """

@@ -104,7 +104,9 @@ def as_log_slopes(
 
 
 def components_of(basis: SplineBasis, mean: Floats, directions: Floats, variances: Floats) -> FunctionalComponents:
-    """Make components from directions; the projections of the components are the pseudo-inverse of the directions.
+    """Make components from the change of the coefficients for each unit of each score.
+
+    The pseudo-inverse of these changes gives the projections, which compute scores from coefficients.
 
     The variance that the components do not explain is unknown. Therefore, `energy` contains cumulative shares not of
     the total variance, but of the variance that all components explain together.

@@ -193,7 +193,7 @@ def _labels_of(tx: Transaction, request: TokenCreate) -> Mapping[str, str] | Non
     if request.labels is None:
         return tx.principal.labels if claims_jobs else None
     if not claims_jobs:
-        detail = "Only a token with the scope work, which claims jobs, can be bound to labels of workers."
+        detail = "Only a token that can claim jobs can have labels: add the scope `work`, or leave out the labels."
         raise InvalidProblem(detail, errors=[FieldError(pointer="/labels", code="needs-work", detail=detail)])
     labels_key(request.labels)  # raises InvalidProblem for labels that no worker can announce
     if (beyond := first_outside(request.labels, tx.principal.labels)) is not None:

@@ -75,9 +75,10 @@ def alone(file: Path) -> Iterator[Connection]:
 
 
 def vacuum(file: Path) -> None:
-    """Copy an SQLite file without its free pages.
+    """Rewrite an SQLite file without its free pages.
 
-    Raises the errors of `alone`, and an error if the disk has no space for the copy.
+    Raises the errors of `alone`, and `DatabaseUnusable` if SQLite fails, for example because the disk has no space for
+    its temporary copy.
     """
     with alone(file) as connection:
         connection.commit()  # a vacuum runs outside of transactions; the lock stays

@@ -165,8 +165,8 @@ def _combine(
         )
     if len(merged.combined) > MOST_COMBINED:
         raise InvalidProblem(
-            f"A merge combines the changes of both sides in at most {MOST_COMBINED:,} entries, but both sides have "
-            f"changed {len(merged.combined):,}. Merge in several steps, first an earlier version.",
+            f"In {len(merged.combined):,} entries, changes of both sides must be combined, but one merge can combine "
+            f"at most {MOST_COMBINED:,}. Merge in several steps: first merge an earlier version.",
             code="too-many-combined",
         )
     tree = change(store, ours, merged.changes)

@@ -101,7 +101,7 @@ def plan_outputs(tx: Transaction, wanted: OutputEntries, head: str | None, most:
     annotations = AnnotationMerger(tx, wanted.project_id, MOST_MERGED_BY_JOB)
     merged = _merged(reader, base, head_tree, entries, annotations)
     if len(merged.combined) > MOST_COMBINED:
-        return PlannedCommit(head, too_many_changes(MOST_COMBINED, "combines its changes with those of others in"))
+        return PlannedCommit(head, too_many_changes(MOST_COMBINED, " if others have changed the dataset meanwhile"))
     tree = change(store, base, _values(entries)) if merged.conflicts else change(store, head_tree, merged.changes)
     in_folder = not merged.conflicts and _is_in_folder(tx, wanted, head, merged.changes)
     return PlannedCommit(
@@ -158,7 +158,7 @@ def _values(entries: Mapping[str, DatasetEntry | None]) -> dict[str, Value | Non
 def _unfit(entries: Mapping[str, DatasetEntry | None], most: int) -> CommitConflict | None:
     """Return the reason why a commit cannot contain these entries, or None."""
     if len(entries) > most:
-        return too_many_changes(most, "changes")
+        return too_many_changes(most)
     long = [path_and_kind(key)[0] for key in entries if len(key.partition("\t")[0]) > LONGEST_PATH]
     if long:
         detail = f"{counted(len(long), 'output')} would have a path of more than {LONGEST_PATH} characters."
@@ -166,15 +166,12 @@ def _unfit(entries: Mapping[str, DatasetEntry | None], most: int) -> CommitConfl
     return None
 
 
-def too_many_changes(most: int, verb: str) -> CommitConflict:
-    """Return the conflict of a job whose commit would have more than `most` changes.
-
-    `verb` is the verb of the error text, such as `changes`.
-    """
+def too_many_changes(most: int, condition: str = "") -> CommitConflict:
+    """Return the conflict of a job whose commit would have more than `most` changes, if `condition` holds."""
     return CommitConflict(
         code="too-many-changes",
-        detail=f"Such a commit {verb} at most {most:,} entries. The outputs are in the project; commit them by a "
-        "request.",
+        detail=f"The commit of a job can change at most {most:,} entries{condition}. The outputs are in the project; "
+        "commit them by a request.",
     )
 
 

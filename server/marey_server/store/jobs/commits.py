@@ -305,7 +305,7 @@ def _commit(tx: Transaction, row: Any, outputs: Sequence[Mapping[str, Any]]) -> 
     if not outputs:
         return {}
     if len(outputs) > MOST_COMMITTED_AT_ONCE:
-        return _columns(CommittedOutputs(conflict=too_many_changes(MOST_COMMITTED_AT_ONCE, "changes")))
+        return _columns(CommittedOutputs(conflict=too_many_changes(MOST_COMMITTED_AT_ONCE)))
     try:
         return _columns(commit_outputs(tx, _entries_of(tx, row, outputs), _mover(tx, row)))
     except ApiProblem as error:
