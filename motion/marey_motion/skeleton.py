@@ -284,7 +284,7 @@ def _checked_names(names: Sequence[str]) -> tuple[str, ...]:
         raise SkeletonError("a skeleton needs at least one joint", where="joint_names")
     for joint, name in enumerate(names):
         if not isinstance(name, str) or not name:
-            raise SkeletonError(f"the name of joint {joint} must be text, not {name!r}", where="joint_names")
+            raise SkeletonError(f"the name of joint {joint} must be nonempty text, not {name!r}", where="joint_names")
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
         raise SkeletonError(

@@ -55,7 +55,11 @@ class LineageRevision(Answer):
         description="Newest revision of the item. If it is greater than `revision`, `revision` is outdated."
     )
     deleted: bool = False
-    purged: bool = Field(False, description="Whether the item was deleted for good; nothing else is left of it.")
+    purged: bool = Field(
+        False,
+        description="Whether the item was purged: its content, name and tags were deleted for good, and only its place "
+        "in the lineage is left.",
+    )
     distance: int = Field(
         description="Number of jobs between the start and this revision: negative for inputs, positive for results."
     )

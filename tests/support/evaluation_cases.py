@@ -53,7 +53,11 @@ def straight_record(asked: Reference, speeds_m_s: NDArray[np.float64]) -> TrialR
 
 
 def walked_record(rows: Sequence[int], status: Sequence[Status] | None = None) -> TrialRecord:
-    """Return a record whose only content is the displayed rows; by default, searches have chosen all jumps."""
+    """Return a record that contains only the displayed rows and their status.
+
+    By default, a row that does not follow the previous row counts as chosen by a search (`REPLACING`); all others are
+    `KEPT`.
+    """
     shown = np.array(rows, dtype=np.int32)
     jumped = np.concatenate(([False], np.diff(shown) != 1))
     chosen = np.where(jumped, Status.REPLACING, Status.KEPT) if status is None else np.array(status)

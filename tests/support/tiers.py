@@ -120,12 +120,12 @@ LEFT_OUT = pytest.StashKey[Counter[str]]()
 
 
 def examples(count: int) -> int:
-    """Return the number of examples of a property test that draws `count` in the tier `test`."""
+    """Return how many examples a property test draws in the running tier; `count` is the number in the tier `test`."""
     return max(1, count * hypothesis.settings.default.max_examples // EXAMPLES)
 
 
 def steps(count: int) -> int:
-    """Return the number of steps of a state machine that takes `count` in the tier `test`."""
+    """Return how many steps a state machine takes in the running tier; `count` is the number in the tier `test`."""
     return count * hypothesis.settings.default.stateful_step_count // STEPS
 
 

@@ -26,7 +26,7 @@ class _OpenInvitations:
         return pages(self.transport, Invitation, self.url)
 
     def withdraw(self, named: str) -> None:
-        """Withdraw an open invitation, named by its id or its prefix."""
+        """Withdraw an open invitation, named by its `id` or its `prefix`, the text between the two `_` of its code."""
         self.transport.send("DELETE", f"{self.url}/{named}", repeatable=False)
 
 

@@ -210,10 +210,10 @@ def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, 
 
 
 def _standing_heels(contacts: FootContacts, blend: int) -> Flags:
-    """Find the frames (F,) in which a heel stays planted: until shortly before each new contact of its toe.
+    """Find the frames (F,) in which a heel is kept in place: its contacts, except frames before its toe lands.
 
     The ankle follows the toe, so each toe contact moves the ankle. A heel that is planted over several toe contacts
-    would otherwise jump from one position to the next.
+    moves to its next position during the excepted frames, at most `blend` before each contact; otherwise it would jump.
     """
     heel = contacts.heel.copy()
     for (_, lifted), (landed, _) in pairwise(runs(contacts.toe)):

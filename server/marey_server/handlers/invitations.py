@@ -60,7 +60,7 @@ class ProjectInvitation(Resource):
 
     @writes(access=Access.OWNER)
     async def delete(self, project: str, invitation: str) -> Rendered:
-        """Withdraw an open invitation, named by its id or its prefix; its code is not valid any more."""
+        """Withdraw an open invitation, named by its `id` or its `prefix`; its code is not valid any more."""
         return await self.answer(issuing.withdraw_invitation, project, invitation)
 
 
@@ -93,7 +93,7 @@ class ServerInvitation(Resource):
 
     @writes(access=Access.ADMINISTRATOR, scope="admin")
     async def delete(self, invitation: str) -> Rendered:
-        """Withdraw an open invitation, named by its id or its prefix; its code is not valid any more."""
+        """Withdraw an open invitation, named by its `id` or its `prefix`; its code is not valid any more."""
         return await self.answer(issuing.withdraw_account_invitation, invitation)
 
 

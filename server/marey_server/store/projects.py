@@ -281,8 +281,8 @@ def _guess_limit(tx: Transaction, per_hour: int) -> RateLimit:
 
 def _too_many_guesses(wait_s: int) -> TooManyRequestsProblem:
     return TooManyRequestsProblem(
-        "You have tried too many project names that are taken by projects that you may not see; you can create a "
-        f"project in {wait_s} s.",
+        "You have tried too many project names that are taken by projects that you may not see; try again in "
+        f"{wait_s} s.",
         code="too-many-names",
         context={"wait_s": wait_s},
         headers={"Retry-After": str(wait_s)},

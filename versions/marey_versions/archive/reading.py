@@ -184,7 +184,8 @@ class Archive:
                 raise BadArchive(f"{name}: an entry is not valid: {error}") from error
             if root != record.tree:
                 raise BadArchive(
-                    f"{name}: the entries do not have the digest in the commit; this file was altered later"
+                    f"{name}: with these changes, the entries do not have the digest that the commit states; the "
+                    "changes were altered after the archive was written"
                 )
             roots[digest] = root
         return Versions(store, roots)

@@ -47,9 +47,10 @@ def place_joints(parents, offsets, root, local, spins, places):  # type: ignore[
 
 @compiled
 def place_tips(targets, spins, places, tips, turns):  # type: ignore[no-untyped-def]
-    """Fill `tips` (C, 3) and `turns` (C, 4): positions of the targets' points, and rotations of their joints.
+    """Fill `tips` (C, 3) and `turns` (C, 4) for a pose: for each target, its point's position and its joint's rotation.
 
-    `spins` (K, 4) and `places` (K, 3) are rotations and positions of all joints. All four arrays are in the world.
+    The point of a target is the one that the target constrains; it moves with the joint. `spins` (K, 4) and `places`
+    (K, 3) are the rotations and positions of all joints in the pose. All four arrays are in world coordinates.
     """
     for c in range(targets.kinds.shape[0]):
         k = targets.joints[c]

@@ -124,13 +124,13 @@ def _shown(row: Row[Any]) -> Invitation:
 
 
 def withdraw_invitation(tx: Transaction, project_name: str, named: str) -> None:
-    """Withdraw an invitation to a project, named by its id or its prefix. Raises `NotFoundProblem`."""
+    """Withdraw an invitation to a project, named by its `id` or its `prefix`. Raises `NotFoundProblem`."""
     project_row = projects.require(tx, project_name)
     _withdraw(tx, named, invitation.c.project_id == project_row.id)
 
 
 def withdraw_account_invitation(tx: Transaction, named: str) -> None:
-    """Withdraw an invitation that can create accounts, named by its id or its prefix.
+    """Withdraw an invitation that can create accounts, named by its `id` or its `prefix`.
 
     Only administrators may do this. Raises `NotFoundProblem`.
     """
