@@ -397,6 +397,45 @@ def test_a_conflict_is_listed_and_decided(owner: httpx.Client, two_branches: Cal
     assert entries(owner)["a"]["parts"] == entries(owner, "trial")["a"]["parts"]
 
 
+def test_the_parts_of_a_conflict_are_taken_from_different_versions(
+    owner: httpx.Client, two_branches: Callable[..., None], database: Database
+) -> None:
+    def edit(joint: str) -> None:
+        put(owner, "gaits/a", joint)
+        put_mapping(owner, "gaits/a", joint)
+
+    put_mapping(owner, "gaits/a", "Joint a")
+    ok(owner.post(f"{GAITS}/commits", json={"message": "with a mapping"}), 201)
+    two_branches(lambda: edit("Pelvis"), lambda: edit("Root"))
+    of = {"ours": entries(owner), "theirs": entries(owner, "trial"), "base": entries(owner, "main~1")}
+
+    def merge(*taken: tuple[str | None, str], **fields: Any) -> httpx.Response:
+        decided = [{"path": "a", "kind": "skeleton", "take": side, "part": part} for part, side in taken]
+        return owner.post(f"{GAITS}/merges", json={"version": "trial", "resolutions": decided, **fields})
+
+    conflict = refused(merge(("mapping", "theirs")), 409, "merge-conflicts")["context"]
+    assert [(one["path"], one["parts"]) for one in conflict["conflicts"]] == [("a", ["hierarchy"])]
+    apart = ("hierarchy", "ours"), ("mapping", "theirs")
+    for extra in (("mapping", "ours"), ("path", "ours"), (None, "ours")):
+        refused(merge(*apart, extra), 422, "no-conflict")
+    ok(merge(("hierarchy", "ours"), ("mapping", "base"), preview=True))
+    ok(merge(*apart))
+    for part, side in apart:
+        assert entries(owner)["a"]["parts"][part] == of[side]["a"]["parts"][part]
+    ok(owner.post(f"{GAITS}/reverts", json={"version": "main", "parent": 1}))
+    ok(owner.post(f"{GAITS}/refs", json={"name": "again", "kind": "branch", "at": "main~2"}), 201)
+    mixed = [
+        {"path": "a", "kind": "skeleton", "take": side, "part": part}
+        for part, side in (("hierarchy", "ours"), ("mapping", "base"))
+    ]
+    ok(owner.post(f"{GAITS}/cherry-picks", json={"version": "trial", "into": "again", "resolutions": mixed}))
+    assert entries(owner, "again")["a"]["parts"] == {
+        "hierarchy": of["ours"]["a"]["parts"]["hierarchy"],
+        "mapping": of["base"]["a"]["parts"]["mapping"],
+    }
+    assert not list(check_store(database))
+
+
 def test_two_conflicts_at_one_path_are_decided_one_after_the_other(
     owner: httpx.Client, two_branches: Callable[..., None]
 ) -> None:

@@ -12,7 +12,7 @@ from marey_schemas.consents import ConsentOverride
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, EntryPath
 from marey_schemas.datasets.naming import RefName
 from marey_schemas.kinds import Kind
-from marey_schemas.names import MOST_TAGS, Digest, Message, Tag
+from marey_schemas.names import MOST_TAGS, Digest, Message, PartName, Tag
 
 MOST_CONTENTS = 256
 """Greatest number of revisions, and of documents, in one request."""
@@ -20,8 +20,6 @@ MOST_CHECKED = 500
 """Greatest number of revisions in one request to check whether revisions may be exported."""
 MOST_RECEIVED_CHANGES = 200_000
 """Greatest number of entries that a commit from an archive or another server may change."""
-
-PartName = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 
 
 def _require_time(text: str) -> str:

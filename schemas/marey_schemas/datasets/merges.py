@@ -11,7 +11,7 @@ from marey_schemas.base import Answer, Request
 from marey_schemas.datasets.commits import Commit, Entry, EntryPath
 from marey_schemas.datasets.naming import MAIN, RefName, Version
 from marey_schemas.kinds import Kind
-from marey_schemas.names import Digest, Message
+from marey_schemas.names import Digest, Message, PartName
 
 MOST_CONFLICTS = 1000
 """Greatest number of conflicts that an answer lists."""
@@ -35,11 +35,19 @@ class Resolution(Request):
     If two entries want one path, the other entry goes back to its own path on the branch or in the base. An entry that
     one side has added has no such path, and is dropped. Several conflicts can have the same path and kind. The first
     resolution decides the first of them, the second resolution the second one, and so on.
+
+    If a conflict has several parts, each part can be decided by a resolution of its own. Then the resolutions of one
+    conflict follow each other, and the conflict remains until all of its parts are decided.
     """
 
     path: EntryPath
     kind: Kind
     take: Side
+    part: PartName | None = Field(
+        None,
+        description="Part of the conflict that this decides, such as `motion`, `path` or `tags`; null: all parts. A "
+        "part that was computed from another one, as the sample tree of a model, is decided together with that one.",
+    )
 
 
 class CombineRequest(Request):
@@ -100,9 +108,9 @@ class EntryConflict(Answer):
     path: str
     kind: Kind
     parts: tuple[str, ...] = Field(
-        description="Parts that both sides have changed. `path`: both sides have moved the entry, or have different "
-        "entries at the same path. `tags`: the entry would have more than 64 tags. `entry`: one side has removed the "
-        "entry."
+        description="Parts that both sides have changed and no resolution decides. `path`: both sides have moved the "
+        "entry, or have different entries at the same path. `tags`: the entry would have more than 64 tags. `entry`: "
+        "one side has removed the entry."
     )
     base: Entry | None
     ours: Entry | None

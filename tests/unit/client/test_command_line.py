@@ -497,6 +497,16 @@ def test_a_conflict_cannot_be_decided_for_two_sides() -> None:
     assert one == same
     with pytest.raises(WrongUsage, match="two different sides"):
         resolutions_of(["raw/a:clip"], None, ["/raw/a:clip"])
+    with pytest.raises(WrongUsage, match="two different sides"):
+        resolutions_of(["raw/a:clip"], ["raw/a:clip/motion"], None)
+
+
+def test_the_parts_of_a_conflict_are_decided_for_different_sides() -> None:
+    found = resolutions_of(["raw/a:clip/motion"], ["raw/a:clip/info"], None)
+    assert [(one.path, one.kind, one.take, one.part) for one in found] == [
+        ("raw/a", "clip", "ours", "motion"),
+        ("raw/a", "clip", "theirs", "info"),
+    ]
 
 
 def test_a_token_is_bound_to_labels_and_listed_with_them(

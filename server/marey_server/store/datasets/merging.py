@@ -36,8 +36,9 @@ from marey_server.store.purge_lock import last_purge
 from marey_server.store.transaction import Transaction
 from marey_versions.ancestry import nearest_common
 from marey_versions.annotations import LabelClash, LabelledRange
+from marey_versions.choices import Choice
 from marey_versions.compared import ComparedEntry, compare_entries
-from marey_versions.merging import MergeConflict, merge_entries
+from marey_versions.merging import MergeConflict, MergedEntries, merge_entries
 from marey_versions.records import key_of, path_and_kind
 from marey_versions.tree.building import build
 from marey_versions.tree.difference import difference
@@ -152,17 +153,11 @@ def _combine(
         build(store, []) if one is None else tree_of(tx, commit.dataset_id, one)
         for one in (answer.base, answer.ours, answer.theirs)
     )
-    resolutions = [(key_of(one.path, one.kind), one.take) for one in request.resolutions]
+    resolutions = [Choice(key_of(one.path, one.kind), one.take, one.part) for one in request.resolutions]
     mine, their = (_changed(store, base, side, most) for side in (ours, theirs))
     annotations = AnnotationMerger(tx, project_id)
     merged = merge_entries(mine, their, resolutions, annotations.merge)
-    # While conflicts remain, a further resolution of a decided key may be for one that only the next answer shows.
-    unknown = [key for key in merged.unused if key not in merged.decided or not merged.conflicts]
-    if unknown:
-        path, kind = path_and_kind(unknown[0])
-        raise InvalidProblem(
-            f"The {kind} at {path!r} is not in conflict; remove its resolution from the request.", code="no-conflict"
-        )
+    _require_all_used(merged)
     if len(merged.combined) > MOST_COMBINED:
         raise InvalidProblem(
             f"A merge combines the changes of both sides in at most {MOST_COMBINED:,} entries, but both sides have "
@@ -184,6 +179,26 @@ def _combine(
         documents=annotations.documents,
     )  # fmt: skip
     return PreparedMerge(answer, commit)
+
+
+def _require_all_used(merged: MergedEntries) -> None:
+    """Raise `InvalidProblem` if a resolution has decided no conflict.
+
+    While conflicts remain, a further resolution of a decided key may be for one that only the next answer shows.
+    """
+    unknown = [one for one in merged.unused if one.key not in merged.decided or not merged.conflicts]
+    if not unknown:
+        return
+    (path, kind), part = path_and_kind(unknown[0].key), unknown[0].part
+    if part is not None:
+        raise InvalidProblem(
+            f"The part {part!r} of the {kind} at {path!r} is not in conflict, is decided already, or is not in the "
+            f"version {unknown[0].take.value!r}; remove its resolution from the request.",
+            code="no-conflict",
+        )
+    raise InvalidProblem(
+        f"The {kind} at {path!r} is not in conflict; remove its resolution from the request.", code="no-conflict"
+    )
 
 
 def record_merge(
