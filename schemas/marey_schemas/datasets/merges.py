@@ -1,4 +1,4 @@
-"""Merges of versions of datasets, and checkouts into folders, in requests and answers."""
+"""Merges of versions of datasets in requests and answers."""
 
 from __future__ import annotations
 
@@ -142,20 +142,3 @@ class MergeAnswer(Answer):
     changes: int = Field(description="Number of entries of the branch that change.")
     conflicts: tuple[EntryConflict, ...] = Field(description="The first conflicts without a resolution, by path.")
     conflict_count: int = Field(description="Number of conflicts without a resolution.")
-
-
-class CheckoutRequest(Request):
-    """Request to bring the folder of a dataset to the state of a version."""
-
-    version: Version = MAIN
-    discard: bool = Field(False, description="Discard changes in the folder that no commit has recorded.")
-
-
-class CheckoutAnswer(Answer):
-    """Result of a checkout, with the numbers of entries that it changed in the folder of a dataset."""
-
-    commit: str = Field(description="Digest of the commit whose content the folder has now.")
-    added: int
-    removed: int
-    moved: int
-    changed: int

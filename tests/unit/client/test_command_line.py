@@ -24,7 +24,7 @@ from marey_client.cli import projects, tokens, with_global_options_first
 from marey_client.cli.addresses import Address, require_item, the_thing
 from marey_client.cli.app import app
 from marey_client.cli.clip_jobs import _print_aligned, _print_warnings, print_labelled
-from marey_client.cli.datasets import combining
+from marey_client.cli.datasets import combining, versions
 from marey_client.cli.datasets.combining import resolutions_of
 from marey_client.cli.files import uploading
 from marey_client.cli.files.listing import _items_in
@@ -490,6 +490,21 @@ def test_a_token_whose_file_cannot_be_written_is_never_made(
     with pytest.raises(Forbidden):
         tokens.create_token(NO_OPTIONS, "ci", output=tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+def test_a_checkout_says_how_many_of_how_many_entries_were_taken(
+    script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(versions, "connect", lambda context: script.marey())
+    counts = {"added": 300, "removed": 2, "moved": 0, "changed": 0}
+    digest = "sha256:" + "a" * 64
+    script.answers = [httpx.Response(200, json={"commit": digest, "taken": 300, "entries": 142220, **counts})]
+    versions.checkout(NO_OPTIONS, "lab/gaits@v1", query="subject = 02", path=["/raw/"])
+    sent = json.loads(script.requests[0].content)
+    assert sent == {"version": "v1", "query": "subject = 02", "paths": ["raw"], "discard": False}
+    assert capsys.readouterr().err == (
+        "the folder has 300 of 142,220 entries of aaaaaaaaaaaa now: 300 added, 2 removed\n"
+    )
 
 
 def test_a_conflict_cannot_be_decided_for_two_sides() -> None:

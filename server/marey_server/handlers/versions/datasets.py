@@ -5,9 +5,10 @@ from __future__ import annotations
 from pydantic import Field
 
 from marey_schemas.base import Request
+from marey_schemas.datasets.checkouts import CheckoutAnswer, CheckoutRequest
 from marey_schemas.datasets.commits import Commit, CommitCreate, Entry, EntryOrigins, EntryPath
 from marey_schemas.datasets.differences import DatasetDifference, ListedCommit
-from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest, MergeAnswer, MergeRequest, PickRequest
+from marey_schemas.datasets.merges import MergeAnswer, MergeRequest, PickRequest
 from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefMove, Version
 from marey_schemas.datasets.protection import ProtectionRule
 from marey_schemas.kinds import Kind
@@ -239,10 +240,14 @@ class FolderCheckout(Resource):
     async def post(self, project: str, dataset: str, body: CheckoutRequest) -> Rendered:
         """Bring the folder of the dataset to the state of a version: items are added, changed, moved and removed.
 
+        With `query` or `paths`, only the selected entries are checked out. The folder remembers this: its commits keep
+        all other entries of the version.
+
         If the folder has changes that no commit has recorded, the request is refused with 409, unless it asks to
         discard them. Removed items can be restored, and earlier revisions of items remain.
         """
-        return await self.answer(datasets.check_out, project, dataset, body)
+        selected = await self.look_up(datasets.select_entries, project, dataset, body)
+        return await self.answer(datasets.check_out, project, dataset, body, selected)
 
 
 class DatasetCommit(Resource):

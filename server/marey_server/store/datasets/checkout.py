@@ -10,8 +10,8 @@ from typing import Any
 from sqlalchemy import Row, exists, select, update
 
 from marey_schemas.access import Role
+from marey_schemas.datasets.checkouts import CheckoutAnswer, CheckoutRequest
 from marey_schemas.datasets.commits import MOST_CHANGES
-from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest
 from marey_schemas.items import ItemChange
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MOST_TAGS
@@ -19,15 +19,17 @@ from marey_schemas.wording import counted
 from marey_server.access.folder_rights import FolderRoleProblem
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import collections, items, projects
-from marey_server.store.datasets.chunks import StoredChunks
+from marey_server.store.datasets.chunks import StoredChunks, store_chunks
 from marey_server.store.datasets.folders import FolderState, read_folder
 from marey_server.store.datasets.history import revisions_with, tree_of
+from marey_server.store.datasets.manifests import FolderManifest, read_manifest, store_manifest
 from marey_server.store.datasets.naming import find_dataset, resolve
+from marey_server.store.datasets.selecting import SelectedEntries
 from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.items import Draft, StoredDocument
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.projects import ProjectRow
-from marey_server.store.purge_lock import hold_off_purges
+from marey_server.store.purge_lock import hold_off_purges, require_no_purge_since
 from marey_server.store.tables import collection, dataset, item
 from marey_server.store.transaction import Transaction
 from marey_versions.compared import ComparedEntry, compare_entries
@@ -36,8 +38,13 @@ from marey_versions.tree.difference import Changed
 from marey_versions.tree.reading import Tree
 
 
-def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest) -> CheckoutAnswer:
+def check_out(
+    tx: Transaction, project: str, name: str, request: CheckoutRequest, selected: SelectedEntries | None = None
+) -> CheckoutAnswer:
     """Replace the content of a dataset's folder by a version, which becomes the parent of the folder's next commit.
+
+    If the request selects a part of the version, `selected` is this part. The folder then has the selected entries
+    only, and its next commits change no other entries.
 
     An item whose entry has moved or changed keeps its id. If the folder lacks an entry of the version, the deleted item
     of this entry is restored if possible; otherwise a new item is created.
@@ -51,12 +58,12 @@ def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest
     rights = rights_of_caller(tx, project_row)
     found = find_dataset(tx, project_row, name)
     rights.require_below(found.path or "", Role.MAINTAINER)
-    digest = resolve(tx, found.id, request.version)
+    manifest = _wanted(tx, project_row, found, request, selected)
     state = read_folder(tx, project_row, found)
     store = StoredChunks(tx)
     if not request.discard:
         _require_recorded(tx, found, state, store)
-    wanted = Tree(store, tree_of(tx, found.id, digest))
+    wanted = Tree(store, manifest.tree)
     back = state.changes_since(wanted)
     targets = wanted.get_several(back)
     changes = [Changed(key, state.entries.get(key), targets.get(key)) for key in sorted(back)]
@@ -70,20 +77,35 @@ def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest
     _require_possible(found, compared)
     _Checkout(tx, project_row, found, state).apply(compared)
     # A commit of the folder that is being recorded sees by `rev` that the folder has other content now.
-    values = {"folder_commit": digest, "updated_us": tx.now_us, "rev": dataset.c.rev + 1}
+    values = {"folder_commit": store_manifest(tx, manifest), "updated_us": tx.now_us, "rev": dataset.c.rev + 1}
     tx.execute(update(dataset).where(dataset.c.id == found.id).values(**values))
     counts = Counter(one.change for one in compared)
     return CheckoutAnswer(
-        commit=digest, added=counts["added"], removed=counts["removed"], moved=counts["moved"],
-        changed=counts["changed"],
+        commit=manifest.commit, taken=len(wanted), entries=len(Tree(store, tree_of(tx, found.id, manifest.commit))),
+        added=counts["added"], removed=counts["removed"], moved=counts["moved"], changed=counts["changed"],
     )  # fmt: skip
 
 
+def _wanted(
+    tx: Transaction,
+    project_row: ProjectRow,
+    found: Row[Any],
+    request: CheckoutRequest,
+    selected: SelectedEntries | None,
+) -> FolderManifest:
+    """Return the manifest that the folder gets, and store the tree of a selection."""
+    if not request.partial:
+        digest = resolve(tx, found.id, request.version)
+        return FolderManifest(digest, tree_of(tx, found.id, digest))
+    assert selected is not None, "entries are selected before they are checked out"
+    require_no_purge_since(tx, project_row.id, selected.last_purge)
+    store_chunks(tx, selected.chunks)
+    return FolderManifest(selected.commit, selected.tree, request.query, request.paths)
+
+
 def _require_recorded(tx: Transaction, found: Row[Any], state: FolderState, store: StoredChunks) -> None:
-    if found.folder_commit is None:
-        changed: Sequence[str] = sorted(state.entries)
-    else:
-        changed = sorted(state.changes_since(Tree(store, tree_of(tx, found.id, found.folder_commit))))
+    manifest = read_manifest(tx, found)
+    changed = state.entries if manifest is None else state.changes_since(Tree(store, manifest.tree))
     if changed:
         raise ConflictProblem(
             f"The folder {found.path!r} has changes that no commit has recorded; commit or discard them.",

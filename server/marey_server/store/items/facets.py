@@ -7,10 +7,10 @@ the clips of evaluations among these inputs. The kind of the job must declare th
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import and_, select
 
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.facets import ItemFacets
@@ -125,6 +125,28 @@ def publish_facets(tx: Transaction, project_id: str, facets: StoredFacets) -> No
             added = tx.insert_into(item_facet)
             key = list(item_facet.primary_key.columns)
             tx.execute(added.on_conflict_do_update(index_elements=key, set_={"value": added.excluded.value}), rows)
+
+
+def facets_of_contents(tx: Transaction, project_id: str, contents: Iterable[str]) -> dict[str, dict[str, float]]:
+    """Return the facets of revisions of a project by content digest; contents without facets are left out.
+
+    Revisions with the same content share their facets. If they have different values, the newest revision decides.
+    """
+    found: dict[str, dict[str, float]] = {}
+    wanted = sorted(set(contents))
+    for some in in_lists(wanted):
+        statement = (
+            select(revision.c.content, item_facet.c.name, item_facet.c.value)
+            .join(item, item.c.id == revision.c.item_id)
+            .join(
+                item_facet, and_(item_facet.c.item_id == revision.c.item_id, item_facet.c.number == revision.c.number)
+            )
+            .where(revision.c.content.in_(some), item.c.project_id == project_id)
+            .order_by(revision.c.created_us, revision.c.item_id, revision.c.number)
+        )
+        for row in tx.execute(statement):
+            found.setdefault(row.content, {})[row.name] = row.value
+    return found
 
 
 def _not_purged(tx: Transaction, project_id: str, items: Sequence[str]) -> Sequence[str]:

@@ -20,6 +20,7 @@ from marey_server import faults
 from marey_server.errors import ConflictProblem, NotFoundProblem
 from marey_server.store import projects
 from marey_server.store.datasets.chunks import StoredChunks
+from marey_server.store.datasets.manifests import roots_of_folders
 from marey_server.store.jobs.reading import UNFINISHED
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import PURGED_MEANWHILE, begin_purge
@@ -61,7 +62,9 @@ class PreparedDatasetPurge:
     citing: frozenset[str]
     """Jobs that read one of `commits`; while the dataset is deleted, no new jobs can read these, except retries."""
     chunks: Mapping[str, int]
-    """Digests of the chunks that are only in trees of this dataset, with the times at which they were stored last."""
+    """Digests of the chunks that no other dataset needs, with the times at which they were stored last.
+
+    Apart from the chunks of this dataset, these are chunks of former selections, of which no dataset has a record."""
     freed_bytes: int
 
 
@@ -83,16 +86,14 @@ def prepare_dataset_purge(tx: Transaction, project: str, request: DatasetPurgeRe
     project_row = projects.require(tx, project)
     projects.require_scope(tx, project, "read")  # because the answer shows names
     row = _find(tx, project_row, request.dataset)
-    own = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id == row.id)
     others = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id != row.id)
-    store = StoredChunks(tx)
-    needed = _below(store, set(tx.execute(others).scalars()), known=())
-    going = sorted(_below(store, set(tx.execute(own).scalars()), known=needed) - needed)
+    roots = set(tx.execute(others).scalars()) | roots_of_folders(tx, dataset.c.id != row.id)
+    needed = _below(StoredChunks(tx), roots)
     chunks: dict[str, int] = {}
     size_bytes = 0
     stored = select(tree_chunk.c.digest, tree_chunk.c.created_us, func.length(tree_chunk.c.data).label("size"))
-    for some in in_lists(going):
-        for found in tx.execute(stored.where(tree_chunk.c.digest.in_(some))):
+    for found in tx.execute(stored.execution_options(yield_per=1000)):
+        if found.digest not in needed:
             chunks[found.digest] = found.created_us
             size_bytes += found.size
     commits = _own_commits(tx, project_row, row.id)
@@ -233,13 +234,10 @@ def _still_held(answer: DatasetPurgeAnswer) -> ConflictProblem:
 # -- chunks -----------------------------------------------------------------------------------------------------------
 
 
-def _below(store: StoredChunks, roots: Collection[str], known: Collection[str]) -> set[str]:
-    """Return the digests of the chunks `roots` and of all chunks below them.
-
-    The search leaves out chunks in `known`, and does not search below them.
-    """
+def _below(store: StoredChunks, roots: Collection[str]) -> set[str]:
+    """Return the digests of the chunks `roots` and of all chunks below them."""
     found: set[str] = set()
-    waiting = set(roots).difference(known)
+    waiting = set(roots)
     while waiting:
         batch = next(in_lists(waiting))
         waiting.difference_update(batch)
@@ -247,7 +245,7 @@ def _below(store: StoredChunks, roots: Collection[str], known: Collection[str]) 
         for digest, data in store.load(batch).items():
             chunk = decode_trusted(digest, data)
             if isinstance(chunk, Branch):
-                waiting |= {child.digest for child in chunk.children}.difference(found, known)
+                waiting |= {child.digest for child in chunk.children}.difference(found)
     return found
 
 
