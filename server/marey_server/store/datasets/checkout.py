@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from sqlalchemy import Row, exists, select, update
@@ -27,11 +27,12 @@ from marey_server.store.datasets.naming import find_dataset, resolve
 from marey_server.store.datasets.selecting import SelectedEntries
 from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.items import Draft, StoredDocument
+from marey_server.store.items.facets import add_facets, facets_of_contents
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges, require_no_purge_since
 from marey_server.store.tables import collection, dataset, item
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.compared import ComparedEntry, compare_entries
 from marey_versions.records import DatasetEntry
 from marey_versions.tree.difference import Changed
@@ -139,6 +140,8 @@ class _Checkout:
     project: ProjectRow
     dataset: Row[Any]
     state: FolderState
+    given: dict[str, str] = field(default_factory=dict)
+    """Content digest of each item that gets a new revision, by the id of the item."""
 
     def apply(self, compared: Sequence[ComparedEntry]) -> None:
         """Change the folder, in an order that frees each path before an item is created there or moved there."""
@@ -156,6 +159,7 @@ class _Checkout:
             self._change(one, documents)
         for one in of_kind["added"]:
             self._add(one, documents)
+        self._keep_facets()
 
     def _documents(self, entries: Iterable[DatasetEntry]) -> dict[str, tuple[str, Mapping[str, str]]]:
         """Find, for the content of each entry, an item with a revision that has this content.
@@ -194,6 +198,7 @@ class _Checkout:
         kind, item_id = Kind(one.after.kind), self._item(one)
         if one.parts:
             items.set_parts(self.tx, self.project, kind, item_id, documents[one.after.content][1], self._message)
+            self.given[item_id] = one.after.content
         if one.before is not None and set(one.before.tags) != set(one.after.tags):
             tags = ItemChange(tags=one.after.tags)
             items.change_item(self.tx, self.project.name, kind, item_id, tags, expected_rev=None)
@@ -212,16 +217,26 @@ class _Checkout:
             place = ItemChange(name=name, collection=folder, tags=one.after.tags)
             items.change_item(self.tx, self.project.name, kind, item_id, place, expected_rev=None)
             items.set_parts(self.tx, self.project, kind, item_id, parts, self._message)
+            self.given[item_id] = one.after.content
             return
         draft = Draft(
             name_in_batch="", kind=kind, item_name=name, collection=folder, tags=one.after.tags,
             parts={part: StoredDocument(digest) for part, digest in parts.items()}, reuse="new",
             message=self._message,
         )  # fmt: skip
-        items.publish(
+        (made,) = items.publish(
             self.tx, self.project, [draft], author_id=self.tx.principal.user_id,
             rights=rights_of_caller(self.tx, self.project), refer_to_deleted=True,
         )  # fmt: skip
+        self.given[made.item] = one.after.content
+
+    def _keep_facets(self) -> None:
+        """Give the new revisions the facets of their content, which an earlier revision may have."""
+        known = facets_of_contents(self.tx, self.project.id, self.given.values())
+        measured = sorted(item_id for item_id, content in self.given.items() if content in known)
+        for some in in_lists(measured):
+            heads = self.tx.execute(select(item.c.id, item.c.head).where(item.c.id.in_(some)))
+            add_facets(self.tx, [(row.id, row.head, known[self.given[row.id]]) for row in heads])
 
     def _can_restore(self, kind: Kind, item_id: str) -> bool:
         """Return whether an item is deleted and may be restored, and no other item has its former folder and name."""

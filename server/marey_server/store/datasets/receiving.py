@@ -33,6 +33,7 @@ from marey_server.store.datasets.revisions import item_name, publish_contents, r
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.items import Draft, StoredDocument
+from marey_server.store.items.facets import fill_facets
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges, last_purge, require_no_purge_since
@@ -57,6 +58,8 @@ class LocalRevisions:
     """Digest of the document of each part."""
     last_purge: int
     """Time of the last purge of the project before the revisions were found."""
+    facets: Mapping[str, Mapping[str, float]]
+    """Facets of the received revisions."""
 
 
 def find_local(tx: Transaction, project: str, received: Sequence[ReceivedRevision]) -> LocalRevisions:
@@ -71,7 +74,8 @@ def find_local(tx: Transaction, project: str, received: Sequence[ReceivedRevisio
     require_contents(wanted - found.keys())
     parts = read_part_digests(tx, set(found.values()))
     held = {content: RevisionKey(*key) for content, key in found.items()}
-    return LocalRevisions(held, {content: parts[key] for content, key in held.items()}, last)
+    facets = {one.content: one.facets for one in received}
+    return LocalRevisions(held, {content: parts[key] for content, key in held.items()}, last, facets)
 
 
 def prepare_revisions(received: Sequence[ReceivedRevision], local: LocalRevisions) -> dict[str, Draft]:
@@ -124,6 +128,7 @@ def store_revisions(
     }
     rights = rights_of_caller(tx, project_row)
     added = publish_contents(tx, project_row, placed, author_id=tx.principal.user_id, rights=rights)
+    fill_facets(tx, project_row.id, local.facets)
     return StoredRevisions(added=added)
 
 
