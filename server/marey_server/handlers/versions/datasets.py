@@ -18,7 +18,7 @@ from marey_server.http.declarations import Access, RequestBody, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
-from marey_server.store import datasets
+from marey_server.store import datasets, purging
 
 MAX_COMMIT_BYTES = 16 * MIB
 
@@ -99,9 +99,14 @@ class DatasetRef(Resource):
 
     @writes(access=Access.MAINTAINER, precondition="required")
     async def delete(self, project: str, dataset: str, ref: str) -> Rendered:
-        """Delete a branch or a tag; no commit is deleted."""
+        """Delete a branch or a tag; no commit is deleted.
+
+        A tag is not deleted while a job that has not ended, or an item that a job made, cites its version, unless
+        another tag names this version.
+        """
+        citing = await self.look_up(purging.find_citations, project, dataset, ref)
         expected_rev = self.precondition.expected_rev
-        return await self.answer(datasets.delete_ref, project, dataset, ref, expected_rev=expected_rev)
+        return await self.answer(purging.delete_uncited_ref, project, dataset, ref, citing, expected_rev=expected_rev)
 
 
 class BranchProtection(Resource):

@@ -7,39 +7,32 @@ has, too, stays readable there, and does not count.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Row, delete, exists, func, select
 
-from marey_schemas.kinds import Kind
-from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, ItemHolder, JobHolder, words_of
-from marey_schemas.queue.jobs import JobState, commits_of
+from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, words_of
 from marey_server import faults
 from marey_server.errors import ConflictProblem, NotFoundProblem
 from marey_server.store import projects
 from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.manifests import roots_of_folders
-from marey_server.store.jobs.reading import UNFINISHED
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import PURGED_MEANWHILE, begin_purge
-from marey_server.store.purging.holders import FoundHolders
+from marey_server.store.purging.citations import holders_of, jobs_citing
 from marey_server.store.purging.recording import STILL_HELD
 from marey_server.store.tables import (
-    collection,
     commit_parent,
     dataset,
     dataset_commit,
     dataset_ref,
     fast_forward,
-    item,
-    job,
     proposal,
     proposal_check,
     proposal_comment,
     proposal_review,
-    revision,
     tree_chunk,
 )
 from marey_server.store.transaction import Transaction, in_lists
@@ -97,7 +90,7 @@ def prepare_dataset_purge(tx: Transaction, project: str, request: DatasetPurgeRe
             chunks[found.digest] = found.created_us
             size_bytes += found.size
     commits = _own_commits(tx, project_row, row.id)
-    return PreparedDatasetPurge(row.id, commits, _citing(tx, project_row, commits), chunks, size_bytes)
+    return PreparedDatasetPurge(row.id, commits, jobs_citing(tx, project_row.id, commits), chunks, size_bytes)
 
 
 def record_dataset_purge(
@@ -146,7 +139,7 @@ def _answer(
 ) -> DatasetPurgeAnswer:
     row = _find(tx, project_row, prepared.id)
     others = (dataset.c.project_id == project_row.id, dataset.c.name == row.name, dataset.c.id != row.id)
-    held = _holders(tx, _with_retries(tx, prepared.citing))
+    held = holders_of(tx, prepared.citing)
     return DatasetPurgeAnswer(
         preview=request.preview, dataset=row.id, name=row.name, commits=_count(tx, dataset_commit, row.id),
         proposals=_count(tx, proposal, row.id), holders=tuple(held.holders), others=held.others,
@@ -173,52 +166,6 @@ def _own_commits(tx: Transaction, project_row: ProjectRow, dataset_id: str) -> f
     )
     own = select(dataset_commit.c.digest).where(dataset_commit.c.dataset_id == dataset_id, ~other)
     return frozenset(tx.execute(own).scalars())
-
-
-def _citing(tx: Transaction, project_row: ProjectRow, commits: frozenset[str]) -> frozenset[str]:
-    """Return the jobs of the project whose inputs were taken from `commits`."""
-    if not commits:
-        return frozenset()
-    jobs = select(job.c.id, job.c.inputs).where(job.c.project_id == project_row.id).execution_options(yield_per=10)
-    return frozenset(row.id for row in tx.execute(jobs) if not commits.isdisjoint(commits_of(row.inputs)))
-
-
-def _with_retries(tx: Transaction, citing: Iterable[str]) -> set[str]:
-    """Return the ids of the jobs `citing`, of all their retries, and of the tasks of all these jobs."""
-    found = set(citing)
-    ahead = found
-    while ahead:
-        further: set[str] = set()
-        for some in in_lists(sorted(ahead)):
-            further.update(tx.execute(select(job.c.id).where(job.c.retry_of.in_(some))).scalars())
-            further.update(tx.execute(select(job.c.id).where(job.c.parent_id.in_(some))).scalars())
-        ahead = further - found
-        found = found | further
-    return found
-
-
-def _holders(tx: Transaction, citing: Collection[str]) -> FoundHolders:
-    """Return the citing jobs that have not ended, and the items that citing jobs made and that were not purged."""
-    held = FoundHolders()
-    ordered = sorted(citing)
-    items: set[str] = set()
-    for some in in_lists(ordered):
-        jobs = select(job.c.id, job.c.kind, job.c.state).where(
-            job.c.id.in_(some), job.c.state.in_(UNFINISHED), job.c.parent_id.is_(None)
-        )
-        for row in tx.execute(jobs.order_by(job.c.id)):
-            held.add(JobHolder(job=row.id, kind=row.kind, state=JobState(row.state)))
-        items.update(tx.execute(select(revision.c.item_id).where(revision.c.job_id.in_(some))).scalars())
-    for some in in_lists(sorted(items)):
-        made = (
-            select(item.c.id, item.c.kind, item.c.name, item.c.deleted_us, collection.c.path)
-            .join(collection, collection.c.id == item.c.collection_id)
-            .where(item.c.id.in_(some), item.c.purged_us.is_(None))
-        )
-        for row in tx.execute(made.order_by(item.c.id)):
-            path = f"{row.path}/{row.name}".lstrip("/")
-            held.add(ItemHolder(item=row.id, kind=Kind(row.kind), path=path, deleted=row.deleted_us is not None))
-    return held
 
 
 def _still_held(answer: DatasetPurgeAnswer) -> ConflictProblem:
