@@ -11,6 +11,7 @@ from tests.support.store_fixtures import motion_tree, skeleton_tree
 
 from marey_client import Marey
 from marey_client.blobs import Blobs
+from marey_client.errors import RequestFailed
 from marey_client.handles.versions import DatasetHandle
 from marey_client.items import ItemHandle
 from marey_client.project import ProjectHandle
@@ -196,3 +197,18 @@ def test_a_file_that_a_version_needs_is_copied_although_its_clip_is_deleted(
     lab.clips.get(clip).delete()
     assert owner.fetch(file) == b"HIERARCHY"
     assert partner.datasets.pull(gaits, "gaits").moved
+
+
+def test_a_reference_to_an_item_of_the_receiving_project_is_refused_with_what_to_do(
+    marey: Marey, lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle
+) -> None:
+    """Only the receiving project knows the item, so that the same document has another digest there."""
+    rig = make_rig(partner)
+    body = {"schema": "marey/document@1", "rig": {"item": rig.id, "revision": 1}}
+    study = lab.items(Kind.STUDY).create("study", {"study": body})
+    commit(gaits, study=study)
+    with pytest.raises(RequestFailed, match=f"study 'study' refers to the item {rig.id} of this project") as caught:
+        partner.datasets.pull(gaits, "gaits")
+    assert (caught.value.code, "another project" in str(caught.value)) == ("other-content", True)
+    marey.create_project(ProjectCreate(name="third"))
+    assert marey.project("third").datasets.pull(gaits, "gaits").moved
