@@ -59,7 +59,6 @@ class Clients:
     """Connections of one user to both servers, and the name of the project there."""
 
     user: str
-    role: Role
     servers: Mapping[str, Marey]
     project_name: str
 

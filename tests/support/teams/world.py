@@ -12,7 +12,7 @@ from typing import NamedTuple
 from tests.support.rest_server import People
 from tests.support.teams.comparison import Comparison
 from tests.support.teams.hosts import Host, Line
-from tests.support.teams.model import PARTNER, STUDIO, Model
+from tests.support.teams.model import PARTNER, ROLES, STUDIO, Model
 from tests.support.teams.operations import RACED, Clients, Failed, Operation, Outcome, Refused, attempt
 
 from marey_client import Marey
@@ -20,7 +20,6 @@ from marey_client.errors import Unreachable
 from marey_schemas.access import ProjectCreate, Role
 from marey_server.store import garbage
 
-ROLES = {"ann": Role.OWNER, "mia": Role.MAINTAINER, "ben": Role.CONTRIBUTOR, "rea": Role.READER}
 RANKS = {role: rank for rank, role in enumerate(Role)}
 
 
@@ -67,7 +66,7 @@ class World:
             for name, role in ROLES.items():
                 if name != "ann":
                     made.members.put(name, role)
-        return {name: Clients(name, role, self._servers[name], project) for name, role in ROLES.items()}
+        return {name: Clients(name, self._servers[name], project) for name in ROLES}
 
     def close(self) -> None:
         """Close all connections."""
@@ -130,7 +129,7 @@ class Session:
         self.log.append(f"{clients.user}: repeated -> {outcome}")
         before = self.model.copy()
         try:
-            if RANKS[clients.role] >= RANKS[operation.role]:
+            if RANKS[self.model.roles[clients.user]] >= RANKS[operation.role]:
                 operation.assume(self.model)
             self._absorb(self.model, operation, clients, outcome)
         except AssertionError:
@@ -146,7 +145,7 @@ class Session:
 
     @staticmethod
     def _absorb(model: Model, operation: Operation, clients: Clients, outcome: Outcome) -> None:
-        if RANKS[clients.role] < RANKS[operation.role]:
+        if RANKS[model.roles[clients.user]] < RANKS[operation.role]:
             operation.forbidden(model, outcome)
         else:
             operation.absorb(model, clients, outcome)
