@@ -436,6 +436,17 @@ def test_the_parts_of_a_conflict_are_taken_from_different_versions(
     assert not list(check_store(database))
 
 
+def test_no_branch_or_tag_hides_a_commit(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    """Otherwise, somebody who names a commit by its first digits would get the version of the branch."""
+    first = ok(owner.get(f"{GAITS}/commits/main"))["digest"].removeprefix("sha256:")
+    put(owner, "gaits/a", "Pelvis")
+    gaits("second")
+    for name, kind in ((first, "branch"), (first[:12], "tag"), (first[:8], "branch")):
+        refused(owner.post(f"{GAITS}/refs", json={"name": name, "kind": kind}), 409, "name-taken")
+    ok(owner.post(f"{GAITS}/refs", json={"name": "20261127", "kind": "tag"}), 201)
+    assert ok(owner.get(f"{GAITS}/commits/{first[:12]}"))["digest"] == f"sha256:{first}"
+
+
 def test_two_conflicts_at_one_path_are_decided_one_after_the_other(
     owner: httpx.Client, two_branches: Callable[..., None]
 ) -> None:
@@ -794,13 +805,14 @@ def test_contents_of_other_projects_and_unknown_ones_are_null(owner: httpx.Clien
     content = revision_content(entry["kind"], entry["parts"])
     ok(owner.post("/projects", json={"name": "other"}), 201)
     wanted: dict[str, Any] = {"revisions": [content], "documents": [{"content": content, "part": "hierarchy"}]}
-    assert contents(owner, "/projects/other", **wanted) == {"revisions": [None], "documents": [None]}
+    nothing = {"revisions": [None], "documents": [None], "facets": [{}]}
+    assert contents(owner, "/projects/other", **wanted) == nothing
     assert contents(owner, **wanted)["revisions"] != [None]
     unknown: dict[str, Any] = {
         "revisions": ["sha256:" + "0" * 64],
         "documents": [{"content": content, "part": "nothing"}],
     }
-    assert contents(owner, **unknown) == {"revisions": [None], "documents": [None]}
+    assert contents(owner, **unknown) == nothing
     many = ["sha256:" + "0" * 64] * 257
     refused(owner.post(f"{LAB}/contents", json={"revisions": many}), 422, "invalid-body")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 from sqlalchemy import CTE, Row, delete, func, insert, literal_column, null, select
@@ -177,11 +178,15 @@ def read_ref(tx: Transaction, project: str, name: str, ref: str) -> Ref:
 
 
 def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> Ref:
-    """Create a branch or a tag at a version. Raises `ConflictProblem` if another branch or tag has the name."""
+    """Create a branch or a tag at a version.
+
+    Raises `ConflictProblem` if another branch or tag has the name, or if the name is the beginning of a digest.
+    """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
     row = find_dataset(tx, project_row, name)
     digest = resolve(tx, row.id, request.at)
+    _require_no_commit(tx, row.id, request.name)
     held = tx.execute(select(func.count()).where(dataset_ref.c.dataset_id == row.id)).scalar_one()
     _require_room(held, MOST_REFS, "branches and tags in a dataset", "too-many-refs")
     with taken(ConflictProblem(f"There is a branch or tag {request.name!r} already.", code="name-taken")):
@@ -314,17 +319,33 @@ def first_parents(dataset_id: str, start: str, steps: int) -> CTE:
     )
 
 
-def _by_digits(tx: Transaction, dataset_id: str, name: str) -> str:
+def _commits_by_digits(tx: Transaction, dataset_id: str, name: str) -> Sequence[str]:
+    """Return at most two commits whose digest begins with the digits in `name`; none if `name` is not digits."""
     match = _DIGITS.fullmatch(name)
     if match is None:
-        raise _no_version(name)
+        return ()
     first = f"sha256:{match[1]}"
     statement = select(dataset_commit.c.digest).where(
         dataset_commit.c.dataset_id == dataset_id,
         dataset_commit.c.digest >= first,
         dataset_commit.c.digest <= f"{first}g",
     )
-    found = tx.execute(statement.limit(2)).scalars().all()
+    return tx.execute(statement.limit(2)).scalars().all()
+
+
+def _require_no_commit(tx: Transaction, dataset_id: str, name: str) -> None:
+    """Raise `ConflictProblem` if the digest of a commit begins with a name.
+
+    A branch or tag with this name would hide the commit from everybody who names it by these digits.
+    """
+    if found := _commits_by_digits(tx, dataset_id, name):
+        raise ConflictProblem(
+            f"The commit {found[0]} is named by its first digits {name!r}; choose another name.", code="name-taken"
+        )
+
+
+def _by_digits(tx: Transaction, dataset_id: str, name: str) -> str:
+    found = _commits_by_digits(tx, dataset_id, name)
     if not found:
         raise _no_version(name)
     if len(found) > 1:
