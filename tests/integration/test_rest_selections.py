@@ -7,6 +7,7 @@ from typing import Any
 
 import httpx
 import pytest
+from sqlalchemy import delete as delete_rows
 from sqlalchemy import select
 from tests.integration.test_rest_datasets import (
     GAITS,
@@ -69,6 +70,7 @@ def in_folder(owner: httpx.Client) -> list[str]:
         ({"query": "folder = gaits/raw and not tag = night"}, ["raw/b"]),
         ({"query": "joints = 1 and name in (a, c)"}, ["old/c", "raw/a"]),
         ({"paths": ["old", "raw/b"]}, ["old/c", "raw/b"]),
+        ({"paths": ["raw/a", "raw", "raw/b"]}, ["raw/a", "raw/b"]),
         ({"paths": ["raw"], "query": "path = gaits/old/c or path = gaits/raw/b"}, ["raw/b"]),
     ],
 )
@@ -133,6 +135,7 @@ def test_a_selection_that_is_behind_its_branch_is_named(owner: httpx.Client, gai
         ({"query": "tag = day"}, 422, "empty-selection"),
         ({"query": "tag ="}, 400, "bad-query"),
         ({"paths": ["raw", "ra"]}, 404, "no-entry"),
+        ({"paths": ["raw", "raw/z"]}, 404, "no-entry"),
         ({"paths": ["../raw"]}, 404, "no-entry"),
         ({"query": "joints = 1", "version": "nothing"}, 404, "no-version"),
     ],
@@ -168,6 +171,7 @@ def test_a_query_compares_the_content_of_the_version(
     monkeypatch.setattr(selecting, "MOST_SEARCHED", 1)
     refused(owner.post(f"{GAITS}/checkout", json={"query": "joints = 1"}), 422, "large-selection")
     assert check_out(owner, query="name = c and joints = 1") == (1, 3)
+    assert check_out(owner, query="not name = c and folder = gaits") == (2, 3)
 
 
 def test_a_purge_deletes_what_former_selections_have_stored(
@@ -188,3 +192,17 @@ def test_a_purge_deletes_what_former_selections_have_stored(
     assert database.read(SYSTEM, manifests) == 1
     assert not list(check_store(database))
     assert ok(owner.post(f"{LAB}/datasets/other/checkout", json={"discard": True}))["taken"] == 3
+
+
+def test_a_lost_record_of_what_is_checked_out_is_found(
+    owner: httpx.Client, gaits: Callable[..., Any], database: Database
+) -> None:
+    check_out(owner, paths=["raw"])
+
+    def lose(tx: Transaction) -> None:
+        rows = tx.execute(select(tree_chunk)).all()
+        (manifest,) = [row.digest for row in rows if b'"manifest"' in bytes(row.data)]
+        tx.execute(delete_rows(tree_chunk).where(tree_chunk.c.digest == manifest))
+
+    database.write(SYSTEM, lose)
+    assert {one.code for one in check_store(database)} == {"folder-unknown"}

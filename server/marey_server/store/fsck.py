@@ -324,7 +324,7 @@ def _check_folder(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     """Return a fault if the record of what is checked out in a dataset's folder is missing."""
     try:
         manifest = read_manifest(tx, row)
-        if manifest is not None:
+        if manifest is not None and manifest.partial:
             len(Tree(StoredChunks(tx), manifest.tree))
     except DamagedChunk as error:
         return [StoreDefect("folder-unknown", row.id, f"what is checked out in the folder is not known: {error}")]

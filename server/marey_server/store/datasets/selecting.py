@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 from sqlalchemy import Row, select
@@ -82,21 +83,34 @@ def _at_paths(tree: Tree, paths: Sequence[str]) -> Iterator[tuple[str, Value]]:
     """Return the entries of a tree at the given paths and below them, in the order of their keys."""
     if not paths:
         return tree.entries()
+    wanted = set(paths)
     chosen: dict[str, Value] = {}
-    for path in sorted(set(paths)):
-        here = [one for prefix in prefixes_of(path) for one in tree.entries(prefix=prefix)]
-        if not here:
+    for path in sorted(wanted):
+        entries = chain.from_iterable(tree.entries(prefix=prefix) for prefix in prefixes_of(path))
+        first = next(entries, None)
+        if first is None:
             raise NotFoundProblem(f"The version has no entry at {path!r} or below it.", code="no-entry")
-        chosen.update(here)
+        if not wanted.intersection(_folders_above(path)):  # otherwise these entries are read with those of the folder
+            chosen.update([first, *entries])
     return iter(sorted(chosen.items()))
+
+
+def _folders_above(path: str) -> list[str]:
+    parts = path.split("/")
+    return ["/".join(parts[:end]) for end in range(1, len(parts))]
 
 
 def _matching(
     tx: Transaction, project_id: str, folder: str, query: Query, entries: Iterable[tuple[str, Value]]
 ) -> Iterator[tuple[str, Value]]:
     """Yield the entries that a query selects; conditions on path and tags are evaluated first, without a database."""
-    early = [one for one in operands_of(query) if {part.field for part in conditions_of(one)} <= OF_ENTRIES]
-    for some in batched(_limited(_early(entries, early, folder)), SEARCHED_AT_ONCE):
+    operands = list(operands_of(query))
+    early = [one for one in operands if {part.field for part in conditions_of(one)} <= OF_ENTRIES]
+    found = _early(entries, early, folder)
+    if len(early) == len(operands):
+        yield from ((entry.key, entry.value) for entry in found)
+        return
+    for some in batched(_limited(found), SEARCHED_AT_ONCE):
         rows = _revisions(tx, project_id, [entry.content for entry in some])
         facts = _facts(tx, project_id, folder, some, rows)
         yield from ((entry.key, entry.value) for entry, one in zip(some, facts, strict=True) if matches(query, one))
