@@ -436,6 +436,26 @@ def test_the_parts_of_a_conflict_are_taken_from_different_versions(
     assert not list(check_store(database))
 
 
+def test_a_repeated_request_gets_its_commit_although_the_branches_are_gone(
+    owner: httpx.Client, two_branches: Callable[..., None]
+) -> None:
+    two_branches(lambda: put(owner, "gaits/a", "Pelvis"), lambda: change(owner, "gaits/b", tags=["slow"]))
+    ok(owner.post(f"{GAITS}/refs", json={"name": "work", "kind": "branch"}), 201)
+    removal = {"change": "remove", "path": "b", "kind": "skeleton"}
+    requests = {
+        "merges": {"version": "trial", "into": "work", "write_id": "a merge of trial"},
+        "commits": {"branch": "work", "message": "m", "changes": [removal], "write_id": "a commit of changes"},
+    }
+    first = {name: owner.post(f"{GAITS}/{name}", json=body) for name, body in requests.items()}
+    made = {name: answer.json().get("commit") or answer.json() for name, answer in first.items()}
+    for ref in ("trial", "work"):
+        assert owner.delete(f"{GAITS}/refs/{ref}", headers={"If-Match": "*"}).status_code == 204
+    for name, body in requests.items():
+        again = owner.post(f"{GAITS}/{name}", json=body)
+        assert again.is_success, again.text
+        assert (again.json().get("commit") or again.json()) == made[name]
+
+
 def test_no_branch_or_tag_hides_a_commit(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
     """Otherwise, somebody who names a commit by its first digits would get the version of the branch."""
     first = ok(owner.get(f"{GAITS}/commits/main"))["digest"].removeprefix("sha256:")

@@ -101,7 +101,8 @@ def prepare_commit(tx: Transaction, project: str, name: str, request: CommitCrea
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
     recorded = recorded_as(tx, found.id, request.write_id)
-    head = head_of(tx, found.id, request.branch, None if recorded else request.expected)
+    # A repeated request gets its commit, even if the branch is gone meanwhile.
+    head = None if recorded else head_of(tx, found.id, request.branch, request.expected)
     parents = () if head is None else (head,)
     prepared = PreparedCommit(
         found.id, request.branch, head, parents, request.message, request.write_id, recorded=recorded,

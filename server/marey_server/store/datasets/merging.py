@@ -68,10 +68,10 @@ def prepare_merge(
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
+    if (repeated := _repeated(tx, project, found, request)) is not None:
+        return repeated
     theirs = resolve(tx, found.id, request.version)
     started = _start(tx, found, request, theirs, f"Merge {request.version} into {request.into}")
-    if started.commit.recorded is not None:
-        return started
     ours = started.answer.ours
     base = _common(tx, found.id, ours, theirs)
     if base == theirs:
@@ -92,13 +92,13 @@ def prepare_pick(tx: Transaction, project: str, name: str, request: PickRequest,
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
+    if (repeated := _repeated(tx, project, found, request)) is not None:
+        return repeated
     picked = read_commit(tx, project, name, request.version)
     before = _parent_of(picked, request.parent)
     base, theirs = (picked.digest, before) if undo else (before, picked.digest)
     first_line = picked.message.partition("\n")[0][:100]
     started = _start(tx, found, request, theirs, f"Revert {first_line!r}" if undo else picked.message)
-    if started.commit.recorded is not None:
-        return started
     merge = _combine(
         tx, project_row.id, request, replace(started, answer=started.answer.model_copy(update={"base": base}))
     )
@@ -119,20 +119,36 @@ def _parent_of(picked: Commit, parent: int | None) -> str | None:
     return picked.parents[(parent or 1) - 1] if picked.parents else None
 
 
+def _repeated(tx: Transaction, project: str, found: Row[Any], request: CombineRequest) -> PreparedMerge | None:
+    """Return the merge that an earlier request with the same `write_id` has recorded; None if there is none.
+
+    The branch and the version of the request may be gone meanwhile, so neither is looked up.
+    """
+    recorded = recorded_as(tx, found.id, request.write_id)
+    if recorded is None:
+        return None
+    parents = (*read_commit(tx, project, found.name, recorded).parents, recorded, recorded)
+    commit = PreparedCommit(
+        found.id, request.into, None, (), request.message, request.write_id, recorded=recorded,
+        last_purge=last_purge(tx, found.project_id),
+    )  # fmt: skip
+    ours, theirs = parents[:2]
+    answer = MergeAnswer(commit=None, base=None, ours=ours, theirs=theirs, changes=0, conflicts=(), conflict_count=0)
+    return PreparedMerge(answer, commit)
+
+
 def _start(
     tx: Transaction, found: Row[Any], request: CombineRequest, theirs: str | None, message: str
 ) -> PreparedMerge:
     """Return a merge of the commit `theirs` into the branch that `request` names; the result is not computed yet.
 
-    `commit.recorded` is set if an earlier request has recorded the merge. `message` is the message of the commit if
-    the request contains none.
+    `message` is the message of the commit if the request contains none.
     """
-    recorded = recorded_as(tx, found.id, request.write_id)
-    ours = head_of(tx, found.id, request.into, None if recorded else request.expected)
+    ours = head_of(tx, found.id, request.into, request.expected)
     if ours is None:
         raise InvalidProblem(f"The branch {request.into!r} has no commits yet.", code="no-commits")
     commit = PreparedCommit(
-        found.id, request.into, ours, (ours,), request.message or message, request.write_id, recorded=recorded,
+        found.id, request.into, ours, (ours,), request.message or message, request.write_id,
         last_purge=last_purge(tx, found.project_id),
     )  # fmt: skip
     answer = MergeAnswer(commit=None, base=None, ours=ours, theirs=theirs, changes=0, conflicts=(), conflict_count=0)
