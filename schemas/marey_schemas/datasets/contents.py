@@ -19,7 +19,7 @@ MOST_CONTENTS = 256
 """Greatest number of revisions, and of documents, in one request."""
 MOST_CHECKED = 500
 """Greatest number of revisions in one request to check whether revisions may be exported."""
-MOST_RECEIVED_FACETS = 64
+MOST_RECEIVED_FACETS = 1000
 """Greatest number of facets of one received revision."""
 MOST_RECEIVED_CHANGES = 200_000
 """Greatest number of entries that a commit from an archive or another server may change."""
