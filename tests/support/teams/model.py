@@ -113,10 +113,21 @@ class Model:
     """Entries of versions, by the digest of the tree of these entries, on both servers."""
     roles: dict[str, Role] = field(default_factory=ROLES.copy)
     """Roles of the users in both projects."""
+    folder_roles: dict[tuple[str, str], Role] = field(default_factory=dict)
+    """Roles of users in folders, and in everything below these, by user and folder."""
 
     def copy(self) -> Model:
         projects = {name: one.copy() for name, one in self.projects.items()}
-        return Model(projects, dict(self.commits), dict(self.trees), dict(self.roles))
+        return Model(projects, dict(self.commits), dict(self.trees), dict(self.roles), dict(self.folder_roles))
+
+    def role_of(self, user: str, place: str | None) -> Role:
+        """Return the role of a user in a folder; None: in the project."""
+        inside = {
+            folder: role
+            for (of, folder), role in self.folder_roles.items()
+            if of == user and place is not None and f"{place}/".startswith(f"{folder}/")
+        }
+        return inside[max(inside, key=len)] if inside else self.roles[user]
 
     def note_tree(self, state: State, tree: str) -> None:
         """Check that versions have the same tree if, and only if, they have the same entries."""

@@ -105,6 +105,10 @@ class Operation(ABC):
     def again(self, outcome: Outcome, second: Outcome) -> None:  # noqa: B027 - most have nothing to check
         """Check the outcome `second` of the operation when it was sent again after it had succeeded with `outcome`."""
 
+    def place(self, model: Model) -> str | None:
+        """Return the folder in which the user needs the role; None: in the project."""
+        return None
+
     def project(self, model: Model) -> ModelProject:
         return model.projects[self.lab]
 

@@ -34,3 +34,37 @@ class SetRole(Operation):
     def absorb(self, model: Model, clients: Clients, outcome: Outcome) -> None:
         assert set(accepted(outcome)) == {self.to}
         model.roles[self.user] = self.to
+
+
+@dataclass(frozen=True)
+class SetFolderRole(Operation):
+    """Change of the role that a member has in a folder and below it, on both servers; None removes this role."""
+
+    role = Role.OWNER
+    user: str
+    folder: str
+    to: Role | None
+
+    @property
+    def label(self) -> str:
+        return f"SetFolderRole {'' if self.to is None else self.to.value}".rstrip()
+
+    @property
+    def labs(self) -> tuple[str, ...]:
+        return LABS
+
+    def send(self, clients: Clients) -> None:
+        for lab in LABS:
+            project = clients.project(lab)
+            found = project.collections.at(self.folder)
+            assert found is not None
+            if self.to is None:
+                project.members.in_folders.remove(found, self.user)
+            else:
+                project.members.in_folders.put(found, self.user, self.to)
+
+    def absorb(self, model: Model, clients: Clients, outcome: Outcome) -> None:
+        assert accepted(outcome) is None
+        model.folder_roles.pop((self.user, self.folder), None)
+        if self.to is not None:
+            model.folder_roles[self.user, self.folder] = self.to

@@ -129,7 +129,7 @@ class Session:
         self.log.append(f"{clients.user}: repeated -> {outcome}")
         before = self.model.copy()
         try:
-            if RANKS[self.model.roles[clients.user]] >= RANKS[operation.role]:
+            if _may(self.model, operation, clients):
                 operation.assume(self.model)
             self._absorb(self.model, operation, clients, outcome)
         except AssertionError:
@@ -145,10 +145,10 @@ class Session:
 
     @staticmethod
     def _absorb(model: Model, operation: Operation, clients: Clients, outcome: Outcome) -> None:
-        if RANKS[model.roles[clients.user]] < RANKS[operation.role]:
-            operation.forbidden(model, outcome)
-        else:
+        if _may(model, operation, clients):
             operation.absorb(model, clients, outcome)
+        else:
+            operation.forbidden(model, outcome)
 
     def _count(self, operation: Operation, outcome: Outcome) -> None:
         code = f" {outcome.code}" if isinstance(outcome, Refused) else ""
@@ -231,6 +231,11 @@ class Session:
         self.comparison(lab).files(host.database, collected=a_day_later)
         self.log.append(f"collect garbage of {lab}, {a_day_later=}")
         self.world.counts[f"CollectGarbage{' a day later' if a_day_later else ''}"] += 1
+
+
+def _may(model: Model, operation: Operation, clients: Clients) -> bool:
+    """Return whether the user has the role that an operation requires."""
+    return RANKS[model.role_of(clients.user, operation.place(model))] >= RANKS[operation.role]
 
 
 def _unanswered(outcome: Outcome) -> bool:
