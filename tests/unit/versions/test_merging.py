@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from tests.support.tiers import examples
 
@@ -350,6 +350,12 @@ def test_a_resolution_of_a_part_decides_what_was_made_from_it() -> None:
 
 @settings(max_examples=examples(300), deadline=None)
 @given(states, states, states, st.sampled_from([Side.OURS, Side.THEIRS]))
+@example(
+    state(a=entry("1"), b=entry("2", "1")),
+    state(a=entry("1", None, "x"), b=entry("1")),
+    state(a=entry("2", "1")),
+    Side.THEIRS,
+)
 def test_the_same_side_for_every_part_is_that_side_for_the_conflict(
     base: State, ours: State, theirs: State, side: Side
 ) -> None:
@@ -359,7 +365,8 @@ def test_the_same_side_for_every_part_is_that_side_for_the_conflict(
     (result, merged), (same, again) = merge(base, ours, theirs, whole), merge(base, ours, theirs, apart)
     added_twice = any(one.base is None and one.parts != ("path",) for one in conflicts)  # then a side is taken whole
     if not merged.conflicts and not added_twice:
-        assert (same, again.conflicts, again.unused) == (result, [], [])
+        unused = [one.key for one in merged.unused]  # of conflicts that the other resolutions have removed
+        assert (same, again.conflicts, [one.key for one in again.unused]) == (result, [], unused)
 
 
 def test_more_tags_than_an_item_can_have_are_a_conflict() -> None:
