@@ -98,8 +98,13 @@ def test_a_commit_of_a_part_keeps_what_was_not_checked_out(
     gaits("moved and removed")
     assert difference(owner, "main~1", "main") == [("removed", "raw/b", None), ("moved", "raw/e", "raw/d")]
     assert sorted(entries(owner)) == ["old/c", "raw/a", "raw/e"]
+    head = ok(owner.get(f"{GAITS}/commits/main"))["digest"]
+    shown = {"commit": head, "query": None, "paths": ["raw"]}
+    assert ok(owner.get(GAITS))["checked_out"] == shown
+    assert [one["checked_out"] for one in ok(owner.get(f"{LAB}/datasets"))["items"]] == [shown]
     assert check_out(owner, paths=["old"]) == (1, 3)
     assert check_out(owner) == (3, 3)
+    assert ok(owner.get(GAITS))["checked_out"] == {**shown, "paths": []}
     delete(owner, "gaits/old/c")
     assert gaits("all of it")["entries"] == 2
     assert not list(check_store(database))
@@ -206,3 +211,7 @@ def test_a_lost_record_of_what_is_checked_out_is_found(
 
     database.write(SYSTEM, lose)
     assert {one.code for one in check_store(database)} == {"folder-unknown"}
+    assert [one["checked_out"] for one in ok(owner.get(f"{LAB}/datasets"))["items"]] == [None]
+    refused(owner.post(f"{GAITS}/checkout", json={}), 500, "dataset-damaged")
+    assert check_out(owner, discard=True) == (3, 3)
+    assert not list(check_store(database))

@@ -17,6 +17,7 @@ from marey_schemas.wording import counted
 if TYPE_CHECKING:
     from marey_schemas.datasets.commits import Commit, Origin
     from marey_schemas.datasets.differences import ListedCommit
+    from marey_schemas.datasets.naming import Dataset
     from marey_schemas.datasets.protection import Protection
 
 dataset = typer.Typer(
@@ -67,8 +68,16 @@ def list_datasets(context: typer.Context, project_name: ProjectName, as_json: As
         found = list(marey.project(project_name).datasets.list())
     if as_json:
         return print_json(found)
-    rows = [(one.name, one.collection, one.created_at.date(), one.description) for one in found]
-    return print_table(("dataset", "folder", "created", "description"), rows)
+    rows = [(one.name, one.collection, _checked_out(one), one.created_at.date(), one.description) for one in found]
+    return print_table(("dataset", "folder", "checked out", "created", "description"), rows)
+
+
+def _checked_out(one: Dataset) -> str:
+    """Return what is checked out in the folder, such as `1f3a9c07d2e4: tag = night; raw, rigs`."""
+    if one.checked_out is None:
+        return ""
+    selection = "; ".join(filter(None, (one.checked_out.query, ", ".join(one.checked_out.paths))))
+    return f"{short(one.checked_out.commit)}{f': {selection}' if selection else ''}"
 
 
 @dataset.command("commit")

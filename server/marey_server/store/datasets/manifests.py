@@ -7,7 +7,7 @@ entries that are not in the folder are never taken for removed ones.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,11 +15,12 @@ from sqlalchemy import ColumnElement, Row, and_, select
 
 from marey_server.store.datasets.chunks import StoredChunks, store_chunks
 from marey_server.store.tables import dataset, dataset_commit
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.tree.chunks import Leaf, encode
-from marey_versions.tree.reading import Tree
+from marey_versions.tree.reading import ChunkReader
 
 _KEY = "manifest"
+_IS_COMMIT = and_(dataset_commit.c.dataset_id == dataset.c.id, dataset_commit.c.digest == dataset.c.folder_commit)
 
 
 @dataclass(frozen=True)
@@ -45,14 +46,26 @@ class FolderManifest:
 
 def read_manifest(tx: Transaction, found: Row[Any]) -> FolderManifest | None:
     """Return the manifest of a dataset's folder; None if no version was checked out or committed there yet."""
-    digest = found.folder_commit
-    if digest is None:
-        return None
-    of_commit = (dataset_commit.c.dataset_id == found.id, dataset_commit.c.digest == digest)
-    tree = tx.execute(select(dataset_commit.c.tree).where(*of_commit)).scalar()
-    if tree is not None:
-        return FolderManifest(digest, str(tree))
-    return FolderManifest(**Tree(StoredChunks(tx), digest).get_several([_KEY])[_KEY])
+    return read_manifests(tx, [found]).get(found.id)
+
+
+def read_manifests(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, FolderManifest]:
+    """Return the manifests of the folders of datasets, by id of the dataset; folders without one are left out."""
+    named = {row.id: row.folder_commit for row in rows if row.folder_commit is not None}
+    found: dict[str, FolderManifest] = {}
+    for some in in_lists(sorted(named)):
+        is_commit = and_(
+            dataset_commit.c.dataset_id == dataset.c.id, dataset_commit.c.digest == dataset.c.folder_commit
+        )
+        whole = select(dataset.c.id, dataset_commit.c.digest, dataset_commit.c.tree).join(dataset_commit, is_commit)
+        for row in tx.execute(whole.where(dataset.c.id.in_(some))):
+            found[row.id] = FolderManifest(row.digest, row.tree)
+    reader = ChunkReader(StoredChunks(tx))
+    partial = sorted(named.keys() - found.keys())
+    for of, chunk in zip(partial, reader.several([named[one] for one in partial]), strict=True):
+        assert isinstance(chunk, Leaf)
+        found[of] = FolderManifest(**dict(chunk.entries)[_KEY])
+    return found
 
 
 def store_manifest(tx: Transaction, manifest: FolderManifest) -> str:
@@ -66,15 +79,11 @@ def store_manifest(tx: Transaction, manifest: FolderManifest) -> str:
 
 def roots_of_folders(tx: Transaction, *conditions: ColumnElement[bool]) -> set[str]:
     """Return the roots of the trees that manifests need, for the datasets that meet the conditions."""
-    is_commit = and_(dataset_commit.c.dataset_id == dataset.c.id, dataset_commit.c.digest == dataset.c.folder_commit)
     partial = (
         select(dataset.c.id, dataset.c.folder_commit)
-        .outerjoin(dataset_commit, is_commit)
+        .outerjoin(dataset_commit, _IS_COMMIT)
         .where(dataset.c.folder_commit.is_not(None), dataset_commit.c.digest.is_(None), *conditions)
     )
-    store = StoredChunks(tx)
-    roots: set[str] = set()
-    for row in tx.execute(partial):
-        value: Mapping[str, Any] = Tree(store, row.folder_commit).get_several([_KEY])[_KEY]
-        roots.update((row.folder_commit, value["tree"]))
-    return roots
+    rows = tx.execute(partial).all()
+    manifests = read_manifests(tx, rows)
+    return {root for row in rows for root in (row.folder_commit, manifests[row.id].tree)}

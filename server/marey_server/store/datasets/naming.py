@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import CTE, Row, delete, func, insert, literal_column, null, select
 
 from marey_schemas.access import Role
-from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind, RefMove
+from marey_schemas.datasets.naming import MAIN, CheckedOut, Dataset, DatasetCreate, Ref, RefCreate, RefKind, RefMove
 from marey_schemas.datasets.protection import ProtectionRule
 from marey_schemas.event_kinds import AuditKind, OrdinaryEventKind
 from marey_schemas.items import Page
@@ -17,6 +17,7 @@ from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import collections, listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
+from marey_server.store.datasets.manifests import FolderManifest, read_manifests
 from marey_server.store.datasets.protection import (
     require_deletable,
     require_no_protected_branch,
@@ -30,6 +31,7 @@ from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import collection, commit_parent, dataset, dataset_commit, dataset_ref
 from marey_server.store.transaction import Transaction
+from marey_versions.tree.chunks import DamagedChunk
 
 MOST_DATASETS = 1000
 """Greatest number of datasets in a project."""
@@ -57,9 +59,18 @@ def _shown_rows(project_row: ProjectRow) -> Any:
     )
 
 
-def _shown(row: Row[Any]) -> Dataset:
+def _shown(tx: Transaction, rows: Sequence[Row[Any]]) -> tuple[Dataset, ...]:
+    try:
+        manifests = read_manifests(tx, rows)
+    except DamagedChunk:  # which `marey db fsck` finds; the damage of one dataset must not hide the others
+        manifests = {}
+    return tuple(_shown_dataset(row, manifests.get(row.id)) for row in rows)
+
+
+def _shown_dataset(row: Row[Any], manifest: FolderManifest | None) -> Dataset:
     return Dataset(
         id=row.id, name=row.name, description=row.description, collection=row.path,
+        checked_out=None if manifest is None else CheckedOut.model_validate(manifest.shown),
         created_at=datetime_of(row.created_us), updated_at=datetime_of(row.updated_us), rev=row.rev,
     )  # fmt: skip
 
@@ -88,7 +99,7 @@ def create_dataset(tx: Transaction, project: str, request: DatasetCreate) -> Dat
         tx.execute(insert(dataset).values(**row))
     tx.execute(insert(dataset_ref).values(**new_ref(tx, dataset_id, MAIN, RefKind.BRANCH, None)))
     tx.emit("dataset.created", dataset_id, project_id=project_row.id, name=request.name)
-    return _shown(find_dataset(tx, project_row, request.name))
+    return _shown(tx, [find_dataset(tx, project_row, request.name)])[0]
 
 
 def _require_room(held: int, most: int, of_what: str, code: str) -> None:
@@ -98,7 +109,7 @@ def _require_room(held: int, most: int, of_what: str, code: str) -> None:
 
 def read_dataset(tx: Transaction, project: str, name: str) -> Dataset:
     """Return a dataset as a document."""
-    return _shown(find_dataset(tx, projects.require(tx, project), name))
+    return _shown(tx, [find_dataset(tx, projects.require(tx, project), name)])[0]
 
 
 def list_datasets(tx: Transaction, project: str, *, cursor: str | None, limit: int) -> Page:
@@ -108,7 +119,7 @@ def list_datasets(tx: Transaction, project: str, *, cursor: str | None, limit: i
     rows, following = listing.read_page(
         tx, _shown_rows(project_row), order, ["datasets", project_row.id], cursor, limit
     )
-    return Page(items=tuple(map(_shown, rows)), next_cursor=following)
+    return Page(items=_shown(tx, rows), next_cursor=following)
 
 
 def delete_dataset(tx: Transaction, project: str, name: str, *, expected_rev: ExpectedRev) -> None:

@@ -18,6 +18,7 @@ from marey_server.errors import ConflictProblem
 from marey_server.store import projects
 from marey_server.store.datasets.naming import delete_ref, find_dataset, find_ref
 from marey_server.store.jobs.reading import UNFINISHED
+from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.purging.holders import FoundHolders
 from marey_server.store.revs import ExpectedRev
 from marey_server.store.tables import collection, dataset_ref, item, job, revision
@@ -42,7 +43,9 @@ def delete_uncited_ref(
     raises `ConflictProblem` if a job that has not ended, or an item that a job made, cites the version of the tag, and
     no other tag names this version.
     """
-    found = find_ref(tx, find_dataset(tx, projects.require(tx, project), name).id, ref)
+    project_row = projects.require(tx, project)
+    hold_off_purges(tx, project_row.id)
+    found = find_ref(tx, find_dataset(tx, project_row, name).id, ref)
     delete_ref(tx, project, name, ref, expected_rev=expected_rev)  # which locks all branches and tags
     held = holders_of(tx, citing)
     if found is None or not held.holders or _has_tag(tx, found):
