@@ -111,8 +111,7 @@ def _matching(
         yield from ((entry.key, entry.value) for entry in found)
         return
     for some in batched(_limited(found), SEARCHED_AT_ONCE):
-        rows = _revisions(tx, project_id, [entry.content for entry in some])
-        facts = _facts(tx, project_id, folder, some, rows)
+        facts = _facts(tx, project_id, folder, some)
         yield from ((entry.key, entry.value) for entry, one in zip(some, facts, strict=True) if matches(query, one))
 
 
@@ -143,24 +142,24 @@ def _facts_of(entry: DatasetEntry, folder: str, **more: Any) -> QueriedFacts:
     return QueriedFacts(name=name, folder=inside, tags=entry.tags, **known)
 
 
-def _facts(
-    tx: Transaction, project_id: str, folder: str, entries: Sequence[DatasetEntry], rows: Mapping[str, Row[Any]]
-) -> Iterator[QueriedFacts]:
-    """Yield the facts of entries; `rows` contains the revision with the content of each entry."""
+def _facts(tx: Transaction, project_id: str, folder: str, entries: Sequence[DatasetEntry]) -> Iterator[QueriedFacts]:
+    """Yield the facts of entries: their own ones, and those of a revision with the content of the entry."""
+    contents = [entry.content for entry in entries]
+    rows = _revisions(tx, project_id, contents)
     summaries = _summaries(tx, rows)
     names = _names(tx, project_id, {one.skeleton_id for one in summaries.values() if one.skeleton_id is not None})
     facets = facets_of_contents(tx, project_id, rows)
-    for entry in entries:
-        if (row := rows.get(entry.content)) is None:
+    for entry, content in zip(entries, contents, strict=True):
+        if (row := rows.get(content)) is None:
             yield _facts_of(entry, folder)
             continue
-        summary = summaries[entry.content]
+        summary = summaries[content]
         newest = row.head == row.number
         yield _facts_of(
             entry, folder, revision=row.number, created_at=datetime_of(row.item_created_us),
             updated_at=datetime_of(row.updated_us if newest else row.created_us), summary=summary.shown,
             frames=summary.frames, skeleton=summary.skeleton_id, skeleton_name=names.get(summary.skeleton_id or ""),
-            facets=facets.get(entry.content, {}),
+            facets=facets.get(content, {}),
         )  # fmt: skip
 
 
