@@ -32,6 +32,8 @@ DIGEST_PATTERN = r"^sha256:[0-9a-f]{64}$"
 Digest = Annotated[str, StringConstraints(pattern=DIGEST_PATTERN)]
 """Digest of bytes: `sha256:` and 64 hexadecimal digits."""
 
+PartName = Annotated[str, StringConstraints(min_length=1, max_length=64)]
+
 Message = Annotated[str, StringConstraints(max_length=2000)]
 
 JointName = Annotated[str, StringConstraints(min_length=1, max_length=1024)]

@@ -10,9 +10,9 @@ from tests.support.interleaving import Step, interleave
 from tests.support.store_fixtures import WRITE, Lab, requiring, skeleton_tree
 
 from marey_schemas.access import Role
+from marey_schemas.datasets.checkouts import CheckoutRequest
 from marey_schemas.datasets.commits import CommitCreate, PutEntry
 from marey_schemas.datasets.contents import ReceivedCommit, ReceivedRevision
-from marey_schemas.datasets.merges import CheckoutRequest
 from marey_schemas.datasets.naming import MAIN, DatasetCreate, RefCreate, RefKind
 from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.items import Item, ItemCreate

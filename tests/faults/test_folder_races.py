@@ -13,8 +13,8 @@ from tests.support.interleaving import HEAD_START_S, Abandoned, Step, interleave
 from tests.support.store_fixtures import WRITE, Lab, declared, requiring, skeleton_tree
 
 from marey_schemas.access import EVERY_MEMBER, FolderRoleChange, Role
+from marey_schemas.datasets.checkouts import CheckoutRequest
 from marey_schemas.datasets.commits import CommitCreate
-from marey_schemas.datasets.merges import CheckoutRequest
 from marey_schemas.datasets.naming import DatasetCreate
 from marey_schemas.items import CollectionChange, CollectionCreate, ItemChange, ItemCreate
 from marey_schemas.kinds import Kind

@@ -17,6 +17,8 @@ from tests.support.teams.model import PARTNER, STUDIO
 from tests.support.teams.world import World
 from tests.support.tiers import examples, is_soak, steps
 
+from marey_server.access import roles
+from marey_server.access.folder_rights import FolderRights
 from marey_server.store import garbage
 from marey_server.store.database.connections import Database
 from marey_server.store.datasets import committing, merging
@@ -52,7 +54,8 @@ EXPECTED = (
     "(deaths", "(lost answers)", "(repeated writes)", "ArchiveAndImport", "CheckOut", "CherryPick", "CollectGarbage",
     "CommitChanges", "CommitFolder", "Copy", "CreateAnnotation", "CreateBranch", "CreateClip", "CreateTag",
     "DeleteItem", "DeleteRef", "Merge", "merge-conflicts", "Resolved", "Purge", "still-held", "Rename", "Reset",
-    "RestoreItem", "Revert", "Revise", "UploadFile", "overtaken",
+    "RestoreItem", "Revert", "Revise", "SetFolderRole reader", "SetRole reader", "UploadFile",
+    "insufficient-role", "overtaken",
 )  # fmt: skip
 """Texts, each of which must occur in a name that a long run counts; otherwise the run would test too little."""
 
@@ -115,6 +118,16 @@ def forget_write_ids(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(committing, "recorded_as", lambda _tx, _dataset, _write_id: None)
 
 
+def check_no_role(patch: pytest.MonkeyPatch) -> None:
+    """Let every member do everything."""
+    patch.setattr(roles, "includes", lambda _held, _needed: True)
+
+
+def ignore_folder_roles(patch: pytest.MonkeyPatch) -> None:
+    """Let members have their roles in the project in every folder."""
+    patch.setattr(FolderRights, "require", lambda _self, _path, _role: None)
+
+
 VERSIONS = ("commit", "create_branch", "merge", "revise", "annotate")
 PLANTS: dict[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]] = {
     drop_their_side: VERSIONS,
@@ -123,6 +136,8 @@ PLANTS: dict[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]] = {
     purge_what_versions_contain: ("commit", "delete_item", "purge_item"),
     revert_only_one_entry: ("commit", "revert"),
     forget_write_ids: ("commit", "repeat"),
+    check_no_role: ("commit", "demote"),
+    ignore_folder_roles: ("create_clip", "restrict"),
 }
 """Faults that are planted, and for each the kinds of steps in the programs that must find it."""
 

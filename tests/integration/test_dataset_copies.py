@@ -14,12 +14,17 @@ from tests.support.store_fixtures import motion_tree, skeleton_tree
 
 from marey_client import Marey
 from marey_client.blobs import Blobs
+from marey_client.errors import RequestFailed
 from marey_client.handles.versions import DatasetHandle
 from marey_client.items import ItemHandle
 from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate, Role
-from marey_schemas.datasets.commits import Commit, PutEntry, RemoveEntry
+from marey_schemas.datasets.commits import Commit, MoveEntry, PutEntry, RemoveEntry
 from marey_schemas.kinds import Kind
+from marey_server.access.principal import SYSTEM
+from marey_server.store import projects
+from marey_server.store.items.facets import publish_facets
+from marey_server.store.transaction import Transaction
 
 
 @pytest.fixture
@@ -117,6 +122,67 @@ def test_a_checkout_creates_labels_of_a_deleted_clip(lab: ProjectHandle) -> None
     assert gaits.check_out().removed == 1
 
 
+def measure(server: Server, item: ItemHandle, project: str = "lab", **values: float) -> None:
+    """Publish facets of the newest revision of an item, as a job does."""
+    stated = [[item.id, item.item.revision, values]]
+
+    def publish(tx: Transaction) -> None:
+        publish_facets(tx, projects.require(tx, project).id, stated)
+
+    server.database.write(SYSTEM, publish)
+
+
+def facets_of(project: ProjectHandle) -> dict[str, dict[str, float]]:
+    return {one.item.name: dict(one.item.facets) for one in project.clips.list(collection="gaits")}
+
+
+def test_facets_come_with_a_copy_and_with_an_archive(
+    server: Server, marey: Marey, lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle, tmp_path: Path
+) -> None:
+    """Queries select the same clips on the source, after a copy, and after the import of an archive."""
+    clip = make_clip(lab, make_rig(lab))
+    measure(server, clip, usage=0.5, used_frames=1.0)
+    commit(gaits, walk=clip)
+    marey.create_project(ProjectCreate(name="third"))
+    third = marey.project("third")
+    gaits.archive(tmp_path / "gaits.tar")
+    third.datasets.import_archive(tmp_path / "gaits.tar", "gaits")
+    partner.datasets.pull(gaits, "gaits")
+    for copy in (partner, third):
+        copy.datasets.at("gaits").check_out()
+        assert facets_of(copy) == {"walk": {"usage": 0.5, "used_frames": 1.0}}
+        assert [one.item.name for one in copy.clips.list(query="facet.usage = 0.5")] == ["walk"]
+
+
+def test_a_copy_adds_facets_to_content_that_the_project_has_and_replaces_none(
+    server: Server, lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle
+) -> None:
+    walk = make_clip(lab, make_rig(lab))
+    commit(gaits, walk=walk)
+    partner.datasets.pull(gaits, "gaits")
+    partner.datasets.at("gaits").check_out()
+    (there,) = partner.clips.list(collection="gaits")
+    measure(server, there, "partner", usage=0.25)
+    measure(server, walk, usage=0.5, used_frames=1.0)
+    gaits.commit("Move", changes=[MoveEntry(path="walk", kind=Kind.CLIP, to="stroll")])
+    partner.datasets.pull(gaits, "gaits")
+    assert facets_of(partner) == {"walk": {"usage": 0.25, "used_frames": 1.0}}
+
+
+def test_a_checkout_of_known_content_keeps_its_facets(server: Server, lab: ProjectHandle) -> None:
+    gaits = lab.datasets.create("gaits", collection="gaits")
+    rig = make_rig(lab)
+    clip = lab.clips.create("walk", {"motion": motion_tree(rig.item, joints=2)}, collection="gaits")
+    measure(server, clip, usage=0.5)
+    first = gaits.commit("measured")
+    clip.put_part("info", {"schema": "marey/clip-info@1", "comment": "changed"})
+    gaits.commit("changed")
+    assert facets_of(lab) == {"walk": {}}
+    gaits.check_out(first.digest)
+    assert facets_of(lab) == {"walk": {"usage": 0.5}}
+    assert next(lab.clips.list(collection="gaits")).item.revision == 3
+
+
 def test_a_file_that_a_version_needs_is_copied_although_its_clip_is_deleted(
     server: Server, lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle
 ) -> None:
@@ -134,3 +200,18 @@ def test_a_file_that_a_version_needs_is_copied_although_its_clip_is_deleted(
     lab.clips.get(clip).delete()
     assert owner.fetch(file) == b"HIERARCHY"
     assert partner.datasets.pull(gaits, "gaits").moved
+
+
+def test_a_reference_to_an_item_of_the_receiving_project_is_refused_with_what_to_do(
+    marey: Marey, lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle
+) -> None:
+    """Only the receiving project knows the item, so that the same document has another digest there."""
+    rig = make_rig(partner)
+    body = {"schema": "marey/document@1", "rig": {"item": rig.id, "revision": 1}}
+    study = lab.items(Kind.STUDY).create("study", {"study": body})
+    commit(gaits, study=study)
+    with pytest.raises(RequestFailed, match=f"study 'study' refers to the item {rig.id} of this project") as caught:
+        partner.datasets.pull(gaits, "gaits")
+    assert (caught.value.code, "another project" in str(caught.value)) == ("other-content", True)
+    marey.create_project(ProjectCreate(name="third"))
+    assert marey.project("third").datasets.pull(gaits, "gaits").moved

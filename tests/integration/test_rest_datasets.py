@@ -397,6 +397,76 @@ def test_a_conflict_is_listed_and_decided(owner: httpx.Client, two_branches: Cal
     assert entries(owner)["a"]["parts"] == entries(owner, "trial")["a"]["parts"]
 
 
+def test_the_parts_of_a_conflict_are_taken_from_different_versions(
+    owner: httpx.Client, two_branches: Callable[..., None], database: Database
+) -> None:
+    def edit(joint: str) -> None:
+        put(owner, "gaits/a", joint)
+        put_mapping(owner, "gaits/a", joint)
+
+    put_mapping(owner, "gaits/a", "Joint a")
+    ok(owner.post(f"{GAITS}/commits", json={"message": "with a mapping"}), 201)
+    two_branches(lambda: edit("Pelvis"), lambda: edit("Root"))
+    of = {"ours": entries(owner), "theirs": entries(owner, "trial"), "base": entries(owner, "main~1")}
+
+    def merge(*taken: tuple[str | None, str], **fields: Any) -> httpx.Response:
+        decided = [{"path": "a", "kind": "skeleton", "take": side, "part": part} for part, side in taken]
+        return owner.post(f"{GAITS}/merges", json={"version": "trial", "resolutions": decided, **fields})
+
+    conflict = refused(merge(("mapping", "theirs")), 409, "merge-conflicts")["context"]
+    assert [(one["path"], one["parts"]) for one in conflict["conflicts"]] == [("a", ["hierarchy"])]
+    apart = ("hierarchy", "ours"), ("mapping", "theirs")
+    for extra in (("mapping", "ours"), ("path", "ours"), (None, "ours")):
+        refused(merge(*apart, extra), 422, "no-conflict")
+    ok(merge(("hierarchy", "ours"), ("mapping", "base"), preview=True))
+    ok(merge(*apart))
+    for part, side in apart:
+        assert entries(owner)["a"]["parts"][part] == of[side]["a"]["parts"][part]
+    ok(owner.post(f"{GAITS}/reverts", json={"version": "main", "parent": 1}))
+    ok(owner.post(f"{GAITS}/refs", json={"name": "again", "kind": "branch", "at": "main~2"}), 201)
+    mixed = [
+        {"path": "a", "kind": "skeleton", "take": side, "part": part}
+        for part, side in (("hierarchy", "ours"), ("mapping", "base"))
+    ]
+    ok(owner.post(f"{GAITS}/cherry-picks", json={"version": "trial", "into": "again", "resolutions": mixed}))
+    assert entries(owner, "again")["a"]["parts"] == {
+        "hierarchy": of["ours"]["a"]["parts"]["hierarchy"],
+        "mapping": of["base"]["a"]["parts"]["mapping"],
+    }
+    assert not list(check_store(database))
+
+
+def test_a_repeated_request_gets_its_commit_although_the_branches_are_gone(
+    owner: httpx.Client, two_branches: Callable[..., None]
+) -> None:
+    two_branches(lambda: put(owner, "gaits/a", "Pelvis"), lambda: change(owner, "gaits/b", tags=["slow"]))
+    ok(owner.post(f"{GAITS}/refs", json={"name": "work", "kind": "branch"}), 201)
+    removal = {"change": "remove", "path": "b", "kind": "skeleton"}
+    requests = {
+        "merges": {"version": "trial", "into": "work", "write_id": "a merge of trial"},
+        "commits": {"branch": "work", "message": "m", "changes": [removal], "write_id": "a commit of changes"},
+    }
+    first = {name: owner.post(f"{GAITS}/{name}", json=body) for name, body in requests.items()}
+    made = {name: answer.json().get("commit") or answer.json() for name, answer in first.items()}
+    for ref in ("trial", "work"):
+        assert owner.delete(f"{GAITS}/refs/{ref}", headers={"If-Match": "*"}).status_code == 204
+    for name, body in requests.items():
+        again = owner.post(f"{GAITS}/{name}", json=body)
+        assert again.is_success, again.text
+        assert (again.json().get("commit") or again.json()) == made[name]
+
+
+def test_no_branch_or_tag_hides_a_commit(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    """Otherwise, somebody who names a commit by its first digits would get the version of the branch."""
+    first = ok(owner.get(f"{GAITS}/commits/main"))["digest"].removeprefix("sha256:")
+    put(owner, "gaits/a", "Pelvis")
+    gaits("second")
+    for name, kind in ((first, "branch"), (first[:12], "tag"), (first[:8], "branch")):
+        refused(owner.post(f"{GAITS}/refs", json={"name": name, "kind": kind}), 409, "name-taken")
+    ok(owner.post(f"{GAITS}/refs", json={"name": "20261127", "kind": "tag"}), 201)
+    assert ok(owner.get(f"{GAITS}/commits/{first[:12]}"))["digest"] == f"sha256:{first}"
+
+
 def test_two_conflicts_at_one_path_are_decided_one_after_the_other(
     owner: httpx.Client, two_branches: Callable[..., None]
 ) -> None:
@@ -755,13 +825,14 @@ def test_contents_of_other_projects_and_unknown_ones_are_null(owner: httpx.Clien
     content = revision_content(entry["kind"], entry["parts"])
     ok(owner.post("/projects", json={"name": "other"}), 201)
     wanted: dict[str, Any] = {"revisions": [content], "documents": [{"content": content, "part": "hierarchy"}]}
-    assert contents(owner, "/projects/other", **wanted) == {"revisions": [None], "documents": [None]}
+    nothing = {"revisions": [None], "documents": [None], "facets": [{}]}
+    assert contents(owner, "/projects/other", **wanted) == nothing
     assert contents(owner, **wanted)["revisions"] != [None]
     unknown: dict[str, Any] = {
         "revisions": ["sha256:" + "0" * 64],
         "documents": [{"content": content, "part": "nothing"}],
     }
-    assert contents(owner, **unknown) == {"revisions": [None], "documents": [None]}
+    assert contents(owner, **unknown) == nothing
     many = ["sha256:" + "0" * 64] * 257
     refused(owner.post(f"{LAB}/contents", json={"revisions": many}), 422, "invalid-body")
 

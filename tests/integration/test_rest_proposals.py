@@ -29,7 +29,7 @@ from marey_server.store.datasets.proposals import WaitingMerges, accepting
 from marey_server.store.datasets.proposals import waiting as waiting_module
 from marey_server.store.fsck import check_store
 from marey_server.store.tables import job, proposal
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import Quotas, Transaction
 from marey_versions.tree.chunks import DamagedChunk
 
 LAB = "/projects/lab"
@@ -541,6 +541,34 @@ def test_wrong_versions_and_full_lists_are_refused(team: Team, monkeypatch: pyte
     for _ in range(2):
         ok(check(team.ben, 1, "pending"))
     refused(check(team.ben, 1, "pending", name="other"), 409, "long-proposal")
+
+
+def test_the_texts_of_proposals_have_limits(team: Team, server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each text counts 200 bytes more than it has, so that empty ones are limited, too."""
+    texts = "marey_server.store.datasets.proposals.texts"
+    monkeypatch.setattr(f"{texts}.MOST_TEXT_OF_PROPOSAL", 1000)
+    monkeypatch.setattr(server.database, "quotas", Quotas(project_proposal_bytes=1500))
+
+    def propose(text: str) -> httpx.Response:
+        return team.ada.post(PROPOSALS, json={"title": "t", "source": "trial", "description": text})
+
+    def comment(number: int, text: str) -> httpx.Response:
+        return team.ben.post(f"{PROPOSALS}/{number}/comments", json={"text": text})
+
+    ok(propose("ü" * 50), 201)  # 300 bytes
+    ok(comment(1, "x" * 100), 201)
+    ok(check(team.ben, 1, "pending", text="x" * 150))
+    problem = refused(comment(1, "x"), 409, "long-proposal")
+    assert problem["context"] == {"used": 950, "limit": 1000}
+    review = {"verdict": "approve", "text": ""}
+    refused(team.mia.post(f"{PROPOSALS}/1/reviews", json=review), 409, "long-proposal")
+    refused(check(team.ben, 1, "pending", text="x" * 201), 409, "long-proposal")
+    ok(check(team.ben, 1, "pending", text="x" * 200))  # instead of the earlier report
+    ok(propose("x" * 300), 201)
+    exceeded = refused(propose("x"), 409, "quota-exceeded")
+    assert exceeded["context"] == {"quota": "project_proposal_bytes", "used": 1500, "limit": 1500}
+    refused(comment(2, "x"), 409, "quota-exceeded")
+    assert ok(team.rita.get(f"{PROPOSALS}/2"))["comments"] == 0
 
 
 @on_sqlite

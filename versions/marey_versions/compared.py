@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -114,16 +115,16 @@ def _of_part(part: str) -> Callable[[DatasetEntry], Hashable]:
 
 def _paired(compared: list[ComparedEntry], alike: Callable[[DatasetEntry], Hashable]) -> list[ComparedEntry]:
     """Pair each removed entry with an added entry of the same kind for which `alike` returns the same value."""
-    removed: dict[tuple[str, Hashable], list[ComparedEntry]] = {}
+    removed: dict[tuple[str, Hashable], deque[ComparedEntry]] = {}
     for one in compared:
         if one.after is None and one.before is not None and alike(one.before) is not None:
-            removed.setdefault((one.before.kind, alike(one.before)), []).append(one)
+            removed.setdefault((one.before.kind, alike(one.before)), deque()).append(one)
     gone: set[int] = set()
     paired: list[ComparedEntry] = []
     for one in compared:
         fits = removed.get((one.after.kind, alike(one.after))) if one.before is None and one.after else None
         if fits:
-            partner = fits.pop(0)
+            partner = fits.popleft()
             gone.add(id(partner))
             paired.append(ComparedEntry(partner.before, one.after))
         else:

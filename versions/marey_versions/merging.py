@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -11,6 +10,7 @@ from marey_schemas.datasets.merges import Side
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.names import MOST_TAGS
 from marey_versions.annotations import AnnotationClash
+from marey_versions.choices import Choice, Choices
 from marey_versions.compared import ComparedEntry
 from marey_versions.records import DatasetEntry
 from marey_versions.tree.chunks import Value
@@ -63,11 +63,16 @@ reason why the changes exclude each other, or None if parts of this kind are not
 
 
 class CombinedEntry(NamedTuple):
-    """Entry with changes of both sides, so that neither side has a revision with its content."""
+    """Entry whose parts come from several versions, so that none of them has a revision with its content."""
 
     entry: DatasetEntry
-    ours: DatasetEntry
-    theirs: DatasetEntry
+    sides: tuple[DatasetEntry, ...]
+    """The entry on our side, on their side, and in the base if the base has it."""
+
+    def source_of(self, part: str) -> DatasetEntry | None:
+        """Return the first of `sides` with this part of the entry; None if the part was merged from several."""
+        digest = self.entry.parts[part]
+        return next((one for one in self.sides if one.parts.get(part) == digest), None)
 
 
 @dataclass
@@ -80,14 +85,14 @@ class MergedEntries:
     conflicts: list[MergeConflict] = field(default_factory=list)
     decided: set[str] = field(default_factory=set)
     """Keys of the resolutions that decided a conflict."""
-    unused: list[str] = field(default_factory=list)
-    """Keys of the resolutions that decided no conflict, in order; a key may also be in `decided`."""
+    unused: list[Choice] = field(default_factory=list)
+    """Resolutions that decided no conflict, by key; a key may also be in `decided`."""
 
 
 def merge_entries(
     ours: Iterable[ComparedEntry],
     theirs: Iterable[ComparedEntry],
-    resolutions: Iterable[tuple[str, Side]],
+    resolutions: Iterable[Choice],
     merge_parts: MergeParts | None = None,
 ) -> MergedEntries:
     """Merge the changes that two sides have made since their base.
@@ -95,8 +100,8 @@ def merge_entries(
     Parameters
     ----------
     ours, theirs : the entries that differ between the base and each side
-    resolutions : keys of conflicts, with the side to take. Each resolution decides one conflict. If several conflicts
-        have the same key, their resolutions are used in order
+    resolutions : decisions about conflicts. Each decides one conflict, or one part of it; of several conflicts with the
+        same key, the first resolutions with this key decide the first, and so on
     merge_parts : merges the parts that both sides have changed; None: such parts are in conflict
 
     Returns
@@ -115,7 +120,7 @@ def merge_entries(
     if merge_parts is not None:
         _merge_documents(sides, merge_parts)
     merged = MergedEntries()
-    choices = _Choices(resolutions, merged.decided)
+    choices = Choices(resolutions, merged.decided)
     decided: list[_Decided] = []
     for three in sides:
         found = _decide(three, choices)
@@ -126,27 +131,6 @@ def merge_entries(
     _apply(decided, mine, choices, merged)
     merged.unused += choices.left()
     return merged
-
-
-class _Choices:
-    """Resolutions that are not used yet. Each decides one conflict only: the one that its author has seen."""
-
-    def __init__(self, resolutions: Iterable[tuple[str, Side]], used: set[str]) -> None:
-        self._left: defaultdict[str, deque[Side]] = defaultdict(deque)
-        for key, side in resolutions:
-            self._left[key].append(side)
-        self._used = used
-
-    def take(self, key: str) -> Side | None:
-        """Return the next resolution of a conflict with this key and use it up, or None if there is none."""
-        if key not in self._left or not self._left[key]:
-            return None
-        self._used.add(key)
-        return self._left[key].popleft()
-
-    def left(self) -> list[str]:
-        """Return the keys of the resolutions that are left, in order."""
-        return sorted(key for key, sides in self._left.items() for _ in sides)
 
 
 class _Decided(NamedTuple):
@@ -165,8 +149,9 @@ class _Decided(NamedTuple):
         """
         if self.merged is None or self.ours is None or self.theirs is None:
             return None
-        known = [one.parts for one in (self.base, self.ours, self.theirs) if one is not None]
-        return None if self.merged.parts in known else CombinedEntry(self.merged, self.ours, self.theirs)
+        sides = (self.ours, self.theirs, *(() if self.base is None else (self.base,)))
+        known = [one.parts for one in sides]
+        return None if self.merged.parts in known else CombinedEntry(self.merged, sides)
 
     @property
     def moves(self) -> bool:
@@ -211,6 +196,23 @@ class _Sides:
             self.clashes = _clashes(self.base, self.ours, self.theirs)
 
     @property
+    def by_name(self) -> dict[Side, DatasetEntry | None]:
+        """The entry by the name of the version; without the base if the base does not have it."""
+        found = {Side.OURS: self.ours, Side.THEIRS: self.theirs}
+        return found if self.base is None else {**found, Side.BASE: self.base}
+
+    @property
+    def groups(self) -> dict[str, set[str]]:
+        """For each clashing part, the clashing parts that must come from the same side."""
+        found = {part: {part} for part in self.clashes}
+        pairs = () if self.ours is None else _made_together(self.ours.kind)
+        for made_from, made in pairs:
+            if made_from in found and made in found:
+                found[made_from] |= found[made]
+                found.update(dict.fromkeys(found[made_from], found[made_from]))
+        return found
+
+    @property
     def changed_parts(self) -> Iterator[ChangedPart]:
         """The clashing parts, if both sides have the entry."""
         for part in self.clashes:
@@ -230,29 +232,31 @@ def _merge_documents(sides: Sequence[_Sides], merge_parts: MergeParts) -> None:
             one.clashes = tuple(name for name in one.clashes if name != part.part)
 
 
-def _decide(sides: _Sides, choices: _Choices) -> _Decided | MergeConflict:
+def _decide(sides: _Sides, choices: Choices) -> _Decided | MergeConflict:
     base, ours, theirs = sides.base, sides.ours, sides.theirs
     if theirs in (ours, base):
         return _Decided(base, ours, theirs, ours)
     if ours == base:
         return _Decided(base, ours, theirs, theirs)
     if not sides.clashes:
-        return _Decided(base, ours, theirs, _combined(sides))
+        return _Decided(base, ours, theirs, _combined(sides, {}))
     conflict = MergeConflict(base, ours, theirs, sides.clashes, sides.clash)
-    choice = choices.take(conflict.key)
-    if choice is None:
-        return conflict
+    choice = choices.take(conflict.key, sides.groups, sides.by_name)
+    if not isinstance(choice, Side):
+        if left := tuple(part for part in sides.clashes if part not in choice):
+            return conflict._replace(parts=left)
+        if "entry" not in choice:
+            return _Decided(base, ours, theirs, _combined(sides, choice))
+        choice = choice["entry"]
     if choice is Side.BASE:
         return _Decided(base, ours, theirs, base)
     whole = "entry" in sides.clashes or base is None
-    chosen = (ours if choice is Side.OURS else theirs) if whole else _combined(sides, choice)
+    chosen = sides.by_name[choice] if whole else _combined(sides, dict.fromkeys(sides.clashes, choice))
     return _Decided(base, ours, theirs, chosen)
 
 
-def _apply(
-    decided: Sequence[_Decided], mine: Iterable[ComparedEntry], choices: _Choices, merged: MergedEntries
-) -> None:
-    """Add to `merged` the changes that turn our tree into the merged tree.
+def _apply(decided: Sequence[_Decided], mine: Iterable[ComparedEntry], choices: Choices, merged: MergedEntries) -> None:
+    """Add changes of our tree to `merged`; if another entry already has the new key of an entry, add a conflict.
 
     If two entries should get the same key, and this cannot be resolved, a conflict is added. `mine` contains the
     entries that our side has changed.
@@ -281,8 +285,8 @@ def _gets_place_of_theirs(one: _Decided) -> bool:
     return one.theirs is not None and one.merged is not None and one.theirs.key == one.merged.key
 
 
-def _collide(one: _Decided, held: dict[str, _Decided], choices: _Choices) -> MergeConflict | None:
-    """Decide which of two entries gets a key; the other entry returns to an earlier path.
+def _collide(one: _Decided, held: dict[str, _Decided], choices: Choices) -> MergeConflict | None:
+    """Decide which of two entries gets a key; the other one goes back to its own place.
 
     `held` contains entries by key; one of them has the key that `one` should get. The other entry is dropped if it has
     no earlier path, because a side has added it. The result is a conflict if there is no resolution, or if the earlier
@@ -291,9 +295,11 @@ def _collide(one: _Decided, held: dict[str, _Decided], choices: _Choices) -> Mer
     key = one.result.key
     other = held[key]
     conflict = MergeConflict(None, other.merged, one.merged, ("path",))
-    choice = choices.take(key)
-    if choice is None:
-        return conflict
+    choice = choices.take(key, {"path": ("path",)}, tuple(Side))
+    if not isinstance(choice, Side):
+        if not choice:
+            return conflict
+        choice = choice["path"]
     winner, loser = (one, other) if choice is Side.THEIRS else (other, one)
     if (back := loser.place_beside(key)) is not None:
         moved = loser.at(back)
@@ -334,22 +340,22 @@ def _excludes(base: Any, ours: Any, theirs: Any) -> bool:
     return ours not in (base, theirs) and theirs != base
 
 
-def _combined(sides: _Sides, choice: Side = Side.OURS) -> DatasetEntry | None:
-    """Return the entry with the changes of both sides; clashing parts are taken from the side `choice`."""
-    base, ours, theirs, clashes = sides.base, sides.ours, sides.theirs, sides.clashes
+def _combined(sides: _Sides, taken: Mapping[str, Side]) -> DatasetEntry | None:
+    """Return the entry with the changes of both sides; `taken` contains the side of each clashing part."""
+    base, ours, theirs = sides.base, sides.ours, sides.theirs
     if ours is None or theirs is None:
         return None
+    chosen = {name: one for name, side in taken.items() if (one := sides.by_name[side]) is not None}
     of_base: Mapping[str, str] = {} if base is None else base.parts
-    preferred, other = (ours, theirs) if choice is Side.OURS else (theirs, ours)
     parts = {
         name: digest
         for name in sorted(ours.parts.keys() | theirs.parts.keys())
-        if (digest := _newer(name in clashes, of_base.get(name), preferred.parts.get(name), other.parts.get(name)))
+        if (digest := chosen[name].parts.get(name) if name in chosen else _newer(name, of_base, ours, theirs))
         is not None
-    } | sides.merged
-    path = preferred.path if base is None else _newer("path" in clashes, base.path, preferred.path, other.path)
-    tags = preferred.tags if "tags" in clashes else _merged_tags(base, ours, theirs)
-    return DatasetEntry(path or preferred.path, ours.kind, parts, tuple(sorted(tags)))
+    }
+    path = chosen["path"].path if "path" in chosen else theirs.path if ours.path == (base or ours).path else ours.path
+    tags = chosen["tags"].tags if "tags" in chosen else _merged_tags(base, ours, theirs)
+    return DatasetEntry(path, ours.kind, parts | sides.merged, tuple(sorted(tags)))
 
 
 def _merged_tags(base: DatasetEntry | None, ours: DatasetEntry, theirs: DatasetEntry) -> set[str]:
@@ -358,5 +364,6 @@ def _merged_tags(base: DatasetEntry | None, ours: DatasetEntry, theirs: DatasetE
     return (old | set(ours.tags) | set(theirs.tags)) - (old - set(ours.tags)) - (old - set(theirs.tags))
 
 
-def _newer(clash: bool, base: str | None, preferred: str | None, other: str | None) -> str | None:
-    return preferred if clash or preferred != base else other
+def _newer(part: str, of_base: Mapping[str, str], ours: DatasetEntry, theirs: DatasetEntry) -> str | None:
+    """Return a part as the side that has changed it has it."""
+    return (theirs if ours.parts.get(part) == of_base.get(part) else ours).parts.get(part)

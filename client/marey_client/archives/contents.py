@@ -9,6 +9,7 @@ from marey_client.errors import UnexpectedAnswer
 from marey_client.transport import BLOCKS, MAX_ANSWER_BYTES, as_json
 from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree
+from marey_schemas.sizes import batched
 
 if TYPE_CHECKING:
     from marey_client.transport import Transport
@@ -26,6 +27,16 @@ def request_contents(
     response = transport.send("POST", url, content=as_json(request), headers={"Accept": BLOCKS})
     answer: dict[str, Any] = decode_tree(response.content, MSGPACK, max_bytes=MAX_ANSWER_BYTES, keep_blocks=keep_blocks)
     return answer
+
+
+def read_facets(transport: Transport, project_url: str, contents: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return the facets of revisions of a project by content digest; revisions without facets are left out."""
+    facets: dict[str, dict[str, float]] = {}
+    for some in batched(contents, MOST_CONTENTS):
+        found = request_contents(transport, project_url, ContentsRequest(revisions=tuple(some)))
+        named = zip(some, found.get("facets", ()), strict=False)  # servers of earlier versions send none
+        facets.update((content, values) for content, values in named if values)
+    return facets
 
 
 def first_documents(

@@ -105,11 +105,16 @@ class _Import:
     """Revisions of entries, by content digest."""
     held: set[str] = field(default_factory=set)
     """Content digests of the revisions that the project has."""
+    sent: set[str] = field(default_factory=set)
+    """Content digests of the revisions that were sent."""
+    facets: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Facets of the revisions in the archive, by content digest."""
     homes: dict[str, str] = field(default_factory=dict)
     """Content digest of a revision that contains the document, by the digest of the document."""
 
     def run(self, begins: str | None) -> Commit:
         require_base(self.archive, self.dataset.has)
+        self.facets = self.archive.facets()
         history = self.archive.history()
         changes = {digest: self.archive.changes(digest) for digest, _ in history}
         # All at first, because a document may refer to a revision that only a later commit has as an entry.
@@ -124,6 +129,7 @@ class _Import:
             if digest not in known:
                 self._ensure(put[digest])
                 self._send_commit(record, changes[digest], None)
+        self._add_facets()
         head = self.archive.manifest.commit
         if begins is not None:
             self._send_commit(self.archive.commit(head), changes[head], begins)
@@ -228,9 +234,19 @@ class _Import:
         for content in contents:
             one = self._revision(content)
             parts = {part: self._part(digest) for part, digest in one.parts.items()}
-            sent.append({"content": content, "kind": one.kind, "path": one.path, "parts": parts})
+            facets = self.facets.get(content, {})
+            sent.append(
+                {"content": content, "kind": one.kind, "path": one.path, "parts": parts}
+                | ({"facets": facets} if facets else {})  # which servers of earlier versions do not know
+            )
         self.dataset.transport.send_tree("POST", f"{self.dataset.url}/contents", {"revisions": sent})
         self._note(contents)
+        self.sent.update(contents)
+
+    def _add_facets(self) -> None:
+        """Add facets to the revisions that the project already had; all their documents are references."""
+        for some in batched(sorted(self.facets.keys() & self.held - self.sent), MOST_CONTENTS):
+            self._send(some)
 
     def _part(self, digest: str) -> Any:
         """Return a part of a revision for a request: the document, or a reference to a revision that contains it.

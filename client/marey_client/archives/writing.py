@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
 
-from marey_client.archives.contents import first_documents, request_contents
+from marey_client.archives.contents import first_documents, read_facets, request_contents
 from marey_client.archives.receiving import require_receivable
 from marey_client.blobs import Blobs
 from marey_client.errors import ArchiveInUse, BadRequest, NothingToArchive, UnexpectedAnswer
@@ -190,6 +190,7 @@ class _Making:
             self._add_commit(commit, unchanged=bool(bases))
         self.check(sorted(self.known))
         self._add_documents(self.documents)
+        self._add_facets()
         parents = {parent for commit in commits for parent in commit.parents}
         self.writer.finish(self.dataset.name, head.digest, sorted(parents & before.keys()))
 
@@ -331,6 +332,13 @@ class _Making:
                     {digest: PartOfContent(content=content, part=part) for part, digest in one["parts"].items()}
                 )
                 self.writer.add(ArchiveMember(MemberKind.REVISION, content), canonical_json(one))
+
+    def _add_facets(self) -> None:
+        """Add the facets of all revisions, which jobs may have published after the revisions were committed."""
+        facets = read_facets(self.dataset.transport, self.dataset.project_url, sorted(self.known))
+        if facets:
+            data = canonical_json(facets)
+            self.writer.add(ArchiveMember(MemberKind.FACETS, digest_of(data)), data)
 
     def _add_file(self, member: ArchiveMember) -> None:
         if member in self.writer:

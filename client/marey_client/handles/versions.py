@@ -16,16 +16,10 @@ from marey_client.handles.proposals import Proposals
 from marey_client.paging import pages
 from marey_client.progress import OnProgress, ignore_progress
 from marey_client.transport import Params, Transport, as_json, read_model
+from marey_schemas.datasets.checkouts import CheckoutAnswer, CheckoutRequest
 from marey_schemas.datasets.commits import Commit, CommitCreate, Entry, EntryChange, EntryOrigins
 from marey_schemas.datasets.differences import DatasetDifference, ListedCommit
-from marey_schemas.datasets.merges import (
-    CheckoutAnswer,
-    CheckoutRequest,
-    MergeAnswer,
-    MergeRequest,
-    PickRequest,
-    Resolution,
-)
+from marey_schemas.datasets.merges import MergeAnswer, MergeRequest, PickRequest, Resolution
 from marey_schemas.datasets.naming import MAIN, Dataset, Ref, RefCreate, RefKind, RefMove
 from marey_schemas.datasets.protection import ProtectionRule
 from marey_schemas.kinds import Kind
@@ -214,12 +208,17 @@ class DatasetHandle:
         """
         return bisect(read_range(self, good, bad, first_parent=first_parent), is_bad, on_step)
 
-    def check_out(self, version: str = MAIN, *, discard: bool = False) -> CheckoutAnswer:
-        """Change the folder of the dataset to the content of a version.
+    def check_out(
+        self, version: str = MAIN, *, query: str | None = None, paths: Sequence[str] = (), discard: bool = False
+    ) -> CheckoutAnswer:
+        """Bring the folder of the dataset to the state of a version.
+
+        With `query` or `paths`, only the entries are checked out that the query selects and that are at one of the
+        paths or below it. The folder remembers this selection: later commits of the folder keep all other entries.
 
         Raises `Conflict` if the folder has changes that no commit has recorded, unless `discard` is true.
         """
-        request = CheckoutRequest(version=version, discard=discard)
+        request = CheckoutRequest(version=version, query=query, paths=tuple(paths), discard=discard)
         return self.transport.post(CheckoutAnswer, f"{self.url}/checkout", request, repeatable=False)
 
     def archive(

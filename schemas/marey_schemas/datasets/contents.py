@@ -12,16 +12,17 @@ from marey_schemas.consents import ConsentOverride
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, EntryPath
 from marey_schemas.datasets.naming import RefName
 from marey_schemas.kinds import Kind
-from marey_schemas.names import MOST_TAGS, Digest, Message, Tag
+from marey_schemas.names import MOST_TAGS, Digest, Message, PartName, Tag
+from marey_schemas.queue.facets import FacetName, FacetValue
 
 MOST_CONTENTS = 256
 """Greatest number of revisions, and of documents, in one request."""
 MOST_CHECKED = 500
 """Greatest number of revisions in one request to check whether revisions may be exported."""
+MOST_RECEIVED_FACETS = 1000
+"""Greatest number of facets of one received revision."""
 MOST_RECEIVED_CHANGES = 200_000
 """Greatest number of entries that a commit from an archive or another server may change."""
-
-PartName = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 
 
 def _require_time(text: str) -> str:
@@ -77,6 +78,12 @@ class ReceivedRevision(Request):
         description='Documents by part, in which references to revisions are `{"content": digest}`. If the project '
         "already has a revision with the same document in this part, the document can be replaced by "
         '`{"content": digest}` with the content digest of that revision.',
+    )
+    facets: dict[FacetName, FacetValue] = Field(
+        default_factory=dict,
+        max_length=MOST_RECEIVED_FACETS,
+        description="Numbers that jobs have published about the revision. They are added to all revisions with this "
+        "content; numbers that the project has already stay.",
     )
 
 

@@ -1,4 +1,4 @@
-"""Merges of versions of datasets, and checkouts into folders, in requests and answers."""
+"""Merges of versions of datasets in requests and answers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from marey_schemas.base import Answer, Request
 from marey_schemas.datasets.commits import Commit, Entry, EntryPath
 from marey_schemas.datasets.naming import MAIN, RefName, Version
 from marey_schemas.kinds import Kind
-from marey_schemas.names import Digest, Message
+from marey_schemas.names import Digest, Message, PartName
 
 MOST_CONFLICTS = 1000
 """Greatest number of conflicts that an answer lists."""
@@ -32,15 +32,22 @@ class Side(StrEnum):
 class Resolution(Request):
     """Decision about a conflict: the side whose version of an entry is kept.
 
-    If the two sides have different entries at one path, the entry that is not kept goes back to its own path on the
-    branch or in the base. An entry that one side has added has no such path, and is dropped. Several conflicts can have
-    the same path and kind. The first resolution for this path and kind decides the first conflict, the second
-    resolution decides the second conflict, and so on.
+    If two entries want one path, the other entry goes back to its own path on the branch or in the base. An entry that
+    one side has added has no such path, and is dropped. Several conflicts can have the same path and kind. The first
+    resolution decides the first of them, the second resolution the second one, and so on.
+
+    If a conflict has several parts, each part can be decided by a resolution of its own. Then the resolutions of one
+    conflict follow each other, and the conflict remains until all of its parts are decided.
     """
 
     path: EntryPath
     kind: Kind
     take: Side
+    part: PartName | None = Field(
+        None,
+        description="Part of the conflict that this decides, such as `motion`, `path` or `tags`; null: all parts. A "
+        "part that was computed from another one, as the sample tree of a model, is decided together with that one.",
+    )
 
 
 class CombineRequest(Request):
@@ -101,9 +108,9 @@ class EntryConflict(Answer):
     path: str
     kind: Kind
     parts: tuple[str, ...] = Field(
-        description="Parts that both sides have changed. `path`: both sides have moved the entry, or have different "
-        "entries at the same path. `tags`: the entry would have more than 64 tags. `entry`: one side has removed the "
-        "entry."
+        description="Parts that both sides have changed and no resolution decides. `path`: both sides have moved the "
+        "entry, or have different entries at the same path. `tags`: the entry would have more than 64 tags. `entry`: "
+        "one side has removed the entry."
     )
     base: Entry | None
     ours: Entry | None
@@ -135,20 +142,3 @@ class MergeAnswer(Answer):
     changes: int = Field(description="Number of entries of the branch that change.")
     conflicts: tuple[EntryConflict, ...] = Field(description="The first conflicts without a resolution, by path.")
     conflict_count: int = Field(description="Number of conflicts without a resolution.")
-
-
-class CheckoutRequest(Request):
-    """Request to change the folder of a dataset to the content of a version."""
-
-    version: Version = MAIN
-    discard: bool = Field(False, description="Discard changes in the folder that no commit has recorded.")
-
-
-class CheckoutAnswer(Answer):
-    """Result of a checkout, with the numbers of entries that it changed in the folder of a dataset."""
-
-    commit: str = Field(description="Digest of the commit whose content the folder has now.")
-    added: int
-    removed: int
-    moved: int
-    changed: int

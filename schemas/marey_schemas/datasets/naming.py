@@ -36,6 +36,14 @@ class DatasetCreate(Request):
     )
 
 
+class CheckedOut(Answer):
+    """Version that the folder of a dataset has, apart from later changes, and the selection of a part of it."""
+
+    commit: str
+    query: str | None = Field(description="Query that selected the entries; null: none.")
+    paths: tuple[str, ...] = Field(description="Entries and folders that were selected; empty: all.")
+
+
 class Dataset(Answer):
     """A dataset: a history of versions of named entries."""
 
@@ -43,6 +51,9 @@ class Dataset(Answer):
     name: str
     description: str
     collection: str | None = Field(description="Folder whose content commits record; null: commits list their changes.")
+    checked_out: CheckedOut | None = Field(
+        None, description="Version in the folder; null if no version was committed or checked out there."
+    )
     created_at: datetime
     updated_at: datetime
     rev: int

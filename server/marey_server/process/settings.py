@@ -234,6 +234,12 @@ class Settings(BaseSettings):
     user_invitations: int = Field(
         Quotas.user_invitations, ge=0, description="Greatest number of open invitations that a user has created."
     )
+    project_proposal_bytes: int = Field(
+        Quotas.project_proposal_bytes,
+        ge=0,
+        description="Greatest number of bytes of the descriptions, comments, reviews and checks of all proposals of a "
+        "project.",
+    )
     webhook_networks: tuple[IPv4Network | IPv6Network, ...] = Field(
         (),
         description='Networks to which webhooks may be sent although they are not public, such as ["10.1.0.0/16"].',

@@ -28,6 +28,7 @@ from marey_server.store.database.connections import Database
 from marey_server.store.database.schema import schema_at_head
 from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.history import revisions_with
+from marey_server.store.datasets.manifests import read_manifest
 from marey_server.store.documents import items_named_in
 from marey_server.store.events import newest_number
 from marey_server.store.items.summaries import summarise
@@ -61,6 +62,7 @@ from marey_server.store.tables import (
 from marey_server.store.transaction import Transaction
 from marey_versions.records import CommitRecord, entry_of
 from marey_versions.tree.chunks import Branch, DamagedChunk, decode
+from marey_versions.tree.reading import Tree
 
 PAGE = 100
 MISCOUNTED = "counter-wrong"
@@ -315,7 +317,18 @@ def _check_dataset(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         record = CommitRecord(one.tree, tuple(parents.get(one.digest, ())), one.author, one.message, one.at)
         if record.digest != one.digest:
             findings.append(StoreDefect("commit-corrupt", row.id, f"the commit {one.digest} has another digest"))
-    return findings + _check_entries(tx, row) + _check_proposals(tx, row)
+    return findings + _check_folder(tx, row) + _check_entries(tx, row) + _check_proposals(tx, row)
+
+
+def _check_folder(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
+    """Return a fault if the record of what is checked out in a dataset's folder is missing."""
+    try:
+        manifest = read_manifest(tx, row)
+        if manifest is not None and manifest.partial:
+            len(Tree(StoredChunks(tx), manifest.tree))
+    except DamagedChunk as error:
+        return [StoreDefect("folder-unknown", row.id, f"what is checked out in the folder is not known: {error}")]
+    return []
 
 
 def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:

@@ -54,6 +54,7 @@ class Quotas:
     project_webhooks: int = 20
     project_invitations: int = 100
     user_invitations: int = 1000
+    project_proposal_bytes: int = 64 * 2**20
 
 
 class Transaction:

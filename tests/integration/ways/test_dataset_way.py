@@ -81,6 +81,9 @@ def test_the_commands_of_the_page_work_in_their_order(run: CommandLine, project:
         run(*shlex.split(line)[1:])
     walker.comment("walk", "on trial")
     run(*shlex.split(commit)[1:])
+    for line in next(walker.blocks).splitlines():
+        assert "the folder has 1 of 2 entries" in run(*shlex.split(line)[1:]).stderr
+    assert [clip.name for clip in project.clips.list()] == ["turn"]
     walker.follow()
     assert (walker.clip("walk").item.tags, walker.clip("walk").info().comment) == (("slow",), "on trial")
     walker.commit("Theirs", "trial", "theirs")

@@ -51,6 +51,9 @@ class CreateItem(Operation):
         items = clients.project(self.lab).items(self.content.kind)
         return items.create(self.name, parts, collection=self.folder, tags=self.tags).item
 
+    def place(self, model: Model) -> str:
+        return self.folder
+
     def absorb(self, model: Model, clients: Clients, outcome: Outcome) -> None:
         project = self.project(model)
         refers = frozenset() if self.of is None else frozenset({self.of.item})

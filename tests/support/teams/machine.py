@@ -12,10 +12,13 @@ from tests.support.teams.choices import Chooser, some_dataset
 from tests.support.teams.combining import Combine, Merge
 from tests.support.teams.contents import Content, Hierarchy
 from tests.support.teams.item_operations import CreateItem, DeleteItem, Purge
+from tests.support.teams.model import ROLES
 from tests.support.teams.operations import CommitChanges, CreateRef, Operation, Outcome, Refused, Reset
+from tests.support.teams.role_operations import SetFolderRole, SetRole
 from tests.support.teams.transfers import CheckOut
 from tests.support.teams.world import FINE, LABS, Fate, Session, World
 
+from marey_schemas.access import Role
 from marey_schemas.datasets.commits import PutEntry
 from marey_schemas.datasets.merges import Side
 from marey_schemas.datasets.naming import RefKind
@@ -97,7 +100,15 @@ class TeamsMachine(RuleBasedStateMachine):
             raise Diverged(f"{error!r}\nafter:\n{self.session.history}") from error
 
     def _take(self, choose: Chooser, chance: random.Random) -> None:
-        special = {"race": 8, "look": 4, "repeat": 2, "collect_garbage": 3, "work_in_folder": 3}
+        special = {
+            "race": 8,
+            "demote": 3,
+            "restrict": 3,
+            "look": 4,
+            "repeat": 2,
+            "collect_garbage": 3,
+            "work_in_folder": 3,
+        }
         weights = {name: weight for name, weight in (WEIGHTS | special).items() if not self.only or name in self.only}
         kind = chance.choices(list(weights), list(weights.values()))[0]
         if kind in special:
@@ -179,6 +190,29 @@ class TeamsMachine(RuleBasedStateMachine):
             other = Reset(choose.lab, mine.name, mine.branch, chance.choice(known))
         if other is not None:
             self.session.race({"ben": mine, "ann": other}, _without_loss(_fate(chance)))
+
+    def _demote(self, choose: Chooser, chance: random.Random) -> None:
+        """Let an owner make another owner a reader while that one writes; afterwards, restore the first role."""
+        choose.user = "mia"
+        operation = choose.operation(chance.choice(("commit", "reset", "delete_ref", "purge_item", "create_clip")))
+        if operation is None:
+            return
+        self.session.do(SetRole(choose.lab, "mia", Role.OWNER), "ann")
+        self.session.race({"mia": operation, "ann": SetRole(choose.lab, "mia", Role.READER)})
+        self._do(operation, "mia", chance)
+        self.session.do(SetRole(choose.lab, "mia", ROLES["mia"]), "ann")
+
+    def _restrict(self, choose: Chooser, chance: random.Random) -> None:
+        """Change the role of a member in a folder while the member creates items there; then remove this role."""
+        choose.user, to = chance.choice((("ben", Role.READER), ("rea", Role.CONTRIBUTOR)))
+        operation = choose.create_clip()
+        if not isinstance(operation, CreateItem):
+            return
+        self.session.race({choose.user: operation, "ann": SetFolderRole(choose.lab, choose.user, "gaits", to)})
+        another = choose.create_clip()
+        if another is not None:
+            self._do(another, choose.user, chance)
+        self.session.do(SetFolderRole(choose.lab, choose.user, "gaits", None), "ann")
 
     def teardown(self) -> None:
         if self.diverged:

@@ -9,10 +9,13 @@ from typing import Any, NamedTuple
 from tests.support.teams.contents import Content, files_of, references_of
 from tests.support.teams.three_way import Entry, Key, State
 
+from marey_schemas.access import Role
 from marey_schemas.kinds import Kind
 
 STUDIO, PARTNER = "studio", "partner"
 """Names of the two servers."""
+ROLES = {"ann": Role.OWNER, "mia": Role.MAINTAINER, "ben": Role.CONTRIBUTOR, "rea": Role.READER}
+"""Roles of the users when a program begins."""
 
 
 class Made(NamedTuple):
@@ -108,10 +111,23 @@ class Model:
     commits: dict[str, Made] = field(default_factory=dict)
     trees: dict[str, State] = field(default_factory=dict)
     """Entries of versions, by the digest of the tree of these entries, on both servers."""
+    roles: dict[str, Role] = field(default_factory=ROLES.copy)
+    """Roles of the users in both projects."""
+    folder_roles: dict[tuple[str, str], Role] = field(default_factory=dict)
+    """Roles of users in folders, and in everything below these, by user and folder."""
 
     def copy(self) -> Model:
         projects = {name: one.copy() for name, one in self.projects.items()}
-        return Model(projects, dict(self.commits), dict(self.trees))
+        return Model(projects, dict(self.commits), dict(self.trees), dict(self.roles), dict(self.folder_roles))
+
+    def role_of(self, user: str, place: str | None) -> Role:
+        """Return the role of a user in a folder; None: in the project."""
+        inside = {
+            folder: role
+            for (of, folder), role in self.folder_roles.items()
+            if of == user and place is not None and f"{place}/".startswith(f"{folder}/")
+        }
+        return inside[max(inside, key=len)] if inside else self.roles[user]
 
     def note_tree(self, state: State, tree: str) -> None:
         """Check that versions have the same tree if, and only if, they have the same entries."""

@@ -59,7 +59,6 @@ class Clients:
     """Connections of one user to both servers, and the name of the project on them."""
 
     user: str
-    role: Role
     servers: Mapping[str, Marey]
     project_name: str
 
@@ -105,6 +104,10 @@ class Operation(ABC):
 
     def again(self, outcome: Outcome, second: Outcome) -> None:  # noqa: B027 - most have nothing to check
         """Check the outcome `second` of the repeated operation, which had succeeded with `outcome` the first time."""
+
+    def place(self, model: Model) -> str | None:
+        """Return the folder in which the user needs the role; None: in the project."""
+        return None
 
     def project(self, model: Model) -> ModelProject:
         return model.projects[self.lab]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from tests.support.rest_server import People
 from tests.support.teams.comparison import Comparison
 from tests.support.teams.hosts import Host, Line
-from tests.support.teams.model import PARTNER, STUDIO, Model
+from tests.support.teams.model import PARTNER, ROLES, STUDIO, Model
 from tests.support.teams.operations import RACED, Clients, Failed, Operation, Outcome, Refused, attempt
 
 from marey_client import Marey
@@ -20,7 +20,6 @@ from marey_client.errors import Unreachable
 from marey_schemas.access import ProjectCreate, Role
 from marey_server.store import garbage
 
-ROLES = {"ann": Role.OWNER, "mia": Role.MAINTAINER, "ben": Role.CONTRIBUTOR, "rea": Role.READER}
 RANKS = {role: rank for rank, role in enumerate(Role)}
 
 
@@ -67,7 +66,7 @@ class World:
             for name, role in ROLES.items():
                 if name != "ann":
                     made.members.put(name, role)
-        return {name: Clients(name, role, self._servers[name], project) for name, role in ROLES.items()}
+        return {name: Clients(name, self._servers[name], project) for name in ROLES}
 
     def close(self) -> None:
         """Close all connections."""
@@ -130,7 +129,7 @@ class Session:
         self.log.append(f"{clients.user}: repeated -> {outcome}")
         before = self.model.copy()
         try:
-            if RANKS[clients.role] >= RANKS[operation.role]:
+            if _may(self.model, operation, clients):
                 operation.assume(self.model)
             self._absorb(self.model, operation, clients, outcome)
         except AssertionError:
@@ -146,10 +145,10 @@ class Session:
 
     @staticmethod
     def _absorb(model: Model, operation: Operation, clients: Clients, outcome: Outcome) -> None:
-        if RANKS[clients.role] < RANKS[operation.role]:
-            operation.forbidden(model, outcome)
-        else:
+        if _may(model, operation, clients):
             operation.absorb(model, clients, outcome)
+        else:
+            operation.forbidden(model, outcome)
 
     def _count(self, operation: Operation, outcome: Outcome) -> None:
         code = f" {outcome.code}" if isinstance(outcome, Refused) else ""
@@ -235,6 +234,11 @@ class Session:
         self.comparison(lab).files(host.database, collected=a_day_later)
         self.log.append(f"collect garbage of {lab}, {a_day_later=}")
         self.world.counts[f"CollectGarbage{' a day later' if a_day_later else ''}"] += 1
+
+
+def _may(model: Model, operation: Operation, clients: Clients) -> bool:
+    """Return whether the user has the role that an operation requires."""
+    return RANKS[model.role_of(clients.user, operation.place(model))] >= RANKS[operation.role]
 
 
 def _unanswered(outcome: Outcome) -> bool:

@@ -24,7 +24,7 @@ from marey_client.cli import projects, tokens, with_global_options_first
 from marey_client.cli.addresses import Address, require_item, the_thing
 from marey_client.cli.app import app
 from marey_client.cli.clip_jobs import _print_aligned, _print_warnings, print_labelled
-from marey_client.cli.datasets import combining
+from marey_client.cli.datasets import combining, versions
 from marey_client.cli.datasets.combining import resolutions_of
 from marey_client.cli.files import uploading
 from marey_client.cli.files.listing import _items_in
@@ -492,11 +492,36 @@ def test_a_token_whose_file_cannot_be_written_is_never_made(
     assert not (tmp_path / "new").exists()
 
 
+def test_a_checkout_says_how_many_of_how_many_entries_were_taken(
+    script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(versions, "connect", lambda context: script.marey())
+    counts = {"added": 300, "removed": 2, "moved": 0, "changed": 0}
+    digest = "sha256:" + "a" * 64
+    script.answers = [httpx.Response(200, json={"commit": digest, "taken": 300, "entries": 142220, **counts})]
+    versions.checkout(NO_OPTIONS, "lab/gaits@v1", query="subject = 02", path=["/raw/"])
+    sent = json.loads(script.requests[0].content)
+    assert sent == {"version": "v1", "query": "subject = 02", "paths": ["raw"], "discard": False}
+    assert capsys.readouterr().err == (
+        "the folder has 300 of 142,220 entries of aaaaaaaaaaaa now: 300 added, 2 removed\n"
+    )
+
+
 def test_a_conflict_cannot_be_decided_for_two_sides() -> None:
     [one, same] = resolutions_of(None, ["raw/a:clip", "raw/a:clip"], None)
     assert one == same
     with pytest.raises(WrongUsage, match="two different sides"):
         resolutions_of(["raw/a:clip"], None, ["/raw/a:clip"])
+    with pytest.raises(WrongUsage, match="two different sides"):
+        resolutions_of(["raw/a:clip"], ["raw/a:clip/motion"], None)
+
+
+def test_the_parts_of_a_conflict_are_decided_for_different_sides() -> None:
+    found = resolutions_of(["raw/a:clip/motion"], ["raw/a:clip/info"], None)
+    assert [(one.path, one.kind, one.take, one.part) for one in found] == [
+        ("raw/a", "clip", "ours", "motion"),
+        ("raw/a", "clip", "theirs", "info"),
+    ]
 
 
 def test_a_token_is_bound_to_labels_and_listed_with_them(

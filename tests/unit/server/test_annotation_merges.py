@@ -10,10 +10,10 @@ from tests.support.committing_desk import CommittingDesk
 from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import motion_tree, skeleton_tree
 
+from marey_schemas.datasets.checkouts import CheckoutRequest
 from marey_schemas.datasets.commits import PutEntry
 from marey_schemas.datasets.merges import (
     MOST_CONFLICTING_SEGMENTS,
-    CheckoutRequest,
     MergeAnswer,
     MergeRequest,
     PickRequest,

@@ -10,7 +10,7 @@ from tests.support.queue_desk import Desk, document, output
 from tests.support.store_fixtures import ALL_RIGHTS, WRITE, requiring
 
 from marey_schemas.access import ProjectCreate
-from marey_schemas.items import Item
+from marey_schemas.items import Item, ItemRevert
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import PurgeRequest
 from marey_schemas.queue.facets import ItemFacets, require_facet_names
@@ -62,6 +62,16 @@ def measure(desk: Desk, things: list[str], *usages: float, number: int = 0) -> s
     desk.stage_outputs(lease, output(f"m{number}"), facets=tuple(map(measured, things, usages)))
     desk.complete(lease)
     return job
+
+
+def test_a_revert_restores_the_facets_of_the_earlier_content(desk: Desk) -> None:
+    (thing,) = desk.things(1)
+    measure(desk, [thing], 0.5)
+    changed = document(content="other")
+    write(desk, items.put_part, "lab", Kind.STUDY, thing, "study", changed, expected_rev=None)
+    assert study(desk, thing).facets == {}
+    back = write(desk, items.revert_item, "lab", Kind.STUDY, thing, ItemRevert(revision=1), expected_rev=None)
+    assert (back.revision, back.facets) == (3, {"usage": 0.5})
 
 
 def test_a_job_publishes_facets_of_its_inputs_when_it_completes(desk: Desk) -> None:

@@ -11,8 +11,8 @@ from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import Lab, declared, requiring, skeleton_tree
 
 from marey_schemas.access import EVERY_MEMBER, FolderRoleChange, MemberChange, ProjectCreate, Role, UserCreate
+from marey_schemas.datasets.checkouts import CheckoutRequest
 from marey_schemas.datasets.commits import CommitCreate
-from marey_schemas.datasets.merges import CheckoutRequest
 from marey_schemas.datasets.naming import DatasetCreate
 from marey_schemas.items import Collection, CollectionCreate, ItemChange, ItemCreate
 from marey_schemas.kinds import Kind

@@ -19,6 +19,7 @@ from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.queries.fields import FIELDS, OPERATORS, field_names, find_field
 from marey_schemas.queries.grammar import Condition, Negation, Query, parse
+from marey_schemas.queries.matching import QueriedFacts, matches
 from marey_server.errors import BadRequestProblem
 from marey_server.store import items, projects
 from marey_server.store.database.connections import Database
@@ -109,6 +110,14 @@ def values_of(lab: QueriedLab, clip: Item, field: str) -> list[Any]:
     if field.startswith("facet."):
         return [value for name, value in clip.facets.items() if field == f"facet.{name}"]
     return known[field] if field in known else [summary[field]] if field in summary else []
+
+
+def facts_of(lab: QueriedLab, clip: Item) -> QueriedFacts:
+    return QueriedFacts(
+        name=clip.name, folder=clip.collection, tags=clip.tags, revision=clip.revision, created_at=clip.created_at,
+        updated_at=clip.updated_at, summary=clip.summary, frames=clip.summary["frames"],
+        skeleton=clip.summary["skeleton"], skeleton_name=lab.rigs[clip.summary["skeleton"]], facets=clip.facets,
+    )  # fmt: skip
 
 
 def folded(field: str, text: str) -> str:
@@ -203,6 +212,7 @@ def test_sql_selects_what_the_conditions_say(queried: QueriedLab, text: str, few
         found = queried.read(items.list_items, "lab", Kind.CLIP, filters, limit=100, count=True)
     assert {clip.id for clip in found.items} == expected
     assert found.count == len(expected)
+    assert {clip.id for clip in queried.clips if matches(query, facts_of(queried, clip))} == expected
     explained = queried.read(items.explain_query, "lab", Kind.CLIP, ItemFilters(), text)
     assert (explained.items, explained.selected) == (len(queried.clips), len(expected))
     parts = [parse(part.condition) for part in explained.conditions]

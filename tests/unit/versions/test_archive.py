@@ -378,3 +378,32 @@ def test_nothing_comes_after_the_manifest_and_large_members_are_not_read(monkeyp
     monkeypatch.setattr("marey_versions.archive.reading.MOST_BYTES", 10)
     with pytest.raises(BadArchive, match="at most 10 are accepted"):
         checked(file)
+
+
+def test_facets_are_read_and_belong_to_revisions_of_the_archive() -> None:
+    content = next(member.digest for member in example().members if member.kind is MemberKind.REVISION)
+
+    def with_facets(tree: Any) -> io.BytesIO:
+        made, data = example(), canonical_json(tree)
+        made.members[ArchiveMember(MemberKind.FACETS, digest_of(data))] = data
+        return made.write()
+
+    facets = {content: {"usage": 0.5, "used_frames": 1}}
+    assert checked(with_facets(facets)).facets() == facets
+    assert checked(example().write()).facets() == {}
+    stranger = digest_of(b"another revision")
+    with pytest.raises(BadArchive, match=f"^facets/.*no version in the archive contains {stranger}"):
+        checked(with_facets({stranger: {"usage": 0.5}}))
+    wrong: list[Any] = [[], {content: 1}, {content: {"usage": "much"}}, {content: {"usage": True}}, {"no digest": {}}]
+    for tree in wrong:
+        with pytest.raises(BadArchive, match="not a list of facets"):
+            checked(with_facets(tree))
+
+
+def test_only_archives_with_facets_have_the_newer_schema() -> None:
+    """A program that does not know facets then says that it must be updated, and not that a member is damaged."""
+    content = next(member.digest for member in example().members if member.kind is MemberKind.REVISION)
+    made, data = example(), canonical_json({content: {"usage": 0.5}})
+    made.members[ArchiveMember(MemberKind.FACETS, digest_of(data))] = data
+    for written, schema in ((example(), b"marey/archive@1"), (made, b"marey/archive@2")):
+        assert schema in written.write().getvalue()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from tests.support.tiers import examples
 
@@ -13,6 +13,7 @@ from marey_schemas.datasets.differences import ChangeKind
 from marey_schemas.datasets.merges import Side
 from marey_schemas.names import MOST_TAGS
 from marey_versions.annotations import ADDED_TWICE, AnnotationClash
+from marey_versions.choices import Choice
 from marey_versions.compared import ComparedEntry, compare_entries
 from marey_versions.merging import ChangedPart, MergedEntries, merge_entries
 from marey_versions.records import DatasetEntry, key_of
@@ -50,10 +51,14 @@ def compared(before: State, after: State) -> list[ComparedEntry]:
 
 
 def merge(
-    base: State, ours: State, theirs: State, resolutions: Mapping[str, Side] | Sequence[tuple[str, Side]] = ()
+    base: State,
+    ours: State,
+    theirs: State,
+    resolutions: Mapping[str, Side] | Sequence[tuple[str, Side] | tuple[str, Side, str | None]] = (),
 ) -> tuple[State, MergedEntries]:
     pairs = list(resolutions.items()) if isinstance(resolutions, Mapping) else resolutions
-    merged = merge_entries(compared(base, ours), compared(base, theirs), pairs)
+    choices = [Choice(*one) for one in pairs]
+    merged = merge_entries(compared(base, ours), compared(base, theirs), choices)
     result: dict[str, Value | None] = {**ours, **merged.changes}
     return {key: value for key, value in result.items() if value is not None}, merged
 
@@ -229,9 +234,7 @@ def test_each_content_is_that_of_a_side_or_is_listed_as_combined(
     for key, value in result.items():
         assert value["parts"] in of_sides or combined[key].entry.value == value
     for one in combined.values():
-        assert all(
-            digest in (one.ours.parts.get(part), one.theirs.parts.get(part)) for part, digest in one.entry.parts.items()
-        )
+        assert all(one.source_of(part) in one.sides[:2] for part in one.entry.parts)
 
 
 def model(model: str, tree: str | None, report: str | None = None) -> Value:
@@ -306,6 +309,66 @@ def test_conflicts_name_the_parts_and_are_decided_part_by_part() -> None:
     assert merge(base, ours, theirs, {key: Side.BASE})[0] == base
 
 
+def test_each_part_of_a_conflict_is_decided_by_its_own_resolution() -> None:
+    base, key = state(a=entry("1", "1", "x")), key_of("a", "clip")
+    ours, theirs = state(a=entry("2", "2", "x")), state(a=entry("3", "3", "x"))
+    sides = base, ours, theirs
+    assert merge(*sides, [(key, Side.OURS, "motion"), (key, Side.THEIRS, "info")])[0] == state(a=entry("2", "3", "x"))
+    result, merged = merge(*sides, [(key, Side.BASE, "info"), (key, Side.THEIRS, "motion")])
+    assert result == state(a=entry("3", "1", "x"))
+    assert [one.source_of("info") for one in merged.combined] == [DatasetEntry("a", "clip", base[key]["parts"], ("x",))]
+    result, merged = merge(*sides, [(key, Side.OURS, "motion")])
+    assert (result, [one.parts for one in merged.conflicts], merged.unused) == (ours, [("info",)], [])
+    for extra in (Choice(key, Side.OURS, "motion"), Choice(key, Side.OURS), Choice(key, Side.OURS, "tags")):
+        merged = merge(*sides, [(key, Side.OURS, "motion"), (key, Side.THEIRS, "info"), extra])[1]
+        assert (merged.conflicts, merged.unused) == ([], [extra])
+    assert merge(*sides, [(key, Side.OURS, "path")])[1].unused == [Choice(key, Side.OURS, "path")]
+
+
+def test_the_path_is_decided_apart_from_the_content() -> None:
+    base, key = state(a=entry("1", "1")), key_of("b", "clip")
+    sides = base, state(b=entry("2", "1")), state(c=entry("3", "1"))
+    assert merge(*sides)[1].conflicts[0].parts == ("path", "motion")
+    assert merge(*sides, [(key, Side.THEIRS, "path"), (key, Side.OURS, "motion")])[0] == state(c=entry("2", "1"))
+    assert merge(*sides, [(key, Side.BASE, "path"), (key, Side.THEIRS, "motion")])[0] == state(a=entry("3", "1"))
+
+
+def test_a_part_that_the_base_lacks_is_not_taken_from_it() -> None:
+    key = key_of("a", "clip")
+    sides = state(), state(a=entry("1", "1")), state(a=entry("2", "2"))
+    assert merge(*sides, [(key, Side.OURS, "motion"), (key, Side.THEIRS, "info")])[0] == state(a=entry("1", "2"))
+    assert merge(*sides, [(key, Side.BASE, "motion")])[1].unused == [Choice(key, Side.BASE, "motion")]
+    assert merge(*sides, [(key, Side.BASE)])[0] == state()
+
+
+def test_a_resolution_of_a_part_decides_what_was_made_from_it() -> None:
+    key = key_of("a", "model")
+    sides = {key: model("1", "1")}, {key: model("2", "2")}, {key: model("3", "3")}
+    assert merge(*sides, [(key, Side.THEIRS, "tree")])[0] == sides[2]
+    assert merge(*sides, [(key, Side.OURS, "model"), (key, Side.THEIRS, "tree")])[1].unused != []
+
+
+@settings(max_examples=examples(300), deadline=None)
+@given(states, states, states, st.sampled_from([Side.OURS, Side.THEIRS]))
+@example(
+    state(a=entry("1"), b=entry("2", "1")),
+    state(a=entry("1", None, "x"), b=entry("1")),
+    state(a=entry("2", "1")),
+    Side.THEIRS,
+)
+def test_the_same_side_for_every_part_is_that_side_for_the_conflict(
+    base: State, ours: State, theirs: State, side: Side
+) -> None:
+    conflicts = merge(base, ours, theirs)[1].conflicts
+    whole = [(one.key, side) for one in conflicts]
+    apart = [(one.key, side, part) for one in conflicts for part in one.parts]
+    (result, merged), (same, again) = merge(base, ours, theirs, whole), merge(base, ours, theirs, apart)
+    added_twice = any(one.base is None and one.parts != ("path",) for one in conflicts)  # then a side is taken whole
+    if not merged.conflicts and not added_twice:
+        unused = [one.key for one in merged.unused]  # of conflicts that the other resolutions have removed
+        assert (same, again.conflicts, [one.key for one in again.unused]) == (result, [], unused)
+
+
 def test_more_tags_than_an_item_can_have_are_a_conflict() -> None:
     many = [f"tag {number}" for number in range(MOST_TAGS)]
     base, key = state(a=entry("1", None, *many[1:])), key_of("a", "clip")
@@ -361,7 +424,7 @@ def test_a_merged_document_is_kept_where_a_side_decides_the_path(take: Side, pat
     sides = [ComparedEntry(base, ours)], [ComparedEntry(base, theirs)]
     undecided = merge_entries(*sides, (), lambda changed: ["23" for _ in changed])
     assert [one.parts for one in undecided.conflicts] == [("path",)]
-    merged = merge_entries(*sides, [(ours.key, take)], lambda changed: ["23" for _ in changed])
+    merged = merge_entries(*sides, [Choice(ours.key, take)], lambda changed: ["23" for _ in changed])
     expected = {key_of(path, "clip"): {"parts": {"motion": motion, "info": "1"}, "tags": []}}
     assert {key: value for key, value in merged.changes.items() if value is not None} == expected
 

@@ -35,6 +35,7 @@ class _Check:
             self.archive.versions()
         while self.documents:
             self._document(self.documents.pop())
+        self._facets()
         if left := sorted(self.archive.members.keys() - self.checked):
             raise BadArchive(f"{left[0].name}: no version in the archive contains this member; it was added later")
 
@@ -89,6 +90,14 @@ class _Check:
         if member not in self.checked:
             for _ in self.archive.file(digest):
                 pass
+            self._mark(member)
+
+    def _facets(self) -> None:
+        """Check that facets belong to revisions of the archive, or to earlier ones if the archive builds on these."""
+        strangers = sorted(self.archive.facets().keys() - self.known)
+        for member in [one for one in self.archive.members if one.kind is MemberKind.FACETS]:
+            if strangers:
+                raise BadArchive(f"{member.name}: no version in the archive contains {strangers[0]}")
             self._mark(member)
 
     def _mark(self, member: ArchiveMember) -> None:

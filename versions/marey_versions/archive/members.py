@@ -17,6 +17,8 @@ from marey_schemas.sizes import MIB
 from marey_versions.tree.chunks import digest_of
 
 SCHEMA = "marey/archive@1"
+SCHEMA_WITH_FACETS = "marey/archive@2"
+"""Schema of archives that have facets; programs that know only the other schema refuse these archives."""
 MANIFEST = "archive.json"
 """Name of the last member. An archive without this member is incomplete."""
 MOST_BYTES = 256 * MIB
@@ -35,6 +37,8 @@ class MemberKind(StrEnum):
     """Entries that differ between a commit and its first parent; the digest in the name is that of the commit."""
     REVISION = "revisions"
     """Revision that documents refer to: its kind, and the content digests of its parts."""
+    FACETS = "facets"
+    """Facets of revisions: values by the name of the facet, by the content digest of the revision."""
     DOCUMENT = "documents"
     ARRAY = "arrays"
     FILE = "files"

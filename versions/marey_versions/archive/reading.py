@@ -15,6 +15,7 @@ from marey_versions.archive.members import (
     MANIFEST,
     MOST_BYTES,
     SCHEMA,
+    SCHEMA_WITH_FACETS,
     ArchiveMember,
     BadArchive,
     MemberKind,
@@ -126,6 +127,14 @@ class Archive:
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise BadArchive(f"{member.name}: the content of the member is not a list of changes: {error!r}") from error
 
+    def facets(self) -> dict[str, dict[str, float]]:
+        """Return the facets of revisions by content digest; an interrupted writing may have left older values, too."""
+        found: dict[str, dict[str, float]] = {}
+        for member in self.members:
+            if member.kind is MemberKind.FACETS:
+                found.update(_facets(member, canonical_tree(member, self._read(member))))
+        return found
+
     def _read(self, member: ArchiveMember) -> bytes:
         return self._bytes(member.name, *self._place(member))
 
@@ -210,12 +219,23 @@ def _manifest(data: bytes) -> Manifest:
         schema, manifest = tree["schema"], Manifest(str(tree["dataset"]), str(tree["commit"]), base)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise BadArchive(f"{MANIFEST}: the content of the member is not the manifest of an archive") from error
-    if schema != SCHEMA:
-        raise BadArchive(f"{MANIFEST}: this version of Marey reads {SCHEMA}, not {str(schema)[:80]!r}; update Marey")
+    if schema not in (SCHEMA, SCHEMA_WITH_FACETS):
+        raise BadArchive(
+            f"{MANIFEST}: this version of Marey reads {SCHEMA_WITH_FACETS}, not {str(schema)[:80]!r}; update Marey"
+        )
     for digest in (manifest.commit, *base):
         if not is_digest(digest):
             raise BadArchive(f"{MANIFEST}: {digest[:80]!r} is not the digest of a commit")
     return manifest
+
+
+def _facets(member: ArchiveMember, tree: Any) -> dict[str, dict[str, float]]:
+    by_content = tree.items() if isinstance(tree, dict) else [("", None)]
+    for content, values in by_content:
+        numbers = values.values() if isinstance(values, dict) and is_digest(content) else [None]
+        if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in numbers):
+            raise BadArchive(f"{member.name}: the content of the member is not a list of facets")
+    return dict(by_content)
 
 
 def _change(line: Mapping[str, Any]) -> EntryChange:

@@ -9,7 +9,15 @@ from collections.abc import Sequence
 from typing import BinaryIO
 
 from marey_schemas.encoding.canonical import canonical_json
-from marey_versions.archive.members import MANIFEST, SCHEMA, ArchiveMember, BadArchive, read_headers
+from marey_versions.archive.members import (
+    MANIFEST,
+    SCHEMA,
+    SCHEMA_WITH_FACETS,
+    ArchiveMember,
+    BadArchive,
+    MemberKind,
+    read_headers,
+)
 
 
 class ArchiveWriter:
@@ -44,7 +52,8 @@ class ArchiveWriter:
         """
         counts = Counter(name.partition("/")[0] for name in self._held)
         manifest = {
-            "schema": SCHEMA, "dataset": dataset, "commit": commit, "base": sorted(base),
+            "schema": SCHEMA_WITH_FACETS if counts[MemberKind.FACETS] else SCHEMA,
+            "dataset": dataset, "commit": commit, "base": sorted(base),
             "members": dict(sorted(counts.items())),
         }  # fmt: skip
         data = canonical_json(manifest)

@@ -76,7 +76,7 @@ def verify(file: ArchivePath, as_json: AsJson = False) -> None:
     """Check that an archive is complete, and that nothing in it was changed. No server is needed.
 
     The commit is printed last. Compare it with the commit that you expect: a new archive with other content also
-    passes this check.
+    passes this check. The digest of the commit covers everything except facets, the numbers that jobs have published.
     """
     from marey_versions.archive.checking import check_archive
 
@@ -88,6 +88,8 @@ def verify(file: ArchivePath, as_json: AsJson = False) -> None:
             facts["without"] = ", ".join(manifest.base)
         else:
             facts["entries"] = sum(1 for _ in opened.versions().entries(manifest.commit))
+        if facets := opened.facets():
+            facts["revisions with facets"] = len(facets)
         facts |= {"members": len(opened.members), "commit": manifest.commit}
     print_json(facts) if as_json else print_pairs(facts.items())
 

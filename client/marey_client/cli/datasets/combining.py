@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from marey_client.handles.versions import DatasetHandle, PickOptions
-    from marey_schemas.datasets.merges import EntryConflict, MergeAnswer, Resolution
+    from marey_schemas.datasets.merges import EntryConflict, MergeAnswer, Resolution, Side
+
+CONFLICT = "PATH:KIND[/PART]"
+"""Form in which the options name a conflict, or one of its parts."""
 
 Into = Annotated[str, typer.Option(help="Branch that gets the changes.")]
 CommitMessage = Annotated[str, typer.Option("--message", "-m", help="Message of the commit.")]
@@ -25,21 +28,25 @@ Preview = Annotated[bool, typer.Option("--preview", help="Show the result withou
 Ours = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="PATH:KIND", help="Resolve the conflict in this entry with the content of the branch; may be repeated."
+        metavar=CONFLICT,
+        help="Resolve the conflict in this entry, or in this part of it, with the content of the branch; may be "
+        "repeated.",
     ),
 ]
 Theirs = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="PATH:KIND",
-        help="Resolve the conflict in this entry with the content of the other version; may be repeated.",
+        metavar=CONFLICT,
+        help="Resolve the conflict in this entry, or in this part of it, with the content of the other version; may be "
+        "repeated.",
     ),
 ]
 Base = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="PATH:KIND",
-        help="Resolve the conflict in this entry with the content before both changes; may be repeated.",
+        metavar=CONFLICT,
+        help="Resolve the conflict in this entry, or in this part of it, with the content before both changes; may be "
+        "repeated.",
     ),
 ]
 Parent = Annotated[
@@ -177,20 +184,36 @@ def resolutions_of(
     ours: Sequence[str] | None, theirs: Sequence[str] | None, base: Sequence[str] | None
 ) -> list[Resolution]:
     """Return the decision for each conflict that the options --ours, --theirs and --base name."""
-    from marey_schemas.datasets.merges import Resolution, Side
+    from marey_schemas.datasets.merges import Side
 
     found: list[Resolution] = []
     for side, places in ((Side.OURS, ours), (Side.THEIRS, theirs), (Side.BASE, base)):
         for place in places or ():
-            path, colon, kind = place.rpartition(":")
-            if not colon:
-                raise WrongUsage(f"{place!r} names no kind; write path:kind, such as raw/walk:clip")
-            one = Resolution.model_validate({"path": path.strip("/"), "kind": kind, "take": side})
-            if any((other.path, other.kind) == (one.path, one.kind) and other.take != side for other in found):
-                # Their order would decide which conflict each resolves, and options of different names have no order.
+            one = _resolution(place, side)
+            if any(_order_matters(one, other) for other in found):
                 raise WrongUsage(f"{place!r} has two different sides; to choose them one by one, use Python or REST")
             found.append(one)
     return found
+
+
+def _resolution(place: str, side: Side) -> Resolution:
+    """Return the decision that a text such as `raw/walk:clip` or `raw/walk:clip/motion` describes."""
+    from marey_schemas.datasets.merges import Resolution
+
+    path, colon, named = place.rpartition(":")
+    if not colon:
+        raise WrongUsage(f"{place!r} names no kind; write path:kind, such as raw/walk:clip")
+    kind, _, part = named.partition("/")
+    return Resolution.model_validate({"path": path.strip("/"), "kind": kind, "take": side, "part": part or None})
+
+
+def _order_matters(one: Resolution, other: Resolution) -> bool:
+    """Return whether the order of two decisions would decide which conflict each resolves.
+
+    Options of different names have no order.
+    """
+    same_part = one.part == other.part or None in (one.part, other.part)
+    return (one.path, one.kind) == (other.path, other.kind) and one.take != other.take and same_part
 
 
 def _print_result(found: MergeAnswer, into: str) -> None:

@@ -17,6 +17,7 @@ from marey_schemas.wording import counted
 if TYPE_CHECKING:
     from marey_schemas.datasets.commits import Commit, Origin
     from marey_schemas.datasets.differences import ListedCommit
+    from marey_schemas.datasets.naming import Dataset
     from marey_schemas.datasets.protection import Protection
 
 dataset = typer.Typer(
@@ -67,8 +68,16 @@ def list_datasets(context: typer.Context, project_name: ProjectName, as_json: As
         found = list(marey.project(project_name).datasets.list())
     if as_json:
         return print_json(found)
-    rows = [(one.name, one.collection, one.created_at.date(), one.description) for one in found]
-    return print_table(("dataset", "folder", "created", "description"), rows)
+    rows = [(one.name, one.collection, _checked_out(one), one.created_at.date(), one.description) for one in found]
+    return print_table(("dataset", "folder", "checked out", "created", "description"), rows)
+
+
+def _checked_out(one: Dataset) -> str:
+    """Return what is checked out in the folder, such as `1f3a9c07d2e4: tag = night; raw, rigs`."""
+    if one.checked_out is None:
+        return ""
+    selection = "; ".join(filter(None, (one.checked_out.query, ", ".join(one.checked_out.paths))))
+    return f"{short(one.checked_out.commit)}{f': {selection}' if selection else ''}"
 
 
 @dataset.command("commit")
@@ -245,19 +254,35 @@ def _origin_row(name: str, one: Origin, path: str) -> tuple[object, ...]:
 def checkout(
     context: typer.Context,
     place: VersionPlace,
+    query: Annotated[
+        str | None, typer.Option(help="Check out only the entries that this query selects, as in `marey ls --query`.")
+    ] = None,
+    path: Annotated[
+        list[str] | None,
+        typer.Option(help="Check out only this entry, or the entries below this folder; may be repeated."),
+    ] = None,
     discard: Annotated[
         bool, typer.Option("--discard", help="Discard changes in the folder that no commit has recorded.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Change the folder of a dataset to the content of a version. Items that the command removes can be restored."""
+    """Bring the folder of a dataset to the state of a version. Items removed by the command can be restored.
+
+    With --query or --path, only a part of the version is checked out. The folder remembers the part: commits of the
+    folder keep all entries that were not checked out. To take all entries again, repeat the command without the option.
+    """
     at = parse(place, version=True)
     with connect(context) as marey:
-        found = at.on(marey).check_out(at.version, discard=discard)
+        paths = [one.strip("/") for one in path or ()]
+        found = at.on(marey).check_out(at.version, query=query, paths=paths, discard=discard)
     if as_json:
         return print_json(found)
-    counts = ", ".join(f"{count:,} {name}" for name, count in found.model_dump(exclude={"commit"}).items() if count)
-    return print_message(f"the folder has the entries of {short(found.commit)} now: {counts or 'nothing differed'}")
+    named = {name: getattr(found, name) for name in ("added", "removed", "moved", "changed")}
+    counts = ", ".join(f"{count:,} {name}" for name, count in named.items() if count)
+    return print_message(
+        f"the folder has {found.taken:,} of {counted(found.entries, 'entry')} of {short(found.commit)} now: "
+        f"{counts or 'nothing differed'}"
+    )
 
 
 def _pairs(one: Commit) -> list[tuple[str, object]]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pydantic import Field
 
 from marey_schemas.base import Request
+from marey_schemas.datasets.checkouts import CheckoutAnswer, CheckoutRequest
 from marey_schemas.datasets.commits import Commit, CommitCreate, Entry, EntryOrigins, EntryPath
 from marey_schemas.datasets.differences import DatasetDifference, ListedCommit
-from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest, MergeAnswer, MergeRequest, PickRequest
+from marey_schemas.datasets.merges import MergeAnswer, MergeRequest, PickRequest
 from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefMove, Version
 from marey_schemas.datasets.protection import ProtectionRule
 from marey_schemas.kinds import Kind
@@ -17,7 +18,7 @@ from marey_server.http.declarations import Access, RequestBody, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
-from marey_server.store import datasets
+from marey_server.store import datasets, purging
 
 MAX_COMMIT_BYTES = 16 * MIB
 
@@ -98,9 +99,14 @@ class DatasetRef(Resource):
 
     @writes(access=Access.MAINTAINER, precondition="required")
     async def delete(self, project: str, dataset: str, ref: str) -> Rendered:
-        """Delete a branch or a tag; no commit is deleted."""
+        """Delete a branch or a tag; no commit is deleted.
+
+        A tag is not deleted while a job that has not ended, or an item that a job made, cites its version, unless
+        another tag names this version.
+        """
+        citing = await self.look_up(purging.find_citations, project, dataset, ref)
         expected_rev = self.precondition.expected_rev
-        return await self.answer(datasets.delete_ref, project, dataset, ref, expected_rev=expected_rev)
+        return await self.answer(purging.delete_uncited_ref, project, dataset, ref, citing, expected_rev=expected_rev)
 
 
 class BranchProtection(Resource):
@@ -239,10 +245,14 @@ class FolderCheckout(Resource):
     async def post(self, project: str, dataset: str, body: CheckoutRequest) -> Rendered:
         """Bring the folder of the dataset to the state of a version: items are added, changed, moved and removed.
 
-        If the folder has changes that no commit has recorded, the answer is 409; the request can ask to discard these
-        changes. Removed items can be restored, and earlier revisions of items remain.
+        With `query` or `paths`, only the selected entries are checked out. The folder remembers this: its commits keep
+        all other entries of the version.
+
+        If the folder has changes that no commit has recorded, the request is refused with 409, unless it asks to
+        discard them. Removed items can be restored, and earlier revisions of items remain.
         """
-        return await self.answer(datasets.check_out, project, dataset, body)
+        selected = await self.look_up(datasets.select_entries, project, dataset, body)
+        return await self.answer(datasets.check_out, project, dataset, body, selected)
 
 
 class DatasetCommit(Resource):

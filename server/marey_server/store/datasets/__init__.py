@@ -31,6 +31,7 @@ from marey_server.store.datasets.receiving import (
     record_receipt,
     store_revisions,
 )
+from marey_server.store.datasets.selecting import select_entries
 
 __all__ = [
     "PreparedCommit",
@@ -63,5 +64,6 @@ __all__ = [
     "record_commit",
     "record_merge",
     "record_receipt",
+    "select_entries",
     "store_revisions",
 ]

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from sqlalchemy import Row, exists, select, update
 
 from marey_schemas.access import Role
+from marey_schemas.datasets.checkouts import CheckoutAnswer, CheckoutRequest
 from marey_schemas.datasets.commits import MOST_CHANGES
-from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest
 from marey_schemas.items import ItemChange
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MOST_TAGS
@@ -19,25 +19,33 @@ from marey_schemas.wording import counted
 from marey_server.access.folder_rights import FolderRoleProblem
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import collections, items, projects
-from marey_server.store.datasets.chunks import StoredChunks
+from marey_server.store.datasets.chunks import StoredChunks, store_chunks
 from marey_server.store.datasets.folders import FolderState, read_folder
 from marey_server.store.datasets.history import revisions_with, tree_of
+from marey_server.store.datasets.manifests import FolderManifest, read_manifest, store_manifest
 from marey_server.store.datasets.naming import find_dataset, resolve
+from marey_server.store.datasets.selecting import SelectedEntries
 from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.items import Draft, StoredDocument
+from marey_server.store.items.facets import add_facets, facets_of_contents
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.projects import ProjectRow
-from marey_server.store.purge_lock import hold_off_purges
+from marey_server.store.purge_lock import hold_off_purges, require_no_purge_since
 from marey_server.store.tables import collection, dataset, item
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.compared import ComparedEntry, compare_entries
 from marey_versions.records import DatasetEntry
 from marey_versions.tree.difference import Changed
 from marey_versions.tree.reading import Tree
 
 
-def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest) -> CheckoutAnswer:
+def check_out(
+    tx: Transaction, project: str, name: str, request: CheckoutRequest, selected: SelectedEntries | None = None
+) -> CheckoutAnswer:
     """Replace the content of a dataset's folder by a version, which becomes the parent of the folder's next commit.
+
+    If the request selects a part of the version, `selected` is this part. The folder then has the selected entries
+    only, and its next commits change no other entries.
 
     An item whose entry has moved or changed keeps its id. If the folder lacks an entry of the version, the deleted item
     of this entry is restored if possible; otherwise a new item is created.
@@ -51,12 +59,12 @@ def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest
     rights = rights_of_caller(tx, project_row)
     found = find_dataset(tx, project_row, name)
     rights.require_below(found.path or "", Role.MAINTAINER)
-    digest = resolve(tx, found.id, request.version)
+    manifest = _wanted(tx, project_row, found, request, selected)
     state = read_folder(tx, project_row, found)
     store = StoredChunks(tx)
     if not request.discard:
         _require_recorded(tx, found, state, store)
-    wanted = Tree(store, tree_of(tx, found.id, digest))
+    wanted = Tree(store, manifest.tree)
     back = state.changes_since(wanted)
     targets = wanted.get_several(back)
     changes = [Changed(key, state.entries.get(key), targets.get(key)) for key in sorted(back)]
@@ -70,20 +78,35 @@ def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest
     _require_possible(found, compared)
     _Checkout(tx, project_row, found, state).apply(compared)
     # A commit of the folder that is being recorded sees by `rev` that the folder has other content now.
-    values = {"folder_commit": digest, "updated_us": tx.now_us, "rev": dataset.c.rev + 1}
+    values = {"folder_commit": store_manifest(tx, manifest), "updated_us": tx.now_us, "rev": dataset.c.rev + 1}
     tx.execute(update(dataset).where(dataset.c.id == found.id).values(**values))
     counts = Counter(one.change for one in compared)
     return CheckoutAnswer(
-        commit=digest, added=counts["added"], removed=counts["removed"], moved=counts["moved"],
-        changed=counts["changed"],
+        commit=manifest.commit, taken=len(wanted), entries=len(Tree(store, tree_of(tx, found.id, manifest.commit))),
+        added=counts["added"], removed=counts["removed"], moved=counts["moved"], changed=counts["changed"],
     )  # fmt: skip
 
 
+def _wanted(
+    tx: Transaction,
+    project_row: ProjectRow,
+    found: Row[Any],
+    request: CheckoutRequest,
+    selected: SelectedEntries | None,
+) -> FolderManifest:
+    """Return the manifest that the folder gets, and store the tree of a selection."""
+    if not request.partial:
+        digest = resolve(tx, found.id, request.version)
+        return FolderManifest(digest, tree_of(tx, found.id, digest))
+    assert selected is not None, "entries are selected before they are checked out"
+    require_no_purge_since(tx, project_row.id, selected.last_purge)
+    store_chunks(tx, selected.chunks)
+    return FolderManifest(selected.commit, selected.tree, request.query, request.paths)
+
+
 def _require_recorded(tx: Transaction, found: Row[Any], state: FolderState, store: StoredChunks) -> None:
-    if found.folder_commit is None:
-        changed: Sequence[str] = sorted(state.entries)
-    else:
-        changed = sorted(state.changes_since(Tree(store, tree_of(tx, found.id, found.folder_commit))))
+    manifest = read_manifest(tx, found)
+    changed = state.entries if manifest is None else state.changes_since(Tree(store, manifest.tree))
     if changed:
         raise ConflictProblem(
             f"The folder {found.path!r} has changes that no commit has recorded; commit or discard them.",
@@ -117,6 +140,8 @@ class _Checkout:
     project: ProjectRow
     dataset: Row[Any]
     state: FolderState
+    given: dict[str, str] = field(default_factory=dict)
+    """Content digest of each item that gets a new revision, by the id of the item."""
 
     def apply(self, compared: Sequence[ComparedEntry]) -> None:
         """Change the folder, in an order that frees each path before an item is created there or moved there."""
@@ -134,6 +159,7 @@ class _Checkout:
             self._change(one, documents)
         for one in of_kind["added"]:
             self._add(one, documents)
+        self._keep_facets()
 
     def _documents(self, entries: Iterable[DatasetEntry]) -> dict[str, tuple[str, Mapping[str, str]]]:
         """Find, for the content of each entry, an item with a revision that has this content.
@@ -172,6 +198,7 @@ class _Checkout:
         kind, item_id = Kind(one.after.kind), self._item(one)
         if one.parts:
             items.set_parts(self.tx, self.project, kind, item_id, documents[one.after.content][1], self._message)
+            self.given[item_id] = one.after.content
         if one.before is not None and set(one.before.tags) != set(one.after.tags):
             tags = ItemChange(tags=one.after.tags)
             items.change_item(self.tx, self.project.name, kind, item_id, tags, expected_rev=None)
@@ -190,16 +217,26 @@ class _Checkout:
             place = ItemChange(name=name, collection=folder, tags=one.after.tags)
             items.change_item(self.tx, self.project.name, kind, item_id, place, expected_rev=None)
             items.set_parts(self.tx, self.project, kind, item_id, parts, self._message)
+            self.given[item_id] = one.after.content
             return
         draft = Draft(
             name_in_batch="", kind=kind, item_name=name, collection=folder, tags=one.after.tags,
             parts={part: StoredDocument(digest) for part, digest in parts.items()}, reuse="new",
             message=self._message,
         )  # fmt: skip
-        items.publish(
+        (made,) = items.publish(
             self.tx, self.project, [draft], author_id=self.tx.principal.user_id,
             rights=rights_of_caller(self.tx, self.project), refer_to_deleted=True,
         )  # fmt: skip
+        self.given[made.item] = one.after.content
+
+    def _keep_facets(self) -> None:
+        """Give the new revisions the facets of their content, which an earlier revision may have."""
+        known = facets_of_contents(self.tx, self.project.id, self.given.values())
+        measured = sorted(item_id for item_id, content in self.given.items() if content in known)
+        for some in in_lists(measured):
+            heads = self.tx.execute(select(item.c.id, item.c.head).where(item.c.id.in_(some)))
+            add_facets(self.tx, [(row.id, row.head, known[self.given[row.id]]) for row in heads])
 
     def _can_restore(self, kind: Kind, item_id: str) -> bool:
         """Return whether an item is deleted and may be restored, and no other item has its former folder and name."""

@@ -31,6 +31,7 @@ from marey_server.store.datasets.chunks import StoredChunks, store_chunks
 from marey_server.store.datasets.contents import Contents, find_contents_of, store_contents
 from marey_server.store.datasets.folders import read_folder, tags_of
 from marey_server.store.datasets.history import read_commit, tree_of
+from marey_server.store.datasets.manifests import FolderManifest, read_manifest, store_manifest
 from marey_server.store.datasets.naming import find_dataset, find_ref, is_tag
 from marey_server.store.datasets.protection import Mover, require_move
 from marey_server.store.datasets.revisions import store_combined
@@ -40,7 +41,7 @@ from marey_server.store.purge_lock import hold_off_purges, last_purge, require_n
 from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, fast_forward, item, user
 from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.merging import CombinedEntry
-from marey_versions.records import CommitRecord, DatasetEntry, RevisionKey, key_of
+from marey_versions.records import CommitRecord, DatasetEntry, RevisionKey, key_of, path_and_kind
 from marey_versions.tree.building import build
 from marey_versions.tree.chunks import Value
 from marey_versions.tree.editing import change
@@ -48,6 +49,18 @@ from marey_versions.tree.reading import Tree
 
 BRANCH_MOVED = "branch-moved"
 """Code of the error for a branch whose newest commit is not the expected one."""
+
+
+@dataclass(frozen=True)
+class FolderCommit:
+    """Folder from which a commit is made."""
+
+    rev: int
+    """`rev` of the dataset when the folder was read."""
+    was: str | None
+    """Value of `dataset.folder_commit` when the folder was read."""
+    partial: FolderManifest | None
+    """FolderManifest that the folder gets, apart from its commit; None if the folder has whole versions."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +82,8 @@ class PreparedCommit:
     """Entries that combine changes of both sides of a merge; the project may not have revisions of them yet."""
     documents: Mapping[str, PreparedDocument] = field(default_factory=dict)
     """Documents that are not stored yet, of the entries in `combined`, by content digest."""
-    folder_rev: int | None = None
-    """`rev` of the dataset when its folder was read; None if the entries are not from the folder."""
+    folder: FolderCommit | None = None
+    """State of the folder with the entries; None if the entries are not from the folder."""
     existing: str | None = None
     """Existing commit to which the branch moves; None if the branch moves to a new commit."""
     recorded: str | None = None
@@ -88,7 +101,8 @@ def prepare_commit(tx: Transaction, project: str, name: str, request: CommitCrea
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
     recorded = recorded_as(tx, found.id, request.write_id)
-    head = head_of(tx, found.id, request.branch, None if recorded else request.expected)
+    # A repeated request gets its commit, even if the branch is gone meanwhile.
+    head = None if recorded else head_of(tx, found.id, request.branch, request.expected)
     parents = () if head is None else (head,)
     prepared = PreparedCommit(
         found.id, request.branch, head, parents, request.message, request.write_id, recorded=recorded,
@@ -98,17 +112,16 @@ def prepare_commit(tx: Transaction, project: str, name: str, request: CommitCrea
         return prepared
     store = StoredChunks(tx)
     before = None if head is None else tree_of(tx, found.id, head)
+    folder = None
     if request.changes is None:
-        _require_checked_out(found, head)
-        tree, contents = _from_folder(tx, project_row, found, store, before)
+        tree, contents, folder = _from_folder(tx, project_row, found, store, head)
     else:
         tree, contents = _from_changes(tx, project_row, store, before, request.changes)
     if tree == before:
         raise InvalidProblem(f"Nothing has changed since the newest commit of {request.branch!r}.", code="no-changes")
     return replace(
-        prepared, tree=tree, entries=len(Tree(store, tree)), chunks=store.new, contents=contents,
-        folder_rev=found.rev if request.changes is None else None,
-    )  # fmt: skip
+        prepared, tree=tree, entries=len(Tree(store, tree)), chunks=store.new, contents=contents, folder=folder
+    )
 
 
 def record_commit(
@@ -141,8 +154,8 @@ def record_commit(
     if prepared.existing is not None and prepared.write_id is not None:
         tx.execute(insert(fast_forward).values(dataset_id=found.id, write_id=prepared.write_id, digest=digest))
     move_branch_to(tx, prepared, digest, mover)
-    if prepared.folder_rev is not None:  # after the branch, as in commits of jobs, so that the two never deadlock
-        _follow_with_folder(tx, prepared, digest)
+    if prepared.folder is not None:  # after the branch, as in commits of jobs, so that the two never deadlock
+        _follow_with_folder(tx, found.id, prepared.folder, digest)
     tx.emit("branch.moved", found.id, project_id=project_row.id, branch=prepared.branch, commit=digest)
     faults.point("dataset_commit.before_commit")
     tx.after_commit(lambda: faults.point("dataset_commit.after_commit"))
@@ -257,43 +270,68 @@ def author_of(tx: Transaction) -> str:
 # -- the content of a folder ------------------------------------------------------------------------------------------
 
 
-def _require_checked_out(found: Row[Any], parent: str | None) -> None:
+def _require_checked_out(found: Row[Any], manifest: FolderManifest | None, parent: str | None) -> None:
     """Raise `ConflictProblem` if the commit checked out in the folder is not the newest commit of the branch."""
-    if found.folder_commit != parent:
+    there = None if manifest is None else manifest.commit
+    if there != parent:
         raise ConflictProblem(
             f"The version that is checked out in the folder {found.path!r} is not the newest one of this branch. "
             "Check out the branch, or commit to the branch that is checked out.",
             code="folder-elsewhere",
-            context={"folder_commit": found.folder_commit, "commit": parent},
-        )
+            context={
+                "folder_commit": there, "commit": parent,
+                "checked_out": None if manifest is None else manifest.shown,
+            },
+        )  # fmt: skip
 
 
 def _from_folder(
-    tx: Transaction, project_row: ProjectRow, found: Row[Any], store: StoredChunks, before: str | None
-) -> tuple[str, Contents]:
+    tx: Transaction, project_row: ProjectRow, found: Row[Any], store: StoredChunks, head: str | None
+) -> tuple[str, Contents, FolderCommit]:
     """Store a tree of entries that is made from the items in the dataset's folder.
 
-    If there is an earlier tree `before`, only the entries that differ from it are changed. Returns the digest of the
-    root of the tree, and the content digests of the items.
+    If the branch has a commit `head`, only the entries that differ from what was checked out are changed in its tree.
+    Returns the digest of the root of the tree, the content digests of the items, and the state of the folder.
     """
+    manifest = read_manifest(tx, found)
+    _require_checked_out(found, manifest, head)
     state = read_folder(tx, project_row, found)
-    if before is None:
-        return build(store, sorted(state.entries.items())), state.contents
-    return change(store, before, state.changes_since(Tree(store, before))), state.contents
+    folder = FolderCommit(found.rev, found.folder_commit, None)
+    if head is None or manifest is None:
+        return build(store, sorted(state.entries.items())), state.contents, folder
+    changes, before = state.changes_since(Tree(store, manifest.tree)), tree_of(tx, found.id, head)
+    if manifest.partial:
+        _require_selected(found, changes, Tree(store, manifest.tree), Tree(store, before))
+        folder = replace(folder, partial=replace(manifest, tree=change(store, manifest.tree, changes)))
+    return change(store, before, changes), state.contents, folder
 
 
-def _follow_with_folder(tx: Transaction, prepared: PreparedCommit, digest: str) -> None:
+def _require_selected(found: Row[Any], changes: Mapping[str, Value | None], selected: Tree, before: Tree) -> None:
+    """Raise `ConflictProblem` if the folder has an item in the place of an entry that was not checked out."""
+    hidden = sorted(before.get_several(changes).keys() - selected.get_several(changes).keys())
+    if hidden:
+        path, kind = path_and_kind(hidden[0])
+        raise ConflictProblem(
+            f"The version has a {kind} at {path!r} that is not checked out in the folder {found.path!r}, but another "
+            "one is there. Rename it, or check out a selection that includes this entry.",
+            code="not-checked-out",
+            context={"count": len(hidden), "path": path, "kind": kind},
+        )
+
+
+def _follow_with_folder(tx: Transaction, dataset_id: str, folder: FolderCommit, digest: str) -> None:
     """Note that a commit is checked out in the folder from which it was made.
 
     If somebody has checked out a version since the folder was read, the folder no longer has the entries of the commit.
     Then nothing is noted, because the next commit of the folder would otherwise undo this commit.
     """
     unchanged = (
-        dataset.c.id == prepared.dataset_id,
-        dataset.c.rev == prepared.folder_rev,  # a checkout of the version that is checked out already increases it, too
-        dataset.c.folder_commit.is_not_distinct_from(prepared.head),
+        dataset.c.id == dataset_id,
+        dataset.c.rev == folder.rev,  # a checkout of the version that is checked out already increases it, too
+        dataset.c.folder_commit.is_not_distinct_from(folder.was),
     )
-    tx.execute(update(dataset).where(*unchanged).values(folder_commit=digest))
+    now = digest if folder.partial is None else store_manifest(tx, replace(folder.partial, commit=digest))
+    tx.execute(update(dataset).where(*unchanged).values(folder_commit=now))
 
 
 # -- explicit changes -------------------------------------------------------------------------------------------------

@@ -94,7 +94,7 @@ def _read(
             if row.project_id == project_id and RevisionKey(row.item_id, row.number) in some
         ]
         lacking = {row.document_digest for row in rows if row.of_revision is None}
-        bodies = _bodies(tx, lacking)
+        bodies = bodies_of(tx, lacking)
         by_revision: dict[RevisionKey, list[Any]] = {}
         for row in rows:
             by_revision.setdefault(RevisionKey(row.item_id, row.number), []).append(row)
@@ -138,7 +138,8 @@ def _among(wanted: Collection[RevisionKey]) -> tuple[ColumnElement[bool], ...]:
     return revision_part.c.item_id.in_(sorted(ids)), revision_part.c.number.in_(sorted(numbers))
 
 
-def _bodies(tx: Transaction, digests: Collection[str]) -> dict[str, Any]:
+def bodies_of(tx: Transaction, digests: Collection[str]) -> dict[str, Any]:
+    """Return the bodies of documents, in which arrays are references, by digest."""
     rows = tx.execute(select(document.c.digest, document.c.body).where(document.c.digest.in_(sorted(digests))))
     return {row.digest: row.body for row in rows}
 

@@ -36,8 +36,9 @@ from marey_server.store.purge_lock import last_purge
 from marey_server.store.transaction import Transaction
 from marey_versions.ancestry import nearest_common
 from marey_versions.annotations import LabelClash, LabelledRange
+from marey_versions.choices import Choice
 from marey_versions.compared import ComparedEntry, compare_entries
-from marey_versions.merging import MergeConflict, merge_entries
+from marey_versions.merging import MergeConflict, MergedEntries, merge_entries
 from marey_versions.records import key_of, path_and_kind
 from marey_versions.tree.building import build
 from marey_versions.tree.difference import difference
@@ -67,10 +68,10 @@ def prepare_merge(
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
+    if (repeated := _repeated(tx, project, found, request)) is not None:
+        return repeated
     theirs = resolve(tx, found.id, request.version)
     started = _start(tx, found, request, theirs, f"Merge {request.version} into {request.into}")
-    if started.commit.recorded is not None:
-        return started
     ours = started.answer.ours
     base = _common(tx, found.id, ours, theirs)
     if base == theirs:
@@ -91,13 +92,13 @@ def prepare_pick(tx: Transaction, project: str, name: str, request: PickRequest,
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
+    if (repeated := _repeated(tx, project, found, request)) is not None:
+        return repeated
     picked = read_commit(tx, project, name, request.version)
     before = _parent_of(picked, request.parent)
     base, theirs = (picked.digest, before) if undo else (before, picked.digest)
     first_line = picked.message.partition("\n")[0][:100]
     started = _start(tx, found, request, theirs, f"Revert {first_line!r}" if undo else picked.message)
-    if started.commit.recorded is not None:
-        return started
     merge = _combine(
         tx, project_row.id, request, replace(started, answer=started.answer.model_copy(update={"base": base}))
     )
@@ -118,20 +119,36 @@ def _parent_of(picked: Commit, parent: int | None) -> str | None:
     return picked.parents[(parent or 1) - 1] if picked.parents else None
 
 
+def _repeated(tx: Transaction, project: str, found: Row[Any], request: CombineRequest) -> PreparedMerge | None:
+    """Return the merge that an earlier request with the same `write_id` has recorded; None if there is none.
+
+    The branch and the version of the request may be gone meanwhile, so neither is looked up.
+    """
+    recorded = recorded_as(tx, found.id, request.write_id)
+    if recorded is None:
+        return None
+    parents = (*read_commit(tx, project, found.name, recorded).parents, recorded, recorded)
+    commit = PreparedCommit(
+        found.id, request.into, None, (), request.message, request.write_id, recorded=recorded,
+        last_purge=last_purge(tx, found.project_id),
+    )  # fmt: skip
+    ours, theirs = parents[:2]
+    answer = MergeAnswer(commit=None, base=None, ours=ours, theirs=theirs, changes=0, conflicts=(), conflict_count=0)
+    return PreparedMerge(answer, commit)
+
+
 def _start(
     tx: Transaction, found: Row[Any], request: CombineRequest, theirs: str | None, message: str
 ) -> PreparedMerge:
     """Return a merge of the commit `theirs` into the branch that `request` names; the result is not computed yet.
 
-    `commit.recorded` is set if an earlier request has recorded the merge. `message` is the message of the commit if
-    the request contains none.
+    `message` is the message of the commit if the request contains none.
     """
-    recorded = recorded_as(tx, found.id, request.write_id)
-    ours = head_of(tx, found.id, request.into, None if recorded else request.expected)
+    ours = head_of(tx, found.id, request.into, request.expected)
     if ours is None:
         raise InvalidProblem(f"The branch {request.into!r} has no commits yet.", code="no-commits")
     commit = PreparedCommit(
-        found.id, request.into, ours, (ours,), request.message or message, request.write_id, recorded=recorded,
+        found.id, request.into, ours, (ours,), request.message or message, request.write_id,
         last_purge=last_purge(tx, found.project_id),
     )  # fmt: skip
     answer = MergeAnswer(commit=None, base=None, ours=ours, theirs=theirs, changes=0, conflicts=(), conflict_count=0)
@@ -152,17 +169,11 @@ def _combine(
         build(store, []) if one is None else tree_of(tx, commit.dataset_id, one)
         for one in (answer.base, answer.ours, answer.theirs)
     )
-    resolutions = [(key_of(one.path, one.kind), one.take) for one in request.resolutions]
+    resolutions = [Choice(key_of(one.path, one.kind), one.take, one.part) for one in request.resolutions]
     mine, their = (_changed(store, base, side, most) for side in (ours, theirs))
     annotations = AnnotationMerger(tx, project_id)
     merged = merge_entries(mine, their, resolutions, annotations.merge)
-    # While conflicts remain, a further resolution of a decided key may be for one that only the next answer shows.
-    unknown = [key for key in merged.unused if key not in merged.decided or not merged.conflicts]
-    if unknown:
-        path, kind = path_and_kind(unknown[0])
-        raise InvalidProblem(
-            f"The {kind} at {path!r} is not in conflict; remove its resolution from the request.", code="no-conflict"
-        )
+    _require_all_used(merged)
     if len(merged.combined) > MOST_COMBINED:
         raise InvalidProblem(
             f"In {len(merged.combined):,} entries, changes of both sides must be combined, but one merge can combine "
@@ -184,6 +195,26 @@ def _combine(
         documents=annotations.documents,
     )  # fmt: skip
     return PreparedMerge(answer, commit)
+
+
+def _require_all_used(merged: MergedEntries) -> None:
+    """Raise `InvalidProblem` if a resolution has decided no conflict.
+
+    While conflicts remain, a further resolution of a decided key may be for one that only the next answer shows.
+    """
+    unknown = [one for one in merged.unused if one.key not in merged.decided or not merged.conflicts]
+    if not unknown:
+        return
+    (path, kind), part = path_and_kind(unknown[0].key), unknown[0].part
+    if part is not None:
+        raise InvalidProblem(
+            f"The part {part!r} of the {kind} at {path!r} is not in conflict, is decided already, or is not in the "
+            f"version {unknown[0].take.value!r}; remove its resolution from the request.",
+            code="no-conflict",
+        )
+    raise InvalidProblem(
+        f"The {kind} at {path!r} is not in conflict; remove its resolution from the request.", code="no-conflict"
+    )
 
 
 def record_merge(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 from sqlalchemy import CTE, Row, delete, func, insert, literal_column, null, select
 
 from marey_schemas.access import Role
-from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind, RefMove
+from marey_schemas.datasets.naming import MAIN, CheckedOut, Dataset, DatasetCreate, Ref, RefCreate, RefKind, RefMove
 from marey_schemas.datasets.protection import ProtectionRule
 from marey_schemas.event_kinds import AuditKind, OrdinaryEventKind
 from marey_schemas.items import Page
@@ -16,6 +17,7 @@ from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import collections, listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
+from marey_server.store.datasets.manifests import FolderManifest, read_manifests
 from marey_server.store.datasets.protection import (
     require_deletable,
     require_no_protected_branch,
@@ -29,6 +31,7 @@ from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import collection, commit_parent, dataset, dataset_commit, dataset_ref
 from marey_server.store.transaction import Transaction
+from marey_versions.tree.chunks import DamagedChunk
 
 MOST_DATASETS = 1000
 """Greatest number of datasets in a project."""
@@ -56,9 +59,18 @@ def _shown_rows(project_row: ProjectRow) -> Any:
     )
 
 
-def _shown(row: Row[Any]) -> Dataset:
+def _shown(tx: Transaction, rows: Sequence[Row[Any]]) -> tuple[Dataset, ...]:
+    try:
+        manifests = read_manifests(tx, rows)
+    except DamagedChunk:  # which `marey db fsck` finds; the damage of one dataset must not hide the others
+        manifests = {}
+    return tuple(_shown_dataset(row, manifests.get(row.id)) for row in rows)
+
+
+def _shown_dataset(row: Row[Any], manifest: FolderManifest | None) -> Dataset:
     return Dataset(
         id=row.id, name=row.name, description=row.description, collection=row.path,
+        checked_out=None if manifest is None else CheckedOut.model_validate(manifest.shown),
         created_at=datetime_of(row.created_us), updated_at=datetime_of(row.updated_us), rev=row.rev,
     )  # fmt: skip
 
@@ -87,7 +99,7 @@ def create_dataset(tx: Transaction, project: str, request: DatasetCreate) -> Dat
         tx.execute(insert(dataset).values(**row))
     tx.execute(insert(dataset_ref).values(**new_ref(tx, dataset_id, MAIN, RefKind.BRANCH, None)))
     tx.emit("dataset.created", dataset_id, project_id=project_row.id, name=request.name)
-    return _shown(find_dataset(tx, project_row, request.name))
+    return _shown(tx, [find_dataset(tx, project_row, request.name)])[0]
 
 
 def _require_room(held: int, most: int, of_what: str, code: str) -> None:
@@ -97,7 +109,7 @@ def _require_room(held: int, most: int, of_what: str, code: str) -> None:
 
 def read_dataset(tx: Transaction, project: str, name: str) -> Dataset:
     """Return a dataset as a document."""
-    return _shown(find_dataset(tx, projects.require(tx, project), name))
+    return _shown(tx, [find_dataset(tx, projects.require(tx, project), name)])[0]
 
 
 def list_datasets(tx: Transaction, project: str, *, cursor: str | None, limit: int) -> Page:
@@ -107,7 +119,7 @@ def list_datasets(tx: Transaction, project: str, *, cursor: str | None, limit: i
     rows, following = listing.read_page(
         tx, _shown_rows(project_row), order, ["datasets", project_row.id], cursor, limit
     )
-    return Page(items=tuple(map(_shown, rows)), next_cursor=following)
+    return Page(items=_shown(tx, rows), next_cursor=following)
 
 
 def delete_dataset(tx: Transaction, project: str, name: str, *, expected_rev: ExpectedRev) -> None:
@@ -177,11 +189,15 @@ def read_ref(tx: Transaction, project: str, name: str, ref: str) -> Ref:
 
 
 def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> Ref:
-    """Create a branch or a tag at a version. Raises `ConflictProblem` if another branch or tag has the name."""
+    """Create a branch or a tag at a version.
+
+    Raises `ConflictProblem` if another branch or tag has the name, or if the name is the beginning of a digest.
+    """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
     row = find_dataset(tx, project_row, name)
     digest = resolve(tx, row.id, request.at)
+    _require_no_commit(tx, row.id, request.name)
     held = tx.execute(select(func.count()).where(dataset_ref.c.dataset_id == row.id)).scalar_one()
     _require_room(held, MOST_REFS, "branches and tags in a dataset", "too-many-refs")
     with taken(ConflictProblem(f"There is a branch or tag {request.name!r} already.", code="name-taken")):
@@ -314,17 +330,33 @@ def first_parents(dataset_id: str, start: str, steps: int) -> CTE:
     )
 
 
-def _by_digits(tx: Transaction, dataset_id: str, name: str) -> str:
+def _commits_by_digits(tx: Transaction, dataset_id: str, name: str) -> Sequence[str]:
+    """Return at most two commits whose digest begins with the digits in `name`; none if `name` is not digits."""
     match = _DIGITS.fullmatch(name)
     if match is None:
-        raise _no_version(name)
+        return ()
     first = f"sha256:{match[1]}"
     statement = select(dataset_commit.c.digest).where(
         dataset_commit.c.dataset_id == dataset_id,
         dataset_commit.c.digest >= first,
         dataset_commit.c.digest <= f"{first}g",
     )
-    found = tx.execute(statement.limit(2)).scalars().all()
+    return tx.execute(statement.limit(2)).scalars().all()
+
+
+def _require_no_commit(tx: Transaction, dataset_id: str, name: str) -> None:
+    """Raise `ConflictProblem` if the digest of a commit begins with a name.
+
+    A branch or tag with this name would hide the commit from everybody who names it by these digits.
+    """
+    if found := _commits_by_digits(tx, dataset_id, name):
+        raise ConflictProblem(
+            f"The commit {found[0]} is named by its first digits {name!r}; choose another name.", code="name-taken"
+        )
+
+
+def _by_digits(tx: Transaction, dataset_id: str, name: str) -> str:
+    found = _commits_by_digits(tx, dataset_id, name)
     if not found:
         raise _no_version(name)
     if len(found) > 1:

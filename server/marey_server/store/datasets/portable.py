@@ -14,6 +14,7 @@ from marey_server.store.datasets.contents import Contents, find_contents_of
 from marey_server.store.datasets.history import revisions_with
 from marey_server.store.datasets.naming import find_dataset
 from marey_server.store.items.consents import find_ended_with, record_override, require_consent
+from marey_server.store.items.facets import facets_of_contents
 from marey_server.store.items.reading import MOST_BYTES_AT_ONCE
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.purge_lock import hold_off_purges
@@ -44,7 +45,7 @@ def check_export(tx: Transaction, project: str, name: str, request: ExportCheck)
 
 
 def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> dict[str, Any]:
-    """Load the requested revisions of a project by content digest, and the requested documents with encoded arrays.
+    """Load the requested revisions of a project by content digest, their facets, and documents with encoded arrays.
 
     A revision or document that the project does not have is None. If the documents together are too large, the list of
     documents ends early; it always contains the first one.
@@ -56,7 +57,14 @@ def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> di
     return {
         "revisions": _described(tx, held, contents, request),
         "documents": _loaded(tx, project_row.id, held, request),
+        "facets": _facets(tx, project_row.id, request),
     }
+
+
+def _facets(tx: Transaction, project_id: str, request: ContentsRequest) -> list[dict[str, float]]:
+    """Return the facets of each requested revision."""
+    found = facets_of_contents(tx, project_id, request.revisions)
+    return [found.get(one, {}) for one in request.revisions]
 
 
 def _described(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Row, and_, or_, select
+from sqlalchemy import Row, or_, select
 
 from marey_schemas.access import Role
 from marey_schemas.datasets.proposal_states import ProposalState
@@ -72,16 +72,15 @@ def require_deletable(tx: Transaction, ref: Row[Any]) -> None:
         raise ConflictProblem(
             f"The branch {ref.name!r} is protected; remove the protection before you delete the branch.", code=CODE
         )
-    followed = and_(proposal.c.source == ref.name, proposal.c.head.is_(None))
     about = select(proposal.c.number).where(
         proposal.c.dataset_id == ref.dataset_id,
         proposal.c.state == ProposalState.OPEN.value,
-        or_(followed, proposal.c.target == ref.name),
+        or_(proposal.c.source == ref.name, proposal.c.target == ref.name),
     )
     number = tx.execute(about.limit(1)).scalar()
     if number is not None:
         raise ConflictProblem(
-            f"The open proposal {number} has the branch {ref.name!r} as source or target; merge or close it first.",
+            f"The open proposal {number} has {ref.name!r} as source or target; merge or close it first.",
             code="proposal-open",
             context={"proposal": number},
         )

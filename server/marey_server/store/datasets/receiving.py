@@ -33,12 +33,21 @@ from marey_server.store.datasets.revisions import item_name, publish_contents, r
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.items import Draft, StoredDocument
+from marey_server.store.items.facets import fill_facets
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges, last_purge, require_no_purge_since
-from marey_server.store.tables import dataset_commit
-from marey_server.store.transaction import Transaction
-from marey_versions.records import CommitRecord, RevisionKey, contents_in, key_of, local_document, revision_content
+from marey_server.store.tables import dataset_commit, item, revision
+from marey_server.store.transaction import Transaction, in_lists
+from marey_versions.records import (
+    CommitRecord,
+    RevisionKey,
+    contents_in,
+    key_of,
+    local_document,
+    references_in,
+    revision_content,
+)
 from marey_versions.tree.building import build
 from marey_versions.tree.chunks import Value
 from marey_versions.tree.editing import change
@@ -57,21 +66,49 @@ class LocalRevisions:
     """Digest of the document of each part."""
     last_purge: int
     """Time of the last purge of the project before the revisions were found."""
+    facets: Mapping[str, Mapping[str, float]]
+    """Facets of the received revisions."""
 
 
 def find_local(tx: Transaction, project: str, received: Sequence[ReceivedRevision]) -> LocalRevisions:
     """Find the revisions that a request contains or refers to.
 
-    Raises `ConflictProblem` if the project lacks a revision that a received revision refers to.
+    Raises `ConflictProblem` if the project lacks a revision that a received revision refers to, and `InvalidProblem` if
+    a received revision refers to an item of this project by its id.
     """
     project_row = projects.require(tx, project)
     last = last_purge(tx, project_row.id)
+    _require_no_own_ids(tx, project_row.id, received)
     wanted = {content for one in received for content in contents_in(one.parts)}
     found = revisions_with(tx, project_row.id, wanted | {one.content for one in received})
     require_contents(wanted - found.keys())
     parts = read_part_digests(tx, set(found.values()))
     held = {content: RevisionKey(*key) for content, key in found.items()}
-    return LocalRevisions(held, {content: parts[key] for content, key in held.items()}, last)
+    facets = {one.content: one.facets for one in received}
+    return LocalRevisions(held, {content: parts[key] for content, key in held.items()}, last, facets)
+
+
+def _require_no_own_ids(tx: Transaction, project_id: str, received: Sequence[ReceivedRevision]) -> None:
+    """Raise `InvalidProblem` if a received document refers to an item of this project by its id.
+
+    The sender refers to all items of its own project by content. An id of another project, which anybody can write into
+    free members of a document, stays in the document, and is a reference only in the project that has the item. There,
+    the document would have another digest.
+    """
+    named = {key: one for one in received for key in references_in(one.parts)}
+    ids = sorted({key.item for key in named})
+    for some in in_lists(ids):
+        own = select(revision.c.item_id, revision.c.number).join(item, item.c.id == revision.c.item_id)
+        for row in tx.execute(own.where(revision.c.item_id.in_(some), item.c.project_id == project_id)):
+            one = named.get(RevisionKey(row.item_id, row.number))
+            if one is not None:
+                raise InvalidProblem(
+                    f"The {one.kind.value} {one.path or one.content!r} refers to the item {row.item_id} of this "
+                    "project by its id, so its content would have another digest here. Receive the versions in "
+                    "another project.",
+                    code="other-content",
+                    context={"content": one.content, "item": row.item_id, "revision": row.number},
+                )
 
 
 def prepare_revisions(received: Sequence[ReceivedRevision], local: LocalRevisions) -> dict[str, Draft]:
@@ -124,6 +161,7 @@ def store_revisions(
     }
     rights = rights_of_caller(tx, project_row)
     added = publish_contents(tx, project_row, placed, author_id=tx.principal.user_id, rights=rights)
+    fill_facets(tx, project_row.id, local.facets)
     return StoredRevisions(added=added)
 
 

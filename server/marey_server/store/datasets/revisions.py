@@ -94,15 +94,15 @@ def store_combined(
 
     `merged` maps the content digests of parts that were merged to their documents.
     """
-    sides = {side.content for one in combined for side in (one.ours, one.theirs)}
+    sides = {side.content for one in combined for part in one.entry.parts if (side := one.source_of(part)) is not None}
     held = {content: RevisionKey(*key) for content, key in revisions_with(tx, project_row.id, sides).items()}
     require_contents(sides - held.keys())
     stored = read_part_digests(tx, set(held.values()))
     drafts: dict[str, Draft] = {}
-    for entry, ours, theirs in combined:
-        parts: dict[str, PartContent] = {}
+    for one in combined:
+        entry, parts = one.entry, dict[str, PartContent]()
         for part, digest in entry.parts.items():
-            side = next((one for one in (ours, theirs) if one.parts.get(part) == digest), None)
+            side = one.source_of(part)
             parts[part] = merged[digest] if side is None else StoredDocument(stored[held[side.content]][part])
         drafts[entry.content] = Draft(
             name_in_batch=entry.content, kind=Kind(entry.kind), parts=parts, reuse="new", message=message,

@@ -17,6 +17,7 @@ from marey_server.store.database.violations import taken
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.items.drafts import Draft
+from marey_server.store.items.facets import repeat_facets
 from marey_server.store.items.history import no_revision
 from marey_server.store.items.publishing import publish
 from marey_server.store.items.reading import find_item, no_item, shown_items
@@ -152,6 +153,7 @@ def revert_item(
     if not parts:
         raise no_revision(item_id, request.revision)
     set_parts(tx, project_row, kind, item_id, parts, request.message or f"Revert to revision {request.revision}")
+    repeat_facets(tx, item_id, request.revision, _find_to_change(tx, project_row, kind, item_id).head)
     return _shown(tx, project_row, kind, item_id)
 
 

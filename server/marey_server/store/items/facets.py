@@ -1,4 +1,4 @@
-"""Facets (named numbers that jobs publish about revisions of their inputs): checks, staging and publication.
+"""Facets (named numbers that jobs publish about revisions of their inputs): checks, staging, publication and copies.
 
 An attempt stages facets together with its results. Like results, facets are published when the attempt succeeds,
 deleted if it fails, and shared with identical jobs. An attempt can state facets only of the inputs of its job, and of
@@ -7,10 +7,10 @@ the clips of evaluations among these inputs. The kind of the job must declare th
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import and_, select
 
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.facets import ItemFacets
@@ -125,6 +125,63 @@ def publish_facets(tx: Transaction, project_id: str, facets: StoredFacets) -> No
             added = tx.insert_into(item_facet)
             key = list(item_facet.primary_key.columns)
             tx.execute(added.on_conflict_do_update(index_elements=key, set_={"value": added.excluded.value}), rows)
+
+
+def facets_of_contents(tx: Transaction, project_id: str, contents: Iterable[str]) -> dict[str, dict[str, float]]:
+    """Return the facets of revisions of a project by content digest; contents without facets are left out.
+
+    Revisions with the same content share their facets. If they have different values, the newest revision decides.
+    """
+    found: dict[str, dict[str, float]] = {}
+    wanted = sorted(set(contents))
+    for some in in_lists(wanted):
+        statement = (
+            select(revision.c.content, item_facet.c.name, item_facet.c.value)
+            .join(item, item.c.id == revision.c.item_id)
+            .join(
+                item_facet, and_(item_facet.c.item_id == revision.c.item_id, item_facet.c.number == revision.c.number)
+            )
+            .where(revision.c.content.in_(some), item.c.project_id == project_id)
+            .order_by(revision.c.created_us, revision.c.item_id, revision.c.number)
+        )
+        for row in tx.execute(statement):
+            found.setdefault(row.content, {})[row.name] = row.value
+    return found
+
+
+def fill_facets(tx: Transaction, project_id: str, values: Mapping[str, Mapping[str, float]]) -> None:
+    """Give facets to all revisions of a project with certain content; facets that a revision has keep their values.
+
+    `values` maps content digests to the values by name. Other revisions than those of `publish_facets` get facets only
+    here: revisions that come from archives and other servers, and revisions to which a checkout gives known content.
+    """
+    contents = sorted(content for content, named in values.items() if named)
+    for some in in_lists(contents):
+        with_content = (
+            select(revision.c.content, revision.c.item_id, revision.c.number)
+            .join(item, item.c.id == revision.c.item_id)
+            .where(revision.c.content.in_(some), item.c.project_id == project_id, item.c.purged_us.is_(None))
+            .order_by(revision.c.item_id, revision.c.number)
+        )
+        add_facets(tx, [(row.item_id, row.number, values[row.content]) for row in tx.execute(with_content)])
+
+
+def repeat_facets(tx: Transaction, item_id: str, number: int, again: int) -> None:
+    """Give the revision `again` of an item the facets of an earlier revision with the same content."""
+    of_revision = (item_facet.c.item_id == item_id, item_facet.c.number == number)
+    rows = tx.execute(select(item_facet.c.name, item_facet.c.value).where(*of_revision))
+    add_facets(tx, [(item_id, again, {row.name: row.value for row in rows})])
+
+
+def add_facets(tx: Transaction, stated: Iterable[tuple[str, int, Mapping[str, float]]]) -> None:
+    """Add facets to revisions: item id, number and values by name; facets that a revision has keep their values."""
+    rows = [
+        {"item_id": one, "number": number, "name": name, "value": value}
+        for one, number, values in stated
+        for name, value in sorted(values.items())
+    ]
+    if rows:
+        tx.execute(tx.insert_into(item_facet).on_conflict_do_nothing(), rows)
 
 
 def _not_purged(tx: Transaction, project_id: str, items: Sequence[str]) -> Sequence[str]:

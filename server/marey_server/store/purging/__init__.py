@@ -5,6 +5,7 @@ An item that something still needs is not purged; the module `holders` finds wha
 """
 
 from marey_server.store.purging.candidates import PreparedPurge, prepare_purge
+from marey_server.store.purging.citations import delete_uncited_ref, find_citations
 from marey_server.store.purging.recording import preview_purge, record_purge
 from marey_server.store.purging.whole_datasets import (
     prepare_dataset_purge,
@@ -14,6 +15,8 @@ from marey_server.store.purging.whole_datasets import (
 
 __all__ = [
     "PreparedPurge",
+    "delete_uncited_ref",
+    "find_citations",
     "prepare_dataset_purge",
     "prepare_purge",
     "preview_dataset_purge",

@@ -7,38 +7,32 @@ has, too, stays readable there, and does not count.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Row, delete, exists, func, select
 
-from marey_schemas.kinds import Kind
-from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, ItemHolder, JobHolder, words_of
-from marey_schemas.queue.jobs import JobState, commits_of
+from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, words_of
 from marey_server import faults
 from marey_server.errors import ConflictProblem, NotFoundProblem
 from marey_server.store import projects
 from marey_server.store.datasets.chunks import StoredChunks
-from marey_server.store.jobs.reading import UNFINISHED
+from marey_server.store.datasets.manifests import roots_of_folders
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import PURGED_MEANWHILE, begin_purge
-from marey_server.store.purging.holders import FoundHolders
+from marey_server.store.purging.citations import holders_of, jobs_citing
 from marey_server.store.purging.recording import STILL_HELD
 from marey_server.store.tables import (
-    collection,
     commit_parent,
     dataset,
     dataset_commit,
     dataset_ref,
     fast_forward,
-    item,
-    job,
     proposal,
     proposal_check,
     proposal_comment,
     proposal_review,
-    revision,
     tree_chunk,
 )
 from marey_server.store.transaction import Transaction, in_lists
@@ -61,7 +55,9 @@ class PreparedDatasetPurge:
     citing: frozenset[str]
     """Jobs that read one of `commits`; while the dataset is deleted, no new jobs can read these, except retries."""
     chunks: Mapping[str, int]
-    """Digests of the chunks that are only in trees of this dataset, with the times at which they were stored last."""
+    """Digests of the chunks that no other dataset needs, with the times at which they were stored last.
+
+    Apart from the chunks of this dataset, these are chunks of former selections, of which no dataset has a record."""
     freed_bytes: int
 
 
@@ -83,20 +79,18 @@ def prepare_dataset_purge(tx: Transaction, project: str, request: DatasetPurgeRe
     project_row = projects.require(tx, project)
     projects.require_scope(tx, project, "read")  # because the answer shows names
     row = _find(tx, project_row, request.dataset)
-    own = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id == row.id)
     others = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id != row.id)
-    store = StoredChunks(tx)
-    needed = _below(store, set(tx.execute(others).scalars()), known=())
-    going = sorted(_below(store, set(tx.execute(own).scalars()), known=needed) - needed)
+    roots = set(tx.execute(others).scalars()) | roots_of_folders(tx, dataset.c.id != row.id)
+    needed = _below(StoredChunks(tx), roots)
     chunks: dict[str, int] = {}
     size_bytes = 0
     stored = select(tree_chunk.c.digest, tree_chunk.c.created_us, func.length(tree_chunk.c.data).label("size"))
-    for some in in_lists(going):
-        for found in tx.execute(stored.where(tree_chunk.c.digest.in_(some))):
+    for found in tx.execute(stored.execution_options(yield_per=1000)):
+        if found.digest not in needed:
             chunks[found.digest] = found.created_us
             size_bytes += found.size
     commits = _own_commits(tx, project_row, row.id)
-    return PreparedDatasetPurge(row.id, commits, _citing(tx, project_row, commits), chunks, size_bytes)
+    return PreparedDatasetPurge(row.id, commits, jobs_citing(tx, project_row.id, commits), chunks, size_bytes)
 
 
 def record_dataset_purge(
@@ -145,7 +139,7 @@ def _answer(
 ) -> DatasetPurgeAnswer:
     row = _find(tx, project_row, prepared.id)
     others = (dataset.c.project_id == project_row.id, dataset.c.name == row.name, dataset.c.id != row.id)
-    held = _holders(tx, _with_retries(tx, prepared.citing))
+    held = holders_of(tx, prepared.citing)
     return DatasetPurgeAnswer(
         preview=request.preview, dataset=row.id, name=row.name, commits=_count(tx, dataset_commit, row.id),
         proposals=_count(tx, proposal, row.id), holders=tuple(held.holders), others=held.others,
@@ -174,55 +168,6 @@ def _own_commits(tx: Transaction, project_row: ProjectRow, dataset_id: str) -> f
     return frozenset(tx.execute(own).scalars())
 
 
-def _citing(tx: Transaction, project_row: ProjectRow, commits: frozenset[str]) -> frozenset[str]:
-    """Return the jobs of the project whose inputs were taken from `commits`."""
-    if not commits:
-        return frozenset()
-    jobs = select(job.c.id, job.c.inputs).where(job.c.project_id == project_row.id).execution_options(yield_per=10)
-    return frozenset(row.id for row in tx.execute(jobs) if not commits.isdisjoint(commits_of(row.inputs)))
-
-
-def _with_retries(tx: Transaction, citing: Iterable[str]) -> set[str]:
-    """Return the ids of the jobs `citing`, of all their retries, and of the tasks of all these jobs."""
-    found = set(citing)
-    ahead = found
-    while ahead:
-        further: set[str] = set()
-        for some in in_lists(sorted(ahead)):
-            further.update(tx.execute(select(job.c.id).where(job.c.retry_of.in_(some))).scalars())
-            further.update(tx.execute(select(job.c.id).where(job.c.parent_id.in_(some))).scalars())
-        ahead = further - found
-        found = found | further
-    return found
-
-
-def _holders(tx: Transaction, citing: Collection[str]) -> FoundHolders:
-    """Return what holds the dataset: citing jobs that have not ended, and items that citing jobs made.
-
-    Purged items do not count.
-    """
-    held = FoundHolders()
-    ordered = sorted(citing)
-    items: set[str] = set()
-    for some in in_lists(ordered):
-        jobs = select(job.c.id, job.c.kind, job.c.state).where(
-            job.c.id.in_(some), job.c.state.in_(UNFINISHED), job.c.parent_id.is_(None)
-        )
-        for row in tx.execute(jobs.order_by(job.c.id)):
-            held.add(JobHolder(job=row.id, kind=row.kind, state=JobState(row.state)))
-        items.update(tx.execute(select(revision.c.item_id).where(revision.c.job_id.in_(some))).scalars())
-    for some in in_lists(sorted(items)):
-        made = (
-            select(item.c.id, item.c.kind, item.c.name, item.c.deleted_us, collection.c.path)
-            .join(collection, collection.c.id == item.c.collection_id)
-            .where(item.c.id.in_(some), item.c.purged_us.is_(None))
-        )
-        for row in tx.execute(made.order_by(item.c.id)):
-            path = f"{row.path}/{row.name}".lstrip("/")
-            held.add(ItemHolder(item=row.id, kind=Kind(row.kind), path=path, deleted=row.deleted_us is not None))
-    return held
-
-
 def _still_held(answer: DatasetPurgeAnswer) -> ConflictProblem:
     more = f" and {answer.others:,} more" if answer.others else ""
     return ConflictProblem(
@@ -236,13 +181,10 @@ def _still_held(answer: DatasetPurgeAnswer) -> ConflictProblem:
 # -- chunks -----------------------------------------------------------------------------------------------------------
 
 
-def _below(store: StoredChunks, roots: Collection[str], known: Collection[str]) -> set[str]:
-    """Return the digests of the chunks `roots` and of all chunks below them.
-
-    The search leaves out chunks in `known`, and does not search below them.
-    """
+def _below(store: StoredChunks, roots: Collection[str]) -> set[str]:
+    """Return the digests of the chunks `roots` and of all chunks below them."""
     found: set[str] = set()
-    waiting = set(roots).difference(known)
+    waiting = set(roots)
     while waiting:
         batch = next(in_lists(waiting))
         waiting.difference_update(batch)
@@ -250,7 +192,7 @@ def _below(store: StoredChunks, roots: Collection[str], known: Collection[str]) 
         for digest, data in store.load(batch).items():
             chunk = decode_trusted(digest, data)
             if isinstance(chunk, Branch):
-                waiting |= {child.digest for child in chunk.children}.difference(found, known)
+                waiting |= {child.digest for child in chunk.children}.difference(found)
     return found
 
 

@@ -16,6 +16,7 @@ from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.history import tree_of
 from marey_server.store.datasets.naming import find_dataset
 from marey_server.store.datasets.proposals.opening import find_proposal, lock_open, touch
+from marey_server.store.datasets.proposals.texts import require_room
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import proposal_comment, user
 from marey_server.store.transaction import Transaction
@@ -29,8 +30,8 @@ MOST_OF_EACH = 1000
 def add_comment(tx: Transaction, project: str, name: str, number: int, request: CommentCreate) -> Comment:
     """Comment on an open proposal.
 
-    Raises `ConflictProblem` if the proposal has ended or has too many comments. Raises `NotFoundProblem` if the request
-    names an entry that neither the proposed version nor the target has.
+    Raises `NotFoundProblem` if the request names an entry that neither the proposed version nor the target has, and
+    `ConflictProblem` if the proposal has ended or has too many comments. Raises the errors of `require_room`.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
@@ -38,6 +39,7 @@ def add_comment(tx: Transaction, project: str, name: str, number: int, request: 
     row = lock_open(tx, found.id, number)
     if request.path is not None and request.kind is not None:
         _require_entry(tx, row, request.path, request.kind)
+    require_room(tx, project_row.id, found.id, number, request.text)
     first, end = request.frames or (None, None)
     values = {
         "dataset_id": found.id, "proposal": number, "number": next_number(tx, proposal_comment, row, "comments"),

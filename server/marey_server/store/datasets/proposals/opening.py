@@ -17,6 +17,7 @@ from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.datasets.committing import head_of
 from marey_server.store.datasets.naming import find_dataset, find_ref, lock_refs, resolve
+from marey_server.store.datasets.proposals.texts import require_room
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import dataset_ref, proposal, user
 from marey_server.store.transaction import Transaction
@@ -122,8 +123,8 @@ def shown_proposal(row: Row[Any]) -> Proposal:
 def open_proposal(tx: Transaction, project: str, name: str, request: ProposalCreate) -> Proposal:
     """Open a proposal to merge a version into a branch.
 
-    Raises `NotFoundProblem` for an unknown version or branch, and `InvalidProblem` if both are the same branch. Raises
-    `ConflictProblem` if the dataset has too many open proposals.
+    Raises `NotFoundProblem` for an unknown version or branch, `InvalidProblem` if both are the same branch, and
+    `ConflictProblem` if the dataset has too many open proposals. Raises the errors of `require_room`.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
@@ -137,15 +138,17 @@ def open_proposal(tx: Transaction, project: str, name: str, request: ProposalCre
     follows = source is not None and source.kind == RefKind.BRANCH
     _require_room(tx, found.id)
     newest = select(func.coalesce(func.max(proposal.c.number), 0)).where(proposal.c.dataset_id == found.id)
+    number = tx.execute(newest).scalar_one() + 1
+    require_room(tx, project_row.id, found.id, number, request.description)
     row = {
-        "dataset_id": found.id, "number": tx.execute(newest).scalar_one() + 1, "title": request.title,
+        "dataset_id": found.id, "number": number, "title": request.title,
         "description": request.description, "author_id": tx.principal.user_id, "source": request.source,
         "target": request.target, "state": ProposalState.OPEN.value, "head": None if follows else head,
         "created_us": tx.now_us, "updated_us": tx.now_us,
     }  # fmt: skip
     tx.execute(insert(proposal).values(**row))
-    tx.emit("proposal.opened", found.id, project_id=project_row.id, number=row["number"], title=request.title)
-    return shown_proposal(find_proposal(tx, found.id, row["number"]))
+    tx.emit("proposal.opened", found.id, project_id=project_row.id, number=number, title=request.title)
+    return shown_proposal(find_proposal(tx, found.id, number))
 
 
 def _require_room(tx: Transaction, dataset_id: str) -> None:

@@ -1,0 +1,51 @@
+"""Checkouts of versions of datasets, or of parts of them, into folders, in requests and answers."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, StringConstraints
+
+from marey_schemas.base import Answer, Request
+from marey_schemas.datasets.commits import EntryPath
+from marey_schemas.datasets.naming import MAIN, Version
+from marey_schemas.queries.grammar import MOST_CHARACTERS
+
+MOST_PATHS = 1000
+"""Greatest number of paths in one selection."""
+
+
+class CheckoutRequest(Request):
+    """Request to bring the folder of a dataset to the state of a version, or of a part of it.
+
+    `query` and `paths` select the entries that are checked out; without them, all entries are. An entry must meet both.
+    The folder remembers its selection: a commit of the folder changes only selected and new entries.
+    """
+
+    version: Version = MAIN
+    query: Annotated[str, StringConstraints(min_length=1, max_length=MOST_CHARACTERS)] | None = Field(
+        None,
+        description="Query that selects entries, as in lists of items. `path`, `folder`, `name` and `tag` are those of "
+        "the entry in the folder of the dataset; the other fields are those of its content.",
+    )
+    paths: tuple[EntryPath, ...] = Field(
+        (), max_length=MOST_PATHS, description="Entries, or folders whose entries are selected; empty: all entries."
+    )
+    discard: bool = Field(False, description="Discard changes in the folder that no commit has recorded.")
+
+    @property
+    def partial(self) -> bool:
+        """Whether the request selects entries."""
+        return self.query is not None or bool(self.paths)
+
+
+class CheckoutAnswer(Answer):
+    """Result of a checkout, with the numbers of entries that it changed in the folder of a dataset."""
+
+    commit: str = Field(description="Digest of the commit whose content the folder has now.")
+    taken: int = Field(description="Number of entries that the folder has now.")
+    entries: int = Field(description="Number of entries of the version.")
+    added: int
+    removed: int
+    moved: int
+    changed: int

@@ -1,0 +1,69 @@
+"""Room for the texts of proposals: descriptions, comments, reviews and checks.
+
+Each text counts with its bytes in UTF-8 and with `BYTES_OF_ROW`, so that many short or empty texts are limited, too.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import ColumnElement, LargeBinary, Select, Table, cast, func, select
+
+from marey_server.errors import ConflictProblem, QuotaExceededProblem
+from marey_server.store.tables import dataset, proposal, proposal_check, proposal_comment, proposal_review
+from marey_server.store.transaction import Transaction
+
+MOST_TEXT_OF_PROPOSAL = 2 * 2**20
+"""Greatest number of bytes of all texts of one proposal."""
+BYTES_OF_ROW = 200
+
+_TEXTS: tuple[tuple[Table, ColumnElement[Any], ColumnElement[int]], ...] = (
+    (proposal, proposal.c.description, proposal.c.number),
+    (proposal_comment, proposal_comment.c.text, proposal_comment.c.proposal),
+    (proposal_review, proposal_review.c.text, proposal_review.c.proposal),
+    (proposal_check, proposal_check.c.text, proposal_check.c.proposal),
+)
+"""Tables with texts; for each, the column with the text, and the column with the number of the proposal."""
+
+
+def require_room(tx: Transaction, project_id: str, dataset_id: str, number: int, text: str) -> None:
+    """Check that a proposal, which may be a new one, can get a further text.
+
+    Concurrent checks of one project run one after another. Raises `ConflictProblem` if the texts of the proposal would
+    be too long together, and `QuotaExceededProblem` if those of all proposals of the project would be.
+    """
+    more = len(text.encode()) + BYTES_OF_ROW
+    tx.lock(f"texts of proposals {project_id}")
+    used = sum(
+        tx.execute(_size(tx, table, column).where(table.c.dataset_id == dataset_id, place == number)).scalar_one()
+        for table, column, place in _TEXTS
+    )
+    if used + more > MOST_TEXT_OF_PROPOSAL:
+        raise ConflictProblem(
+            f"The texts of a proposal have at most {MOST_TEXT_OF_PROPOSAL:,} bytes. Those of this one have {used:,}, "
+            f"and this needs {more:,} more. Close the proposal and open another, or write a shorter text.",
+            code="long-proposal",
+            context={"used": used, "limit": MOST_TEXT_OF_PROPOSAL},
+        )
+    _require_room_in_project(tx, project_id, more)
+
+
+def _require_room_in_project(tx: Transaction, project_id: str, more: int) -> None:
+    of_project = select(dataset.c.id).where(dataset.c.project_id == project_id)
+    used = sum(
+        tx.execute(_size(tx, table, column).where(table.c.dataset_id.in_(of_project))).scalar_one()
+        for table, column, _ in _TEXTS
+    )
+    limit = tx.quotas.project_proposal_bytes
+    if used + more > limit:
+        raise QuotaExceededProblem(
+            f"The texts of the project's proposals have {used:,} bytes, the limit is {limit:,}, and this needs "
+            f"{more:,} more. Purge deleted datasets, whose proposals count, or ask the operator to raise the setting "
+            "`project_proposal_bytes`.",
+            context={"quota": "project_proposal_bytes", "used": used, "limit": limit},
+        )
+
+
+def _size(tx: Transaction, table: Table, text: ColumnElement[Any]) -> Select[Any]:
+    size = func.octet_length(text) if tx.is_postgres else func.length(cast(text, LargeBinary))
+    return select(func.coalesce(func.sum(size + BYTES_OF_ROW), 0)).select_from(table)

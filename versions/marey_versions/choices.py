@@ -1,0 +1,54 @@
+"""Resolutions of a merge: which of them decides which conflict, or which part of a conflict."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Collection, Container, Iterable, Mapping
+from typing import NamedTuple
+
+from marey_schemas.datasets.merges import Side
+
+
+class Choice(NamedTuple):
+    """Decision of a person about one conflict, or about one part of a conflict."""
+
+    key: str
+    """Key of the conflict."""
+    take: Side
+    part: str | None = None
+    """Name of the part that is decided; None: all parts of the conflict."""
+
+
+class Choices:
+    """Resolutions that are left. Each decides one conflict only, because a person has seen no other one."""
+
+    def __init__(self, resolutions: Iterable[Choice], used: set[str]) -> None:
+        self._left: defaultdict[str, deque[Choice]] = defaultdict(deque)
+        for one in resolutions:
+            self._left[one.key].append(one)
+        self._used = used
+
+    def take(self, key: str, groups: Mapping[str, Collection[str]], sides: Container[Side]) -> Side | dict[str, Side]:
+        """Return the decision about the next conflict with this key, and use up the resolutions that make it.
+
+        The decision is a side, or the sides of single parts; parts without a resolution are missing. `groups` contains
+        for each part in conflict the parts that must come from the same side, the part itself included. A resolution of
+        a part is used only if its side is among `sides`.
+        """
+        found: dict[str, Side] = {}
+        while len(found) < len(groups) and (left := self._left.get(key)):
+            one = left[0]
+            if one.part is None and not found:
+                return self._next(key).take
+            if one.part is None or one.part not in groups or one.part in found or one.take not in sides:
+                break
+            found.update(dict.fromkeys(groups[one.part], self._next(key).take))
+        return found
+
+    def _next(self, key: str) -> Choice:
+        self._used.add(key)
+        return self._left[key].popleft()
+
+    def left(self) -> list[Choice]:
+        """Return the resolutions that are left: by key, and those with the same key in their order."""
+        return [one for key in sorted(self._left) for one in self._left[key]]
