@@ -211,7 +211,7 @@ class DatasetHandle:
     def check_out(
         self, version: str = MAIN, *, query: str | None = None, paths: Sequence[str] = (), discard: bool = False
     ) -> CheckoutAnswer:
-        """Bring the folder of the dataset to the state of a version.
+        """Change the folder of the dataset to the content of a version.
 
         With `query` or `paths`, only the entries are checked out that the query selects and that are at one of the
         paths or below it. The folder remembers this selection: later commits of the folder keep all other entries.

@@ -266,7 +266,7 @@ def checkout(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Bring the folder of a dataset to the state of a version. Items removed by the command can be restored.
+    """Change the folder of a dataset to the content of a version. Items that the command removes can be restored.
 
     With --query or --path, only a part of the version is checked out. The folder remembers the part: commits of the
     folder keep all entries that were not checked out. To take all entries again, repeat the command without the option.
