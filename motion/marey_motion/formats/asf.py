@@ -38,11 +38,12 @@ class Bone:
 
     `vector` is the direction times the length, in the file's unit and world axes. `frame` is the quaternion of the
     bone's `axis`. `channels` are the degrees of freedom in order ("rx", "tz"). `line` is the number of the bone's line
-    in the file.
+    in the file. `written_name` is the name as bytes of the file, by which an AMC file calls the bone.
     """
 
     name: str
     line: int
+    written_name: bytes = b""
     direction: list[float] | None = None
     length: float = 0.0
     frame: NDArray[np.float64] = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
@@ -178,7 +179,7 @@ class _AsfReader:
         self.lines = lines
         self.degrees = True
         self.length_unit: float | None = None
-        self.root = Bone(ROOT, line=1, channels=("tx", "ty", "tz", "rx", "ry", "rz"))
+        self.root = Bone(ROOT, line=1, written_name=ROOT.encode(), channels=("tx", "ty", "tz", "rx", "ry", "rz"))
         self.root_position = [0.0, 0.0, 0.0]
         self.root_axis, self.root_orientation = "xyz", [0.0, 0.0, 0.0]
         self.bones: dict[str, Bone] = {}
@@ -236,7 +237,8 @@ class _AsfReader:
         elif keyword == b"end":
             self._end_bone(bone)
         elif keyword == b"name":
-            bone.name = decode_name(b" ".join(words[1:]))
+            bone.written_name = b" ".join(words[1:])
+            bone.name = decode_name(bone.written_name)
         elif keyword == b"direction":
             bone.direction = self.lines.numbers(words[1:], 3, "direction", bone.name)
         elif keyword == b"length":

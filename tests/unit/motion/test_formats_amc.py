@@ -82,6 +82,14 @@ def test_the_root_may_list_its_channels_in_any_order() -> None:
     np.testing.assert_array_equal(other.rotations, read().rotations)
 
 
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8"])
+def test_bones_have_the_same_name_in_both_files_in_any_encoding(encoding: str) -> None:
+    asf, amc = (text.replace("shin", "tibia_größe").encode(encoding) for text in (ASF, AMC))
+    found = read_amc(amc, "take.amc", companion=asf)
+    assert found.joint_names == ("root", "thigh", "tibia_größe", "sole")
+    np.testing.assert_array_equal(found.rotations, read().rotations)
+
+
 def test_radians_are_read_as_radians() -> None:
     in_radians = AMC.replace(":DEGREES", ":RADIANS").replace("shin 70", f"shin {float(np.radians(70))!r}")
     found = read(in_radians).rotations[0, 2]
