@@ -45,7 +45,7 @@ class Bone:
     line: int
     written_name: bytes = b""
     direction: list[float] | None = None
-    length: float = 0.0
+    length: float | None = None
     frame: NDArray[np.float64] = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
     channels: tuple[str, ...] = ()
 
@@ -53,7 +53,7 @@ class Bone:
     def vector(self) -> NDArray[np.float64]:
         direction = np.array(self.direction or [0.0, 0.0, 0.0])
         norm = np.linalg.norm(direction)
-        return direction / norm * self.length if norm > 0 else direction
+        return direction / norm * (self.length or 0.0) if norm > 0 else direction
 
 
 @dataclass
@@ -261,6 +261,8 @@ class _AsfReader:
             raise self.lines.error("two bones have this name; rename one of them", joint=bone.name)
         if bone.direction is None:
             raise self.lines.error("the bone has no direction; add a line 'direction x y z'", joint=bone.name)
+        if bone.length is None:
+            raise self.lines.error("the bone has no length; add a line 'length x'", joint=bone.name)
         if len(self.bones) + 1 == MAX_JOINTS:
             raise FormatLimit(
                 f"the file has more than {MAX_JOINTS} bones, the most that are accepted",

@@ -174,6 +174,7 @@ def test_what_is_wrong_in_an_amc_is_named_with_its_line(amc: str, line: int, joi
     [
         ("direction 0 -1 0\n    length 8", "length 8", "thigh", "no direction"),
         ("direction 0 -1 0\n    length 8", "direction 0 -1\n    length 8", "thigh", "but 3 are needed"),
+        ("    length 8\n", "", "thigh", "no length"),
         ("length 8", "length long", "thigh", "not a number"),
         ("axis 0 0 20 XYZ", "axis 0 0 20 XYX", "thigh", "order of axes"),
         ("dof rx ry rz", "dof rx ry rw", "thigh", "RX RY RZ"),
