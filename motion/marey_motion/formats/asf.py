@@ -5,6 +5,9 @@ measured. With C the rotation of that frame and M the rotation by the angles, th
 its parent. The joints made from the bones have world-aligned frames at rest (identity rest rotations, as in BVH). Each
 joint is at the start of its bone, so the offset of a joint is the bone vector of the parent; the end of a bone without
 children becomes an end site.
+
+The `position` and `orientation` of the section :root place the whole skeleton in the world, and an AMC moves it
+relative to this place. So the orientation is the rest rotation of the root.
 """
 
 from __future__ import annotations
@@ -61,7 +64,8 @@ class AsfSkeleton:
     """The content of an ASF file: bones in depth-first order, the root first.
 
     `parents` are indices; `length_unit` is the file's `units length` (CMU: 0.45), None if the file has none; `degrees`
-    is false if the file's angles are in radians; `root_position` is the root's position in the rest pose.
+    is false if the file's angles are in radians; `root_position` and the quaternion `root_orientation` are those of the
+    root in the rest pose.
     """
 
     bones: list[Bone]
@@ -69,6 +73,7 @@ class AsfSkeleton:
     length_unit: float | None
     degrees: bool
     root_position: NDArray[np.float64]
+    root_orientation: NDArray[np.float64]
 
     def offsets(self) -> NDArray[np.float64]:
         """Compute the offset of each joint from its parent.
@@ -124,6 +129,8 @@ def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
     SourceMotion    a source without motion
     """
     names = tuple(bone.name for bone in skeleton.bones)
+    rest_rotations = np.tile([1.0, 0.0, 0.0, 0.0], (len(names), 1))
+    rest_rotations[0] = skeleton.root_orientation
     scale: float | None = None
     declared: tuple[str, ...] = ()
     if skeleton.length_unit is not None:
@@ -135,7 +142,7 @@ def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
         display_names=names,
         parents=skeleton.parents,
         offsets=skeleton.offsets(),
-        rest_rotations=np.tile([1.0, 0.0, 0.0, 0.0], (len(names), 1)),
+        rest_rotations=rest_rotations,
         end_sites=skeleton.end_sites(),
         unit_scale_m=scale,
         declared=declared,
@@ -310,7 +317,6 @@ class _AsfReader:
         return frame
 
     def _assembled(self) -> AsfSkeleton:
-        self.root.frame = self._frame(self.root_orientation, self.root_axis)
         bones: list[Bone] = []
         parents: list[int] = []
         waiting = [(ROOT, -1)]
@@ -327,5 +333,10 @@ class _AsfReader:
         if loose is not None:
             raise self.lines.error("the section :hierarchy does not connect this bone to the root", joint=loose)
         return AsfSkeleton(
-            bones, np.array(parents, np.int32), self.length_unit, self.degrees, np.array(self.root_position)
+            bones,
+            np.array(parents, np.int32),
+            self.length_unit,
+            self.degrees,
+            np.array(self.root_position),
+            self._frame(self.root_orientation, self.root_axis),
         )

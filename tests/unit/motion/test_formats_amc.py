@@ -59,6 +59,36 @@ def test_joints_are_where_the_definition_of_the_format_puts_them() -> None:
     np.testing.assert_allclose(placed[1], by_definition([1, 2, 4, 10, 20, 31], [40, 50, 61], 71)[:4], atol=1e-5)
 
 
+PLACED = ASF.replace("axis XYZ\n  position 0 0 0", "axis ZXY\n  position 5 6 7").replace(
+    "orientation 0 0 0", "orientation 25 35 45"
+)
+
+
+def test_position_and_orientation_of_the_root_place_the_whole_motion() -> None:
+    options = ImportOptions(unit_scale_m=1.0, up_axis="y")
+    clip = read_motion(AMC.encode(), "take.amc", companion=PLACED.encode(), options=options).clip
+    assert clip is not None
+    base = Rotation.from_euler("zxy", [25, 35, 45], degrees=True).as_matrix()
+    moved = by_definition([1, 2, 3, 10, 20, 30], [40, 50, 60], 70)[:4]
+    np.testing.assert_allclose(global_positions(clip)[0], [5, 6, 7] + moved @ base.T, atol=1e-5)
+
+
+def test_a_quarter_turn_of_the_root_stands_a_body_up_that_moves_along_z() -> None:
+    turned = ASF.replace("orientation 0 0 0", "orientation -90 0 0")
+    still = AMC.replace("10 20 30", "0 0 0").replace("40 50 60", "0 0 0").replace("shin 70", "shin 0")
+    source = read(still, turned)
+    np.testing.assert_allclose(source.root_positions[0], [1, 3, -2], atol=1e-12)
+    np.testing.assert_allclose(source.rotations[0, 0], [0.5**0.5, -(0.5**0.5), 0, 0], atol=1e-7)
+    np.testing.assert_allclose(source.skeleton.rest_global_positions[2], [0, 0, 8], atol=1e-12)
+
+
+def test_position_and_orientation_of_the_root_place_the_rest_pose() -> None:
+    rest = read(asf=PLACED).skeleton.rest_global_positions
+    base = Rotation.from_euler("zxy", [25, 35, 45], degrees=True).as_matrix()
+    bones = np.array([[0, 0, 0], [0, 0, 0], [0, -8, 0], [0, -15, 0]])
+    np.testing.assert_allclose(rest, [5, 6, 7] + bones @ base.T, atol=1e-12)
+
+
 def test_the_last_bone_ends_in_an_end_site() -> None:
     joint, tip = read().end_sites[0]
     assert joint == 3
