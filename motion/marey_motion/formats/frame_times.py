@@ -1,4 +1,4 @@
-"""Frame rates computed from the rounded frame times of files."""
+"""Frame rates computed from the rounded frame times of files, and frame times to write."""
 
 from __future__ import annotations
 
@@ -68,6 +68,31 @@ def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWar
         values = {"used_hz": declared_hz, "nearest_hz": nearest_hz}
         warnings.append(CheckWarning("frame-rate-unusual", message, values=values))
     return rate_hz
+
+
+def frame_time_to_write(frame_rate_hz: float) -> float:
+    """Compute the frame time to write in a file, and refuse one that `frame_rate_of` does not accept.
+
+    Parameters
+    ----------
+    frame_rate_hz : float    frames per second of the clip
+
+    Returns
+    -------
+    float    seconds between frames
+
+    Raises
+    ------
+    FormatError    if the rate is less than 1 Hz or more than 100 kHz
+    """
+    lowest_hz = 1.0 / LONGEST_FRAME_TIME_S
+    if not lowest_hz <= frame_rate_hz <= HIGHEST_RATE_HZ:
+        raise FormatError(
+            f"a clip of {frame_rate_hz:.6g} Hz cannot be written in this format, which is read only with frame rates "
+            f"from {lowest_hz:g} to {HIGHEST_RATE_HZ:.0f} Hz; resample the clip, or write it as npz",
+            code="frame-rate",
+        )
+    return 1.0 / frame_rate_hz
 
 
 def _no_rate(reason: str, file: str) -> FormatError:
