@@ -10,9 +10,9 @@ from tests.support.motion_files import AMC, ASF
 from marey_motion.errors import FormatError
 from marey_motion.formats import read_motion
 from marey_motion.formats.amc import read_amc
-from marey_motion.importing.plan import pair_companions
 from marey_motion.importing.source import SourceMotion
 from marey_motion.kinematics import global_positions
+from marey_schemas.formats.companions import pair_companions
 from marey_schemas.options.imports import ImportOptions
 
 

@@ -16,8 +16,8 @@ from tests.support.motion_files import ARM, POSITIONS, ZXY, bvh
 from marey_motion import formats
 from marey_motion.documents import clip_from_document, clip_to_document, clip_to_tree, skeleton_to_document
 from marey_motion.exporting import write_clip_file
-from marey_motion.formats import read_motion, write_bvh, write_predecessor_skeleton
-from marey_motion.formats.predecessor import clips, documents
+from marey_motion.formats import predecessor, read_motion, write_bvh, write_predecessor_skeleton
+from marey_motion.formats.predecessor import clips
 from marey_motion.gait import generate_gait
 from marey_motion.importing import anatomy, source
 from marey_motion.importing.files import import_file, mapping_part
@@ -63,7 +63,7 @@ def test_a_compressed_clip_of_the_predecessor_is_detected_and_decoded_once(count
     clip = generate_gait(1.2, 0.0, 1.0, 30.0)
     written = write_clip_file(clip, "predecessor")
     count(formats, "detect_format")
-    count(documents, "decode_document")
+    count(predecessor, "decode_document")
     calls = count(clips, "decode_document")  # the skeleton document is the second file
     planned = PlannedFile("take.bson.bz2", "motion", "", "take", companion="take.skeleton")
     companion = write_predecessor_skeleton(clip.skeleton)
@@ -73,7 +73,7 @@ def test_a_compressed_clip_of_the_predecessor_is_detected_and_decoded_once(count
 
 
 def test_a_model_of_the_predecessor_is_decoded_once(count: Count) -> None:
-    calls = count(documents, "decode_document")
+    calls = count(predecessor, "decode_document")
     read("walk_mm.json", json.dumps(models.layout_3()).encode())
     assert calls == {"decode_document": 1}
 
@@ -185,3 +185,41 @@ def test_joints_keep_their_rotation_orders_on_a_skeleton_with_another_order_of_j
     clip = clip_from_document(MotionDocument.model_validate(parts["motion"]), chosen)
     written = write_clip_file(clip, "bvh", info=parts["info"]).data.decode().splitlines()[-1]
     assert [round(float(word)) for word in written.split()] == [0, 90, 0, 10, 20, 30, 12, 22, 32, 11, 21, 31]
+
+
+def import_all(files: dict[str, bytes]) -> dict[str, ImportedFile]:
+    """Import files as a server does, each with the companion that the plan names."""
+    return {
+        one.name: import_file(
+            FileToImport(
+                one,
+                files[one.name],
+                DIGEST,
+                companion=None if one.companion is None else files[one.companion],
+                companion_digest=None if one.companion is None else DIGEST,
+            )
+        )
+        for one in plan_imports(list(files))
+        if one.role in ("motion", "skeleton")
+    }
+
+
+def test_a_clip_of_the_predecessor_is_imported_with_the_skeleton_of_its_folder() -> None:
+    clip = generate_gait(1.2, 0.0, 1.0, 30.0)
+    files = {
+        "old/skeleton.json": write_predecessor_skeleton(clip.skeleton),
+        "old/walk.bson.bz2": write_clip_file(clip, "predecessor").data,
+    }
+    found = import_all(files)
+    assert {name: one.refusal for name, one in found.items()} == dict.fromkeys(files)
+    skeleton, walk = found["old/walk.bson.bz2"].items
+    assert (walk.item_name, walk.collection, found["old/walk.bson.bz2"].frames) == ("walk", "old", 30)
+    assert walk.parts["info"]["source"]["companion_name"] == "skeleton.json"
+    assert [item.parts for item in found["old/skeleton.json"].items] == [skeleton.parts]
+
+
+def test_a_model_beside_a_skeleton_is_imported_without_a_tree() -> None:
+    skeleton = write_predecessor_skeleton(generate_gait(1.2, 0.0, 1.0, 30.0).skeleton)
+    found = import_all({"skeleton.json": skeleton, "walk.json": json.dumps(models.layout_3()).encode()})
+    assert found["walk.json"].refusal is None
+    assert "tree" not in found["walk.json"].items[-1].parts

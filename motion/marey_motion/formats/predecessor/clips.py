@@ -64,7 +64,8 @@ def motion_of_document(
         return read_skeleton_document(document, file)
     if skeleton is None:
         raise FormatError(
-            "a clip document contains no hierarchy of its joints; import it together with its skeleton document",
+            "a clip document contains no hierarchy of its joints; import it together with its skeleton document, whose "
+            "name must end in 'skeleton', such as skeleton.json",
             code="skeleton-missing",
             file=file,
         )
