@@ -12,6 +12,7 @@ from tests.support.another_loader import positions_by_another_loader
 
 from marey_motion.clip import Clip
 from marey_motion.errors import FormatError, MotionError
+from marey_motion.exporting import write_clip_file
 from marey_motion.formats import read_motion, write_motion
 from marey_motion.formats.bvh_writer import format_table, write_bvh
 from marey_motion.importing.source import SourceInfo
@@ -116,6 +117,17 @@ def test_numbers_are_written_to_six_decimals(value: float) -> None:
 def test_lengths_that_no_loader_could_read_are_refused() -> None:
     with pytest.raises(FormatError, match="is too large to be written"):
         format_table(np.array([[1e13]]))
+
+
+@pytest.mark.parametrize(
+    "source", [None, {"details": {"channels": 5}}, {"details": {"channels": [[1, 2, 3]] * 22}}, {"details": {}}]
+)
+def test_a_record_of_the_import_that_a_user_has_changed_stops_no_export(
+    body: Skeleton, tumbling: Callable[..., Clip], source: object
+) -> None:
+    clip = tumbling(body)
+    assert len(clip.skeleton.joint_names) == 22
+    assert write_clip_file(clip, "bvh", info={"source": source}).data == write_bvh(clip)
 
 
 @pytest.mark.parametrize("file_format", ["bvh", "predecessor"])
