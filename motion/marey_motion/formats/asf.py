@@ -33,6 +33,8 @@ ROOT = "root"
 _AXES = "xyz"
 _IN_DEGREES = {b"deg": True, b"degree": True, b"degrees": True, b"rad": False, b"radian": False, b"radians": False}
 _CHANNELS = {kind + axis for kind in "rt" for axis in _AXES}
+# The format takes commas and parentheses for white space; names may contain them all the same.
+_SPACED = bytes.maketrans(b",()", b"   ")
 
 
 @dataclass
@@ -179,6 +181,10 @@ def parse_asf(data: bytes, file: str) -> AsfSkeleton:
     return _KNOWN.get_or_make(hashlib.sha256(data).digest(), lambda: _AsfReader(TextLines(data, file)).read())
 
 
+def _separated(words: list[bytes]) -> list[bytes]:
+    return b" ".join(words).translate(_SPACED).split()
+
+
 class _AsfReader:
     """Reader of the sections of an ASF file. A section is a keyword with a leading colon, and the lines after it."""
 
@@ -225,7 +231,7 @@ class _AsfReader:
             self.degrees = degrees
 
     def _root(self, words: list[bytes]) -> None:
-        keyword = words[0].lower()
+        keyword, words = words[0].lower(), _separated(words)
         if keyword == b"order":
             self.root.channels = self._channels(words[1:], ROOT)
         elif keyword == b"axis":
@@ -246,7 +252,11 @@ class _AsfReader:
         elif keyword == b"name":
             bone.written_name = b" ".join(words[1:])
             bone.name = decode_name(bone.written_name)
-        elif keyword == b"direction":
+        else:
+            self._bone_numbers(bone, keyword, _separated(words))
+
+    def _bone_numbers(self, bone: Bone, keyword: bytes, words: list[bytes]) -> None:
+        if keyword == b"direction":
             bone.direction = self.lines.numbers(words[1:], 3, "direction", bone.name)
         elif keyword == b"length":
             bone.length = self.lines.numbers(words[1:], 1, "length", bone.name)[0]

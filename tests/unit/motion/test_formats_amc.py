@@ -148,9 +148,13 @@ def test_an_amc_that_does_not_say_its_unit_of_angle_has_that_of_its_asf() -> Non
         ("angle deg", "angle Degrees"),
         (":hierarchy\n  begin", ":HIERARCHY\n  BEGIN"),
         ("shin sole\n  end", "shin sole\n  END"),
+        ("direction 0 -1 0\n    length 8", "direction 0,-1, 0\n    length (8)"),
+        ("axis 0 0 20 XYZ", "axis (0, 0, 20) XYZ"),
+        ("dof rx ry rz", "dof rx, ry, rz"),
+        ("order TX TY TZ RX RY RZ", "order (TX, TY, TZ, RX, RY, RZ)"),
     ],
 )
-def test_keywords_of_an_asf_may_be_written_large_or_out(found: str, written: str) -> None:
+def test_keywords_and_numbers_of_an_asf_may_be_written_in_several_ways(found: str, written: str) -> None:
     assert found in ASF
     np.testing.assert_array_equal(read(asf=ASF.replace(found, written)).rotations, read().rotations)
 
