@@ -228,6 +228,8 @@ class _AsfReader:
             degrees = _IN_DEGREES.get(b" ".join(words[1:]).lower())
             if degrees is None:
                 raise self.lines.error("the unit `angle` must be deg or rad")
+            if self.bones and degrees != self.degrees:
+                raise self.lines.error("the unit of angles comes after the bones; move :units before :bonedata")
             self.degrees = degrees
 
     def _root(self, words: list[bytes]) -> None:

@@ -219,6 +219,7 @@ def test_what_is_wrong_in_an_amc_is_named_with_its_line(amc: str, line: int, joi
         ("shin sole\n", "", "sole", "does not connect"),
         ("shin sole\n", "shin sole\n    root shin\n", "shin", "two parents"),
         ("angle deg", "angle gon", None, "deg or rad"),
+        (":hierarchy", ":units\n  angle rad\n:hierarchy", None, "move :units before :bonedata"),
         ("length 0.45", "length -1", None, "positive"),
         (":hierarchy", ":nothing", None, "no :hierarchy"),
     ],
