@@ -16,6 +16,7 @@ from marey_motion.formats.asf import AsfSkeleton, parse_asf, skeleton_source
 from marey_motion.formats.euler import NO_COLUMN, rotations_from_euler
 from marey_motion.formats.numeric_text import excerpt
 from marey_motion.formats.text_lines import TextLines
+from marey_motion.formats.unpacking import require_unpackable
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.importing.source import SourceMotion
 
@@ -57,6 +58,7 @@ def read_amc(
     lines = TextLines(data, file)
     degrees, declared_rate_hz = _read_amc_header(lines, skeleton.degrees)
     values, gaps = scan_frames(lines, skeleton)
+    require_unpackable(len(values), len(skeleton.bones), values.size, file)
     if gaps:
         message = f"frame numbers jump {gaps} times; frames were read in the order of the file"
         source.warnings.append(CheckWarning("frame-number-gap", message, values={"gaps": gaps}))

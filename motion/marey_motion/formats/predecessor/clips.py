@@ -28,6 +28,7 @@ from marey_motion.formats.predecessor.skeleton import (
     skeleton_document,
 )
 from marey_motion.formats.quaternion_rows import as_rotations
+from marey_motion.formats.unpacking import require_unpackable
 from marey_motion.importing.source import SourceMotion
 from marey_motion.skeleton import Skeleton
 
@@ -194,6 +195,7 @@ def _fill_motion(source: SourceMotion, names: list[str], poses: NDArray[np.float
             file=file,
             joint=unknown,
         )
+    require_unpackable(len(poses), len(indices), poses.size, file)
     given = poses[:, 3:].reshape(len(poses), len(names), 4) * MIRROR_ROTATION
     rotations = np.tile(source.rest_rotations, (len(poses), 1, 1))
     rotations[:, [indices[name] for name in names]] = as_rotations(given, tuple(names), file, source.warnings)
