@@ -6,8 +6,9 @@ An AMC needs its ASF. In the format of Marey's predecessor, a clip needs its ske
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import PurePosixPath
 
 from marey_schemas.formats import FORMATS, FileFormat, format_named
@@ -93,19 +94,18 @@ def is_skeleton_name(name: str) -> bool:
 def _pairings(row: FileFormat, files: _Files) -> Iterator[Pairing]:
     """Pair the files of a folder whose format needs a companion."""
     wanted = str(row.companion)
-    companions = [(stem_of(name), path) for name, path in files if format_named(wanted).names(name)]
+    companions = {stem_of(name).lower(): path for name, path in files if format_named(wanted).names(name)}
     for name, path in files:
         if not row.names(name):
             continue
-        if (found := _best(stem_of(name), companions)) is not None:
-            yield Pairing(path, found, (found,))
-            continue
-        if companions:
-            reason = f"none of the {len(companions)} {wanted.upper()} files in its folder has a matching name"
-        else:
+        found, beside = _best(stem_of(name), companions)
+        code = reason = ""
+        if found is None:
+            code = f"{wanted}-missing"
             reason = f"there is no {wanted.upper()} file in its folder; {row.needs_companion}"
-        others = tuple(other for _, other in companions)
-        yield Pairing(path, None, others, code=f"{wanted}-missing", reason=reason)
+            if companions:
+                reason = f"none of the {wanted.upper()} files in its folder has a matching name"
+        yield Pairing(path, found, beside, code=code, reason=reason)
 
 
 def _pairings_of_predecessor(files: _Files) -> Iterator[Pairing]:
@@ -115,7 +115,7 @@ def _pairings_of_predecessor(files: _Files) -> Iterator[Pairing]:
     graphs, get a skeleton, too, which their import ignores.
     """
     known = [(stem_of(name), path) for name, path in files if _PREDECESSOR.names(name)]
-    skeletons = [(_skeleton_stem(stem), path) for stem, path in known if is_skeleton_name(path)]
+    skeletons = {_skeleton_stem(stem).lower(): path for stem, path in known if is_skeleton_name(path)}
     others = [(stem, path) for stem, path in known if not is_skeleton_name(path)]
     models: dict[str, str] = {}
     for stem, path in others:
@@ -126,9 +126,7 @@ def _pairings_of_predecessor(files: _Files) -> Iterator[Pairing]:
         if model in trees and models[model] == path:
             yield Pairing(path, trees[model], (trees[model],))
         elif skeletons and model == stem and models.get(_without(stem, _TREE_ENDINGS), path) == path:
-            found = _best(stem, skeletons)
-            beside = tuple(other for _, other in skeletons) if found is None else (found,)
-            yield Pairing(path, found, beside, shared=True)
+            yield Pairing(path, *_best(stem, skeletons), shared=True)
 
 
 def _skeleton_stem(stem: str) -> str:
@@ -137,17 +135,18 @@ def _skeleton_stem(stem: str) -> str:
     return bare.rstrip("_-. ")
 
 
-def _best(stem: str, companions: _Files) -> str | None:
-    """Return the path of the best match among the stems and paths of possible companions; None if none matches."""
+def _best(stem: str, companions: Mapping[str, str]) -> tuple[str | None, tuple[str, ...]]:
+    """Return the best match for a stem, or None, and the files that show that it is the best.
+
+    `companions` maps the stems of possible companions, in lower case, to their paths. Two of them show that there is
+    no match: of one, it would be the match.
+    """
     stem = stem.lower()
-    matching = [
-        (len(other), path)
-        for other, path in companions
-        if not other or stem == other.lower() or (stem.startswith(other.lower()) and not stem[len(other)].isalnum())
-    ]
-    if matching:
-        return max(matching)[1]
-    return companions[0][1] if len(companions) == 1 else None
+    ends = [len(stem), *(end for end in range(len(stem) - 1, 0, -1) if not stem[end].isalnum()), 0]
+    found = next((companions[stem[:end]] for end in ends if stem[:end] in companions), None)
+    if found is None and len(companions) == 1:
+        (found,) = companions.values()
+    return found, tuple(islice(companions.values(), 2)) if found is None else (found,)
 
 
 def _without(stem: str, endings: Iterable[str]) -> str:

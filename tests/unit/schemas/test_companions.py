@@ -41,6 +41,16 @@ def test_of_several_skeletons_the_one_with_the_longest_equal_beginning_is_chosen
     assert unclear.beside == ("jump_skeleton.json", "walk_skeleton.json")
 
 
+def test_files_without_a_match_need_two_others_that_show_it() -> None:
+    others = tuple(f"{number:04d}.asf" for number in range(5000))
+    takes = [f"take{number}.amc" for number in range(5000)]
+    pairings = pair_companions([*others, *takes])
+    assert {(pairing.companion, pairing.code) for pairing in pairings} == {(None, "asf-missing")}
+    assert {pairing.beside for pairing in pairings} == {others[:2]}
+    for pairing in pairings[:3]:
+        assert pair_companions([pairing.file, *pairing.beside]) == (pairing,)
+
+
 def test_a_model_has_its_tree_and_no_skeleton() -> None:
     names = ["skeleton.json", "walk_1.5_mm.json", "walk_1.5_cluster_tree.json", "run_quaternion_mm.bson.bz2"]
     assert pairs(*names) == {"walk_1.5_mm.json": "walk_1.5_cluster_tree.json"}
