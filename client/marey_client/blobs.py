@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from io import BufferedRandom
 from pathlib import Path
 from typing import BinaryIO
 
@@ -100,26 +101,30 @@ class Blobs:
     def fetch_to(self, digest: str, target: Path) -> Path:
         """Download a blob to `target`, which is created only when complete; an interrupted download is resumed."""
         with saved_atomically(target) as file:
-
-            def once() -> None:
-                start = file.tell()
-                ranged = {"Accept-Encoding": "identity", **({"Range": f"bytes={start}-"} if start else {})}
-                with self.transport.stream(f"/blobs/{digest}", headers=ranged) as response:
-                    if start and response.status_code != httpx.codes.PARTIAL_CONTENT:
-                        file.seek(0)
-                        file.truncate()
-                    for chunk in response.iter_bytes():
-                        file.write(chunk)
-
-            self.transport.repeat(once, repeatable=True, what=f"GET /blobs/{digest}")
-            file.seek(0)
-            arrived = f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
-            if arrived != digest:
-                raise DigestMismatch(
-                    f"the downloaded blob has the digest {arrived} instead of {digest}: it was damaged on "
-                    "the way or on the server"
-                )
+            self.fetch_into(digest, file)
         return target
+
+    def fetch_into(self, digest: str, file: BufferedRandom) -> None:
+        """Download a blob into an empty file that is open for reading and writing; its position is then the end."""
+
+        def once() -> None:
+            start = file.tell()
+            ranged = {"Accept-Encoding": "identity", **({"Range": f"bytes={start}-"} if start else {})}
+            with self.transport.stream(f"/blobs/{digest}", headers=ranged) as response:
+                if start and response.status_code != httpx.codes.PARTIAL_CONTENT:
+                    file.seek(0)
+                    file.truncate()
+                for chunk in response.iter_bytes():
+                    file.write(chunk)
+
+        self.transport.repeat(once, repeatable=True, what=f"GET /blobs/{digest}")
+        file.seek(0)
+        arrived = f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
+        if arrived != digest:
+            raise DigestMismatch(
+                f"the downloaded blob has the digest {arrived} instead of {digest}: it was damaged on "
+                "the way or on the server"
+            )
 
 
 def _chunks(path: Path, size_bytes: int) -> Iterator[bytes]:

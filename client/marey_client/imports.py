@@ -17,7 +17,8 @@ from marey_client.errors import BadFileName, NothingToUpload, SameName
 from marey_client.jobs import Jobs
 from marey_client.one_or_several import several
 from marey_client.transport import Transport, as_json, read_model
-from marey_schemas.formats import FORMATS, IMPORTED_ENDINGS, LengthUnit, format_named
+from marey_schemas.formats import IMPORTED_ENDINGS, LengthUnit
+from marey_schemas.formats.companions import pair_companions, stem_of
 from marey_schemas.imports import (
     FileName,
     ImportAnswer,
@@ -131,22 +132,22 @@ def _add(files: dict[str, LocalFile], name: str, path: Path) -> None:
 def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
     """Split files into batches that one request can import.
 
-    An AMC file, which cannot be read without an ASF file, is in one batch with all ASF files of its folder. Files whose
-    names differ only in the ending are in one batch, too, because names of clips depend on the files of a request.
+    A file is in one batch with its companion, such as an AMC with its ASF or a model with its tree. Files whose names
+    differ only in the ending are in one batch, too, because names of clips depend on the files of a request.
     """
+    by_name = {file.name: file for file in files}
     groups: defaultdict[tuple[str, str], list[LocalFile]] = defaultdict(list)
     for file in files:
-        path = PurePosixPath(file.name)
-        groups[path.parent.as_posix(), path.stem].append(file)
-    companions = _companions(files)
+        groups[PurePosixPath(file.name).parent.as_posix(), stem_of(file.name)].append(file)
+    beside = {pairing.file: pairing.beside for pairing in pair_companions(by_name)}
+    companions = {name for names in beside.values() for name in names}
     portion: dict[str, LocalFile] = {}
     size = 0
-    for (folder, _), group in groups.items():
-        beside = companions.get(folder, [])
-        needs_companion = any(map(_needs_companion, group))
-        if not needs_companion and all(file in beside for file in group):
-            continue  # goes with the files that need it, never on its own as a skeleton
-        together = {file.name: file for file in [*(beside if needs_companion else []), *group]}
+    for group in groups.values():
+        if all(file.name in companions for file in group):
+            continue  # travels with the files that need it, never on its own
+        needed = [by_name[name] for file in group for name in beside.get(file.name, ())]
+        together = {file.name: file for file in [*needed, *group]}
         together_bytes = sum(file.size_bytes for file in together.values())
         if portion and (len(portion) + len(together) > FILES_PER_IMPORT or size + together_bytes > BYTES_PER_IMPORT):
             yield list(portion.values())
@@ -155,25 +156,6 @@ def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
         portion |= together
     if portion:
         yield list(portion.values())
-
-
-def _companions(files: Sequence[LocalFile]) -> dict[str, list[LocalFile]]:
-    """Return the ASF files of each folder with AMC files; likewise for other formats that need a second file."""
-    wanted: defaultdict[str, set[str]] = defaultdict(set)
-    for file in files:
-        for row in FORMATS:
-            if row.needs_companion and row.names(file.name):
-                wanted[PurePosixPath(file.name).parent.as_posix()].add(str(row.companion))
-    found: defaultdict[str, list[LocalFile]] = defaultdict(list)
-    for file in files:
-        folder = PurePosixPath(file.name).parent.as_posix()
-        if any(format_named(name).names(file.name) for name in wanted.get(folder, ())):
-            found[folder].append(file)
-    return found
-
-
-def _needs_companion(file: LocalFile) -> bool:
-    return any(row.needs_companion and row.names(file.name) for row in FORMATS)
 
 
 @dataclass(frozen=True)

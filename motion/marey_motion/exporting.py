@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from marey_motion.alignment.aligned_documents import restored_clip
 from marey_motion.clip import Clip
@@ -20,6 +20,8 @@ from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.formats import DEFAULT_UNIT, format_named
 from marey_schemas.item_files import ItemToExport
+
+_CHANNELS: TypeAdapter[tuple[tuple[str, ...], ...]] = TypeAdapter(tuple[tuple[str, ...], ...])
 
 
 @dataclass(frozen=True)
@@ -108,10 +110,14 @@ def write_motion_file(
 def _source(clip: Clip, info: Mapping[str, Any]) -> SourceInfo | None:
     """Return the channels of the file from which a clip was imported, as stored in its document `info`.
 
-    Returns None if `info` does not contain the channels, or if the number of joints has changed since the import.
+    Returns None if `info`, which users may write, does not contain the channels, or if the number of joints has changed
+    since the import.
     """
-    details = info.get("source", {}).get("details", {})
-    channels = tuple(tuple(names) for names in details.get("channels", ()))
+    details = (info.get("source") or {}).get("details") or {}
+    try:
+        channels = _CHANNELS.validate_python(details.get("channels"))
+    except ValidationError:
+        return None
     if len(channels) != clip.skeleton.joint_count:
         return None
     return SourceInfo(format="bvh", file="", unit_scale_m=1.0, up_axis="y", channels=channels)

@@ -13,9 +13,9 @@ from marey_motion.editing.annotations.layers import Layer
 from marey_motion.editing.annotations.speed_proposals import propose_reaches
 from marey_motion.editing.annotations.step_proposals import propose_steps
 from marey_motion.formats import read_motion
-from marey_motion.importing.plan import pair_companions
 from marey_motion.matching.body import MatchingBody
 from marey_motion.rigs import map_joints
+from marey_schemas.formats.companions import pair_companions
 from marey_schemas.options.annotations import WristContactProposal
 
 SUBJECTS = ("02", "05", "07", "09", "16")

@@ -8,13 +8,13 @@ import pytest
 
 from marey_motion.clip import Clip
 from marey_motion.formats import read_motion
-from marey_motion.importing.plan import pair_companions
 from marey_motion.kinematics import global_positions
 from marey_motion.looping import rotated
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase, SourceClip
 from marey_motion.rigs import map_joints
+from marey_schemas.formats.companions import pair_companions
 from marey_schemas.options.matching import DatabaseOptions
 
 SUBJECTS = ("02", "05", "07", "09", "16")

@@ -11,7 +11,8 @@ import pytest
 from tests.support.motion_files import AMC, ASF
 from tests.support.rest_server import Server, running
 
-from marey_motion.formats import read_motion
+from marey_motion.formats import read_motion, write_predecessor, write_predecessor_skeleton
+from marey_motion.gait import generate_gait
 from marey_motion.kinematics import forward_kinematics
 from marey_server.store.database.connections import Database
 
@@ -214,6 +215,21 @@ def test_the_same_files_by_another_way_to_the_same_folder_change_nothing(owner: 
     assert statuses(again) == {"walk.bvh": "unchanged", "arm.asf": "companion", "arm_01.amc": "unchanged"}
     items = [[entry["item"] for entry in answer.json()["entries"]] for answer in (first, again)]
     assert items[0] == items[1]
+
+
+def test_a_clip_of_the_predecessor_is_imported_with_the_skeleton_beside_it(owner: httpx.Client) -> None:
+    walk = generate_gait(1.2, 0.0, 1.0, 30.0)
+    files = {
+        "old/skeleton.json": write_predecessor_skeleton(walk.skeleton),
+        "old/walk.bson.bz2": write_predecessor(walk),
+    }
+    answer = send(owner, files)
+    assert statuses(answer) == {"old/skeleton.json": "created", "old/walk.bson.bz2": "created"}
+    skeleton, clip = answer.json()["entries"]
+    assert clip["skeleton"] == skeleton["item"]
+    assert clip["frames"] == 30
+    item = owner.get(f"/projects/lab/clips/{clip['item']}").json()
+    assert (item["collection"], item["name"]) == ("old", "walk")
 
 
 def test_clips_can_be_made_to_use_a_given_skeleton(owner: httpx.Client) -> None:

@@ -117,3 +117,25 @@ root 1 2 4 10 20 31
 shin 71
 thigh 40 50 61
 """
+
+BODY = (
+    "lhipjoint root 1 -0.2 0 2, lfemur lhipjoint 0 -1 0 7.5, ltibia lfemur 0 -1 0 7.5, lfoot ltibia 0 -0.3 1 2, "
+    "rhipjoint root -1 -0.2 0 2, rfemur rhipjoint 0 -1 0 7.5, rtibia rfemur 0 -1 0 7.5, rfoot rtibia 0 -0.3 1 2, "
+    "lowerback root 0 1 0 2, upperback lowerback 0 1 0 2, thorax upperback 0 1 0 2, "
+    "upperneck thorax 0 1 0 1.5, head upperneck 0 1 0 1.6, "
+    "lclavicle thorax 1 0 0 3, lhumerus lclavicle 1 0 0 5, lradius lhumerus 1 0 0 4, lhand lradius 1 0 0 1, "
+    "rclavicle thorax -1 0 0 3, rhumerus rclavicle -1 0 0 5, rradius rhumerus -1 0 0 4, rhand rradius -1 0 0 1"
+)
+"""Bones of a standing body: name, parent, direction and length."""
+
+
+def body_asf(size: float, unit_length: float) -> bytes:
+    """Return an ASF of a body with legs of 17 units times `size`, which states `length` as its unit of length."""
+    bones = [bone.split() for bone in BODY.split(", ")]
+    data = "".join(
+        f"begin\n name {name}\n direction {x} {y} {z}\n length {float(length) * size}\n axis 0 0 0 XYZ\nend\n"
+        for name, _, x, y, z, length in bones
+    )
+    tree = "".join(f"{parent} {name}\n" for name, parent, *_ in bones)
+    units = f":version 1.10\n:units\n length {unit_length}\n angle deg\n"
+    return f"{units}:bonedata\n{data}:hierarchy\nbegin\n{tree}end\n".encode()

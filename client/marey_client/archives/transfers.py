@@ -74,7 +74,7 @@ def _accept(_contents: Sequence[str]) -> None:
 def transfers_folder() -> Path:
     """Return the folder for archives of running copies, below `XDG_CACHE_HOME` or `~/.cache`; delete its old content.
 
-    A copy that was killed leaves its archive, and also the folder of its downloaded files.
+    A copy that was killed leaves its archive. In earlier versions, it also left the folder of its downloaded files.
     """
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "marey" / "transfers"
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)

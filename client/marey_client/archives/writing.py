@@ -99,8 +99,8 @@ def write_archive(
     bases = [dataset.at(one) for one in since]
     part = path.with_name(f"{path.name}.{short_name(head.digest, [one.digest for one in bases])}.part")
     part.parent.mkdir(parents=True, exist_ok=True)
-    with _opened(part) as file, tempfile.TemporaryDirectory(dir=part.parent) as folder:
-        _Making(dataset, ArchiveWriter(file), Path(folder), on_progress, check, to_send).run(head, bases)
+    with _opened(part) as file:
+        _Making(dataset, ArchiveWriter(file), part.parent, on_progress, check, to_send).run(head, bases)
         try:
             check_archive(Archive(file), lambda done, of: on_progress("checking", done, of))
         except BadArchive as error:
@@ -166,7 +166,7 @@ class _Making:
     dataset: DatasetReader
     writer: ArchiveWriter
     folder: Path
-    """Folder for files that were downloaded from the server and are not in the archive yet."""
+    """Folder in whose file system files are kept, without a name, until they are in the archive."""
     on_progress: OnProgress
     check: CheckContents
     to_send: bool
@@ -343,9 +343,11 @@ class _Making:
     def _add_file(self, member: ArchiveMember) -> None:
         if member in self.writer:
             return
-        fetched = Blobs(self.dataset.transport).fetch_to(member.digest, self.folder / "file")
-        with fetched.open("rb") as stream:
-            self.writer.add_stream(member, stream, fetched.stat().st_size)
+        with tempfile.TemporaryFile(dir=self.folder) as file:  # without a name, so that a killed process leaves none
+            Blobs(self.dataset.transport).fetch_into(member.digest, file)
+            size_bytes = file.tell()
+            file.seek(0)
+            self.writer.add_stream(member, file, size_bytes)
 
     def _fetch(self, places: Sequence[PartOfContent]) -> list[Any]:
         """Request the documents at `places` in order; return as many as fit into one answer, at least one."""

@@ -25,10 +25,11 @@ _ID = re.compile(r"([a-z]+)_[0-9a-hjkmnp-tv-z]{26}")
 
 @dataclass(frozen=True)
 class Address:
-    """Project and a path in it; the path may name a folder or an item."""
+    """Project and a path in it; the path may name a folder or an item, and names a folder if a `/` follows it."""
 
     project: str
     path: str
+    is_folder: bool = False
 
     @classmethod
     def parse(cls, text: str) -> Address:
@@ -36,7 +37,12 @@ class Address:
         project, _, path = text.strip("/").partition("/")
         if not project:
             raise WrongUsage(f"{text!r} contains no project; write project/folder/name")
-        return cls(project, path)
+        return cls(project, path, path != "" and text.endswith("/"))
+
+    @classmethod
+    def within(cls, project: str, path: str) -> Address:
+        """Return the address of a path in a project."""
+        return cls.parse(f"{project}/{path}")
 
     def __str__(self) -> str:
         return f"{self.project}/{self.path}" if self.path else self.project
@@ -55,7 +61,7 @@ class Address:
 def find_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> ItemHandle | None:
     """Return the item at an address; None if there is no item of the given kinds, which are tried in order."""
     project = marey.project(address.project)
-    if not address.path:
+    if not address.path or address.is_folder:
         return None
     for kind in kinds:
         items = project.items(kind)
@@ -85,6 +91,8 @@ def _missing(marey: Marey, address: Address, what: str) -> WrongUsage:
     """
     if address.path and marey.project(address.project).collections.at(address.path) is not None:
         return WrongUsage(f"{address} is a folder; `marey ls {address}` lists it")
+    if address.is_folder:
+        what = "no folder"
     return WrongUsage(f"there is {what} at {address}; `marey ls {address.project}` lists the project")
 
 
@@ -231,7 +239,7 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
     address = Address.parse(text)
     if not address.path:
         raise WrongUsage(f"{text!r} is a project; give a folder or an item in it, or see `marey project --help`")
-    wanted = FOLDER if text.endswith("/") else kind
+    wanted = FOLDER if address.is_folder else kind
     found = list(_things(marey.project(address.project), address, wanted, deleted=deleted))
     kinds = list(dict.fromkeys(one.kind for one in found))
     if len(kinds) > 1:

@@ -100,7 +100,7 @@ def submit_job(
                 raise WrongUsage(
                     f"jobs of the kind {kind} have no input {role!r}; their inputs are {', '.join(roles) or 'none'}"
                 )
-            places.setdefault(role, []).append(_input_at(marey, Address(project, place.strip("/")), roles[role]))
+            places.setdefault(role, []).append(_input_at(marey, Address.within(project, place), roles[role]))
         wanted = JobCreate(
             kind=kind,
             inputs={role: tuple(found) if roles[role].many else found[-1] for role, found in places.items()},

@@ -84,7 +84,7 @@ def mv(
         if Address.parse(source).project != to.project:
             raise WrongUsage(f"{source} cannot be moved to another project; download it, and upload it to {to.project}")
     with connect(context) as marey:
-        into_folder = target.endswith("/") or not to.path or len(sources) > 1 or _is_folder(marey, to)
+        into_folder = to.is_folder or not to.path or len(sources) > 1 or _is_folder(marey, to)
         things = [the_thing(marey, source, kind) for source in sources]
         require_apart(things)
         folder, name = (to.path, None) if into_folder else _parted(to.path)

@@ -144,7 +144,7 @@ def _request(
         if address.name.startswith(f"{FOLDER}_"):
             raise WrongUsage(f"{place} is the id of a folder; give its path with a final /, or the ids of items")
         wanted["item"] = address.name
-    elif not address.path or place.endswith("/") or kind == FOLDER or query is not None or _is_folder(project, address):
+    elif not address.path or address.is_folder or kind == FOLDER or query is not None or _is_folder(project, address):
         wanted["collection"] = address.path
     else:
         wanted["path"] = address.path

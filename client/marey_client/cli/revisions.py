@@ -34,8 +34,8 @@ def require_revision(marey: Marey, address: Address, kinds: Sequence[Kind]) -> t
 def find_revision(marey: Marey, address: Address, kinds: Sequence[Kind]) -> tuple[ItemHandle, int | None] | None:
     """Return the item at an address, with the revision number after `@` or None; return None if there is no item."""
     found = find_item(marey, address, kinds)
-    if found is not None:
-        return found, None
+    if found is not None or address.is_folder:
+        return None if found is None else (found, None)
     named = _REVISION.fullmatch(address.path)
     if named is None or (found := find_item(marey, Address(address.project, named[1]), kinds)) is None:
         return None

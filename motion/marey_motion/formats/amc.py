@@ -1,6 +1,7 @@
 """AMC (Acclaim motion capture): reading a motion together with its ASF skeleton.
 
 Angles are rotations about fixed axes (extrinsic), in the order of `dof` in the ASF: `dof rx ry rz` is Rz · Ry · Rx.
+The root moves in the frame of reference that `position` and `orientation` of the ASF's section :root define.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from marey_motion.formats.asf import AsfSkeleton, parse_asf, skeleton_source
 from marey_motion.formats.euler import NO_COLUMN, rotations_from_euler
 from marey_motion.formats.numeric_text import excerpt
 from marey_motion.formats.text_lines import TextLines
+from marey_motion.formats.unpacking import require_unpackable
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.importing.source import SourceMotion
 
@@ -56,6 +58,7 @@ def read_amc(
     lines = TextLines(data, file)
     degrees, declared_rate_hz = _read_amc_header(lines, skeleton.degrees)
     values, gaps = scan_frames(lines, skeleton)
+    require_unpackable(len(values), len(skeleton.bones), values.size, file)
     if gaps:
         message = f"frame numbers jump {gaps} times; frames were read in the order of the file"
         source.warnings.append(CheckWarning("frame-number-gap", message, values={"gaps": gaps}))
@@ -102,7 +105,7 @@ def _read_amc_header(lines: TextLines, degrees: bool) -> tuple[bool, float | Non
 def _fill_motion(source: SourceMotion, skeleton: AsfSkeleton, values: NDArray[np.float64], degrees: bool) -> None:
     turns = np.full((len(skeleton.bones), 3), NO_COLUMN)
     axes = np.zeros((len(skeleton.bones), 3), np.int64)
-    root_positions = np.tile(skeleton.root_position, (len(values), 1))
+    root_moves = np.zeros((len(values), 3))
     column = 0
     for joint, bone in enumerate(skeleton.bones):
         rotating = [i for i, channel in enumerate(bone.channels) if channel[0] == "r"]
@@ -111,12 +114,13 @@ def _fill_motion(source: SourceMotion, skeleton: AsfSkeleton, values: NDArray[np
             turns[joint, turn], axes[joint, turn] = column + i, "xyz".index(bone.channels[i][1])
         for i, channel in enumerate(bone.channels):
             if channel[0] == "t":
-                root_positions[:, "xyz".index(channel[1])] += values[:, column + i]
+                root_moves[:, "xyz".index(channel[1])] += values[:, column + i]
         column += len(bone.channels)
     angles = values if degrees else np.degrees(values)
     rotations = np.empty((len(values), len(skeleton.bones), 4), np.float64)
     rotations_from_euler(angles, turns, axes, rotations)
     frames = np.array([bone.frame for bone in skeleton.bones])
     turned = quaternions.multiply(quaternions.multiply(frames, rotations), quaternions.conjugate(frames))
+    turned[:, 0] = quaternions.multiply(skeleton.root_orientation, turned[:, 0])
     source.rotations = turned.astype(np.float32)
-    source.root_positions = root_positions
+    source.root_positions = skeleton.root_position + quaternions.rotate_vectors(skeleton.root_orientation, root_moves)

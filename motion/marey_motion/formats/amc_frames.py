@@ -44,7 +44,7 @@ class BoneTable:
         -------
         BoneTable    names and columns as arrays
         """
-        names = [bone.name.encode() for bone in bones]
+        names = [bone.written_name for bone in bones]
         widths = [len(bone.channels) for bone in bones]
         return cls(
             np.frombuffer(b"".join(names), np.uint8),

@@ -5,6 +5,9 @@ measured. With C the rotation of that frame and M the rotation by the angles, th
 its parent. The joints made from the bones have world-aligned frames at rest (identity rest rotations, as in BVH). Each
 joint is at the start of its bone, so the offset of a joint is the bone vector of the parent; the end of a bone without
 children becomes an end site.
+
+The `position` and `orientation` of the section :root place the whole skeleton in the world, and an AMC moves it
+relative to this place. So the orientation is the rest rotation of the root.
 """
 
 from __future__ import annotations
@@ -30,6 +33,8 @@ ROOT = "root"
 _AXES = "xyz"
 _IN_DEGREES = {b"deg": True, b"degree": True, b"degrees": True, b"rad": False, b"radian": False, b"radians": False}
 _CHANNELS = {kind + axis for kind in "rt" for axis in _AXES}
+# The format takes commas and parentheses for white space; names may contain them all the same.
+_SPACED = bytes.maketrans(b",()", b"   ")
 
 
 @dataclass
@@ -38,13 +43,14 @@ class Bone:
 
     `vector` is the direction times the length, in the file's unit and world axes. `frame` is the quaternion of the
     bone's `axis`. `channels` are the degrees of freedom in order ("rx", "tz"). `line` is the number of the bone's line
-    in the file.
+    in the file. `written_name` is the name as bytes of the file, by which an AMC file calls the bone.
     """
 
     name: str
     line: int
+    written_name: bytes = b""
     direction: list[float] | None = None
-    length: float = 0.0
+    length: float | None = None
     frame: NDArray[np.float64] = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
     channels: tuple[str, ...] = ()
 
@@ -52,7 +58,7 @@ class Bone:
     def vector(self) -> NDArray[np.float64]:
         direction = np.array(self.direction or [0.0, 0.0, 0.0])
         norm = np.linalg.norm(direction)
-        return direction / norm * self.length if norm > 0 else direction
+        return direction / norm * (self.length or 0.0) if norm > 0 else direction
 
 
 @dataclass
@@ -60,7 +66,8 @@ class AsfSkeleton:
     """The content of an ASF file: bones in depth-first order, the root first.
 
     `parents` are indices; `length_unit` is the file's `units length` (CMU: 0.45), None if the file has none; `degrees`
-    is false if the file's angles are in radians; `root_position` is the root's position in the rest pose.
+    is false if the file's angles are in radians; `root_position` and the quaternion `root_orientation` are those of the
+    root in the rest pose.
     """
 
     bones: list[Bone]
@@ -68,6 +75,7 @@ class AsfSkeleton:
     length_unit: float | None
     degrees: bool
     root_position: NDArray[np.float64]
+    root_orientation: NDArray[np.float64]
 
     def offsets(self) -> NDArray[np.float64]:
         """Compute the offset of each joint from its parent.
@@ -123,6 +131,8 @@ def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
     SourceMotion    a source without motion
     """
     names = tuple(bone.name for bone in skeleton.bones)
+    rest_rotations = np.tile([1.0, 0.0, 0.0, 0.0], (len(names), 1))
+    rest_rotations[0] = skeleton.root_orientation
     scale: float | None = None
     declared: tuple[str, ...] = ()
     if skeleton.length_unit is not None:
@@ -134,7 +144,7 @@ def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
         display_names=names,
         parents=skeleton.parents,
         offsets=skeleton.offsets(),
-        rest_rotations=np.tile([1.0, 0.0, 0.0, 0.0], (len(names), 1)),
+        rest_rotations=rest_rotations,
         end_sites=skeleton.end_sites(),
         unit_scale_m=scale,
         declared=declared,
@@ -171,6 +181,10 @@ def parse_asf(data: bytes, file: str) -> AsfSkeleton:
     return _KNOWN.get_or_make(hashlib.sha256(data).digest(), lambda: _AsfReader(TextLines(data, file)).read())
 
 
+def _separated(words: list[bytes]) -> list[bytes]:
+    return b" ".join(words).translate(_SPACED).split()
+
+
 class _AsfReader:
     """Reader of the sections of an ASF file. A section is a keyword with a leading colon, and the lines after it."""
 
@@ -178,7 +192,7 @@ class _AsfReader:
         self.lines = lines
         self.degrees = True
         self.length_unit: float | None = None
-        self.root = Bone(ROOT, line=1, channels=("tx", "ty", "tz", "rx", "ry", "rz"))
+        self.root = Bone(ROOT, line=1, written_name=ROOT.encode(), channels=("tx", "ty", "tz", "rx", "ry", "rz"))
         self.root_position = [0.0, 0.0, 0.0]
         self.root_axis, self.root_orientation = "xyz", [0.0, 0.0, 0.0]
         self.bones: dict[str, Bone] = {}
@@ -214,10 +228,12 @@ class _AsfReader:
             degrees = _IN_DEGREES.get(b" ".join(words[1:]).lower())
             if degrees is None:
                 raise self.lines.error("the unit `angle` must be deg or rad")
+            if self.bones and degrees != self.degrees:
+                raise self.lines.error("the unit of angles comes after the bones; move :units before :bonedata")
             self.degrees = degrees
 
     def _root(self, words: list[bytes]) -> None:
-        keyword = words[0].lower()
+        keyword, words = words[0].lower(), _separated(words)
         if keyword == b"order":
             self.root.channels = self._channels(words[1:], ROOT)
         elif keyword == b"axis":
@@ -236,8 +252,13 @@ class _AsfReader:
         elif keyword == b"end":
             self._end_bone(bone)
         elif keyword == b"name":
-            bone.name = decode_name(b" ".join(words[1:]))
-        elif keyword == b"direction":
+            bone.written_name = b" ".join(words[1:])
+            bone.name = decode_name(bone.written_name)
+        else:
+            self._bone_numbers(bone, keyword, _separated(words))
+
+    def _bone_numbers(self, bone: Bone, keyword: bytes, words: list[bytes]) -> None:
+        if keyword == b"direction":
             bone.direction = self.lines.numbers(words[1:], 3, "direction", bone.name)
         elif keyword == b"length":
             bone.length = self.lines.numbers(words[1:], 1, "length", bone.name)[0]
@@ -259,6 +280,8 @@ class _AsfReader:
             raise self.lines.error("two bones have this name; rename one of them", joint=bone.name)
         if bone.direction is None:
             raise self.lines.error("the bone has no direction; add a line 'direction x y z'", joint=bone.name)
+        if bone.length is None:
+            raise self.lines.error("the bone has no length; add a line 'length x'", joint=bone.name)
         if len(self.bones) + 1 == MAX_JOINTS:
             raise FormatLimit(
                 f"the file has more than {MAX_JOINTS} bones, the most that are accepted",
@@ -306,7 +329,6 @@ class _AsfReader:
         return frame
 
     def _assembled(self) -> AsfSkeleton:
-        self.root.frame = self._frame(self.root_orientation, self.root_axis)
         bones: list[Bone] = []
         parents: list[int] = []
         waiting = [(ROOT, -1)]
@@ -323,5 +345,10 @@ class _AsfReader:
         if loose is not None:
             raise self.lines.error("the section :hierarchy does not connect this bone to the root", joint=loose)
         return AsfSkeleton(
-            bones, np.array(parents, np.int32), self.length_unit, self.degrees, np.array(self.root_position)
+            bones,
+            np.array(parents, np.int32),
+            self.length_unit,
+            self.degrees,
+            np.array(self.root_position),
+            self._frame(self.root_orientation, self.root_axis),
         )

@@ -19,6 +19,7 @@ from marey_motion.formats.frame_times import frame_rate_of
 from marey_motion.formats.joint_names import unique_names
 from marey_motion.formats.numeric_text import BadNumber, scan_numbers
 from marey_motion.formats.text_lines import TextLines, number_problem
+from marey_motion.formats.unpacking import require_unpackable
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.importing.source import SourceMotion
 from marey_schemas.wording import counted
@@ -80,6 +81,7 @@ def read_bvh(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
         declared_frame_time_s=header.frame_time_s,
     )
     if len(values):
+        require_unpackable(len(values), len(offsets), values.size, file)
         _fill_motion(source, values, channel_columns(channels))
         source.frame_rate_hz = frame_rate_hz or frame_rate_of(header.frame_time_s, file, warnings)
     return source

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from marey_motion.clip import Clip
 from marey_motion.errors import FormatError
 from marey_motion.formats.euler import euler_from_rotations
+from marey_motion.formats.frame_times import frame_time_to_write
 from marey_motion.importing.source import SourceInfo
 from marey_motion.importing.units import unit_in_metres
 from marey_motion.kernels import compiled
@@ -46,13 +47,14 @@ def write_bvh(
 
     Raises
     ------
-    FormatError    if a length in that unit has more than twelve digits before the decimal point
+    FormatError    if a length in that unit has more than twelve digits before the decimal point, or if the frame rate
+        is less than 1 Hz or more than 100 kHz
     """
     order = _depth_first(clip.skeleton)
     axes = np.array([_axes_of(clip.skeleton, joint, rotation_order, source) for joint in order])
     scale = 1.0 / unit_in_metres(unit)
     lines = _hierarchy(clip, order, axes, scale)
-    lines += ["MOTION", f"Frames: {clip.frame_count}", f"Frame Time: {1.0 / clip.frame_rate_hz!r}", ""]
+    lines += ["MOTION", f"Frames: {clip.frame_count}", f"Frame Time: {frame_time_to_write(clip.frame_rate_hz)!r}", ""]
     return "\n".join(lines).encode() + format_table(_channel_values(clip, order, axes, scale))
 
 

@@ -17,6 +17,7 @@ from marey_motion.importing.landmarks import KEPT_SKELETONS
 from marey_motion.importing.source import ImportedMotion, SourceInfo, SourceMotion
 from marey_motion.importing.units import infer_conversion
 from marey_motion.skeleton import EndSite, Skeleton
+from marey_schemas.documents.clips import MAX_FRAME_RATE_HZ, MIN_FRAME_RATE_HZ
 from marey_schemas.lru import LruCache
 from marey_schemas.options.imports import ImportOptions, UpAxis
 
@@ -98,7 +99,14 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
 
 
 def _check_range(source: SourceMotion, file: str) -> None:
-    """Refuse lengths so large that their squares or float32 values would overflow. No body or path is that long."""
+    """Refuse frame rates that no clip may have, and lengths so large that their squares or float32 values overflow."""
+    rate_hz = source.frame_rate_hz
+    if rate_hz is not None and not MIN_FRAME_RATE_HZ <= rate_hz <= MAX_FRAME_RATE_HZ:
+        message = (
+            f"the frame rate is {rate_hz:.6g} Hz, but must be from {MIN_FRAME_RATE_HZ} to {MAX_FRAME_RATE_HZ:.0f} Hz; "
+            "set the rate with --fps (frame_rate_hz)"
+        )
+        raise FormatError(message, code="value-range", file=file)
     tips = np.array([offset for _, offset in source.end_sites])
     for values in (source.offsets, tips, source.root_positions, source.translations):
         if values is not None and np.abs(values).max(initial=0.0) > _LARGEST_LENGTH:

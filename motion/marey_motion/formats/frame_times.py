@@ -1,9 +1,10 @@
-"""Frame rates computed from the rounded frame times of files."""
+"""Frame rates computed from the rounded frame times of files, and frame times to write."""
 
 from __future__ import annotations
 
 from marey_motion.errors import FormatError
 from marey_motion.importing.checks import CheckWarning
+from marey_schemas.documents.clips import MAX_FRAME_RATE_HZ
 
 KNOWN_RATES_HZ = (
     *(10.0, 12.0, 12.5, 15.0, 20.0, 24.0, 25.0, 30.0, 40.0, 48.0, 50.0, 60.0, 72.0, 75.0, 80.0, 90.0, 96.0, 100.0),
@@ -15,7 +16,6 @@ SNAP_TOLERANCE = 1e-4
 NOTABLE_DEVIATION = 2e-5
 # Three decimals of a frame time can be this far from the rate they stand for.
 ROUNDED_DEVIATION = 0.02
-HIGHEST_RATE_HZ = 100_000.0
 # Nobody records a body less often; such a "time" is a rate, or milliseconds.
 LONGEST_FRAME_TIME_S = 1.0
 
@@ -50,7 +50,7 @@ def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWar
     if LONGEST_FRAME_TIME_S < frame_time_s < float("inf"):
         reason = f"a Frame Time of {frame_time_s:g} s is too long; it looks like a frame rate, or like milliseconds"
         raise _no_rate(reason, file)
-    if not 1.0 / HIGHEST_RATE_HZ <= frame_time_s < float("inf"):
+    if not 1.0 / MAX_FRAME_RATE_HZ <= frame_time_s < float("inf"):
         raise _no_rate(f"a Frame Time of {frame_time_s} s is not a valid time between frames", file)
     declared_hz = 1.0 / frame_time_s
     nearest_hz = min(KNOWN_RATES_HZ, key=lambda rate_hz: abs(rate_hz - declared_hz))
@@ -68,6 +68,31 @@ def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWar
         values = {"used_hz": declared_hz, "nearest_hz": nearest_hz}
         warnings.append(CheckWarning("frame-rate-unusual", message, values=values))
     return rate_hz
+
+
+def frame_time_to_write(frame_rate_hz: float) -> float:
+    """Compute the frame time to write in a file, and refuse one that `frame_rate_of` does not accept.
+
+    Parameters
+    ----------
+    frame_rate_hz : float    frames per second of the clip
+
+    Returns
+    -------
+    float    seconds between frames
+
+    Raises
+    ------
+    FormatError    if the rate is less than 1 Hz or more than 100 kHz
+    """
+    lowest_hz = 1.0 / LONGEST_FRAME_TIME_S
+    if not lowest_hz <= frame_rate_hz <= MAX_FRAME_RATE_HZ:
+        raise FormatError(
+            f"a clip of {frame_rate_hz:.6g} Hz cannot be written in this format, which is read only with frame rates "
+            f"from {lowest_hz:g} to {MAX_FRAME_RATE_HZ:.0f} Hz; resample the clip, or write it as npz",
+            code="frame-rate",
+        )
+    return 1.0 / frame_rate_hz
 
 
 def _no_rate(reason: str, file: str) -> FormatError:

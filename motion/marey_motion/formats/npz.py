@@ -27,6 +27,8 @@ from marey_motion.clip import Clip
 from marey_motion.errors import FormatError, FormatLimit
 from marey_motion.formats.numeric_text import excerpt
 from marey_motion.formats.quaternion_rows import as_rotations
+from marey_motion.formats.text_lines import decode_name
+from marey_motion.importing.checks import CheckWarning
 from marey_motion.importing.source import SourceMotion
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.skeletons import MAX_JOINTS
@@ -47,6 +49,8 @@ _SKELETON_MEMBERS = (
 )
 _MOTION_MEMBERS = ("frame_rate_hz", "poses")
 _OPTIONAL_MEMBERS = ("translated_joints", "translations")
+# Methods whose members `zipfile` unpacks only up to the declared size.
+_BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 # All that a damaged or hostile archive raises; RuntimeError stands for encryption and for unknown compression, too.
 _ARCHIVE_ERRORS = (
     zipfile.BadZipFile,
@@ -140,15 +144,15 @@ def _foreign(data: bytes, file: str) -> FormatError:
 
 def _source(arrays: dict[str, NDArray[Any]], file: str, frame_rate_hz: float | None) -> SourceMotion:
     joints = arrays["joint_names"].size
-    names = tuple(str(name) for name in arrays["joint_names"])
     if not 1 <= joints <= MAX_JOINTS:
         raise FormatLimit(f"the file has {joints} joints; 1 to {MAX_JOINTS} are accepted", file=file)
+    names = _names(arrays, "joint_names", joints, file)
     sites = _array(arrays, "end_site_joints", "i", (arrays["end_site_joints"].size,), file)
     tips = _array(arrays, "end_site_offsets", "f", (len(sites), 3), file).astype(np.float64)
     source = SourceMotion(
         format=FORMAT,
         joint_names=names,
-        display_names=tuple(str(name) for name in arrays["display_names"]),
+        display_names=_names(arrays, "display_names", joints, file),
         parents=_array(arrays, "parents", "i", (joints,), file).astype(np.int32),
         offsets=_array(arrays, "offsets", "f", (joints, 3), file).astype(np.float64),
         rest_rotations=_array(arrays, "rest_rotations", "f", (joints, 4), file).astype(np.float64),
@@ -156,19 +160,35 @@ def _source(arrays: dict[str, NDArray[Any]], file: str, frame_rate_hz: float | N
         unit_scale_m=1.0,
         up_axis="y",
     )
-    if "poses" in arrays:
-        frames = len(np.atleast_1d(arrays["poses"]))
+    frames = len(np.atleast_1d(arrays["poses"])) if "poses" in arrays else 0
+    if "poses" in arrays and not frames:
+        message = "the file contains no frames; only its skeleton was read"
+        source.warnings.append(CheckWarning("no-frames", message))
+    if frames:
         poses = _array(arrays, "poses", "f", (frames, 3 + 4 * joints), file)
         quaternions = poses[:, 3:].reshape(frames, joints, 4)
         source.root_positions = poses[:, :3].astype(np.float64)
         source.rotations = as_rotations(quaternions, names, file, source.warnings).astype(np.float32)
         source.frame_rate_hz = frame_rate_hz or float(_array(arrays, "frame_rate_hz", "f", (), file))
-    if "poses" in arrays and "translations" in arrays and "translated_joints" in arrays:
+    if frames and "translations" in arrays and "translated_joints" in arrays:
         moved = _array(arrays, "translated_joints", "i", (arrays["translated_joints"].size,), file)
+        if moved.size and not 1 <= moved.min() <= moved.max() < joints:
+            raise FormatError(f"member 'translated_joints' must contain indices from 1 to {joints - 1}", file=file)
         source.translated_joints = tuple(moved.tolist())
-        translations = _array(arrays, "translations", "f", (len(poses), len(moved), 3), file)
+        translations = _array(arrays, "translations", "f", (frames, len(moved), 3), file)
         source.translations = translations.astype(np.float64)
     return source
+
+
+def _names(arrays: dict[str, NDArray[Any]], name: str, count: int, file: str) -> tuple[str, ...]:
+    array = arrays[name]
+    if array.dtype.kind not in "US" or array.shape != (count,):
+        raise FormatError(
+            f"member {name!r} has the type {array.dtype} and the shape {array.shape}, but must have text in the shape "
+            f"({count},)",
+            file=file,
+        )
+    return tuple(decode_name(one) if isinstance(one, bytes) else one for one in array.tolist())
 
 
 def _array(arrays: dict[str, NDArray[Any]], name: str, kind: str, shape: tuple[int, ...], file: str) -> NDArray[Any]:
@@ -189,6 +209,14 @@ def _read_members(data: bytes, file: str) -> dict[str, NDArray[Any]]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = [info for info in archive.infolist() if info.filename.removesuffix(".npy") in known]
+            foreign = next((info for info in members if info.compress_type not in _BOUNDED), None)
+            if foreign is not None:
+                raise FormatError(
+                    f"member {foreign.filename!r} is compressed by a method that numpy does not use; save the arrays "
+                    "with numpy.savez_compressed",
+                    code="not-npz",
+                    file=file,
+                )
             total = sum(info.file_size for info in members)
             if total > MOST_UNPACKED_BYTES or len(members) > len(known):
                 raise FormatLimit(
@@ -205,7 +233,8 @@ def _read_members(data: bytes, file: str) -> dict[str, NDArray[Any]]:
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
     """Read one array, and check that its data have the size given in its header."""
-    content = archive.read(info)
+    with archive.open(info) as member:
+        content = member.read(info.file_size)  # without a number, it would unpack more than the archive declares
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)
     if version != (1, 0):

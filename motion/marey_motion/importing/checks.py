@@ -37,6 +37,7 @@ CODES = {
     "sign-flips-unrolled": "Rotations jumped between a quaternion and its negative; the signs were made continuous.",
     # What was inferred.
     "unit-inferred": "The unit of length is unusual; it was inferred from the size of the body.",
+    "unit-doubtful": "The unit of length that the file states gives legs of another length than an adult's.",
     "up-axis-assumed": "The file does not show which axis points up; y was assumed.",
     "up-axis-converted": "The upward axis of the file is not y; the motion was rotated.",
     "left-handed": "Left and right joints seem to be exchanged: the axes of the file may be left-handed.",

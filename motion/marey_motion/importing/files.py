@@ -6,6 +6,8 @@ database, and takes and returns only plain values, bytes and arrays. Its results
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from pydantic import ValidationError
 
@@ -113,13 +115,13 @@ def _imported(file: FileToImport) -> ImportedFile:
     imported = convert(source, file.planned.name, file.options)
     checks = tuple(_check_document(warning.as_dict()) for warning in imported.warnings)
     items: list[ImportedItem] = []
-    clip, reference = imported.clip, {"output": skeleton_output(file.planned.name)}
-    if file.skeleton is not None and clip is not None:
-        clip = _on_skeleton(clip, given_skeleton(file.skeleton), file.planned.name)
+    reference = {"output": skeleton_output(file.planned.name)}
+    if file.skeleton is not None and imported.clip is not None:
+        imported = _on_skeleton(imported, imported.clip, given_skeleton(file.skeleton), file.planned.name)
         reference = file.skeleton.ref
     else:
         items.append(skeleton_item(file, imported.skeleton))
-    if clip is not None:
+    if (clip := imported.clip) is not None:
         motion = clip_to_tree(clip, reference)
         parts = {"motion": motion, "info": _info(imported, file, checks)}
         items.append(main_item(file, Kind.CLIP, file.planned.item_name, parts))
@@ -173,8 +175,11 @@ def _info(imported: ImportedMotion, file: FileToImport, checks: tuple[Tree, ...]
     return {key: value for key, value in info.items() if value is not None}
 
 
-def _on_skeleton(clip: Clip, skeleton: Skeleton, file: str) -> Clip:
-    """Convert a clip to a given skeleton, which must equal the file's skeleton except in the order of joints."""
+def _on_skeleton(imported: ImportedMotion, clip: Clip, skeleton: Skeleton, file: str) -> ImportedMotion:
+    """Convert a clip to a given skeleton, which must equal the file's skeleton except in the order of joints.
+
+    The channels in the record of the import get the order of the given skeleton, too.
+    """
     own = clip.skeleton
     if set(own.joint_names) != set(skeleton.joint_names):
         odd = ", ".join(sorted(set(own.joint_names) ^ set(skeleton.joint_names))[:5])
@@ -201,4 +206,7 @@ def _on_skeleton(clip: Clip, skeleton: Skeleton, file: str) -> Clip:
     moved = [places[joint] for joint in clip.translated_joints]
     ranks = np.argsort(moved)
     translations = None if clip.translations is None else clip.translations[:, ranks]
-    return Clip(skeleton, clip.frame_rate_hz, poses, translations, tuple(moved[rank] for rank in ranks))
+    clip = Clip(skeleton, clip.frame_rate_hz, poses, translations, tuple(moved[rank] for rank in ranks))
+    channels = imported.source.channels
+    record = replace(imported.source, channels=tuple(channels[joint] for joint in order) if channels else ())
+    return replace(imported, clip=clip, skeleton=skeleton, source=record)

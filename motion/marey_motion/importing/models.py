@@ -10,7 +10,6 @@ from dataclasses import replace
 from pydantic import ValidationError
 
 from marey_motion.errors import FormatError
-from marey_motion.formats.predecessor.documents import model_name
 from marey_motion.formats.predecessor.graph import graph_of_document
 from marey_motion.formats.predecessor.model import PredecessorModel, model_of_document
 from marey_motion.formats.predecessor.tree import read_predecessor_tree
@@ -30,6 +29,7 @@ from marey_motion.modelling.search.tree_documents import sample_tree_to_tree
 from marey_motion.skeleton import SAME_OFFSET_M, same_hierarchy
 from marey_schemas.documents.originals import original_of
 from marey_schemas.documents.references import PartDigestRef
+from marey_schemas.formats.companions import is_skeleton_name, model_name
 from marey_schemas.imports import skeleton_output
 from marey_schemas.kinds import Kind
 from marey_schemas.options.modelling import TreeOptions
@@ -72,7 +72,7 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
 
 
 def _parts(file: FileToImport, found: PredecessorModel, skeleton: Tree) -> dict[str, Tree]:
-    """Make the documents `model` and, if the file has a companion, `tree`."""
+    """Make the documents `model` and, if the companion of the file is a tree, `tree`."""
     name = found.primitive.name or model_name(file.planned.item_name)
     model = primitive_to_tree(replace(found.primitive, name=name), skeleton)
     known: Tree = {
@@ -83,19 +83,19 @@ def _parts(file: FileToImport, found: PredecessorModel, skeleton: Tree) -> dict[
         "original": original_of("model", model, file.planned.name, file.digest),
     }
     parts = {"model": model}
-    if file.companion is not None and file.companion_digest is not None:
-        parts["tree"] = _imported_tree(bytes(file.companion), file, found.primitive)
-        known["tree"] = original_of("tree", parts["tree"], str(file.planned.companion), file.companion_digest)
+    companion = str(file.planned.companion)
+    if file.companion is not None and file.companion_digest is not None and not is_skeleton_name(companion):
+        parts["tree"] = _imported_tree(bytes(file.companion), companion, file.planned.name, found.primitive)
+        known["tree"] = original_of("tree", parts["tree"], companion, file.companion_digest)
     model["provenance"] = {"predecessor": known}
     return parts
 
 
-def _imported_tree(data: bytes, file: FileToImport, primitive: MotionPrimitive) -> Tree:
+def _imported_tree(data: bytes, name: str, model_file: str, primitive: MotionPrimitive) -> Tree:
     """Make the document `tree`; seed and features of an imported tree are unknown, so defaults are written."""
-    name = str(file.planned.companion)
     tree = read_predecessor_tree(data, name)
     if tree.dimensions != primitive.dimensions:
-        model = f"the latent vectors of {file.planned.name} have {primitive.dimensions}"
+        model = f"the latent vectors of {model_file} have {primitive.dimensions}"
         message = f"the samples of the tree have {tree.dimensions} numbers, but {model}"
         raise FormatError(message, code="tree-of-another-model", file=name)
     try:

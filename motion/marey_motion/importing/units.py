@@ -28,7 +28,8 @@ from marey_schemas.options.imports import Handedness, ImportOptions, UpAxis
 CONVENTIONAL_UNITS = ("m", "cm", "mm")
 # Adults, from the joint that carries both legs down the bones to the ankle. No length fits two units in these bounds.
 LEG_LENGTH_M = (0.72, 1.2)
-ANIMAL_LEG_LENGTH_M = (0.1, 1.5)
+# Bodies of any kind, such as children and animals.
+ANY_LEG_LENGTH_M = (0.1, 1.5)
 
 _SAMPLED_FRAMES = 64
 _CLEAR_COSINE = 0.8
@@ -310,39 +311,52 @@ def _choose_unit(source: SourceMotion, body: _Measurements, options: ImportOptio
     if (given := options.metres_per_unit) is not None:
         body.evidence.append(f"unit {given:g} m: given by the user{_as_hips(hip_height, given)}")
         return given
-    if source.unit_scale_m is not None and (
-        not source.declared or body.leg is None or _is_leg(body.leg * source.unit_scale_m)
-    ):
-        why = "; ".join(source.declared) or "fixed by the format"
-        body.evidence.append(f"unit {source.unit_scale_m:g} m: {why}{_as_hips(hip_height, source.unit_scale_m)}")
-        return source.unit_scale_m
+    if (stated := source.unit_scale_m) is not None:
+        legs_m = body.leg * stated if source.declared and body.leg is not None else None
+        if legs_m is None or _within(ANY_LEG_LENGTH_M, legs_m):
+            why = "; ".join(source.declared) or "fixed by the format"
+            body.evidence.append(f"unit {stated:g} m: {why}{_as_hips(hip_height, stated)}")
+            if legs_m is not None and not _within(LEG_LENGTH_M, legs_m):
+                body.warnings.append(_doubtful_unit(stated, legs_m))
+            return stated
     if body.leg is None:
         raise AmbiguousUnits(
             "the unit of length is not clear, because no two legs were found whose length could be measured; "
             "name the unit with --unit (unit_scale_m), such as cm",
             file=body.file,
         )
-    return _unit_of_leg(body, hip_height, up_axis)
+    return _unit_of_leg(body, hip_height, up_axis, stated)
 
 
-def _unit_of_leg(body: _Measurements, hip_height: float, up_axis: UpAxis) -> float:
+def _doubtful_unit(stated: float, legs_m: float) -> CheckWarning:
+    low, high = LEG_LENGTH_M
+    return CheckWarning(
+        "unit-doubtful",
+        f"with the unit that the file states ({stated:.5g} m), the legs are {legs_m:.2f} m long (adults have {low} to "
+        f"{high} m); if the body is an adult's, name the right unit with --unit (unit_scale_m)",
+        values={"unit_scale_m": stated, "leg_length_m": legs_m},
+    )
+
+
+def _unit_of_leg(body: _Measurements, hip_height: float, up_axis: UpAxis, stated: float | None) -> float:
     assert body.leg is not None
     (low, high), known, reason = LEG_LENGTH_M, tuple(UNITS_M), "legs"
     if _walks_on_hands(body, up_axis):
-        (low, high), known, reason = ANIMAL_LEG_LENGTH_M, CONVENTIONAL_UNITS, "hands stay on the ground, and legs"
+        (low, high), known, reason = ANY_LEG_LENGTH_M, CONVENTIONAL_UNITS, "hands stay on the ground, and legs"
     elif not body.landmarks.by_names:
         known, reason = CONVENTIONAL_UNITS, "the build is a body's, and legs"
-    fitting = [name for name in known if low <= body.leg * UNITS_M[name] <= high]
+    fitting = [name for name in known if _within((low, high), body.leg * UNITS_M[name])]
     if len(fitting) != 1:
         raise _ambiguous_unit(body, hip_height)
     scale = UNITS_M[fitting[0]]
     measured = f"{reason} of {body.leg:.4g} units are {body.leg * scale:.2f} m{_as_hips(hip_height, scale)}"
     body.evidence.append(f"unit {fitting[0]} ({scale:.5g} m): {measured}")
-    if fitting[0] not in CONVENTIONAL_UNITS or reason != "legs":
+    if stated is not None or fitting[0] not in CONVENTIONAL_UNITS or reason != "legs":
+        fault = "does not state its unit of length" if stated is None else f"states an impossible unit ({stated:.5g} m)"
         body.warnings.append(
             CheckWarning(
                 "unit-inferred",
-                f"the file does not state its unit of length; {fitting[0]} is assumed, because {measured}",
+                f"the file {fault}; {fitting[0]} is assumed, because {measured}",
                 values={"unit_scale_m": scale, "leg_length_m": body.leg * scale, "hip_height_m": hip_height * scale},
             )
         )
@@ -365,8 +379,8 @@ def _ambiguous_unit(body: _Measurements, hip_height: float) -> AmbiguousUnits:
     )
 
 
-def _is_leg(length_m: float) -> bool:
-    return LEG_LENGTH_M[0] <= length_m <= LEG_LENGTH_M[1]
+def _within(bounds: tuple[float, float], value: float) -> bool:
+    return bounds[0] <= value <= bounds[1]
 
 
 def _hip_height(body: _Measurements, up_axis: UpAxis) -> float:

@@ -23,6 +23,8 @@ from marey_schemas.encoding.arrays import ArrayOf
 from marey_schemas.names import Digest, JointName, Tag
 
 MAX_FRAME_RATE_HZ = 100_000.0
+MIN_FRAME_RATE_HZ = 1e-6
+"""Lowest frame rate of a clip; at much lower ones, the duration of a clip would be no finite number."""
 
 
 class MotionDocument(Request):
@@ -30,7 +32,7 @@ class MotionDocument(Request):
 
     schema_: Literal["marey/motion@1"] = Field("marey/motion@1", alias="schema")
     skeleton: RevisionRef | OutputRef
-    frame_rate_hz: float = Field(gt=0, le=MAX_FRAME_RATE_HZ, allow_inf_nan=False)
+    frame_rate_hz: float = Field(ge=MIN_FRAME_RATE_HZ, le=MAX_FRAME_RATE_HZ, allow_inf_nan=False)
     joints: tuple[JointName, ...] = Field(
         min_length=1, max_length=MAX_JOINTS, description="Order of the joints' rotations in `poses`."
     )

@@ -129,6 +129,17 @@ def written(dataset: ListedDataset, path: Path) -> None:
     write_archive(dataset, head.digest, path, ignore_progress, since=head.parents, check=lambda _contents: None)
 
 
+def test_beside_the_unfinished_archive_no_file_is_left_by_a_process_that_is_killed(tmp_path: Path) -> None:
+    beside: list[list[str]] = []
+
+    def check(_contents: Sequence[str]) -> None:
+        beside.append([path.suffix for path in tmp_path.iterdir()])
+
+    dataset = ListedDataset([])
+    write_archive(dataset, dataset.commits[-1].digest, tmp_path / "gaits.tar", ignore_progress, check=check)
+    assert beside == [[".part"]]
+
+
 def test_a_finished_archive_gets_its_name_before_another_process_may_write_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -32,7 +32,7 @@ from marey_client.cli.files.uploading import _print_entries
 from marey_client.cli.jobs import _done
 from marey_client.cli.pipelines import _print_shortfalls
 from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
-from marey_client.cli.terminal.following import follow, print_ended
+from marey_client.cli.terminal.following import clips_at, follow, print_ended
 from marey_client.cli.terminal.invocation import connect
 from marey_client.cli.terminal.output import print_table
 from marey_client.credentials import Credential, Logins, read_logins, store_login, write_private
@@ -41,7 +41,7 @@ from marey_client.handles.pipelines import PipelineRun
 from marey_client.marey import Marey
 from marey_schemas.imports import ImportEntry
 from marey_schemas.kinds import Kind
-from marey_schemas.queue.jobs import Job, JobState, Progress
+from marey_schemas.queue.jobs import CollectionInput, Job, JobState, Progress
 
 
 def marey(
@@ -243,6 +243,21 @@ def test_addresses_have_a_project_a_path_and_perhaps_an_id() -> None:
     assert str(Address.parse("lab/")) == "lab"
     with pytest.raises(WrongUsage):
         Address.parse("/")
+
+
+def test_a_final_slash_of_an_address_means_the_folder_even_if_a_clip_has_its_name(script: ScriptedServer) -> None:
+    marey, folder = script.marey(), Address.parse("lab/raw/walks/")
+    assert folder == Address.within("lab", "raw/walks/") == Address("lab", "raw/walks", is_folder=True)
+    assert clips_at(marey, folder) == CollectionInput(collection="raw/walks")
+    assert not script.requests
+
+    def no_folder(request: httpx.Request) -> httpx.Response:
+        assert request.url.path.endswith("/collections")
+        return httpx.Response(200, content=b'{"items": [], "next_cursor": null}')
+
+    script.answers = [no_folder]
+    with pytest.raises(WrongUsage, match="there is no folder at lab/raw/walks"):
+        require_item(marey, folder, [Kind.CLIP])
 
 
 def test_a_format_that_cannot_be_written_is_refused_before_anything_is_asked(nowhere: dict[str, str]) -> None:

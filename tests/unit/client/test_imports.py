@@ -52,7 +52,7 @@ def test_files_that_would_get_one_name_are_refused_and_none_is_left_out_silently
     assert len(find_files([tmp_path / "monday", tmp_path / "monday/walk.bvh"]).files) == 1
 
 
-@pytest.mark.parametrize("name", ["clip.bson", "clip.BSON.bz2", "clip.npz", "clip.json"])
+@pytest.mark.parametrize("name", ["clip.bson", "clip.BSON.bz2", "clip.npz", "clip.json", "lab.skeleton"])
 def test_every_format_with_a_reader_is_found_in_a_folder(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("x")
     assert [file.name for file in find_files([tmp_path]).files] == [name]
@@ -185,6 +185,38 @@ def test_an_asf_never_travels_without_the_amc_files_that_need_it() -> None:
     portions = names_of(batches(named(names)))
     assert sorted({name for portion in portions for name in portion}) == names
     assert all(any(name.endswith(".amc") for name in portion) for portion in portions if "b/b.asf" in portion)
+
+
+@pytest.mark.parametrize(
+    ("companion", "file"), [("{}_cluster_tree.json", "{}_mm.json"), ("{}_skeleton.json", "{}_take.bson.bz2")]
+)
+def test_files_that_belong_together_travel_together(companion: str, file: str) -> None:
+    stems = [f"m/walk{number:03d}" for number in range(FILES_PER_IMPORT)]
+    names = ["a/alone.bvh", *sorted(pattern.format(stem) for stem in stems for pattern in (companion, file))]
+    portions = names_of(batches(named(names)))
+    assert sorted(name for portion in portions for name in portion) == names
+    for portion in portions:
+        assert len(portion) <= FILES_PER_IMPORT
+        assert all((companion.format(stem) in portion) == (file.format(stem) in portion) for stem in stems)
+
+
+def test_an_amc_travels_with_its_own_asf_alone_if_its_name_tells_which_it_is() -> None:
+    subjects = range(2 * FILES_PER_IMPORT)
+    names = [f"all/{subject}{ending}" for subject in subjects for ending in (".asf", "_01.amc", "_02.amc")]
+    portions = names_of(batches(named(names)))
+    assert len(portions) < 10
+    for portion in portions:
+        assert len(portion) <= FILES_PER_IMPORT
+        assert {name.partition("_")[0] for name in portion if name.endswith(".amc")} == {
+            name.removesuffix(".asf") for name in portion if name.endswith(".asf")
+        }
+
+
+def test_an_amc_whose_asf_is_unclear_travels_with_all_of_its_folder() -> None:
+    others = [f"a/{number:03d}.bvh" for number in range(FILES_PER_IMPORT - 2)]
+    portions = names_of(batches(named([*others, "b/1.asf", "b/1_01.amc", "b/2.asf", "b/take.amc"])))
+    (portion,) = (one for one in portions if "b/take.amc" in one)
+    assert {"b/1.asf", "b/2.asf"} <= set(portion)
 
 
 class FullDisk:

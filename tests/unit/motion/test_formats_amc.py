@@ -10,9 +10,9 @@ from tests.support.motion_files import AMC, ASF
 from marey_motion.errors import FormatError
 from marey_motion.formats import read_motion
 from marey_motion.formats.amc import read_amc
-from marey_motion.importing.plan import pair_companions
 from marey_motion.importing.source import SourceMotion
 from marey_motion.kinematics import global_positions
+from marey_schemas.formats.companions import pair_companions
 from marey_schemas.options.imports import ImportOptions
 
 
@@ -59,6 +59,36 @@ def test_joints_are_where_the_definition_of_the_format_puts_them() -> None:
     np.testing.assert_allclose(placed[1], by_definition([1, 2, 4, 10, 20, 31], [40, 50, 61], 71)[:4], atol=1e-5)
 
 
+PLACED = ASF.replace("axis XYZ\n  position 0 0 0", "axis ZXY\n  position 5 6 7").replace(
+    "orientation 0 0 0", "orientation 25 35 45"
+)
+
+
+def test_position_and_orientation_of_the_root_place_the_whole_motion() -> None:
+    options = ImportOptions(unit_scale_m=1.0, up_axis="y")
+    clip = read_motion(AMC.encode(), "take.amc", companion=PLACED.encode(), options=options).clip
+    assert clip is not None
+    base = Rotation.from_euler("zxy", [25, 35, 45], degrees=True).as_matrix()
+    moved = by_definition([1, 2, 3, 10, 20, 30], [40, 50, 60], 70)[:4]
+    np.testing.assert_allclose(global_positions(clip)[0], [5, 6, 7] + moved @ base.T, atol=1e-5)
+
+
+def test_a_quarter_turn_of_the_root_stands_a_body_up_that_moves_along_z() -> None:
+    turned = ASF.replace("orientation 0 0 0", "orientation -90 0 0")
+    still = AMC.replace("10 20 30", "0 0 0").replace("40 50 60", "0 0 0").replace("shin 70", "shin 0")
+    source = read(still, turned)
+    np.testing.assert_allclose(source.root_positions[0], [1, 3, -2], atol=1e-12)
+    np.testing.assert_allclose(source.rotations[0, 0], [0.5**0.5, -(0.5**0.5), 0, 0], atol=1e-7)
+    np.testing.assert_allclose(source.skeleton.rest_global_positions[2], [0, 0, 8], atol=1e-12)
+
+
+def test_position_and_orientation_of_the_root_place_the_rest_pose() -> None:
+    rest = read(asf=PLACED).skeleton.rest_global_positions
+    base = Rotation.from_euler("zxy", [25, 35, 45], degrees=True).as_matrix()
+    bones = np.array([[0, 0, 0], [0, 0, 0], [0, -8, 0], [0, -15, 0]])
+    np.testing.assert_allclose(rest, [5, 6, 7] + bones @ base.T, atol=1e-12)
+
+
 def test_the_last_bone_ends_in_an_end_site() -> None:
     joint, tip = read().end_sites[0]
     assert joint == 3
@@ -80,6 +110,14 @@ def test_the_root_may_list_its_channels_in_any_order() -> None:
     )
     np.testing.assert_array_equal(other.root_positions, read().root_positions)
     np.testing.assert_array_equal(other.rotations, read().rotations)
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8"])
+def test_bones_have_the_same_name_in_both_files_in_any_encoding(encoding: str) -> None:
+    asf, amc = (text.replace("shin", "tibia_größe").encode(encoding) for text in (ASF, AMC))
+    found = read_amc(amc, "take.amc", companion=asf)
+    assert found.joint_names == ("root", "thigh", "tibia_größe", "sole")
+    np.testing.assert_array_equal(found.rotations, read().rotations)
 
 
 def test_radians_are_read_as_radians() -> None:
@@ -110,9 +148,13 @@ def test_an_amc_that_does_not_say_its_unit_of_angle_has_that_of_its_asf() -> Non
         ("angle deg", "angle Degrees"),
         (":hierarchy\n  begin", ":HIERARCHY\n  BEGIN"),
         ("shin sole\n  end", "shin sole\n  END"),
+        ("direction 0 -1 0\n    length 8", "direction 0,-1, 0\n    length (8)"),
+        ("axis 0 0 20 XYZ", "axis (0, 0, 20) XYZ"),
+        ("dof rx ry rz", "dof rx, ry, rz"),
+        ("order TX TY TZ RX RY RZ", "order (TX, TY, TZ, RX, RY, RZ)"),
     ],
 )
-def test_keywords_of_an_asf_may_be_written_large_or_out(found: str, written: str) -> None:
+def test_keywords_and_numbers_of_an_asf_may_be_written_in_several_ways(found: str, written: str) -> None:
     assert found in ASF
     np.testing.assert_array_equal(read(asf=ASF.replace(found, written)).rotations, read().rotations)
 
@@ -166,6 +208,7 @@ def test_what_is_wrong_in_an_amc_is_named_with_its_line(amc: str, line: int, joi
     [
         ("direction 0 -1 0\n    length 8", "length 8", "thigh", "no direction"),
         ("direction 0 -1 0\n    length 8", "direction 0 -1\n    length 8", "thigh", "but 3 are needed"),
+        ("    length 8\n", "", "thigh", "no length"),
         ("length 8", "length long", "thigh", "not a number"),
         ("axis 0 0 20 XYZ", "axis 0 0 20 XYX", "thigh", "order of axes"),
         ("dof rx ry rz", "dof rx ry rw", "thigh", "RX RY RZ"),
@@ -176,6 +219,7 @@ def test_what_is_wrong_in_an_amc_is_named_with_its_line(amc: str, line: int, joi
         ("shin sole\n", "", "sole", "does not connect"),
         ("shin sole\n", "shin sole\n    root shin\n", "shin", "two parents"),
         ("angle deg", "angle gon", None, "deg or rad"),
+        (":hierarchy", ":units\n  angle rad\n:hierarchy", None, "move :units before :bonedata"),
         ("length 0.45", "length -1", None, "positive"),
         (":hierarchy", ":nothing", None, "no :hierarchy"),
     ],
@@ -221,7 +265,7 @@ class TestPairing:
         assert alone.companion is None
         assert "no ASF" in str(alone.reason)
         assert unlike.companion is None
-        assert "2 ASF" in str(unlike.reason)
+        assert "none of the ASF files" in str(unlike.reason)
 
 
 def test_frames_may_be_shorter_than_the_names_of_bones_without_channels() -> None:

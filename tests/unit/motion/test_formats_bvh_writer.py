@@ -12,6 +12,7 @@ from tests.support.another_loader import positions_by_another_loader
 
 from marey_motion.clip import Clip
 from marey_motion.errors import FormatError, MotionError
+from marey_motion.exporting import write_clip_file
 from marey_motion.formats import read_motion, write_motion
 from marey_motion.formats.bvh_writer import format_table, write_bvh
 from marey_motion.importing.source import SourceInfo
@@ -116,3 +117,35 @@ def test_numbers_are_written_to_six_decimals(value: float) -> None:
 def test_lengths_that_no_loader_could_read_are_refused() -> None:
     with pytest.raises(FormatError, match="is too large to be written"):
         format_table(np.array([[1e13]]))
+
+
+@pytest.mark.parametrize(
+    "source", [None, {"details": {"channels": 5}}, {"details": {"channels": [[1, 2, 3]] * 22}}, {"details": {}}]
+)
+def test_a_record_of_the_import_that_a_user_has_changed_stops_no_export(
+    body: Skeleton, tumbling: Callable[..., Clip], source: object
+) -> None:
+    clip = tumbling(body)
+    assert len(clip.skeleton.joint_names) == 22
+    assert write_clip_file(clip, "bvh", info={"source": source}).data == write_bvh(clip)
+
+
+@pytest.mark.parametrize("file_format", ["bvh", "predecessor"])
+@pytest.mark.parametrize("rate_hz", [0.5, 0.99, 2e5])
+def test_a_frame_rate_that_no_reader_would_accept_is_not_written(
+    body: Skeleton, tumbling: Callable[..., Clip], file_format: str, rate_hz: float
+) -> None:
+    clip = replace(tumbling(body), frame_rate_hz=rate_hz)
+    with pytest.raises(FormatError, match="resample the clip, or write it as npz") as refused:
+        write_motion(clip, file_format)
+    assert refused.value.code == "frame-rate"
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 1e5])
+def test_the_lowest_and_the_highest_frame_rate_are_read_back(
+    body: Skeleton, tumbling: Callable[..., Clip], rate_hz: float
+) -> None:
+    clip = replace(tumbling(body), frame_rate_hz=rate_hz)
+    read = read_motion(write_bvh(clip), "take.bvh", options=CENTIMETRES).clip
+    assert read is not None
+    assert read.frame_rate_hz == pytest.approx(rate_hz)

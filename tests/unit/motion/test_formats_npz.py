@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -87,10 +88,17 @@ def test_a_compressed_archive_of_the_same_arrays_is_read(archive: dict[str, byte
         ("parents", member(np.full(22, 40, np.int32)), "root"),
         ("poses", member(np.zeros((70, 91), np.float32)), "not a rotation"),
         ("poses", member(np.zeros((70, 90), np.float32)), "shape (70, 91)"),
-        ("frame_rate_hz", member(-1.0), "positive"),
+        ("frame_rate_hz", member(-1.0), "from 1e-06"),
         ("joint_names", member(np.array([object()], object)), "damaged"),
         ("joint_names", member(np.array(["a"] * 22)), "unique"),
+        ("joint_names", member("a"), "text in the shape (1,)"),
+        ("joint_names", member(np.arange(22)), "text in the shape (22,)"),
+        ("display_names", member("a"), "text in the shape (22,)"),
+        ("display_names", member(np.array([], str)), "text in the shape (22,)"),
+        ("frame_rate_hz", member(2e5), "to 100000 Hz"),
+        ("frame_rate_hz", member(1e-310), "from 1e-06"),
         ("translated_joints", member(np.array([7, 3], np.int32)), "increasing"),
+        ("translated_joints", member(np.array([3, 1 << 30], np.int32)), "from 1 to 21"),
         ("poses", b"\x93NUMPY\x01\x00\xff\xff", "damaged"),
         ("poses", b"", "damaged"),
     ],
@@ -128,6 +136,43 @@ def test_an_archive_that_unpacks_to_too_much_is_refused_unopened(
     assert len(bomb) < 1 << 16
     with pytest.raises(FormatLimit, match="unpacks to"):
         read_motion(bomb, "bomb.npz")
+
+
+def test_no_more_is_unpacked_than_the_archive_declares(archive: dict[str, bytes]) -> None:
+    """The sizes in the archive are false: of 64 MiB, it declares 100 bytes."""
+    archive["format.npy"] = bytes(64 << 20)
+    data = bytearray(packed(archive, zipfile.ZIP_DEFLATED))
+    with zipfile.ZipFile(io.BytesIO(data)) as members:
+        declared = members.getinfo("format.npy").file_size.to_bytes(4, "little")
+    directory = data.rindex(b"format.npy") - 46
+    assert data[directory + 24 : directory + 28] == declared
+    data[directory + 24 : directory + 28] = (100).to_bytes(4, "little")
+    tracemalloc.start()
+    try:
+        with pytest.raises(FormatError, match="damaged"):
+            read_motion(bytes(data), "bomb.npz")
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_methods_that_unpack_without_bounds_are_refused(archive: dict[str, bytes], method: int) -> None:
+    with pytest.raises(FormatError, match=r"numpy\.savez_compressed"):
+        read_motion(packed(archive, method), "take.npz")
+
+
+def test_an_archive_without_frames_is_a_skeleton(archive: dict[str, bytes]) -> None:
+    archive["poses.npy"] = member(np.zeros((0, 91), np.float32))
+    imported = read_motion(packed(archive), "take.npz")
+    assert imported.clip is None
+    assert [warning.code for warning in imported.warnings] == ["no-frames"]
+
+
+def test_names_may_be_bytes(archive: dict[str, bytes], body: Skeleton) -> None:
+    for name in ("joint_names", "display_names"):
+        archive[f"{name}.npy"] = member(np.array([one.encode() for one in body.joint_names]))
+    assert read_motion(packed(archive), "take.npz").skeleton.joint_names == body.joint_names
 
 
 def test_a_header_that_announces_more_than_there_is_is_refused(archive: dict[str, bytes]) -> None:

@@ -12,7 +12,8 @@ from tests.support import model_examples
 from tests.support import predecessor_models as models
 
 from marey_motion.arrays import Floats
-from marey_motion.errors import FormatError
+from marey_motion.errors import FormatError, FormatLimit
+from marey_motion.formats.predecessor import model
 from marey_motion.formats.predecessor.encoding import Encoding, encode_document
 from marey_motion.formats.predecessor.model import PredecessorModel, read_predecessor_model
 from marey_motion.formats.predecessor.model_writer import write_predecessor_model
@@ -259,3 +260,11 @@ def test_damaged_models_are_refused_by_what_is_wrong(document: dict[str, Any], t
     with pytest.raises(FormatError, match=told) as refused:
         read_predecessor_model(data, "model.json")
     assert refused.value.file == "model.json"
+
+
+def test_a_small_model_on_a_large_skeleton_is_refused_before_it_fills_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = json.dumps(models.layout_3()).encode()
+    read_predecessor_model(data, "model.json")
+    monkeypatch.setattr(model, "MOST_VALUES", 4000)
+    with pytest.raises(FormatLimit, match="5 components of 9 coefficients for 26 joints have 4,815 numbers"):
+        read_predecessor_model(data, "model.json")

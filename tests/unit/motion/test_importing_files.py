@@ -11,19 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.support import predecessor_models as models
-from tests.support.motion_files import ARM, bvh
+from tests.support.motion_files import ARM, POSITIONS, ZXY, bvh
 
 from marey_motion import formats
-from marey_motion.documents import clip_to_document, clip_to_tree
+from marey_motion.documents import clip_from_document, clip_to_document, clip_to_tree, skeleton_to_document
 from marey_motion.exporting import write_clip_file
-from marey_motion.formats import read_motion, write_bvh, write_predecessor_skeleton
-from marey_motion.formats.predecessor import clips, documents
+from marey_motion.formats import predecessor, read_motion, write_bvh, write_predecessor_skeleton
+from marey_motion.formats.predecessor import clips
 from marey_motion.gait import generate_gait
 from marey_motion.importing import anatomy, source
 from marey_motion.importing.files import import_file, mapping_part
-from marey_motion.importing.items import FileToImport, ImportedFile
+from marey_motion.importing.items import FileToImport, GivenSkeleton, ImportedFile
 from marey_motion.importing.plan import PlannedFile, plan_imports
 from marey_motion.skeleton import Skeleton
+from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import OutputRef
 from marey_schemas.documents.skeletons import MAX_JOINTS
 from marey_schemas.lru import LruCache
@@ -62,7 +63,7 @@ def test_a_compressed_clip_of_the_predecessor_is_detected_and_decoded_once(count
     clip = generate_gait(1.2, 0.0, 1.0, 30.0)
     written = write_clip_file(clip, "predecessor")
     count(formats, "detect_format")
-    count(documents, "decode_document")
+    count(predecessor, "decode_document")
     calls = count(clips, "decode_document")  # the skeleton document is the second file
     planned = PlannedFile("take.bson.bz2", "motion", "", "take", companion="take.skeleton")
     companion = write_predecessor_skeleton(clip.skeleton)
@@ -72,7 +73,7 @@ def test_a_compressed_clip_of_the_predecessor_is_detected_and_decoded_once(count
 
 
 def test_a_model_of_the_predecessor_is_decoded_once(count: Count) -> None:
-    calls = count(documents, "decode_document")
+    calls = count(predecessor, "decode_document")
     read("walk_mm.json", json.dumps(models.layout_3()).encode())
     assert calls == {"decode_document": 1}
 
@@ -162,3 +163,63 @@ def test_a_collection_that_is_too_long_is_a_refusal() -> None:
     found = import_file(FileToImport(planned, bvh(), DIGEST, options=options))
     assert found.refusal is not None
     assert found.refusal.code == "name-invalid"
+
+
+def test_joints_keep_their_rotation_orders_on_a_skeleton_with_another_order_of_joints() -> None:
+    def joint(name: str, x: int, order: str) -> str:
+        channels = " ".join(f"{axis}rotation" for axis in order)
+        return f"JOINT {name}\n{{\nOFFSET {x} 10 0\nCHANNELS 3 {channels}\nEnd Site\n{{\nOFFSET 0 5 0\n}}\n}}\n"
+
+    root = f"HIERARCHY\nROOT Hips\n{{\nOFFSET 0 0 0\nCHANNELS 6 {POSITIONS} {ZXY}\n"
+    left, right = joint("Left", 3, "YZX"), joint("Right", -3, "XYZ")
+    options = ImportOptions(unit_scale_m=0.01, up_axis="y")
+    chosen = read_motion(bvh([], hierarchy=root + right + left + "}\n"), "body.bvh", options=options).skeleton
+    given = GivenSkeleton("skeleton", 1, skeleton_to_document(chosen).model_dump(by_alias=True, exclude_none=True))
+    rows = ["0 90 0 10 20 30 11 21 31 12 22 32"]
+    found = read("take.bvh", bvh(rows, hierarchy=root + left + right + "}\n"), skeleton=given, options=options)
+    parts = found.items[0].parts
+    assert parts["info"]["source"]["details"]["channels"][1:] == [
+        ["Xrotation", "Yrotation", "Zrotation"],
+        ["Yrotation", "Zrotation", "Xrotation"],
+    ]
+    clip = clip_from_document(MotionDocument.model_validate(parts["motion"]), chosen)
+    written = write_clip_file(clip, "bvh", info=parts["info"]).data.decode().splitlines()[-1]
+    assert [round(float(word)) for word in written.split()] == [0, 90, 0, 10, 20, 30, 12, 22, 32, 11, 21, 31]
+
+
+def import_all(files: dict[str, bytes]) -> dict[str, ImportedFile]:
+    """Import files as a server does, each with the companion that the plan names."""
+    return {
+        one.name: import_file(
+            FileToImport(
+                one,
+                files[one.name],
+                DIGEST,
+                companion=None if one.companion is None else files[one.companion],
+                companion_digest=None if one.companion is None else DIGEST,
+            )
+        )
+        for one in plan_imports(list(files))
+        if one.role in ("motion", "skeleton")
+    }
+
+
+def test_a_clip_of_the_predecessor_is_imported_with_the_skeleton_of_its_folder() -> None:
+    clip = generate_gait(1.2, 0.0, 1.0, 30.0)
+    files = {
+        "old/skeleton.json": write_predecessor_skeleton(clip.skeleton),
+        "old/walk.bson.bz2": write_clip_file(clip, "predecessor").data,
+    }
+    found = import_all(files)
+    assert {name: one.refusal for name, one in found.items()} == dict.fromkeys(files)
+    skeleton, walk = found["old/walk.bson.bz2"].items
+    assert (walk.item_name, walk.collection, found["old/walk.bson.bz2"].frames) == ("walk", "old", 30)
+    assert walk.parts["info"]["source"]["companion_name"] == "skeleton.json"
+    assert [item.parts for item in found["old/skeleton.json"].items] == [skeleton.parts]
+
+
+def test_a_model_beside_a_skeleton_is_imported_without_a_tree() -> None:
+    skeleton = write_predecessor_skeleton(generate_gait(1.2, 0.0, 1.0, 30.0).skeleton)
+    found = import_all({"skeleton.json": skeleton, "walk.json": json.dumps(models.layout_3()).encode()})
+    assert found["walk.json"].refusal is None
+    assert "tree" not in found["walk.json"].items[-1].parts

@@ -487,6 +487,24 @@ def test_the_end_of_a_limb_keeps_or_gets_an_orientation(body: Skeleton) -> None:
     assert np.abs(tips - near).max() < 1e-9
 
 
+@pytest.mark.parametrize("solver", ["ccd", "least_squares"])
+def test_an_orientation_turns_the_end_of_a_limb_alone_unless_a_limit_stops_it(
+    body: Skeleton, solver: Literal["ccd", "least_squares"]
+) -> None:
+    motion = _moved(body, frames=3)
+    limb = limb_of(body, "LeftArm", "LeftForeArm", "LeftHand")
+    wanted = quaternions.multiply(quaternions.from_rotation_vector((0.3, -0.4, 0.5)), _spins(body, motion, limb.end))
+    target = OrientationTarget(limb.end, wanted)
+    free = solve(body, motion, [target], freedom=Freedom(limb.joints), limb=limb, solver=solver)
+    assert free.reached.all()
+    turned = quaternions.angle_between(free.motion.rotations, motion.rotations).max(axis=0) > 1e-6
+    assert np.flatnonzero(turned).tolist() == [limb.end]
+    limits = {limb.end: JointLimit.hinge(JointAxes((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), -0.1, 0.1)}
+    for joints in (limb.joints, None):
+        limited = solve(body, motion, [target], freedom=Freedom(joints, limits=limits), limb=limb, solver=solver)
+        assert limited.reached.all()
+
+
 def test_damping_keeps_a_stretching_limb_from_snapping_straight(body: Skeleton) -> None:
     frames = 101
     rest = Motion(

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.support.motion_files import bvh
+from tests.support.motion_files import body_asf, bvh
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
@@ -232,6 +232,21 @@ def test_a_unit_is_given_by_name_or_by_size(walk: Clip, options: dict[str, Any],
 
 def test_a_format_that_fixes_its_unit_is_believed(walk: Clip) -> None:
     assert read_motion(write_npz(walk), "walk.npz").source.unit_scale_m == 1.0
+
+
+@pytest.mark.parametrize("size", [1.0, 0.6, 0.3], ids=["adult", "child", "infant"])
+def test_the_unit_that_a_file_states_counts_for_bodies_of_every_size(size: float) -> None:
+    motion = read_motion(body_asf(size, 0.45), "body.asf")
+    assert motion.source.unit_scale_m == pytest.approx(UNITS_M["cmu"])
+    assert codes(motion) == ({"unit-doubtful"} if size < 0.7 else set())
+
+
+def test_a_stated_unit_that_fits_no_body_is_replaced_with_a_warning() -> None:
+    motion = read_motion(body_asf(5.6, 1.0), "body.asf")  # legs of 95 inches, that is of 95 cm
+    assert motion.source.unit_scale_m == 0.01
+    (warning,) = motion.warnings
+    assert warning.code == "unit-inferred"
+    assert "states an impossible unit" in warning.message
 
 
 @pytest.mark.parametrize(("unit", "metres"), [("cm", 0.01), ("INCH", 0.0254), (0.5, 0.5)])

@@ -70,7 +70,7 @@ def record(
     if (values is None) == (table is None):
         raise WrongUsage("give either values with --set FIELD=VALUE, or a table with --table FILE")
     with connect(context) as marey:
-        clips = _clips_at(marey.project(address.project).clips, address.path, query)
+        clips = _clips_at(marey.project(address.project).clips, address, query)
         if not clips:
             raise WrongUsage(
                 f"{place} has no clips, or none that --query selects; `marey ls {address.project}` lists the project"
@@ -83,10 +83,10 @@ def record(
         _apply(changes)
 
 
-def _clips_at(clips: Any, path: str, query: str | None) -> list[ClipHandle]:
-    """Return the clip at a path, or the clips in the folder at the path and below."""
-    found = list(clips.list(path=path, query=query)) if path else []
-    return found or list(clips.list(collection=path, query=query))
+def _clips_at(clips: Any, address: Address, query: str | None) -> list[ClipHandle]:
+    """Return the clip at an address, or the clips in the folder at the address and below."""
+    found = [] if address.is_folder or not address.path else list(clips.list(path=address.path, query=query))
+    return found or list(clips.list(collection=address.path, query=query))
 
 
 def _pairs(texts: Sequence[str]) -> dict[str, str]:

@@ -142,8 +142,9 @@ def solve(
     limb : TwoBoneLimb, optional    a limb that may turn
     solver : str    "auto", "ccd", "two_bone" or "least_squares". "auto" uses the two-bone solver if a limb is given,
         joints have no limits, and the targets are a position of the limb's end in all axes and, optionally, an
-        orientation of this end. Otherwise, "auto" uses least squares. If the limb is too short in any frame, and other
-        joints or the root may move, "auto" uses least squares, too.
+        orientation of this end. Otherwise, "auto" uses least squares. It also uses least squares if the limb is too
+        short in any frame, and other joints or the root may move. If all targets are orientations of the limb's end,
+        only this end turns, unless it cannot reach the targets in some frame, for example because of its limits.
     options : SolverOptions    tolerances and iterations
 
     Returns
@@ -168,11 +169,14 @@ def solve(
         others = set(freedom.joints or ()) - set(limb.joints)
         if solver == "two_bone" or exact.reached.all() or not (others or freedom.root_moves):
             return exact
-    if limb is not None and all(isinstance(one, OrientationTarget) and one.joint == limb.end for one in targets):
-        freedom = replace(freedom, joints=(limb.end,))  # an orientation alone does not move the limb
-    elif limb is not None and freedom.joints is None:
-        freedom = replace(freedom, joints=limb.joints)
     chosen = solve_ccd if solver == "ccd" else solve_least_squares
+    if limb is not None:
+        freedom = replace(freedom, joints=limb.joints if freedom.joints is None else freedom.joints)
+        if all(isinstance(one, OrientationTarget) and one.joint == limb.end for one in targets):
+            alone = replace(freedom, joints=(limb.end,))
+            turned = chosen(skeleton, motion, targets, freedom=alone, options=options)
+            if turned.reached.all() or freedom.joints == alone.joints:
+                return turned
     return chosen(skeleton, motion, targets, freedom=freedom, options=options)
 
 

@@ -1,6 +1,58 @@
 """Readers and writers for documents of Marey's predecessor, the system of Herrmann et al. (2019)."""
 
-from marey_motion.formats.predecessor.clips import write_predecessor, write_predecessor_skeleton
-from marey_motion.formats.predecessor.documents import read_predecessor
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from marey_motion.formats.predecessor.clips import motion_of_document, write_predecessor, write_predecessor_skeleton
+from marey_motion.formats.predecessor.encoding import decode_document
+from marey_motion.formats.predecessor.graph import is_graph
+from marey_motion.formats.predecessor.model_layouts import layout_of
+from marey_motion.formats.predecessor.tree import is_tree
+from marey_motion.importing.source import SourceDocument, SourceMotion, Subject
 
 __all__ = ["read_predecessor", "write_predecessor", "write_predecessor_skeleton"]
+
+
+def read_predecessor(
+    data: bytes,
+    file: str,
+    *,
+    companion: bytes | None = None,
+    companion_name: str = "the skeleton document",
+    frame_rate_hz: float | None = None,
+) -> SourceMotion | SourceDocument:
+    """Read a file of Marey's predecessor: a motion, which stays in its own unit and axes, or a document without motion.
+
+    Parameters
+    ----------
+    data : bytes    content of the file
+    file : str    name of the file, for messages
+    companion : bytes, optional    the skeleton document of a clip
+    companion_name : str    name of the file of the skeleton document, for messages
+    frame_rate_hz : float, optional    replaces the document's rate
+
+    Returns
+    -------
+    SourceMotion or SourceDocument    motion in centimetres, or the document of a model, tree or graph
+
+    Raises
+    ------
+    FormatError    if a document is invalid; the error names the field, and the joint if there is one
+    """
+    document = decode_document(data, file)
+    subject = _subject_of(document)
+    if subject is not None:
+        return SourceDocument(subject, document)
+    return motion_of_document(
+        document, file, skeleton=companion, skeleton_file=companion_name, frame_rate_hz=frame_rate_hz
+    )
+
+
+def _subject_of(document: Mapping[str, Any]) -> Subject | None:
+    if layout_of(document) is not None:
+        return "model"
+    if is_tree(document):
+        return "tree"
+    return "graph" if is_graph(document) else None

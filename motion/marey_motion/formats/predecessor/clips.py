@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from marey_motion.clip import Clip
 from marey_motion.errors import FormatError
 from marey_motion.formats.document_fields import field_of, number_array, text_list
-from marey_motion.formats.frame_times import frame_rate_of
+from marey_motion.formats.frame_times import frame_rate_of, frame_time_to_write
 from marey_motion.formats.predecessor.encoding import Encoding, decode_document, encode_document
 from marey_motion.formats.predecessor.skeleton import (
     CENTIMETRE_M,
@@ -28,6 +28,7 @@ from marey_motion.formats.predecessor.skeleton import (
     skeleton_document,
 )
 from marey_motion.formats.quaternion_rows import as_rotations
+from marey_motion.formats.unpacking import require_unpackable
 from marey_motion.importing.source import SourceMotion
 from marey_motion.skeleton import Skeleton
 
@@ -64,7 +65,8 @@ def motion_of_document(
         return read_skeleton_document(document, file)
     if skeleton is None:
         raise FormatError(
-            "a clip document contains no hierarchy of its joints; import it together with its skeleton document",
+            "a clip document contains no hierarchy of its joints; import it together with its skeleton document, whose "
+            "name must end in 'skeleton', such as skeleton.json",
             code="skeleton-missing",
             file=file,
         )
@@ -92,7 +94,8 @@ def write_predecessor(clip: Clip, *, form: ClipForm = "poses", encoding: Encodin
 
     Raises
     ------
-    FormatError    if joints below the root have translations, which the format cannot contain
+    FormatError    if joints below the root have translations, which the format cannot contain, or if the frame rate is
+        less than 1 Hz or more than 100 kHz
     """
     skeleton = clip.skeleton
     if clip.translated_joints:
@@ -104,7 +107,7 @@ def write_predecessor(clip: Clip, *, form: ClipForm = "poses", encoding: Encodin
         )
     root = (clip.root_translations.astype(np.float64) - skeleton.offsets[0]) / CENTIMETRE_M * MIRROR_VECTOR
     rotations = clip.rotations.astype(np.float64) * MIRROR_ROTATION
-    frame_time_s = 1.0 / clip.frame_rate_hz
+    frame_time_s = frame_time_to_write(clip.frame_rate_hz)
     if form == "poses":
         rows = np.concatenate([root, rotations.reshape(clip.frame_count, -1)], axis=1)
         return encode_document(
@@ -192,6 +195,7 @@ def _fill_motion(source: SourceMotion, names: list[str], poses: NDArray[np.float
             file=file,
             joint=unknown,
         )
+    require_unpackable(len(poses), len(indices), poses.size, file)
     given = poses[:, 3:].reshape(len(poses), len(names), 4) * MIRROR_ROTATION
     rotations = np.tile(source.rest_rotations, (len(poses), 1, 1))
     rotations[:, [indices[name] for name in names]] = as_rotations(given, tuple(names), file, source.warnings)

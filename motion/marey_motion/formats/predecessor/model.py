@@ -130,6 +130,12 @@ def _skeleton(document: Document, file: str) -> Skeleton | None:
 def _read(parts: ModelParts, layout: Layout, skeleton: Skeleton, file: str) -> PredecessorModel:
     basis, mean, vectors = _functions(parts.space, "space", file)
     animated = _animated(parts, basis, mean, skeleton, file)
+    if (size := len(vectors) * basis.count * (3 + 4 * skeleton.joint_count)) > MOST_VALUES:
+        message = (
+            f"space: {len(vectors)} components of {basis.count} coefficients for {skeleton.joint_count} joints have "
+            f"{size:,} numbers; the limit is {MOST_VALUES:,}"
+        )
+        raise FormatLimit(message, file=file)
     spatial_mean, spatial_vectors = _on_skeleton(mean, vectors, parts.translation_maxima, animated, skeleton)
     frames = basis.frame_count
     time = _constant_speed(frames) if parts.time is None else _time(parts, frames, file)

@@ -1,0 +1,156 @@
+"""Files that an import reads together, found by their names. Client and server must pair files in the same way.
+
+An AMC needs its ASF. In the format of Marey's predecessor, a clip needs its skeleton, and a model may have a tree.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import PurePosixPath
+
+from marey_schemas.formats import FORMATS, FileFormat, format_named
+from marey_schemas.names import base_name
+
+_PREDECESSOR = format_named("predecessor")
+_ENDINGS = sorted((*_PREDECESSOR.endings, *_PREDECESSOR.other_endings), key=len, reverse=True)
+_MODEL_ENDINGS = ("_quaternion_mm", "_mm")
+_TREE_ENDINGS = ("_quaternion_cluster_tree", "_cluster_tree", "_tree")
+_SKELETON = "skeleton"
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """A file that needs a companion, or that may have one.
+
+    Parameters
+    ----------
+    file : name of the file
+    companion : name of its companion; None if there is none
+    beside : names of the files that an import must contain besides `file`, so that it pairs the file in this way
+    shared : whether the companion is also imported on its own
+    code, reason : why the file is refused without a companion; empty if it has one or can do without
+    """
+
+    file: str
+    companion: str | None
+    beside: tuple[str, ...]
+    shared: bool = False
+    code: str = ""
+    reason: str = ""
+
+
+_Files = Sequence[tuple[str, str]]
+"""Names of files in one folder, each with the path as given."""
+
+
+def pair_companions(names: Iterable[str]) -> tuple[Pairing, ...]:
+    """Return a pairing for every file that needs or may have a companion.
+
+    Only files in the same folder are paired. A companion matches if both files have the same stem, or if the stem of
+    the file consists of the stem of the companion, a separator and more text (16.asf for 16_01.amc, 07.asf for
+    07_01-walk.amc). Of several matches, the one with the longest stem is chosen. If none matches, and the folder has
+    only one possible companion, this file is chosen.
+
+    The name of a skeleton of the predecessor ends in `skeleton` (walk_skeleton.json, walk.skeleton), and its stem is
+    the text before this word; without such a text (skeleton.json), it matches every file. A tree has the name of its
+    model with another ending (walk_cluster_tree.json for walk_mm.json).
+    """
+    folders: defaultdict[str, dict[str, str]] = defaultdict(dict)
+    for name in sorted(names):
+        path = PurePosixPath(name.replace("\\", "/"))
+        folders[path.parent.as_posix()][path.name] = name
+    pairings: list[Pairing] = []
+    for row in FORMATS:
+        if row.companion is not None:
+            for folder in folders.values():
+                files = list(folder.items())
+                pairings += _pairings_of_predecessor(files) if row is _PREDECESSOR else _pairings(row, files)
+    return tuple(pairings)
+
+
+def stem_of(name: str) -> str:
+    """Return the name of a file without folders and ending; the ending may have two parts, as in `walk.bson.bz2`."""
+    name = base_name(name)
+    if not _PREDECESSOR.names(name):
+        return PurePosixPath(name).stem
+    ending = next(one for one in _ENDINGS if name.lower().endswith(one))
+    return name[: -len(ending)] or name
+
+
+def model_name(stem: str) -> str:
+    """Return the name of a model by the stem of its file: `walk_left` for `walk_left_quaternion_mm`."""
+    return _without(stem_of(stem) if _PREDECESSOR.names(stem) else stem, _MODEL_ENDINGS)
+
+
+def is_skeleton_name(name: str) -> bool:
+    """Return whether a file has the name of a skeleton in the format of the predecessor."""
+    name = base_name(name).lower()
+    return _PREDECESSOR.names(name) and (name.endswith(f".{_SKELETON}") or stem_of(name).endswith(_SKELETON))
+
+
+def _pairings(row: FileFormat, files: _Files) -> Iterator[Pairing]:
+    """Pair the files of a folder whose format needs a companion."""
+    wanted = str(row.companion)
+    companions = {stem_of(name).lower(): path for name, path in files if format_named(wanted).names(name)}
+    for name, path in files:
+        if not row.names(name):
+            continue
+        found, beside = _best(stem_of(name), companions)
+        code = reason = ""
+        if found is None:
+            code = f"{wanted}-missing"
+            reason = f"there is no {wanted.upper()} file in its folder; {row.needs_companion}"
+            if companions:
+                reason = f"none of the {wanted.upper()} files in its folder has a matching name"
+        yield Pairing(path, found, beside, code=code, reason=reason)
+
+
+def _pairings_of_predecessor(files: _Files) -> Iterator[Pairing]:
+    """Pair the models of a folder with their trees, and its clips with their skeletons.
+
+    By its name, a clip differs only from files that are called models, trees or skeletons. So other files, such as
+    graphs, get a skeleton, too, which their import ignores.
+    """
+    known = [(stem_of(name), path) for name, path in files if _PREDECESSOR.names(name)]
+    skeletons = {_skeleton_stem(stem).lower(): path for stem, path in known if is_skeleton_name(path)}
+    others = [(stem, path) for stem, path in known if not is_skeleton_name(path)]
+    models: dict[str, str] = {}
+    for stem, path in others:
+        models.setdefault(model_name(stem), path)
+    trees = {_without(stem, _TREE_ENDINGS): path for stem, path in others if _without(stem, _TREE_ENDINGS) != stem}
+    for stem, path in others:
+        model = model_name(stem)
+        if model in trees and models[model] == path:
+            yield Pairing(path, trees[model], (trees[model],))
+        elif skeletons and model == stem and models.get(_without(stem, _TREE_ENDINGS), path) == path:
+            yield Pairing(path, *_best(stem, skeletons), shared=True)
+
+
+def _skeleton_stem(stem: str) -> str:
+    """Return the stem of the clips that a skeleton matches; it is empty if the skeleton matches all clips."""
+    bare = stem[: -len(_SKELETON)] if stem.lower().endswith(_SKELETON) else stem
+    return bare.rstrip("_-. ")
+
+
+def _best(stem: str, companions: Mapping[str, str]) -> tuple[str | None, tuple[str, ...]]:
+    """Return the best match for a stem, or None, and the files that show that it is the best.
+
+    `companions` maps the stems of possible companions, in lower case, to their paths. Two of them show that there is
+    no match: of one, it would be the match.
+    """
+    stem = stem.lower()
+    ends = [len(stem), *(end for end in range(len(stem) - 1, 0, -1) if not stem[end].isalnum()), 0]
+    found = next((companions[stem[:end]] for end in ends if stem[:end] in companions), None)
+    if found is None and len(companions) == 1:
+        (found,) = companions.values()
+    return found, tuple(islice(companions.values(), 2)) if found is None else (found,)
+
+
+def _without(stem: str, endings: Iterable[str]) -> str:
+    for ending in endings:
+        if stem.endswith(ending) and len(stem) > len(ending):
+            return stem.removesuffix(ending)
+    return stem

@@ -1,0 +1,53 @@
+"""Small files that describe a huge motion are refused before they fill memory."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import pytest
+from tests.support.motion_files import AMC, ASF, POSITIONS, ZXY, bvh, nested
+
+from marey_motion.errors import FormatLimit
+from marey_motion.formats import ImportOptions, read_motion, unpacking, write_motion, write_predecessor_skeleton
+from marey_motion.gait import generate_gait
+
+File = tuple[str, bytes, bytes | None]
+
+
+def of_bvh(joints: int) -> File:
+    names = [f"joint{number}" for number in range(joints)]
+    hierarchy = nested(names, [f"{POSITIONS} {ZXY}", *[""] * (joints - 1)]).replace("CHANNELS 0 ", "CHANNELS 0")
+    return "walk.bvh", bvh(["1 2 3 4 5 6"] * 20, hierarchy=hierarchy), None
+
+
+def of_amc(bones: int) -> File:
+    fixed = "".join(f"begin\n name b{n}\n direction 0 1 0\n length 1\n axis 0 0 0 XYZ\nend\n" for n in range(bones))
+    names = " ".join(f"b{number}" for number in range(bones))
+    asf = ASF.replace(":hierarchy", f"{fixed}:hierarchy", 1).replace("root thigh", f"root thigh {names}", 1)
+    frames = "".join(f"{number}\nroot 1 2 3 4 5 6\nthigh 1 2 3\nshin 4\n" for number in range(1, 21))
+    return "walk.amc", f"{AMC.partition('1')[0]}{frames}".encode(), asf.encode()
+
+
+def of_predecessor(_joints: int) -> File:
+    clip = generate_gait(1.2, 0.0, 1.0, 30.0)
+    document = json.loads(write_motion(clip, "predecessor", encoding="json"))
+    few = {"joint_sequence": document["joint_sequence"][:1], "poses": [row[:7] for row in document["poses"]]}
+    return "walk.json", json.dumps(document | few).encode(), write_predecessor_skeleton(clip.skeleton)
+
+
+@pytest.mark.parametrize("make", [of_bvh, of_amc, of_predecessor])
+def test_a_motion_of_joints_that_the_file_says_nothing_of_is_limited(
+    make: Callable[[int], File], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, data, companion = make(40)
+    options = ImportOptions(unit_scale_m=0.01, up_axis="y")
+    assert read_motion(data, name, companion=companion, options=options).clip is not None
+    monkeypatch.setattr(unpacking, "MOST_UNPACKED_BYTES", 1 << 13)
+    with pytest.raises(FormatLimit, match="most joints have no channels"):
+        read_motion(data, name, companion=companion, options=options)
+
+
+def test_a_motion_whose_numbers_are_all_in_the_file_may_be_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unpacking, "MOST_UNPACKED_BYTES", 1)
+    assert read_motion(write_motion(generate_gait(1.2, 0.0, 1.0, 30.0), "bvh"), "walk.bvh").clip is not None
