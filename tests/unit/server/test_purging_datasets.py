@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from typing import Any
 
 import pytest
@@ -20,13 +19,11 @@ from marey_server.access.principal import SYSTEM
 from marey_server.errors import ConflictProblem, NotFoundProblem
 from marey_server.store import datasets, events, fsck, items, purging, transaction
 from marey_server.store.datasets import proposals
-from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.items.drafts import Draft
 from marey_server.store.jobs import retrying
 from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, proposal, tree_chunk
 from marey_server.store.tables import proposal_comment as comments
 from marey_server.store.transaction import Transaction
-from marey_versions.tree.chunks import decode
 
 EMPTY_TREE = 1
 """Number of chunks of the empty tree, which the first commit of a dataset stores and no commit needs afterwards."""
@@ -217,32 +214,6 @@ def test_a_tree_that_was_stored_again_after_the_preparation_stays(gaits: Committ
     second.change(PutEntry(path="walk", item=walk))
     gaits.write(purging.record_dataset_purge, "lab", request, prepared)
     assert second.entries() == {"walk": walk}
-    assert sound(gaits)
-
-
-def test_a_purge_reads_no_leaves_of_other_datasets(gaits: CommittingDesk, monkeypatch: pytest.MonkeyPatch) -> None:
-    walk, run = add(gaits.desk, "walk"), add(gaits.desk, "run", 2)
-    gaits.change(*(PutEntry(path=f"take-{number:03d}", item=walk) for number in range(200)))
-    other = CommittingDesk(gaits.desk, "other")
-    other.change(*(PutEntry(path=f"take-{number:03d}", item=run) for number in range(200)))
-    delete_gaits(gaits)
-    read: dict[str, bytes] = {}
-    load = StoredChunks.load
-
-    def noted(self: StoredChunks, digests: Iterable[str]) -> Mapping[str, bytes]:
-        found = load(self, digests)
-        read.update(found)
-        return found
-
-    monkeypatch.setattr(StoredChunks, "load", noted)
-    request = DatasetPurgeRequest(dataset="gaits")
-    prepared = gaits.read(purging.prepare_dataset_purge, "lab", request)
-    of_other = [decode(digest, data) for digest, data in read.items() if digest not in prepared.chunks]
-    assert of_other
-    assert all(chunk.level > 0 for chunk in of_other)
-    monkeypatch.undo()
-    gaits.write(purging.record_dataset_purge, "lab", request, prepared)
-    assert len(other.entries()) == 200
     assert sound(gaits)
 
 

@@ -42,7 +42,7 @@ from marey_server.store.tables import (
     tree_chunk,
 )
 from marey_server.store.transaction import Transaction, in_lists
-from marey_versions.tree.sharing import unshared_chunks
+from marey_versions.tree.chunks import Branch, decode_trusted
 
 _OF_DATASETS = (
     proposal_check, proposal_review, proposal_comment, proposal, dataset_ref, fast_forward, commit_parent,
@@ -77,17 +77,17 @@ def preview_dataset_purge(tx: Transaction, project: str, request: DatasetPurgeRe
 def prepare_dataset_purge(tx: Transaction, project: str, request: DatasetPurgeRequest) -> PreparedDatasetPurge:
     """Find a deleted dataset, the jobs that read its versions, and the chunks that only its versions have.
 
-    This reads all jobs of the project and all trees of the dataset once. Of the other trees of the server, it reads
-    only branches that may have chunks of the dataset below them. Raises `NotFoundProblem`, `ConflictProblem` if the
-    dataset is not deleted, and `ForbiddenProblem` if the caller lacks the scope `read`.
+    This reads all jobs of the project and all trees of the server once. Raises `NotFoundProblem`, `ConflictProblem` if
+    the dataset is not deleted, and `ForbiddenProblem` if the caller lacks the scope `read`.
     """
     project_row = projects.require(tx, project)
     projects.require_scope(tx, project, "read")  # because the answer shows names
     row = _find(tx, project_row, request.dataset)
     own = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id == row.id)
     others = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id != row.id)
-    roots, other_roots = (set(tx.execute(statement.distinct()).scalars()) for statement in (own, others))
-    going = sorted(unshared_chunks(StoredChunks(tx), roots, other_roots))
+    store = StoredChunks(tx)
+    needed = _below(store, set(tx.execute(others).scalars()), known=())
+    going = sorted(_below(store, set(tx.execute(own).scalars()), known=needed) - needed)
     chunks: dict[str, int] = {}
     size_bytes = 0
     stored = select(tree_chunk.c.digest, tree_chunk.c.created_us, func.length(tree_chunk.c.data).label("size"))
@@ -231,6 +231,24 @@ def _still_held(answer: DatasetPurgeAnswer) -> ConflictProblem:
 
 
 # -- chunks -----------------------------------------------------------------------------------------------------------
+
+
+def _below(store: StoredChunks, roots: Collection[str], known: Collection[str]) -> set[str]:
+    """Return the digests of the chunks `roots` and of all chunks below them.
+
+    The search leaves out chunks in `known`, and does not search below them.
+    """
+    found: set[str] = set()
+    waiting = set(roots).difference(known)
+    while waiting:
+        batch = next(in_lists(waiting))
+        waiting.difference_update(batch)
+        found.update(batch)
+        for digest, data in store.load(batch).items():
+            chunk = decode_trusted(digest, data)
+            if isinstance(chunk, Branch):
+                waiting |= {child.digest for child in chunk.children}.difference(found, known)
+    return found
 
 
 def _delete_chunks(tx: Transaction, chunks: Mapping[str, int]) -> None:
