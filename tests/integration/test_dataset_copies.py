@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.support.rest_server import Server
@@ -18,6 +19,7 @@ from marey_client.errors import RequestFailed
 from marey_client.handles.versions import DatasetHandle
 from marey_client.items import ItemHandle
 from marey_client.project import ProjectHandle
+from marey_client.transport import Transport
 from marey_schemas.access import ProjectCreate, Role
 from marey_schemas.datasets.commits import Commit, MoveEntry, PutEntry, RemoveEntry
 from marey_schemas.kinds import Kind
@@ -51,8 +53,8 @@ def gaits(lab: ProjectHandle) -> DatasetHandle:
     return lab.datasets.create("gaits")
 
 
-def make_rig(lab: ProjectHandle) -> ItemHandle:
-    return lab.skeletons.create("rig", {"hierarchy": skeleton_tree(2)})
+def make_rig(lab: ProjectHandle, joints: int = 2) -> ItemHandle:
+    return lab.skeletons.create("rig", {"hierarchy": skeleton_tree(joints)})
 
 
 def make_clip(lab: ProjectHandle, rig: ItemHandle) -> ItemHandle:
@@ -215,3 +217,39 @@ def test_a_reference_to_an_item_of_the_receiving_project_is_refused_with_what_to
     assert (caught.value.code, "another project" in str(caught.value)) == ("other-content", True)
     marey.create_project(ProjectCreate(name="third"))
     assert marey.project("third").datasets.pull(gaits, "gaits").moved
+
+
+@pytest.mark.parametrize("copied_before", [True, False])
+def test_only_the_changed_blocks_of_a_clip_are_sent(
+    lab: ProjectHandle,
+    partner: ProjectHandle,
+    gaits: DatasetHandle,
+    monkeypatch: pytest.MonkeyPatch,
+    copied_before: bool,
+) -> None:
+    """The receiver has the clip from an earlier copy, or gets its earlier version in the same copy."""
+    motion = motion_tree(make_rig(lab, 20).item, joints=20, frames=12 * 256)
+    clip = lab.clips.create("walk", {"motion": motion, "info": {"schema": "marey/clip-info@1", "comment": "c"}})
+    first = commit(gaits, walk=clip)
+    if copied_before:
+        assert_copied(partner, gaits, first)
+    motion["poses"][600:610, 0] += 0.5
+    clip.put_part("motion", motion)
+    second = commit(gaits, walk=clip)
+    sent: list[int] = []
+    send = Transport.send
+
+    def noted(self: Transport, method: str, path: str, *, content: Any = None, **options: Any) -> Any:
+        if path.endswith("/datasets/gaits/contents"):
+            sent.append(len(content))
+        return send(self, method, path, content=content, **options)
+
+    monkeypatch.setattr(Transport, "send", noted)
+    assert_copied(partner, gaits, second)
+    size = motion["poses"].nbytes
+    assert sent[-1] < size / 10
+    assert len([one for one in sent if one > size / 2]) == (0 if copied_before else 1)
+    made = partner.datasets.at("gaits").check_out("main")
+    assert made is not None
+    (copy,) = partner.clips.list(collection="gaits")
+    assert (copy.part("motion")["poses"] == motion["poses"]).all()

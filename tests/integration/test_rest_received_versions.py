@@ -233,3 +233,59 @@ def test_a_clip_refers_to_the_skeleton_of_this_project(client: httpx.Client) -> 
     ((found,), (rig,)) = (ok(client.get(f"{LAB}/{kind}"))["items"] for kind in ("clips", "skeletons"))
     read = ok(client.get(f"{LAB}/clips/{found['id']}/parts/motion"))
     assert read["skeleton"] == {"item": rig["id"], "revision": 1}
+
+
+def numbers(dtype: str, *values: int) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": [len(values)], "data": list(values)}
+
+
+def test_a_partial_array_takes_its_tiles_from_an_array_that_the_project_has(
+    client: httpx.Client, database: Database
+) -> None:
+    rig = skeleton("Hips")
+    first = clip("Hips", rig["content"])
+    send(client, rig)
+    send(client, first)
+    place = {"content": first["content"], "part": "motion"}
+    absent = {"content": "sha256:" + "2" * 64, "part": "motion"}
+    found = ok(client.post(f"{LAB}/contents", json={"tiles": [place, absent, {**place, "part": "info"}]}))
+    assert (list(found["tiles"][0]), found["tiles"][1:]) == (["/poses"], [None, None])
+    partial: dict[str, Any] = {
+        "base": first["content"], "pointer": "/poses", "dtype": "<f4", "shape": [1, 7],
+        "tiles": numbers("<i4", 0), "sizes": numbers("<i4"), "bytes": numbers("|u1"),
+    }  # fmt: skip
+
+    def with_poses(**changed: Any) -> dict[str, Any]:
+        motion = {**first["parts"]["motion"], "frame_rate_hz": 60}
+        content = revision_content("clip", {"motion": document_digest({**motion, "poses": POSES})})
+        return {**first, "content": content, "parts": {"motion": {**motion, "poses": {**partial, **changed}}}}
+
+    for changed, status, code in (
+        ({"base": absent["content"]}, 409, "missing-contents"),
+        ({"base": [1]}, 422, "bad-array"),
+        ({"base": rig["content"]}, 422, "bad-array"),
+        ({"pointer": "/other"}, 422, "bad-array"),
+        ({"pointer": "/joints"}, 422, "bad-array"),
+        ({"tiles": numbers("<i4", 1)}, 422, "bad-array"),
+        ({"shape": [2, 7]}, 422, "bad-array"),
+        ({"shape": [1 << 30, 7]}, 422, "bad-array"),
+    ):
+        refused(client.post(f"{GAITS}/contents", json={"revisions": [with_poses(**changed)]}), status, code)
+    assert send(client, with_poses()) == {"added": 1}
+    assert list(check_store(database)) == []
+
+
+def test_a_partial_array_takes_nothing_from_another_project(client: httpx.Client) -> None:
+    rig = skeleton("Hips")
+    first = clip("Hips", rig["content"])
+    ok(client.post("/projects", json={"name": "other"}), 201)
+    ok(client.post("/projects/other/datasets", json={"name": "gaits"}), 201)
+    for one in (rig, first):
+        ok(client.post("/projects/other/datasets/gaits/contents", json={"revisions": [one]}))
+    send(client, rig)
+    motion = {**first["parts"]["motion"], "poses": {
+        "base": first["content"], "pointer": "/poses", "dtype": "<f4", "shape": [1, 7],
+        "tiles": numbers("<i4", 0), "sizes": numbers("<i4"), "bytes": numbers("|u1"),
+    }}  # fmt: skip
+    answer = client.post(f"{GAITS}/contents", json={"revisions": [{**first, "parts": {"motion": motion}}]})
+    refused(answer, 409, "missing-contents")

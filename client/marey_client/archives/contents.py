@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from marey_client.errors import UnexpectedAnswer
 from marey_client.transport import BLOCKS, MAX_ANSWER_BYTES, as_json
 from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent
+from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree
+from marey_schemas.encoding.partial_arrays import partial_array
 from marey_schemas.sizes import batched
 
 if TYPE_CHECKING:
     from marey_client.transport import Transport
+
+K = TypeVar("K")
 
 
 def request_contents(
@@ -20,8 +25,8 @@ def request_contents(
 ) -> dict[str, Any]:
     """Request revisions and documents of a project by content digest, and return the server's answer as a dict.
 
-    The lists `revisions` and `documents` in the answer have the order of the request. With `keep_blocks`, arrays stay
-    compressed.
+    The lists in the answer, `revisions`, `documents` and `tiles`, have the order of the request. With `keep_blocks`,
+    arrays stay compressed.
     """
     url = f"{project_url}/contents"
     response = transport.send("POST", url, content=as_json(request), headers={"Accept": BLOCKS})
@@ -65,3 +70,32 @@ def read_documents(transport: Transport, project_url: str, places: Sequence[Part
         found = first_documents(transport, project_url, waiting[:MOST_CONTENTS])
         yield from found
         waiting = waiting[len(found) :]
+
+
+@dataclass(frozen=True)
+class ArrayBases:
+    """Arrays of one document of the receiving project."""
+
+    content: str
+    """Content digest of the revision that has the document."""
+    tiles: Mapping[str, Sequence[str]]
+    """Digests of the tiles of each array, by JSON Pointer."""
+
+    def without_shared(self, pointer: str, array: EncodedArray) -> EncodedArray | dict[str, Any]:
+        """Return the array without tiles that the array at the same pointer has; the whole array if it has none."""
+        return partial_array(array, self.content, pointer, self.tiles.get(pointer, ())) or array
+
+
+def bases_of_arrays(transport: Transport, project_url: str, places: Mapping[K, PartOfContent]) -> dict[K, ArrayBases]:
+    """Ask a project for the tiles of documents; documents that the project does not have are left out.
+
+    `places` are the addresses of the documents. The server may leave out documents if all together are too large.
+    """
+    found: dict[K, ArrayBases] = {}
+    for some in batched(places.items(), MOST_CONTENTS):
+        request = ContentsRequest(tiles=tuple(place for _, place in some))
+        tiles = request_contents(transport, project_url, request)["tiles"]
+        for (key, place), of_document in zip(some, tiles, strict=False):
+            if of_document:
+                found[key] = ArrayBases(place.content, of_document)
+    return found

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from marey_client.archives.contents import request_contents
+from marey_client.archives.contents import ArrayBases, bases_of_arrays, request_contents
 from marey_client.blobs import Blobs
 from marey_client.errors import EarlierVersionsMissing, LargeCommit
 from marey_client.progress import OnProgress
@@ -18,19 +18,22 @@ from marey_schemas.datasets.contents import (
     MOST_CONTENTS,
     MOST_RECEIVED_CHANGES,
     ContentsRequest,
+    PartOfContent,
     ReceivedChange,
     ReceivedCommit,
 )
 from marey_schemas.documents.blob_references import references_of
 from marey_schemas.encoding.canonical import attach_arrays
 from marey_schemas.kinds import Kind
-from marey_schemas.sizes import MIB, batched
+from marey_schemas.sizes import KIB, MIB, batched
 from marey_versions.archive.members import ArchiveMember, MemberKind
 from marey_versions.archive.reading import Archive, EntryChange
 from marey_versions.records import CommitRecord, contents_in, path_and_kind, revision_content
 
 MOST_BYTES_SENT = 16 * MIB
 """Total size of documents, in bytes, above which no further revision is added to a request."""
+LEAST_BYTES_SHARED = 16 * KIB
+"""Size of a document in bytes above which the server is asked for tiles of its arrays; for less, that would not pay."""
 
 
 class ReceivingDataset(Protocol):
@@ -111,6 +114,10 @@ class _Import:
     """Facets of the revisions in the archive, by content digest."""
     homes: dict[str, str] = field(default_factory=dict)
     """Content digest of a revision that contains the document, by the digest of the document."""
+    earlier: dict[str, str] = field(default_factory=dict)
+    """For each revision of an entry: the revision that the entry had before, if it is known."""
+    _newest: dict[str, str] = field(default_factory=dict)
+    """For the key of each entry: the revision in the last commit that was noted."""
 
     def run(self, begins: str | None) -> Commit:
         require_base(self.archive, self.dataset.has)
@@ -150,10 +157,14 @@ class _Import:
         for key, (value, unchanged) in changes.items():
             if value is not None:
                 path, kind = path_and_kind(key)
+                before = next(iter(unchanged.values()), self._newest.get(key))
                 for part, content in unchanged.items():
                     self.homes.setdefault(value["parts"][part], content)
                 found.append(revision_content(kind, value["parts"]))
                 self.revisions.setdefault(found[-1], _Revision(kind, value["parts"], path))
+                if before is not None:
+                    self.earlier.setdefault(found[-1], before)
+                self._newest[key] = found[-1]
         return found
 
     # -- revisions -----------------------------------------------------------------------------------------------------
@@ -231,9 +242,10 @@ class _Import:
 
     def _send(self, contents: list[str]) -> None:
         sent = []
+        bases = self._bases(contents)
         for content in contents:
             one = self._revision(content)
-            parts = {part: self._part(digest) for part, digest in one.parts.items()}
+            parts = {part: self._part(digest, bases.get((content, part))) for part, digest in one.parts.items()}
             facets = self.facets.get(content, {})
             sent.append(
                 {"content": content, "kind": one.kind, "path": one.path, "parts": parts}
@@ -248,16 +260,34 @@ class _Import:
         for some in batched(sorted(self.facets.keys() & self.held - self.sent), MOST_CONTENTS):
             self._send(some)
 
-    def _part(self, digest: str) -> Any:
+    def _bases(self, contents: list[str]) -> dict[tuple[str, str], ArrayBases]:
+        """Ask the server for the tiles of the arrays that the new arrays of revisions replace.
+
+        Returns them by content digest and part of the new revision. Small arrays are not asked for.
+        """
+        places = {
+            (content, part): PartOfContent(content=self.earlier[content], part=part)
+            for content in contents
+            if content in self.earlier
+            for part, digest in self._revision(content).parts.items()
+            if self._size_bytes(digest) > LEAST_BYTES_SHARED
+        }
+        return bases_of_arrays(self.dataset.transport, self.dataset.project_url, places)
+
+    def _part(self, digest: str, bases: ArrayBases | None) -> Any:
         """Return a part of a revision for a request: the document, or a reference to a revision that contains it.
 
-        The result is a reference if the project already has the document.
+        The result is a reference if the project already has the document. Tiles of `bases` are left out of the arrays.
         """
         if self._is_stored(digest):
             return {"content": self.homes[digest]}
         tree = self._document(digest)
         self._send_files(set(references_of(str(tree.get("schema")), tree)[1].values()))
-        return attach_arrays(tree, self.archive.array)
+        if bases is None:
+            return attach_arrays(tree, self.archive.array)
+        arrays, _ = references_of(str(tree.get("schema")), tree)
+        pointers = {leaf["content"]: pointer for pointer, leaf in arrays.items()}
+        return attach_arrays(tree, lambda content: bases.without_shared(pointers[content], self.archive.array(content)))
 
     def _send_files(self, digests: set[str]) -> None:
         blobs = Blobs(self.dataset.transport)

@@ -44,6 +44,9 @@ class ContentsRequest(Request):
 
     revisions: tuple[Digest, ...] = Field((), max_length=MOST_CONTENTS)
     documents: tuple[PartOfContent, ...] = Field((), max_length=MOST_CONTENTS)
+    tiles: tuple[PartOfContent, ...] = Field(
+        (), max_length=MOST_CONTENTS, description="Documents whose arrays are requested as digests of their tiles."
+    )
 
 
 class ExportCheck(ConsentOverride):
@@ -77,7 +80,8 @@ class ReceivedRevision(Request):
         min_length=1,
         description='Documents by part, in which references to revisions are `{"content": digest}`. If the project '
         "already has a revision with the same document in this part, the document can be replaced by "
-        '`{"content": digest}` with the content digest of that revision.',
+        '`{"content": digest}` with the content digest of that revision. An array can be a partial array, '
+        "which lacks tiles that another array of the project has; the page about the block format describes it.",
     )
     facets: dict[FacetName, FacetValue] = Field(
         default_factory=dict,

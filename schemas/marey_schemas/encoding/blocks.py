@@ -124,6 +124,17 @@ def cut_frames(data: bytes, start: int, stop: int) -> bytes:
     return _assembled(cut, packed + _packed(cut.of_frames(len(rest)), rest, predict=False))
 
 
+def split(data: bytes) -> list[bytes]:
+    """Return the tiles of an encoded array. Raises `BlockError` if its header is corrupt."""
+    _, starts = _read_head(data)
+    return [data[here:there] for here, there in pairwise(starts)]
+
+
+def join(spec: ArraySpec, packed: list[bytes]) -> bytes:
+    """Return an encoded array that has the given tiles, in the layout that `encode` uses."""
+    return _assembled(_layout_of(spec), packed)
+
+
 def _packed(layout: _Layout, array: NDArray[Any], *, predict: bool) -> list[bytes]:
     """Return the tiles of an array, each compressed separately."""
     table = array.reshape(layout.frames, layout.columns)

@@ -63,7 +63,7 @@ def detach_arrays(tree: Any, keep: Callable[[str, NDArray[Any] | EncodedArray], 
     return tree
 
 
-def attach_arrays(tree: Any, load: Callable[[str], NDArray[Any] | EncodedArray]) -> Any:
+def attach_arrays(tree: Any, load: Callable[[str], Any]) -> Any:
     """Return the tree with each reference replaced by `load(digest)`, the inverse of `detach_arrays`."""
     if isinstance(tree, Mapping):
         if tree.keys() == {"dtype", "shape", "content"}:

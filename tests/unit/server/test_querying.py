@@ -198,6 +198,8 @@ queries = st.recursive(
 @example("facet.usage > 0.5 and not facet.used_frames in (1, 0.025)", 3)
 @example("facet.usage != 1 and has facet.usage", 0)
 @example("subject = 02 and not action ~ walk and tag = night", 1000)
+@example("frames > 4.5 and frames <= 1e14 and not frames < -1e14", 1000)
+@example("frames in (4.5, 5, 1e14) or not frames >= 5.5", 1000)
 @example("shoot_day = 2025-03-01T10:00", 1000)
 @example("shoot_day = 2025-03-01T10:00", 0)
 @example("shoot_day in (2025-02-28, 2025-03-01T10:00)", 1000)
@@ -300,10 +302,45 @@ def test_clips_with_a_value_are_found_through_an_index(
     if not queried.database.is_sqlite:
         return  # Postgres reads so few rows without an index
     monkeypatch.setattr(narrowing, "MOST_ITEMS", few)
-    counting, listing, *_ = queried.read(plans_of, f"{field} = {SHARED_VALUES[field]} and frames > 2", sort)
+    counting, listing, *_ = queried.read(plans_of, f"{field} = {SHARED_VALUES[field]} and rate > 2", sort)
     for plan in (counting, listing):
         assert f"ix_item_by_{field}" in plan
         assert READS_ALL not in plan
+
+
+@pytest.mark.parametrize("sort", ["-created_at", "name", "-frames"])
+@pytest.mark.parametrize(
+    ("query", "index"),
+    [
+        ("frames > 2.5", "frames"),
+        ("frames = 5", "frames"),
+        ("frames in (4, 5)", "frames"),
+        ("created >= 2020-01-01", "creation"),
+        ("updated < 2999-01-01T10:00", "update"),
+    ],
+)
+def test_clips_in_a_range_are_found_through_an_index_if_they_are_few(
+    queried: QueriedLab, query: str, index: str, sort: str
+) -> None:
+    if not queried.database.is_sqlite:
+        return  # as above
+    counting, listing, *_ = queried.read(plans_of, f"{query} and rate > 2", sort)
+    for plan in (counting, listing):
+        assert f"COVERING INDEX ix_item_by_{index} (project_id=? AND kind=? AND " in plan
+        assert READS_ALL not in plan
+
+
+@pytest.mark.parametrize(("sort", "index"), [("-created_at", "creation"), ("name", "name")])
+def test_many_clips_in_a_range_are_read_in_the_order_of_the_list(
+    queried: QueriedLab, monkeypatch: pytest.MonkeyPatch, sort: str, index: str
+) -> None:
+    if not queried.database.is_sqlite:
+        return  # as above
+    monkeypatch.setattr(narrowing, "MOST_ITEMS", 0)
+    counting, listing, *_ = queried.read(plans_of, "frames > 2 and rate > 2", sort)
+    assert "COVERING INDEX ix_item_by_frames" in counting
+    assert f"ix_item_by_{index}" in listing
+    assert "TEMP B-TREE" not in listing
 
 
 @pytest.mark.parametrize("field", INDEXED_FACTS)

@@ -31,11 +31,13 @@ class ProjectContents(Resource):
     async def post(self, project: str, body: ContentsRequest) -> Rendered:
         """Return revisions and documents by their content digests.
 
-        The answer is `{"revisions": [...], "documents": [...], "facets": [...]}` in the order of the request. A
-        revision has its `kind` and the content digests of its `parts`. Its facets are the numbers that jobs have
-        published about it, by name. In documents, references to revisions are replaced by `{"content": digest}`, so
-        that a document has the same digest on every server. A revision or document that the project does not have is
-        null. If the documents together are too large, the last ones are missing from the list: request them again.
+        The answer is `{"revisions": [...], "documents": [...], "facets": [...], "tiles": [...]}` in the order of the
+        request. A revision has its `kind` and the content digests of its `parts`. Its facets are the numbers that jobs
+        have published about it, by name. In documents, references to revisions are replaced by `{"content": digest}`,
+        so that a document has the same digest on every server. For each document in the list `tiles` of the request,
+        the answer has the digests of the tiles of each array, by JSON Pointer. A revision or document that the project
+        does not have is null. If the documents together are too large, the last ones are missing from the list: request
+        them again.
         """
         found = await self.look_up(datasets.load_contents, project, body)
         return await self.render_document(Reply(found))

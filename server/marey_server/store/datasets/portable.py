@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import select
 
 from marey_schemas.access import Role
-from marey_schemas.datasets.contents import ContentsRequest, ExportCheck, ExportPermission
+from marey_schemas.datasets.contents import ContentsRequest, ExportCheck, ExportPermission, PartOfContent
+from marey_schemas.documents.blob_references import members_of
+from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.encoding.partial_arrays import tile_digests
 from marey_server.store import documents, projects
 from marey_server.store.datasets.contents import Contents, find_contents_of
 from marey_server.store.datasets.history import revisions_with
@@ -48,16 +51,17 @@ def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> di
     """Load the requested revisions of a project by content digest, their facets, and documents with encoded arrays.
 
     A revision or document that the project does not have is None. If the documents together are too large, the list of
-    documents ends early; it always contains the first one.
+    documents ends early; it always contains the first one. The same applies to the list of the tiles of documents.
     """
     project_row = projects.require(tx, project)
-    wanted = {*request.revisions, *(one.content for one in request.documents)}
+    wanted = {*request.revisions, *(one.content for one in (*request.documents, *request.tiles))}
     held = {one: RevisionKey(*key) for one, key in revisions_with(tx, project_row.id, wanted).items()}
     contents = find_contents_of(tx, project_row.id, held.values())
     return {
         "revisions": _described(tx, held, contents, request),
-        "documents": _loaded(tx, project_row.id, held, request),
+        "documents": _portable(tx, project_row.id, _loaded(tx, held, request.documents)),
         "facets": _facets(tx, project_row.id, request),
+        "tiles": [_tiles_of(tree) for tree in _loaded(tx, held, request.tiles)],
     }
 
 
@@ -81,10 +85,11 @@ def _described(
 
 
 def _loaded(
-    tx: Transaction, project_id: str, held: Mapping[str, RevisionKey], request: ContentsRequest
-) -> list[dict[str, Any] | None]:
-    parts = read_part_digests(tx, {held[one.content] for one in request.documents if one.content in held})
-    digests = [parts[held[one.content]].get(one.part) if one.content in held else None for one in request.documents]
+    tx: Transaction, held: Mapping[str, RevisionKey], places: Sequence[PartOfContent]
+) -> list[documents.Tree | None]:
+    """Load the documents at `places`, as many as fit into an answer; None stands for one that does not exist."""
+    parts = read_part_digests(tx, {held[one.content] for one in places if one.content in held})
+    digests = [parts[held[one.content]].get(one.part) if one.content in held else None for one in places]
     present = sorted({digest for digest in digests if digest is not None})
     sizes = {
         row.digest: row.size_bytes
@@ -92,9 +97,21 @@ def _loaded(
     }
     chosen = _that_fit(digests, sizes)
     loaded = documents.load_documents(tx, {digest for digest in chosen if digest is not None})
-    referred = {one for tree in loaded.values() for one in references_in(tree)}
+    return [None if digest is None else loaded[digest] for digest in chosen]
+
+
+def _portable(tx: Transaction, project_id: str, trees: Sequence[documents.Tree | None]) -> list[dict[str, Any] | None]:
+    """Return the documents with content digests in place of references to revisions."""
+    referred = {one for tree in trees if tree is not None for one in references_in(tree)}
     contents = find_contents_of(tx, project_id, referred)
-    return [None if digest is None else portable_document(loaded[digest], contents.revisions.get) for digest in chosen]
+    return [None if tree is None else portable_document(tree, contents.revisions.get) for tree in trees]
+
+
+def _tiles_of(tree: documents.Tree | None) -> dict[str, list[str]] | None:
+    """Return the digests of the tiles of each array in a document, by JSON Pointer."""
+    if tree is None:
+        return None
+    return {pointer: tile_digests(one) for pointer, one in members_of(tree) if isinstance(one, EncodedArray)}
 
 
 def _that_fit(digests: list[str | None], sizes: Mapping[str, int]) -> list[str | None]:

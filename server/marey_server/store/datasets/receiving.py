@@ -28,6 +28,7 @@ from marey_server.store.datasets.committing import (
 )
 from marey_server.store.datasets.history import read_commit, revisions_with, tree_of
 from marey_server.store.datasets.naming import find_dataset, find_ref
+from marey_server.store.datasets.partial_contents import Bases, bases_named_in, load_bases, restored
 from marey_server.store.datasets.protection import Mover
 from marey_server.store.datasets.revisions import item_name, publish_contents, require_contents
 from marey_server.store.documents import PreparedDocument
@@ -68,24 +69,28 @@ class LocalRevisions:
     """Time of the last purge of the project before the revisions were found."""
     facets: Mapping[str, Mapping[str, float]]
     """Facets of the received revisions."""
+    bases: Bases
+    """Arrays that have the tiles which partial arrays of the request lack."""
 
 
 def find_local(tx: Transaction, project: str, received: Sequence[ReceivedRevision]) -> LocalRevisions:
     """Find the revisions that a request contains or refers to.
 
-    Raises `ConflictProblem` if the project lacks a revision that a received revision refers to, and `InvalidProblem` if
-    a received revision refers to an item of this project by its id.
+    Raises `ConflictProblem` if the project lacks a revision that a received revision refers to. Raises `InvalidProblem`
+    if a received revision refers to an item of this project by its id, and for a partial array without its base.
     """
     project_row = projects.require(tx, project)
     last = last_purge(tx, project_row.id)
     _require_no_own_ids(tx, project_row.id, received)
-    wanted = {content for one in received for content in contents_in(one.parts)}
+    places = bases_named_in(received)
+    wanted = {content for one in received for content in contents_in(one.parts)} | {one.content for one in places}
     found = revisions_with(tx, project_row.id, wanted | {one.content for one in received})
     require_contents(wanted - found.keys())
     parts = read_part_digests(tx, set(found.values()))
     held = {content: RevisionKey(*key) for content, key in found.items()}
+    stored = {content: parts[key] for content, key in held.items()}
     facets = {one.content: one.facets for one in received}
-    return LocalRevisions(held, {content: parts[key] for content, key in held.items()}, last, facets)
+    return LocalRevisions(held, stored, last, facets, load_bases(tx, places, stored))
 
 
 def _require_no_own_ids(tx: Transaction, project_id: str, received: Sequence[ReceivedRevision]) -> None:
@@ -122,7 +127,8 @@ def _draft(one: ReceivedRevision, local: LocalRevisions) -> Draft:
         if isinstance(tree, dict) and tree.keys() == {"content"}:
             parts[part] = StoredDocument(_stored(one, part, str(tree["content"]), local))
         else:
-            parts[part] = items.prepare_part(one.kind, part, local_document(tree, local.held.get))
+            whole = restored(tree, part, local.bases)
+            parts[part] = items.prepare_part(one.kind, part, local_document(whole, local.held.get))
     return Draft(
         name_in_batch=one.content, kind=one.kind, parts=dict(parts), reuse="new",
         item_name=item_name(one.path or one.kind.value, one.content),

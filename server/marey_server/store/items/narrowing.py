@@ -16,7 +16,7 @@ from sqlalchemy import ColumnElement, Select, func, null, select
 from marey_schemas.kinds import Kind
 from marey_schemas.queries.fields import FACET_PREFIX
 from marey_schemas.queries.grammar import Condition, Query, operands_of
-from marey_server.store.items.querying import facet_meets, stored_text
+from marey_server.store.items.querying import COMPARISONS, Comparison, facet_meets, frames_in_range, stored_text
 from marey_server.store.tables import INDEXED_CHARACTERS, INDEXED_FACTS, MemberStart, item, item_facet, item_tag
 from marey_server.store.transaction import Transaction
 
@@ -57,8 +57,7 @@ def narrow(tx: Transaction, project_id: str, kind: Kind, query: Query) -> Narrow
     """
     fewest, few = MOST_ITEMS + 1, None
     oldest_us, ordered = None, None
-    for condition in _indexed(query):
-        candidates = _with_facet if condition.field.startswith(FACET_PREFIX) else CANDIDATES[condition.field]
+    for condition, candidates in _indexed(query):
         found = candidates(condition, project_id, kind)
         newest = found.limit(MOST_ITEMS + 1).subquery()
         counting = select(func.count().label("number"), func.min(newest.c.created_us).label("since_us"))
@@ -73,13 +72,20 @@ def narrow(tx: Transaction, project_id: str, kind: Kind, query: Query) -> Narrow
     return Narrowing(few) if few is not None else Narrowing(ordered=ordered)
 
 
-def _indexed(query: Query) -> Iterator[Condition]:
-    """Yield the conditions of a query that every selected item meets, and for which an index finds the items."""
+def _indexed(query: Query) -> Iterator[tuple[Condition, Candidates]]:
+    """Yield the conditions that must be true for the query to be true, and whose items an index finds.
+
+    With each condition comes the function that uses the index.
+    """
     for part in operands_of(query):
-        if isinstance(part, Condition) and (
-            (part.operator == "=" and part.field in CANDIDATES) or part.field.startswith(FACET_PREFIX)
-        ):
-            yield part
+        if not isinstance(part, Condition):
+            continue
+        if part.field.startswith(FACET_PREFIX):
+            yield part, _with_facet
+        elif part.operator == "=" and part.field in CANDIDATES:
+            yield part, CANDIDATES[part.field]
+        elif part.field in RANGES and part.operator != "has":
+            yield part, _in_range
 
 
 def _start(condition: Condition) -> ColumnElement[bool]:
@@ -113,5 +119,19 @@ def _with_facet(condition: Condition, _: str, __: Kind) -> Select[Any]:
     return select(item_facet.c.item_id, null().label("created_us")).where(facet_meets(condition))
 
 
+def _in_range(condition: Condition, project_id: str, kind: Kind) -> Select[Any]:
+    """Return a query for the items whose number or time is in the range of the condition, deleted ones included.
+
+    The index of an order has these numbers or times, but not the time of the deletion.
+    """
+    present = (item.c.project_id == project_id, item.c.kind == kind.value)
+    in_range = RANGES[condition.field](condition, project_id)
+    return select(item.c.id, null().label("created_us")).where(*present, in_range)
+
+
+RANGES: dict[str, Comparison] = {
+    "frames": frames_in_range, "created": COMPARISONS["created"], "updated": COMPARISONS["updated"],
+}  # fmt: skip
+"""Comparisons for the fields that are columns in the index of an order of lists."""
 CANDIDATES: dict[str, Candidates] = {**dict.fromkeys(INDEXED_FACTS, _with_fact), "tag": _with_tag}
 """Functions by the name of the field."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from datetime import date, datetime, timedelta
 from string import ascii_lowercase, ascii_uppercase
@@ -35,6 +36,9 @@ from marey_server.store.tables import collection, item, item_facet, item_tag
 
 Comparison = Callable[[Condition, str], ColumnElement[bool]]
 """Function that returns the SQL of a condition in a project; the SQL is never null."""
+
+_MOST_FRAMES = 2.0**31 - 2
+"""Number below the greatest that the column `frames` can hold; no item has so many frames."""
 
 
 def sql_of(query: Query, project_id: str) -> ColumnElement[bool]:
@@ -233,6 +237,22 @@ def _folder(condition: Condition, project_id: str) -> ColumnElement[bool]:
 def _tag(condition: Condition, _: str) -> ColumnElement[bool]:
     own = item_tag.c.item_id == item.c.id
     return exists().where(own, _texts(item_tag.c.tag, condition)).correlate(item)
+
+
+def frames_in_range(condition: Condition, _: str) -> ColumnElement[bool]:
+    """Return the condition of `COMPARISONS` on the number of frames in a form for which a database uses the index.
+
+    The column is compared with whole numbers. A list must not use this form, unless it reads only few items: SQLite
+    would prefer the index of frames to that of the order, and sort all items that it finds.
+    """
+    numbers = [max(0.0, min(float(str(one)), _MOST_FRAMES)) for one in condition.values]
+    if condition.operator == "=":
+        return item.c.frames.in_([int(one) for one in numbers if one >= 1 and one.is_integer()])
+    if condition.operator in (">", ">="):
+        least = math.floor(numbers[0]) + 1 if condition.operator == ">" else math.ceil(numbers[0])
+        return item.c.frames >= max(1, least)  # one limit only, because SQLite uses only the first
+    most = math.ceil(numbers[0]) - 1 if condition.operator == "<" else math.floor(numbers[0])
+    return item.c.frames.between(1, most)
 
 
 def facet_meets(condition: Condition) -> ColumnElement[bool]:
