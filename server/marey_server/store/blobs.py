@@ -107,21 +107,31 @@ def put_blob(
     allows. Raises `InvalidProblem` if the digest of the bytes is not `expected`, and `QuotaExceededProblem` if the
     caller has sent too many bytes.
     """
-    require_sender(tx.principal)
-    places = places_of_sender(tx) if project_id is None else (project_id,)
-    digest = digest_of(content) if isinstance(content, bytes) else content.digest
-    if expected is not None and digest != expected:
-        raise InvalidProblem(
-            f"The bytes have the digest {digest}, not {expected}: they were changed in transit; send them again.",
-            code="digest-mismatch",
-        )
-    new = store_blobs(tx, {digest: content})
-    add_holder(tx, digest, places)
-    if new:
-        count_sent(tx, _size_bytes(content))
+    digest = expected or _digest(content)
+    count_sent(tx, put_uncounted(tx, {digest: content}, project_id=project_id))
     faults.point("blob.put.before_commit")
     tx.after_commit(lambda: faults.point("blob.put.after_commit"))
     return digest
+
+
+def put_uncounted(tx: Transaction, contents: Mapping[str, bytes | Spool], *, project_id: str | None = None) -> int:
+    """Store bytes under their digests as `put_blob` does, but without counting them; return the number of new bytes.
+
+    Pass this number to `count_sent` at the end of the transaction: until the transaction ends, everybody who counts
+    bytes of the same user waits.
+    """
+    require_sender(tx.principal)
+    places = places_of_sender(tx) if project_id is None else (project_id,)
+    for expected, content in contents.items():
+        if (digest := _digest(content)) != expected:
+            raise InvalidProblem(
+                f"The bytes have the digest {digest}, not {expected}: they were changed in transit; send them again.",
+                code="digest-mismatch",
+            )
+    new = store_blobs(tx, contents)
+    for digest in sorted(contents):
+        add_holder(tx, digest, places)
+    return sum(_size_bytes(contents[digest]) for digest in new)
 
 
 def require_sender(principal: Principal) -> None:
@@ -167,6 +177,10 @@ def store_blobs(tx: Transaction, contents: Mapping[str, bytes | Spool]) -> set[s
     new = insert_new(tx, blob, rows)
     tx.blobs.write(tx.connection, {digest: _chunks(contents[digest]) for digest in contents if digest in new})
     return new
+
+
+def _digest(content: bytes | Spool) -> str:
+    return digest_of(content) if isinstance(content, bytes) else content.digest
 
 
 def _size_bytes(content: bytes | Spool) -> int:

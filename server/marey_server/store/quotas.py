@@ -112,22 +112,36 @@ def _open(user_id: str) -> tuple[Any, ...]:
 # -- bytes that users send --------------------------------------------------------------------------------------------
 
 
+def require_sendable(tx: Transaction, size_bytes: int) -> None:
+    """Check that the caller may send new bytes at present, but do not count them; use `count_sent` as well.
+
+    Raises `QuotaExceededProblem`.
+    """
+    if (limit := _part_of_day(tx, size_bytes)) is not None:
+        _require_daily(tx, size_bytes, rate_limits.wait_s(tx, limit))
+
+
 def count_sent(tx: Transaction, size_bytes: int) -> None:
     """Count new bytes that the caller sends; they take space for a day, even if no item ever uses them.
 
-    The server and attempts of jobs have no quotas. Raises `QuotaExceededProblem` if the caller has sent too many bytes.
+    Call this once, at the end of a transaction: until the transaction ends, other counts of the same user wait. The
+    server and attempts of jobs have no quotas. Raises `QuotaExceededProblem` if the caller has sent too many bytes.
     """
-    if (limit := _part_of_day(tx, size_bytes)) is None:
-        return
+    if (limit := _part_of_day(tx, size_bytes)) is not None:
+        _require_daily(tx, size_bytes, 0 if size_bytes > tx.quotas.user_daily_bytes else rate_limits.count(tx, limit))
+
+
+def _require_daily(tx: Transaction, size_bytes: int, wait_s: int) -> None:
+    """Raise `QuotaExceededProblem` if the caller must wait before sending bytes, or has a quota that is too small."""
     most = tx.quotas.user_daily_bytes
-    wait_s = None if size_bytes > most else rate_limits.count(tx, limit)
-    if wait_s == 0:
+    never = size_bytes > most
+    if wait_s == 0 and not never:
         return
     remedy = "The operator can raise the setting `user_daily_bytes`."
     raise QuotaExceededProblem(
         f"You may send {most:,} new bytes per day, and this needs {size_bytes:,} more. "
-        + (remedy if wait_s is None else f"Send it in {wait_s} s. {remedy}"),
-        context={"quota": "user_daily_bytes", "limit": most, "wait_s": wait_s},
+        + (remedy if never else f"Send it in {wait_s} s. {remedy}"),
+        context={"quota": "user_daily_bytes", "limit": most, "wait_s": None if never else wait_s},
     )
 
 
