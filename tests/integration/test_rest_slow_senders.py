@@ -15,9 +15,10 @@ from tests.support.rest_server import PATIENCE_S, Server, running
 from marey_schemas.sizes import KIB, MIB
 from marey_server.handlers.blobs import Blob
 from marey_server.handlers.imports import MAX_FORM_BYTES
-from marey_server.store.blobs import SPOOLED_BYTES, digest_of
+from marey_server.store.blobs import digest_of
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import Client
+from marey_server.store.spools import SPOOLED_BYTES
 
 BODY = b"HIERARCHY"
 BLOB = f"/blobs/{digest_of(BODY)}"

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import tempfile
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from operator import itemgetter
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from sqlalchemy import ColumnElement, Select, Table, and_, or_, select, update
 
 from marey_schemas.access import Scope
 from marey_schemas.problems import FieldError
-from marey_schemas.sizes import KIB
 from marey_server import faults
 from marey_server.access import scopes
 from marey_server.access.principal import Principal
@@ -28,6 +25,7 @@ from marey_server.store.blob_backings import CHUNK_BYTES
 from marey_server.store.jobs import reach
 from marey_server.store.projects import is_visible, writable_projects
 from marey_server.store.quotas import count_sent
+from marey_server.store.spools import Spool
 from marey_server.store.tables import (
     attempt_blob,
     blob,
@@ -47,50 +45,6 @@ GRACE_US = 24 * 3600 * 1_000_000
 
 RENEW_US = GRACE_US // 2
 """Age after which an unreferenced blob must be sent again, so that it is not deleted while a client relies on it."""
-
-SPOOLED_BYTES = 64 * KIB
-"""Greatest number of bytes that a spool keeps in memory."""
-
-
-class Spool:
-    """Temporary storage of bytes that are being received, with their running hash.
-
-    Up to `SPOOLED_BYTES` are kept in memory; a longer body is written to an unnamed file.
-    """
-
-    def __init__(self, directory: str | None = None) -> None:
-        self._file = tempfile.SpooledTemporaryFile(max_size=SPOOLED_BYTES, dir=directory)  # noqa: SIM115
-        self._hash = hashlib.sha256()
-        self.size_bytes = 0
-
-    def write(self, data: bytes) -> None:
-        """Append bytes, and add them to the hash."""
-        self._file.write(data)
-        self._hash.update(data)
-        self.size_bytes += len(data)
-
-    @property
-    def digest(self) -> str:
-        """Return the digest of the bytes written so far."""
-        return f"sha256:{self._hash.hexdigest()}"
-
-    def chunks(self) -> Iterator[bytes]:
-        """Yield all bytes written so far in pieces of 1 MiB."""
-        self._file.seek(0)
-        while chunk := self._file.read(CHUNK_BYTES):
-            yield chunk
-
-    def close(self) -> None:
-        """Close the spool, which discards its bytes."""
-        self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, _type: type[BaseException] | None, _error: BaseException | None, _at: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def digest_of(data: bytes) -> str:
