@@ -18,7 +18,7 @@ from marey_server.handlers.imports import MAX_FORM_BYTES
 from marey_server.store.blobs import digest_of
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import Client
-from marey_server.store.spools import SPOOLED_BYTES
+from marey_server.store.blob_backings import SPOOLED_BYTES
 
 BODY = b"HIERARCHY"
 BLOB = f"/blobs/{digest_of(BODY)}"

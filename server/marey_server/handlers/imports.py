@@ -27,8 +27,8 @@ from marey_server.http.validation import decode_body, validate_body
 from marey_server.motions import importing
 from marey_server.motions.importing import PreparedImport, SourceFile
 from marey_server.store import blobs, projects
+from marey_server.store.blob_backings import SPOOLED_BYTES, Spool
 from marey_server.store.jobs import submission
-from marey_server.store.spools import SPOOLED_BYTES, Spool
 from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:

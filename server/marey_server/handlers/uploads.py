@@ -19,7 +19,7 @@ from marey_server.http.declarations import Access, Bytes, RequestBody, reads, wr
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store import blobs, uploads
-from marey_server.store.spools import Spool
+from marey_server.store.blob_backings import Spool
 
 PIECE_BYTES = MIB
 """Number of bytes written at a time; an interrupted request loses at most this number."""

@@ -16,12 +16,12 @@ from marey_server.access.folder_rights import FolderRoleProblem
 from marey_server.errors import ApiProblem, InvalidProblem
 from marey_server.motions.loading import LOADING
 from marey_server.store import blobs, items, projects, quotas
+from marey_server.store.blob_backings import Spool
 from marey_server.store.documents import PreparedDocument, prepare_document
 from marey_server.store.folder_roles.rights import rights_of_caller, rights_shown
 from marey_server.store.items import Draft, ItemFilters, Published
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
-from marey_server.store.spools import Spool
 from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:  # numeric modules take a second to load, so they are loaded only for imports

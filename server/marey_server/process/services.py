@@ -29,11 +29,11 @@ from marey_server.process.turns import Turns
 from marey_server.process.upload_hashes import UploadHashes
 from marey_server.store import events
 from marey_server.store.credentials import tokens
+from marey_server.store.credentials.server_key import read_seal_key
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs.failure import end_for_lost_author
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.reaper import StartGrace
-from marey_server.store.server_key import read_seal_key
 
 log = logging.getLogger(__name__)
 

@@ -21,11 +21,10 @@ from marey_server.errors import (
     NotFoundProblem,
     UnauthenticatedProblem,
 )
-from marey_server.store.blob_backings import CHUNK_BYTES
+from marey_server.store.blob_backings import CHUNK_BYTES, Spool
 from marey_server.store.jobs import reach
 from marey_server.store.projects import is_visible, writable_projects
 from marey_server.store.quotas import count_sent
-from marey_server.store.spools import Spool
 from marey_server.store.tables import (
     attempt_blob,
     blob,

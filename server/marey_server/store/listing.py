@@ -15,7 +15,7 @@ from sqlalchemy import ColumnElement, Row, Select, UnaryExpression, and_, or_
 
 from marey_schemas.encoding.canonical import canonical_json
 from marey_server.errors import BadRequestProblem
-from marey_server.store.server_key import read_server_key
+from marey_server.store.credentials.server_key import read_server_key
 from marey_server.store.transaction import Transaction
 
 _MAC_BYTES = 16

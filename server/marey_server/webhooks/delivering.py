@@ -218,11 +218,11 @@ class Deliverer:
         share = self._shares.get(batch.sharer) or asyncio.Semaphore(MOST_OF_ONE_USER)
         self._shares[batch.sharer] = share
         async with share, self._places:
-            target = await self._read(outbox.read_target, delivery, before)
+            destination = await self._read(outbox.read_destination, delivery, before)
             lead = self._lead
-            if target is None or lead is None or not self._leads():
+            if destination is None or lead is None or not self._leads():
                 return None
-            result = await self._sender.send(target, delivery)
+            result = await self._sender.send(destination, delivery)
         faults.point("webhook.before_record")
         days = self._services.settings.webhook_failing_days
         recorded = await self._write(outbox.record, lead, delivery, result, before, days)

@@ -13,7 +13,8 @@ from tests.support.tiers import examples
 from marey_schemas.items import Page
 from marey_schemas.kinds import Kind
 from marey_server.errors import BadRequestProblem, InvalidProblem
-from marey_server.store import items, server_key
+from marey_server.store import items
+from marey_server.store.credentials import server_key
 from marey_server.store.database.connections import Database
 from marey_server.store.items import ItemFilters
 from marey_server.store.transaction import Transaction

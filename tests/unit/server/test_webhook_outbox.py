@@ -25,7 +25,7 @@ from marey_server.store.retention import Retention
 from marey_server.store.tables import webhook, webhook_delivery
 from marey_server.store.transaction import Transaction
 from marey_server.store.webhooks import deliveries, managing, outbox
-from marey_server.store.webhooks.outbox import Batch, DeliveryResult, Outcome, Recorded, Target
+from marey_server.store.webhooks.outbox import Batch, DeliveryResult, Destination, Outcome, Recorded
 from marey_server.webhooks import delivering
 from marey_server.webhooks.sending import MOST_OF_ONE_USER
 
@@ -284,11 +284,11 @@ class Silence:
     """Sender whose receivers answer only when `answering` is set; it records where requests were sent."""
 
     def __init__(self) -> None:
-        self.asked: dict[str, Target] = {}
+        self.asked: dict[str, Destination] = {}
         self.answering = asyncio.Event()
 
-    async def send(self, target: Target, delivery: outbox.Delivery) -> DeliveryResult:
-        self.asked[delivery.webhook_id] = target
+    async def send(self, destination: Destination, delivery: outbox.Delivery) -> DeliveryResult:
+        self.asked[delivery.webhook_id] = destination
         await self.answering.wait()
         return ADDED
 
@@ -364,7 +364,7 @@ def test_a_change_while_a_delivery_waits_for_its_share_counts(
                 assert waiting.hook.id not in sender.asked
             else:
                 await until(lambda: waiting.hook.id in sender.asked)
-                assert sender.asked[waiting.hook.id] == Target("https://example.net/", (rotated.secret,))
+                assert sender.asked[waiting.hook.id] == Destination("https://example.net/", (rotated.secret,))
 
     asyncio.run(deliver())
 
@@ -374,7 +374,7 @@ def test_a_delivery_that_was_read_before_the_wanted_kinds_changed_is_not_sent(de
     batch = desk.batch()
     assert batch is not None
     [delivery], before = batch.deliveries, (batch.position, batch.attempts)
-    assert desk.lab.database.read(SYSTEM, outbox.read_target, delivery, before) is not None
+    assert desk.lab.database.read(SYSTEM, outbox.read_destination, delivery, before) is not None
     change = WebhookChange(kinds=("job.failed",))
     desk.lab.write(managing.change_webhook, "lab", desk.hook.id, change, (), required=OWNER)
-    assert desk.lab.database.read(SYSTEM, outbox.read_target, delivery, before) is None
+    assert desk.lab.database.read(SYSTEM, outbox.read_destination, delivery, before) is None

@@ -40,6 +40,7 @@ from marey_server.access.labels import first_outside, keys_within
 from marey_server.access.principal import Principal
 from marey_server.access.secret_tokens import IssuedToken, derive_attempt_token, issue_attempt_token, sealed
 from marey_server.errors import ForbiddenProblem, InvalidProblem, LeaseLostProblem
+from marey_server.store.credentials.server_key import read_seal_key
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs.events import emit_job_events
 from marey_server.store.jobs.exports import lease_inputs
@@ -56,7 +57,6 @@ from marey_server.store.jobs.fencing import (
     require_attempt,
 )
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
-from marey_server.store.server_key import read_seal_key
 from marey_server.store.tables import attempt, job, member, project
 from marey_server.store.transaction import Transaction
 

@@ -106,7 +106,7 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class Target:
+class Destination:
     """URL of a webhook, and the secrets with which a request to it is signed."""
 
     url: str = field(repr=False)
@@ -133,7 +133,7 @@ def next_batch(tx: Transaction, webhook_id: str, scanned: int) -> Batch | None:
     return _batch(row, [*found, *following], complete=complete, waits=False)
 
 
-def read_target(tx: Transaction, delivery: Delivery, before: tuple[int, int]) -> Target | None:
+def read_destination(tx: Transaction, delivery: Delivery, before: tuple[int, int]) -> Destination | None:
     """Return where to send a delivery, or None if it must not be sent any more.
 
     Call this right before sending, because a delivery may wait for a long time. In this time, the webhook may get
@@ -144,7 +144,7 @@ def read_target(tx: Transaction, delivery: Delivery, before: tuple[int, int]) ->
     if row is None:
         return None
     wanted = (row.position, row.attempts) == before and delivery.kind in (*row.kinds, MISSED_KIND)
-    return Target(row.url, _secrets(row, tx.now_us)) if delivery.requested or wanted else None
+    return Destination(row.url, _secrets(row, tx.now_us)) if delivery.requested or wanted else None
 
 
 def _find_active(tx: Transaction, webhook_id: str) -> Row[Any] | None:
