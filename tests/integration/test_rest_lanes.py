@@ -141,6 +141,7 @@ def test_refusals_of_unknown_addresses_methods_and_headers_are_counted(
     ]
     assert [answer.status_code for answer in answers] == [404, 405, 406, 401, 404]
     assert counted == ["127.0.0.1"] * 4 + [user_id]
+    assert server.app.services.metrics.delayed._value.get() == len(counted)
 
 
 def test_all_tokens_of_a_user_are_one_client_except_those_of_workers(
