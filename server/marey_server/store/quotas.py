@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Column, Row, Select, bindparam, exists, func, or_, select, text, update
+from sqlalchemy import Column, Row, Select, and_, bindparam, exists, func, or_, select, text, update
 
 from marey_schemas.access import QuotaChange, QuotasInUse, QuotaUse, Role
 from marey_server.errors import QuotaExceededProblem
@@ -21,6 +21,7 @@ from marey_server.store.invitations.validity import is_unspent
 from marey_server.store.rate_limits import DailyAmount, key_of
 from marey_server.store.tables import (
     UNFINISHED,
+    blob,
     document,
     holding,
     invitation,
@@ -31,6 +32,7 @@ from marey_server.store.tables import (
     revision_part,
     token,
     upload,
+    upload_chunk,
 )
 from marey_server.store.transaction import Transaction
 
@@ -47,7 +49,10 @@ _DELETE = "Delete items that nobody needs, or ask an administrator for a higher 
 
 _RULES = {
     "user_uploads": _Rule("open uploads", "Finish or delete one of them, such as {oldest}."),
-    "user_upload_bytes": _Rule("bytes announced by open uploads", "Finish or delete one of them, such as {oldest}."),
+    "user_upload_bytes": _Rule(
+        "bytes of uploads that are open, or whose pieces are not deleted yet",
+        "Finish or delete one of them, such as {oldest}.",
+    ),
     "user_tokens": _Rule("valid tokens", "Revoke one that you do not need; see `marey token ls`."),
     "user_projects": _Rule("projects that you own", "Delete one, or let another owner take over."),
     "user_jobs": _Rule("unfinished jobs", "Wait until some have ended, or cancel some; see `marey job ls`."),
@@ -74,9 +79,15 @@ def require_room(tx: Transaction, quota: str, more: int = 1) -> None:
     used, limit = int(tx.execute(_used(tx, quota, user_id)).scalar_one()), getattr(tx.quotas, quota)
     if used + more <= limit:
         return
-    oldest = tx.execute(select(upload.c.id).where(*_open(user_id)).order_by(upload.c.created_us).limit(1)).scalar()
-    remedy = _RULES[quota].remedy.format(oldest=oldest) if used else f"The operator can raise the setting `{quota}`."
+    remedy = _remedy(tx, quota, user_id) if used else f"The operator can raise the setting `{quota}`."
     raise _exceeded("You have", quota, _RULES[quota].noun, used, limit, more, remedy)
+
+
+def _remedy(tx: Transaction, quota: str, user_id: str) -> str:
+    oldest = tx.execute(select(upload.c.id).where(*_open(user_id)).order_by(upload.c.created_us).limit(1)).scalar()
+    if quota == "user_upload_bytes" and oldest is None:
+        return "Wait until the server has deleted the pieces of finished uploads, which it does every hour."
+    return _RULES[quota].remedy.format(oldest=oldest)
 
 
 def _exceeded(
@@ -92,7 +103,8 @@ def _used(tx: Transaction, quota: str, user_id: str) -> Select[Any]:
     if quota == "user_uploads":
         return select(func.count()).select_from(upload).where(*_open(user_id))
     if quota == "user_upload_bytes":
-        return select(func.coalesce(func.sum(upload.c.length), 0)).where(*_open(user_id))
+        taking_space = or_(and_(*_open(user_id)), and_(*_useless(user_id)))
+        return select(func.coalesce(func.sum(upload.c.length), 0)).where(taking_space)
     if quota == "user_tokens":
         valid = or_(token.c.expires_us.is_(None), token.c.expires_us > tx.now_us)
         counted = token.c.user_id == user_id, ~token.c.session, token.c.rotation_hash.is_(None), valid
@@ -107,6 +119,16 @@ def _used(tx: Transaction, quota: str, user_id: str) -> Select[Any]:
 
 def _open(user_id: str) -> tuple[Any, ...]:
     return upload.c.user_id == user_id, upload.c.finished_digest.is_(None), upload.c.dropped.is_(False)
+
+
+def _useless(user_id: str) -> tuple[Any, ...]:
+    """Return the conditions for finished uploads whose pieces no blob needs, and which are not deleted yet.
+
+    Their bytes were stored already, so they do not count towards `user_daily_bytes`.
+    """
+    has_pieces = exists().where(upload_chunk.c.upload_id == upload.c.id)
+    has_blob = exists().where(blob.c.upload_id == upload.c.id)
+    return upload.c.user_id == user_id, upload.c.finished_digest.is_not(None), has_pieces, ~has_blob
 
 
 # -- bytes that users send --------------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from marey_server.store import blobs, items, projects, uploads
 from marey_server.store.blobs import digest_of
 from marey_server.store.credentials import tokens
 from marey_server.store.database import connections
+from marey_server.store.garbage import collect_garbage
 from marey_server.store.items import Draft
 from marey_server.store.jobs import reading
 from marey_server.store.transaction import Quotas, Transaction
@@ -161,6 +162,25 @@ def test_an_upload_of_bytes_that_are_there_does_not_count(lab: Lab) -> None:
     lab.write(blobs.put_blob, data)
     lab.write(uploads.finish, first.id, digest_of(data), None)
     lab.write(blobs.put_blob, b"b" * 600)
+
+
+def test_pieces_of_an_upload_that_is_not_needed_count_until_they_are_deleted(lab: Lab) -> None:
+    """Otherwise a user who uploads the same bytes again and again fills the disk without using up any quota."""
+    lab.database.quotas = Quotas(user_upload_bytes=1000)
+    data = b"a" * 600
+    for again in (False, True):
+        made = lab.write(uploads.create_upload, len(data))
+        lab.write(uploads.append, made.id, 0, data)
+        lab.write(uploads.finish, made.id, digest_of(data), None)
+        if not again:  # the pieces of the first upload are the blob
+            lab.write(uploads.abandon, lab.write(uploads.create_upload, 1000).id)
+    with pytest.raises(QuotaExceededProblem, match="Wait until the server has deleted the pieces"):
+        lab.write(uploads.create_upload, 401)
+    open_one = lab.write(uploads.create_upload, 400)
+    with pytest.raises(QuotaExceededProblem, match=f"such as {open_one.id}"):
+        lab.write(uploads.create_upload, 1)
+    collect_garbage(lab.database)
+    lab.write(uploads.create_upload, 600)
 
 
 def read_file(name: str, *contents: bytes) -> PreparedImport:
