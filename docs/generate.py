@@ -10,6 +10,7 @@ from typing import Any
 
 import typer
 from docs.motion_library import library_page
+from prometheus_client.metrics import MetricWrapperBase
 from pydantic_core import PydanticUndefined
 
 import marey_server.app  # noqa: F401 - loads every module, and so every class of errors
@@ -20,6 +21,7 @@ from marey_schemas.queries.fields import FACET_PREFIX, FIELDS, OPERATORS, declar
 from marey_schemas.queries.grammar import MOST_CHARACTERS, MOST_COMPARED_VALUES, MOST_CONDITIONS
 from marey_schemas.queue.job_kinds import job_kinds
 from marey_server import errors
+from marey_server.process.observe import Metrics
 from marey_server.process.settings import Settings
 
 ROOT = Path(__file__).parents[1]
@@ -38,6 +40,7 @@ def pages() -> dict[str, str]:
         "checks.md": checks_page(),
         "queries.md": queries_page(),
         "errors.md": errors_page(),
+        "metrics.md": metrics_page(),
         "motion-library.md": NOTE + library_page(),
     }
 
@@ -111,6 +114,28 @@ if a clip has a newer revision, every condition on the facet is false, until a j
 """
     facets = [(f"`{FACET_PREFIX}{name}`", meaning) for name, meaning in declared_facets().items()]
     return NOTE + text + _table(("facet", "meaning"), facets).rstrip() + "\n"
+
+
+def metrics_page() -> str:
+    """Return the page of the metrics of a server."""
+    rows = [
+        (
+            f"`{one._name}{'_total' if one._type == 'counter' else ''}`",
+            one._type,
+            ", ".join(f"`{label}`" for label in one._labelnames),
+            one._documentation,
+        )
+        for one in vars(Metrics()).values()
+        if isinstance(one, MetricWrapperBase)
+    ]
+    text = """# Metrics
+
+`GET /metrics` returns these metrics in the text format of Prometheus, and the usual metrics of the process
+(`process_…`). Labels never contain what a client sent, such as names, addresses or tokens. [Detect
+attacks](../how-to/see-attacks.md) describes which metrics show an attack.
+
+"""
+    return NOTE + text + _table(("metric", "type", "labels", "meaning"), rows)
 
 
 def settings_page() -> str:

@@ -16,8 +16,8 @@ from tests.support.store_fixtures import Lab
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import InvalidProblem, NotFoundProblem, StorageFullProblem
 from marey_server.store import blob_backings, blobs, garbage
-from marey_server.store.blob_backings import CHUNK_BYTES, DatabaseBlobs, DirectoryBlobs
-from marey_server.store.blobs import Spool, digest_of
+from marey_server.store.blob_backings import CHUNK_BYTES, DatabaseBlobs, DirectoryBlobs, Spool
+from marey_server.store.blobs import digest_of
 from marey_server.store.database.connections import Database
 from marey_server.store.transaction import Transaction
 

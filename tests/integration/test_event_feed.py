@@ -196,6 +196,20 @@ def test_followers_and_waiting_workers_read_nothing_while_nothing_happens(server
         assert numbers == sorted(set(numbers))
 
 
+def test_followers_receive_everything_although_each_page_is_short(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing but the pages themselves tells a follower to read on: the feed is quiet."""
+    monkeypatch.setattr(events, "PAGE_BYTES", 1)
+    token = server.make_project()
+    made = [server.client(token).post("/projects/lab/jobs", json={"kind": "errand"}).json() for _ in range(5)]
+    followers = Followers(server, token, 2)
+    followers.until(lambda received: len([one for one in received if one["kind"] == "job.submitted"]) == 5)
+    for received in followers.received:
+        assert [one["subject"] for one in received if one["kind"] == "job.submitted"] == [one["id"] for one in made]
+        assert len({one["seq"] for one in received}) == len(received)
+
+
 def test_followers_of_one_user_are_limited(database: Database, tmp_path: Path) -> None:
     with running(database, tmp_path, user_followers=2) as server:
         token, other = server.make_project(), server.make_user("oda", administrator=True)

@@ -5,18 +5,25 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from tests.support.rest_server import PATIENCE_S, Server
+from sqlalchemy import update
+from tests.support.rest_server import PATIENCE_S, Server, running
 
 from marey_schemas.encoding.codecs import encode_tree
 from marey_server.access.principal import SYSTEM
 from marey_server.process.refusal_brake import FREE_REFUSALS
+from marey_server.store.blobs import digest_of
 from marey_server.store.credentials import tokens
+from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import Client
+from marey_server.store.tables import attempt
 
+WALK = b"HIERARCHY"
+IMPORT = {"files": [{"name": "walk.bvh", "blob": digest_of(WALK)}]}
 STUDY = {"schema": "marey/document@1", "answer": 42}
 
 
@@ -87,6 +94,30 @@ def test_a_token_that_is_refused_often_takes_its_turns_among_strangers(
     assert [client.known for client in clients] == [False, True]
 
 
+def test_every_server_knows_the_token_of_an_attempt_from_its_first_request_to_its_end(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    owner = server.client(server.make_project())
+    assert owner.put(f"/blobs/{digest_of(WALK)}", content=WALK).is_success
+    assert owner.post("/projects/lab/jobs", json={"kind": "import", "params": IMPORT}).is_success
+    worker = server.client(server.make_user("wanda", administrator=True, scopes=("work",)))
+    (lease,) = worker.post("/leases", json={"worker": "w", "kinds": ["import"]}).json()["leases"]
+    token, place = lease["attempt_token"], f"/jobs/{lease['job']}/attempts/{lease['fence']}"
+    unsealed = token.rpartition("_")[0]
+    with running(Database(server.database.url.render_as_string(hide_password=False)), tmp_path / "other") as other:
+        clients = noted_clients(other, monkeypatch)
+        assert other.client(token).post(f"{place}/heartbeat", json={}).is_success
+        assert other.client(unsealed).post(f"{place}/heartbeat", json={}).is_success
+        assert other.client("mareyjob_" + "0" * 64).get("/me").status_code == 401
+        assert [client.known for client in clients] == [True, True, False]
+        assert clients[0].key == clients[1].key  # so nobody gets more shares by changing the seal
+    clients = noted_clients(server, monkeypatch)
+    server.database.write(SYSTEM, lambda tx: tx.execute(update(attempt).values(ended_us=1)))
+    for _ in range(2):
+        assert server.client(token).post(f"{place}/heartbeat", json={}).json()["code"] == "lease-lost"
+    assert [client.known for client in clients] == [True, False]
+
+
 def test_refusals_of_unknown_addresses_methods_and_headers_are_counted(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,6 +141,7 @@ def test_refusals_of_unknown_addresses_methods_and_headers_are_counted(
     ]
     assert [answer.status_code for answer in answers] == [404, 405, 406, 401, 404]
     assert counted == ["127.0.0.1"] * 4 + [user_id]
+    assert server.app.services.metrics.delayed._value.get() == len(counted)
 
 
 def test_all_tokens_of_a_user_are_one_client_except_those_of_workers(

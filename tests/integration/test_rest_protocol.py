@@ -31,8 +31,7 @@ from marey_server.http.exchange import JOINED_BYTES
 from marey_server.http.negotiation import MediaType
 from marey_server.process.observe import without_received_text
 from marey_server.store import projects, uploads
-from marey_server.store.blob_backings import DirectoryBlobs
-from marey_server.store.blobs import Spool
+from marey_server.store.blob_backings import DirectoryBlobs, Spool
 from marey_server.store.database.connections import Database
 from marey_server.store.items.facets import publish_facets
 from marey_server.store.transaction import Transaction

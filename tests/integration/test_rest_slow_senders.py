@@ -15,7 +15,8 @@ from tests.support.rest_server import PATIENCE_S, Server, running
 from marey_schemas.sizes import KIB, MIB
 from marey_server.handlers.blobs import Blob
 from marey_server.handlers.imports import MAX_FORM_BYTES
-from marey_server.store.blobs import SPOOLED_BYTES, digest_of
+from marey_server.store.blob_backings import SPOOLED_BYTES
+from marey_server.store.blobs import digest_of
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import Client
 
@@ -89,6 +90,50 @@ def test_who_sends_nothing_for_a_while_is_cut_off(database: Database, tmp_path: 
             assert client.recv(1) == b""
         wait_until(lambda: memory.held_bytes == 0)
         assert server.client(token).put(BLOB, content=BODY).status_code == 204
+
+
+HEAD = b"POST /api/v1/login HTTP/1.1\r\nHost: h\r\n"
+FAULTS = {
+    "head-timeout": [b"", HEAD, b"GET /healthz HTTP/1.1\r\nHost: h\r\n\r\n" + HEAD],
+    "body-timeout": [
+        HEAD + b"Content-Type: application/json\r\nContent-Length: 9\r\n\r\n{",
+        HEAD + b"Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n1\r\n",
+        HEAD + b"Content-Length: 9\r\nExpect: 100-continue\r\n\r\n",
+    ],
+    "long-head": [HEAD + b"X: " + b"x" * 70_000],
+    "malformed": [b"GET\r\n\r\n", HEAD + b"Content-Length: x\r\n\r\n", HEAD + b"no colon\r\n\r\n"],
+}
+NO_FAULTS = [
+    b"GET /healthz HTTP/1.1\r\nHost: h\r\n\r\n",  # then the connection is idle
+    b"GET /healthz HTTP/1.1\r\nHost: h\r\nConnection: close\r\n\r\n",
+    HEAD + b"Content-Length: 9000\r\n\r\n{",  # refused at once, which is counted as such
+]
+
+
+def test_each_fault_for_which_a_connection_is_closed_is_counted(database: Database, tmp_path: Path) -> None:
+    with running(database, tmp_path, header_timeout_s=0.4, body_timeout_s=0.4) as server:
+        host, port = server.address.removeprefix("http://").split(":")
+
+        def counted() -> dict[str, float]:
+            samples = [one for metric in server.app.services.metrics.closed.collect() for one in metric.samples]
+            return {one.labels["reason"]: one.value for one in samples}
+
+        def send(data: bytes) -> None:
+            with socket.create_connection((host, int(port)), PATIENCE_S) as client:
+                client.sendall(data)
+                while client.recv(65536):
+                    pass
+
+        for data in NO_FAULTS:
+            send(data)
+        with socket.create_connection((host, int(port)), PATIENCE_S) as client:
+            client.sendall(HEAD)  # and the client leaves
+        for sent in FAULTS.values():
+            for data in sent:
+                send(data)
+        expected = {fault: len(sent) for fault, sent in FAULTS.items()}
+        wait_until(lambda: sum(counted().values()) == sum(expected.values()))
+        assert counted() == expected
 
 
 def test_who_sends_slowly_or_waits_for_the_server_is_not_cut_off(

@@ -121,7 +121,7 @@ class Lab:
     def events(self, after: int = 0, **kwargs: Any) -> list[Event]:
         """Return the events after the one numbered `after`."""
         self.database.write(SYSTEM, events.number_events)
-        found: list[Event] = self.read(events.list_events, self.name, after=after, **kwargs)
+        found: list[Event] = self.read(events.list_events, self.name, after=after, **kwargs).items
         return found
 
     def make_public(self) -> None:

@@ -1,8 +1,9 @@
 """Bearer tokens as text: functions that create them, split them, and hash their secrets.
 
-`marey_<prefix>_<secret>` belongs to a user; the prefix identifies the token's row in the database. `mareyjob_<secret>`
-belongs to an attempt of a job. `mareyinvite_<prefix>_<secret>` is the code of an invitation. The database stores the
-SHA-256 of the secret. A secret has 256 random bits, so a slow hash is not needed.
+`marey_<prefix>_<secret>` belongs to a user; the prefix identifies the token's row in the database.
+`mareyjob_<secret>_<seal>` belongs to an attempt of a job; the seal shows that a server issued it (see `is_sealed`).
+`mareyinvite_<prefix>_<secret>` is the code of an invitation. The database stores the SHA-256 of the secret. A secret
+has 256 random bits, so a slow hash is not needed.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from marey_schemas.invitations import CODE_PREFIX
 
 _USER = "marey_"
 _ATTEMPT = "mareyjob_"
+_SEAL_DIGITS = 32
 
 
 class IssuedToken(NamedTuple):
@@ -79,6 +81,29 @@ def _attempt_token(secret: str) -> IssuedToken:
     return IssuedToken(f"{_ATTEMPT}{secret}", "", hash_secret(secret))
 
 
+def sealed(token: IssuedToken, seal_key: bytes) -> str:
+    """Return the text of an attempt's token with a seal.
+
+    The seal is not needed for access, and not part of the secret: a token without a seal belongs to the same attempt.
+    """
+    return f"{token.text}_{_seal(token.text.removeprefix(_ATTEMPT), seal_key)}"
+
+
+def is_sealed(text: str, seal_key: bytes) -> bool:
+    """Return whether a server with this key issued the text as a token of an attempt.
+
+    No database is needed for this. The attempt may have ended long ago.
+    """
+    secret, _, seal = text.removeprefix(_ATTEMPT).partition("_")
+    if not text.startswith(_ATTEMPT) or not seal.isascii():
+        return False
+    return hmac.compare_digest(seal, _seal(secret, seal_key))
+
+
+def _seal(secret: str, seal_key: bytes) -> str:
+    return hmac.digest(seal_key, secret.encode("utf-8", "surrogatepass"), "sha256").hex()[:_SEAL_DIGITS]
+
+
 def hash_secret(secret: str) -> str:
     """Return the stored hash of a secret: 64 hexadecimal digits."""
     return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
@@ -107,5 +132,10 @@ def _split(text: str, start: str) -> tuple[str, str] | None:
 
 
 def attempt_secret(text: str) -> str | None:
-    """Return the secret of an attempt's token, or None if `text` is no such token."""
-    return text[len(_ATTEMPT) :] or None if text.startswith(_ATTEMPT) else None
+    """Return the secret of an attempt's token, with or without a seal, or None if `text` is no such token."""
+    return text[len(_ATTEMPT) :].partition("_")[0] or None if text.startswith(_ATTEMPT) else None
+
+
+def token_hash(text: str) -> str:
+    """Return a hash that identifies a bearer token; that of an attempt's token does not depend on the seal."""
+    return hash_secret(attempt_secret(text) or text)

@@ -49,14 +49,17 @@ class Events(Resource):
     async def get(self, project: str, query: EventsQuery) -> Reply | None:
         """Return events in the order of their commits; as text/event-stream, also send events that occur later.
 
+        A page may have fewer events than `limit`, because the bodies of its events have at most 4 MiB together. Only a
+        page without events means that there are no more.
+
         If events that follow the event `after` were deleted because of their age, the answer is 410 (`events-deleted`).
         `context` then contains the number after which the remaining events begin.
         """
         after = self._last_received(query)
         await self.services.number_events()
         if self.media is not EVENT_STREAM:
-            found = await self.look_up(events.list_events, project, after=after, limit=query.limit)
-            return Reply(Page(items=tuple(found)))
+            page = await self.look_up(events.list_events, project, after=after, limit=query.limit)
+            return Reply(Page(items=tuple(page.items)))
         project_id = (await self.look_up(projects.require, project)).id
         await self.look_up(events.require_kept, after)
         with self._counted(), wakeups.listen([events_topic(project_id)]) as listener:
@@ -105,17 +108,17 @@ class Events(Resource):
         self.write(": follow\n\n")
         silences = 0
         while self.is_awaited():
-            found = []
+            page = events.EventPage([], complete=True)
             if silences % LOOK_AGAIN_EVERY == 0:
-                found = await self.look_up(events.list_events, project, after=after, limit=events.MAX_EVENTS)
-            for event in found:
+                page = await self.look_up(events.list_events, project, after=after, limit=events.MAX_EVENTS)
+            for event in page.items:
                 self.write(f"id: {event.seq}\nevent: {event.kind}\ndata: {event.model_dump_json()}\n\n")
                 after = event.seq
-            if silences and not found:
+            if silences and not page.items:
                 self.write(": still here\n\n")
             if self._write_buffer:
                 await self.flush()
-            woken = len(found) == events.MAX_EVENTS or await listener.wait(KEEP_ALIVE_S)
+            woken = not page.complete or await listener.wait(KEEP_ALIVE_S)
             silences = 0 if woken else silences + 1
 
 

@@ -27,6 +27,7 @@ from marey_server.http.validation import decode_body, validate_body
 from marey_server.motions import importing
 from marey_server.motions.importing import PreparedImport, SourceFile
 from marey_server.store import blobs, projects
+from marey_server.store.blob_backings import SPOOLED_BYTES, Spool
 from marey_server.store.jobs import submission
 from marey_server.store.transaction import Transaction
 
@@ -60,7 +61,7 @@ class ProjectImports(Resource):
         if content_type.lower().startswith("multipart/"):
             self.parts = MultipartReader(boundary_of(content_type), max_parts=MAX_FILES + 32)
             settings = self.services.settings
-            spooled_bytes = min(settings.import_files_now * blobs.SPOOLED_BYTES, settings.import_bytes_now)
+            spooled_bytes = min(settings.import_files_now * SPOOLED_BYTES, settings.import_bytes_now)
             self.hold_body(BATCH_BYTES + MAX_FORM_BYTES + spooled_bytes)
         else:
             body_type(content_type)
@@ -107,7 +108,7 @@ class ProjectImports(Resource):
             file = SourceFile(name, file.digest, file.size_bytes, None)
         self.files.append(file)
 
-    async def _keep(self, spool: blobs.Spool) -> None:
+    async def _keep(self, spool: Spool) -> None:
         """Store a file as a blob that the caller may use in the project of the import."""
         await store_in_pieces(self, spool)
         await self.change(_keep, self.path_kwargs["project"], spool)
@@ -151,7 +152,7 @@ class ProjectImports(Resource):
 
     async def _submit(self, project: str, options: ImportOptions) -> Reply:
         for file in self.files:
-            if isinstance(file.content, blobs.Spool):
+            if isinstance(file.content, Spool):
                 with file.content as spool:
                     await self._keep(spool)
         files = [{"name": file.name, "blob": file.digest} for file in self.files]
@@ -232,7 +233,7 @@ class ProjectImports(Resource):
         """Discard the received files."""
         super().on_finish()
         for file in getattr(self, "files", ()):
-            if isinstance(file.content, blobs.Spool):
+            if isinstance(file.content, Spool):
                 file.content.close()
 
 
@@ -248,7 +249,7 @@ def _decode(data: bytes, media_type: str) -> ImportRequest:
     return validate_body(ImportRequest, decode_body(data, media_type, max_array_bytes=0))
 
 
-def _keep(tx: Transaction, project: str, spool: blobs.Spool) -> None:
+def _keep(tx: Transaction, project: str, spool: Spool) -> None:
     blobs.put_blob(tx, spool, project_id=projects.require(tx, project).id)
 
 

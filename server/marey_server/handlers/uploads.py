@@ -19,6 +19,7 @@ from marey_server.http.declarations import Access, Bytes, RequestBody, reads, wr
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store import blobs, uploads
+from marey_server.store.blob_backings import Spool
 
 PIECE_BYTES = MIB
 """Number of bytes written at a time; an interrupted request loses at most this number."""
@@ -34,7 +35,7 @@ CHUNKS_PER_WRITE = 4
 """Number of chunks of a long body that are stored in one transaction."""
 
 
-async def store_in_pieces(resource: Resource, spool: blobs.Spool) -> None:
+async def store_in_pieces(resource: Resource, spool: Spool) -> None:
     """Store a long body as a blob that the caller may use; do nothing if the body is short or stored already."""
     if spool.size_bytes <= LONG_BODY_BYTES:
         return

@@ -12,11 +12,11 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Awaitable, Callable, Collection, Iterable
 from typing import Any
 
 from tornado.httpserver import HTTPServer
-from tornado.iostream import IOStream
+from tornado.iostream import IOStream, UnsatisfiableReadError
 
 from marey_schemas.sizes import KIB
 from marey_server.process.password_lanes import limited_address
@@ -41,6 +41,16 @@ LOG_EVERY_S = 60.0
 CHECKS_PER_TIMEOUT = 4
 LEAST_TAKEN_BYTES = 64 * KIB
 """Number of bytes that a client with waiting answers must receive within each write timeout, to stay connected."""
+_FAULTS = {
+    "head-timeout": "did not send the head of a request in time",
+    "body-timeout": "did not send the body of a request in time",
+    "long-head": "sent the head of a request that is too long",
+    "malformed": "sent a malformed request",
+}
+"""Faults of clients for which Tornado closes a connection without calling a resource."""
+_TORNADO_400 = b"HTTP/1.1 400 Bad Request\r\n\r\n"
+"""Answer of Tornado to a malformed request; answers of resources have headers."""
+_TORNADO_100 = b"HTTP/1.1 100 (Continue)\r\n\r\n"
 _EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
@@ -72,7 +82,10 @@ def default_connections() -> int:
 
 
 class _Connection(IOStream):
-    """Connection that counts the bytes received by its client since the last call of `start_count`."""
+    """Connection that counts the bytes received by its client since the last call of `start_count`.
+
+    It also knows for which fault of its client it is closed.
+    """
 
     def __init__(
         self, accepted: socket.socket, address: str, forget: Callable[[_Connection], None], server: HTTPServer
@@ -80,7 +93,47 @@ class _Connection(IOStream):
         super().__init__(accepted, max_buffer_size=server.max_buffer_size, read_chunk_size=server.read_chunk_size)
         self.address = address
         self.taken_bytes, self.since_s = 0, 0.0
+        self.is_counted = False
+        """Whether the connection is closed for a reason that `Connections` counts itself."""
         self._forget = forget
+        self._requests = 0
+        self._reads_head = self._ended_by_client = self._malformed = self._answered = self._sends = False
+
+    def fault(self) -> str | None:
+        """Return the fault of the client (a key of `_FAULTS`) for which the connection is being closed, or None."""
+        if self._malformed:
+            return "malformed"
+        if isinstance(self.error, UnsatisfiableReadError):
+            return "long-head"
+        if self.is_counted or self._ended_by_client or self.error is not None or not self.reading():
+            return None
+        if self._reads_head:
+            return "head-timeout" if self._sends or self._requests == 1 else None  # else it was idle between requests
+        return None if self._answered else "body-timeout"
+
+    def read_until_regex(self, regex: bytes, max_bytes: int | None = None) -> Awaitable[bytes]:
+        """Read the head of a request."""
+        self._requests += 1
+        self._reads_head, self._answered = True, False
+        self._sends = self._read_buffer_size > 0  # the begin of the head may have come with the request before
+        return super().read_until_regex(regex, max_bytes)
+
+    def read_until(self, delimiter: bytes, max_bytes: int | None = None) -> Awaitable[bytes]:
+        """Read the size of a chunk of a body."""
+        self._reads_head = False
+        return super().read_until(delimiter, max_bytes)
+
+    def read_bytes(self, num_bytes: int, partial: bool = False) -> Awaitable[bytes]:
+        """Read a part of a body."""
+        self._reads_head = False
+        return super().read_bytes(num_bytes, partial)
+
+    def read_from_fd(self, buf: bytearray | memoryview) -> int | None:
+        """Read received bytes into `buf`, and return their number; 0 if the client has closed the connection."""
+        count = super().read_from_fd(buf)
+        self._ended_by_client = count == 0
+        self._sends = self._sends or bool(count)
+        return count
 
     def close_fd(self) -> None:
         """Close the socket, so that another connection can be opened."""
@@ -92,6 +145,8 @@ class _Connection(IOStream):
 
         Returns a future that ends when all bytes are written.
         """
+        self._malformed = data == _TORNADO_400
+        self._answered = self._answered or data != _TORNADO_100
         if not self.writing():
             self.start_count(time.monotonic())
         return super().write(data)
@@ -207,11 +262,14 @@ class Connections:
             host = Counter(one.address for one in idle).most_common(1)[0][0]
         own = [one for one in idle if one.address == host]
         for one in own[: max(1, int(self._most * EVICTED_SHARE))]:
+            one.is_counted = True
             one.close()
         if own:
             self._log("evicted", "closed idle connections of %s, because a limit on connections was reached", host)
 
     def _forget(self, one: _Connection) -> None:
+        if self._listening and (fault := one.fault()) is not None:
+            self._log(fault, "closed a connection of %s, which %s", one.address, _FAULTS[fault])
         del self._open[one]
         self._by_address[one.address] -= 1
         if not self._by_address[one.address]:
@@ -247,6 +305,7 @@ class Connections:
             if one.taken_bytes < LEAST_TAKEN_BYTES:
                 self._log("slow", "closed a connection of %s, whose client read only %d bytes in %.0f s",
                           one.address, one.taken_bytes, now_s - one.since_s)  # fmt: skip
+                one.is_counted = True
                 one.close()
             else:
                 one.start_count(now_s)

@@ -9,7 +9,7 @@ from functools import cached_property, partial
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from marey_server.access.principal import ANONYMOUS, Principal
-from marey_server.errors import ClientGoneProblem, UnauthenticatedProblem
+from marey_server.errors import ClientGoneProblem, LeaseLostProblem, UnauthenticatedProblem
 from marey_server.http.calls import Caller, run_plain
 from marey_server.http.declarations import Operation
 from marey_server.http.exchange import Exchange
@@ -23,6 +23,8 @@ from marey_server.store.transaction import Transaction
 P = ParamSpec("P")
 T = TypeVar("T")
 
+_TOKEN_ENDED = (UnauthenticatedProblem, LeaseLostProblem)
+"""Errors of requests whose token may be no longer valid."""
 CLIENT_GONE = "The client closed the connection before the answer was computed."
 
 
@@ -68,7 +70,7 @@ class CallingExchange(Exchange):
     def client(self) -> Client:
         """Client for which this request waits in queues: the owner of its token, or else the client's address.
 
-        The owner of a token counts only if the server has accepted the token before.
+        The owner of a token counts only if the token is known: accepted before, or issued to an attempt of a job.
         """
         token = None
         with suppress(UnauthenticatedProblem):
@@ -76,6 +78,12 @@ class CallingExchange(Exchange):
         if token is not None and (key := self.services.client_key(token)) is not None:
             return Client(key, known=not self.services.refusal_brake.is_often_refused(key), is_gone=self.departure)
         return Client(limited_address(self.client_address), known=False, is_gone=self.departure)
+
+    def _write_problem(self, error: BaseException) -> None:
+        super()._write_problem(error)
+        caller: Caller | None = getattr(self, "caller", None)
+        if caller is not None and caller.token is not None and isinstance(error, _TOKEN_ENDED):
+            self.services.forget_client(caller.token)
 
     async def compute(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run `function` in a thread, away from the event loop, and return its result."""

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from marey_schemas.sizes import KIB, MIB
 from marey_server.errors import StorageFullProblem
 from marey_server.process.services import Services
-from marey_server.store.blobs import Spool
+from marey_server.store.blob_backings import Spool
 
 BATCH_BYTES = MIB
 WRITTEN_AT_ONCE_BYTES = 64 * KIB

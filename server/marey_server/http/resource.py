@@ -170,6 +170,7 @@ class Resource(CallingExchange):
         if error.status >= 500:
             return
         if delay_s := self.services.refusal_brake.delay_s(self.client.key):
+            self.services.metrics.delayed.inc()
             self._release_memory()
             await self.pause(delay_s)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from marey_schemas.access import Role
 from marey_schemas.documents.clips import Check
@@ -15,8 +15,8 @@ from marey_schemas.options.imports import ImportOptions
 from marey_server.access.folder_rights import FolderRoleProblem
 from marey_server.errors import ApiProblem, InvalidProblem
 from marey_server.motions.loading import LOADING
-from marey_server.store import blobs, items, projects
-from marey_server.store.blobs import Spool
+from marey_server.store import blobs, items, projects, quotas
+from marey_server.store.blob_backings import Spool
 from marey_server.store.documents import PreparedDocument, prepare_document
 from marey_server.store.folder_roles.rights import rights_of_caller, rights_shown
 from marey_server.store.items import Draft, ItemFilters, Published
@@ -224,21 +224,34 @@ def require_folder(tx: Transaction, project: str, folder: str) -> None:
 def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> list[ImportEntry]:
     """Store the original files and the items read from them; return one entry for each file.
 
-    A file that cannot be stored is refused and does not affect other files.
+    A file that cannot be stored is refused and does not affect other files. The bytes are counted at the end, because
+    other requests of the user must wait from the count to the end of the transaction.
     """
     row = projects.require(tx, project)
     hold_off_purges(tx, row.id)
     rights_of_caller(tx, row)  # here, because a rollback below would release their lock
     entries: list[ImportEntry] = []
+    sent_bytes = 0
     for together in _runs(files):
         try:
-            with tx.connection.begin_nested():
-                entries += _publish(tx, row, together)
+            stored = [_publish(tx, row, together, sent_bytes)]
         except ApiProblem as error:
             if _concerns_request(error):
                 raise
-            entries += [_publish_alone(tx, row, file) for file in together]
+            stored = []
+            for file in together:
+                stored.append(_publish_alone(tx, row, file, sent_bytes + sum(one.sent_bytes for one in stored)))
+        entries += [entry for one in stored for entry in one.entries]
+        sent_bytes += sum(one.sent_bytes for one in stored)
+    quotas.count_sent(tx, sent_bytes)
     return entries
+
+
+class _Stored(NamedTuple):
+    """Entries of the answer for files that were stored together, and the number of new bytes of their sources."""
+
+    entries: list[ImportEntry]
+    sent_bytes: int = 0
 
 
 def _runs(files: Sequence[PreparedImport]) -> Iterator[list[PreparedImport]]:
@@ -258,29 +271,31 @@ def _concerns_request(error: ApiProblem) -> bool:
     return error.status in REFUSED_ALTOGETHER and not isinstance(error, FolderRoleProblem)
 
 
-def _publish_alone(tx: Transaction, row: ProjectRow, file: PreparedImport) -> ImportEntry:
+def _publish_alone(tx: Transaction, row: ProjectRow, file: PreparedImport, sent_bytes: int) -> _Stored:
     try:
-        with tx.connection.begin_nested():
-            return _publish(tx, row, [file])[0]
+        return _publish(tx, row, [file], sent_bytes)
     except ApiProblem as error:
         if _concerns_request(error):
             raise
-        return _refused(file.name, error)
+        return _Stored([_refused(file.name, error)])
 
 
-def _publish(tx: Transaction, row: ProjectRow, files: Sequence[PreparedImport]) -> list[ImportEntry]:
-    drafts: dict[str, tuple[Draft, ...]] = {}
-    for file in files:
-        if file.entry is None:
-            drafts[file.name] = file.drafts if file.graph is None else (graph_draft(tx, row.name, file.graph),)
-            for source in file.sources:
-                if source.content is not None:
-                    blobs.put_blob(tx, source.content, expected=source.digest, project_id=row.id)
-    every = [draft for some in drafts.values() for draft in some]
-    rights = rights_of_caller(tx, row)
-    published = iter(items.publish(tx, row, every, author_id=tx.principal.user_id, rights=rights))
-    made = {name: list(itertools.islice(published, len(some))) for name, some in drafts.items()}
-    return [file.entry or _entry(file, made[file.name]) for file in files]
+def _publish(tx: Transaction, row: ProjectRow, files: Sequence[PreparedImport], sent_bytes: int) -> _Stored:
+    """Store files together, or none of them. `sent_bytes` is the number of new bytes of the files stored before."""
+    with tx.connection.begin_nested():
+        fresh = [file for file in files if file.entry is None]
+        sources = {one.digest: one.content for file in fresh for one in file.sources if one.content is not None}
+        new_bytes = blobs.put_uncounted(tx, sources, project_id=row.id) if sources else 0
+        if new_bytes:
+            quotas.require_sendable(tx, sent_bytes + new_bytes)
+        drafts: dict[str, tuple[Draft, ...]] = {
+            file.name: file.drafts if file.graph is None else (graph_draft(tx, row.name, file.graph),) for file in fresh
+        }
+        every = [draft for some in drafts.values() for draft in some]
+        rights = rights_of_caller(tx, row)
+        published = iter(items.publish(tx, row, every, author_id=tx.principal.user_id, rights=rights))
+        made = {name: list(itertools.islice(published, len(some))) for name, some in drafts.items()}
+    return _Stored([file.entry or _entry(file, made[file.name]) for file in files], new_bytes)
 
 
 def graph_draft(tx: Transaction, project: str, graph: ImportedGraph) -> Draft:

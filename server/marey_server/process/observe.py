@@ -108,13 +108,7 @@ class Metrics:
             "marey_http_request_seconds", "Time from the headers of a request to the end of its answer.",
             ("method", "route"), buckets=_BUCKETS_S, registry=self.registry,
         )  # fmt: skip
-        self.refusals = Counter(
-            "marey_refusals", "Requests refused, by problem code.", ("code", "route"), registry=self.registry
-        )
-        self.closed = Counter(
-            "marey_connections_closed", "Connections refused or closed to protect others: full, evicted, exhausted "
-            "(no file descriptors left) or slow.", ("reason",), registry=self.registry,
-        )  # fmt: skip
+        self._add_refusals()
         self.received = Counter("marey_http_received_bytes", "Bytes of request bodies.", registry=self.registry)
         self.in_flight = Gauge("marey_http_in_flight", "Requests under way.", registry=self.registry)
         self.connections = Gauge("marey_connections", "Open connections.", registry=self.registry)
@@ -138,6 +132,21 @@ class Metrics:
         self._rendering = asyncio.Lock()
         self._renderings = 0
         self._rendered = b""
+
+    def _add_refusals(self) -> None:
+        self.refusals = Counter(
+            "marey_refusals", "Requests refused, by problem code.", ("code", "route"), registry=self.registry
+        )
+        self.closed = Counter(
+            "marey_connections_closed", "Connections refused or closed to protect others, by reason: `full` (too many "
+            "connections), `exhausted` (no file descriptors left), `evicted` (idle), `slow` (the client does not read "
+            "the answer), `head-timeout` or `body-timeout` (the client does not send the head or the body of a request "
+            "in time), `long-head` or `malformed` (the request cannot be read).", ("reason",), registry=self.registry,
+        )  # fmt: skip
+        self.delayed = Counter(
+            "marey_refusals_delayed", "Refusals that were delayed because the event loop was late and the client was "
+            "often refused.", registry=self.registry,
+        )  # fmt: skip
 
     def _add_webhooks(self) -> None:
         self.webhook_deliveries = Counter(

@@ -14,7 +14,7 @@ from typing import Any
 from marey_schemas.lru import LruCache
 from marey_server.access import scopes
 from marey_server.access.principal import SYSTEM, Principal
-from marey_server.access.secret_tokens import hash_secret
+from marey_server.access.secret_tokens import is_sealed, token_hash
 from marey_server.errors import AuthorLostProblem, UnavailableProblem
 from marey_server.motions.searching import SearchableKey
 from marey_server.process.children import Children
@@ -29,6 +29,7 @@ from marey_server.process.turns import Turns
 from marey_server.process.upload_hashes import UploadHashes
 from marey_server.store import events
 from marey_server.store.credentials import tokens
+from marey_server.store.credentials.server_key import read_seal_key
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs.failure import end_for_lost_author
 from marey_server.store.jobs.policy import QueuePolicy
@@ -97,7 +98,8 @@ class Services:
         self._faults: list[str] = []
         self._tokens_noted: LruCache[str, float] = LruCache(max_entries=TOKENS_REMEMBERED)
         self._client_keys: LruCache[str, str] = LruCache(max_entries=TOKENS_REMEMBERED)
-        """Keys that `client_key` returns, by the hash of the token."""
+        """Keys that `client_key` returns, by `token_hash`; "" if the token was refused."""
+        self._seal_key = database.read(SYSTEM, read_seal_key)
         self.queue_policy = QueuePolicy(settings.lease_ttl_s, settings.heartbeat_s, settings.cancel_grace_s)
         self.start_grace = StartGrace(self.queue_policy)
         self._watch()
@@ -125,15 +127,25 @@ class Services:
         """Return the key of the client that has a token, or None if no request with this token was accepted before.
 
         All tokens of a user belong to one client, so that nobody gets more than one share by creating tokens. Each
-        worker and each attempt is a client of its own.
+        worker and each attempt is a client of its own. The token of an attempt is known before its first request,
+        because its seal shows that a server has issued it.
         """
-        return self._client_keys.get(hash_secret(token))
+        hashed = token_hash(token)
+        key = self._client_keys.get(hashed)
+        if key is None and is_sealed(token, self._seal_key):
+            return hashed
+        return key or None
+
+    def forget_client(self, token: str) -> None:
+        """Treat a token that is no longer valid like an invented one, until a request with it is accepted again."""
+        if self.client_key(token) is not None:  # invented tokens must not displace others
+            self._client_keys.put(token_hash(token), "")
 
     def note_use(self, token: str, principal: Principal) -> None:
         """Record the use of a token; each token is updated in the database at most once per `NOTE_USE_EVERY_S`."""
-        token_hash = hash_secret(token)
+        hashed = token_hash(token)
         user_id = None if scopes.only_work(principal.scopes) else principal.user_id
-        self._client_keys.put(token_hash, user_id or token_hash)
+        self._client_keys.put(hashed, user_id or hashed)
         token_id, now = principal.token_id, time.monotonic()
         if token_id is None:
             return

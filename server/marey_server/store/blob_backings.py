@@ -1,27 +1,76 @@
 """Backings that store the bytes of blobs; the rows of the table `blob` say which blobs exist.
 
 A backing is called inside the transaction that inserts or deletes the blob's row. This row is the lock: no other
-transaction can write or remove the same bytes before this transaction ends.
+transaction can write or remove the same bytes before this transaction ends. Bytes that are being received are in a
+`Spool`.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol
+from types import TracebackType
+from typing import Any, Protocol, Self
 
 from sqlalchemy import Connection, bindparam, delete, insert, select
 
+from marey_schemas.sizes import KIB
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.tables import blob, blob_chunk, upload_chunk
 
 CHUNK_BYTES = 2**20
 BYTES_PER_STATEMENT = 4 * CHUNK_BYTES
 """Total size in bytes of the rows that are inserted with one statement."""
+
+
+SPOOLED_BYTES = 64 * KIB
+"""Greatest number of bytes that a spool keeps in memory."""
+
+
+class Spool:
+    """Temporary storage of bytes that are being received, with their running hash.
+
+    Up to `SPOOLED_BYTES` are kept in memory; a longer body is written to an unnamed file.
+    """
+
+    def __init__(self, directory: str | None = None) -> None:
+        self._file = tempfile.SpooledTemporaryFile(max_size=SPOOLED_BYTES, dir=directory)  # noqa: SIM115
+        self._hash = hashlib.sha256()
+        self.size_bytes = 0
+
+    def write(self, data: bytes) -> None:
+        """Append bytes, and add them to the hash."""
+        self._file.write(data)
+        self._hash.update(data)
+        self.size_bytes += len(data)
+
+    @property
+    def digest(self) -> str:
+        """Return the digest of the bytes written so far."""
+        return f"sha256:{self._hash.hexdigest()}"
+
+    def chunks(self) -> Iterator[bytes]:
+        """Yield all bytes written so far in pieces of 1 MiB."""
+        self._file.seek(0)
+        while chunk := self._file.read(CHUNK_BYTES):
+            yield chunk
+
+    def close(self) -> None:
+        """Close the spool, which discards its bytes."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, _type: type[BaseException] | None, _error: BaseException | None, _at: TracebackType | None
+    ) -> None:
+        self.close()
 
 
 class BlobBacking(Protocol):

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import tempfile
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from operator import itemgetter
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from sqlalchemy import ColumnElement, Select, Table, and_, or_, select, update
 
 from marey_schemas.access import Scope
 from marey_schemas.problems import FieldError
-from marey_schemas.sizes import KIB
 from marey_server import faults
 from marey_server.access import scopes
 from marey_server.access.principal import Principal
@@ -24,7 +21,7 @@ from marey_server.errors import (
     NotFoundProblem,
     UnauthenticatedProblem,
 )
-from marey_server.store.blob_backings import CHUNK_BYTES
+from marey_server.store.blob_backings import CHUNK_BYTES, Spool
 from marey_server.store.jobs import reach
 from marey_server.store.projects import is_visible, writable_projects
 from marey_server.store.quotas import count_sent
@@ -48,50 +45,6 @@ GRACE_US = 24 * 3600 * 1_000_000
 RENEW_US = GRACE_US // 2
 """Age after which an unreferenced blob must be sent again, so that it is not deleted while a client relies on it."""
 
-SPOOLED_BYTES = 64 * KIB
-"""Greatest number of bytes that a spool keeps in memory."""
-
-
-class Spool:
-    """Temporary storage of bytes that are being received, with their running hash.
-
-    Up to `SPOOLED_BYTES` are kept in memory; a longer body is written to an unnamed file.
-    """
-
-    def __init__(self, directory: str | None = None) -> None:
-        self._file = tempfile.SpooledTemporaryFile(max_size=SPOOLED_BYTES, dir=directory)  # noqa: SIM115
-        self._hash = hashlib.sha256()
-        self.size_bytes = 0
-
-    def write(self, data: bytes) -> None:
-        """Append bytes, and add them to the hash."""
-        self._file.write(data)
-        self._hash.update(data)
-        self.size_bytes += len(data)
-
-    @property
-    def digest(self) -> str:
-        """Return the digest of the bytes written so far."""
-        return f"sha256:{self._hash.hexdigest()}"
-
-    def chunks(self) -> Iterator[bytes]:
-        """Yield all bytes written so far in pieces of 1 MiB."""
-        self._file.seek(0)
-        while chunk := self._file.read(CHUNK_BYTES):
-            yield chunk
-
-    def close(self) -> None:
-        """Close the spool, which discards its bytes."""
-        self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, _type: type[BaseException] | None, _error: BaseException | None, _at: TracebackType | None
-    ) -> None:
-        self.close()
-
 
 def digest_of(data: bytes) -> str:
     """Return the digest `sha256:<hex>` of bytes."""
@@ -107,21 +60,31 @@ def put_blob(
     allows. Raises `InvalidProblem` if the digest of the bytes is not `expected`, and `QuotaExceededProblem` if the
     caller has sent too many bytes.
     """
-    require_sender(tx.principal)
-    places = places_of_sender(tx) if project_id is None else (project_id,)
-    digest = digest_of(content) if isinstance(content, bytes) else content.digest
-    if expected is not None and digest != expected:
-        raise InvalidProblem(
-            f"The bytes have the digest {digest}, not {expected}: they were changed in transit; send them again.",
-            code="digest-mismatch",
-        )
-    new = store_blobs(tx, {digest: content})
-    add_holder(tx, digest, places)
-    if new:
-        count_sent(tx, _size_bytes(content))
+    digest = expected or _digest(content)
+    count_sent(tx, put_uncounted(tx, {digest: content}, project_id=project_id))
     faults.point("blob.put.before_commit")
     tx.after_commit(lambda: faults.point("blob.put.after_commit"))
     return digest
+
+
+def put_uncounted(tx: Transaction, contents: Mapping[str, bytes | Spool], *, project_id: str | None = None) -> int:
+    """Store bytes under their digests as `put_blob` does, but without counting them; return the number of new bytes.
+
+    Pass this number to `count_sent` at the end of the transaction: until the transaction ends, everybody who counts
+    bytes of the same user waits.
+    """
+    require_sender(tx.principal)
+    places = places_of_sender(tx) if project_id is None else (project_id,)
+    for expected, content in contents.items():
+        if (digest := _digest(content)) != expected:
+            raise InvalidProblem(
+                f"The bytes have the digest {digest}, not {expected}: they were changed in transit; send them again.",
+                code="digest-mismatch",
+            )
+    new = store_blobs(tx, contents)
+    for digest in sorted(contents):
+        add_holder(tx, digest, places)
+    return sum(_size_bytes(contents[digest]) for digest in new)
 
 
 def require_sender(principal: Principal) -> None:
@@ -168,6 +131,10 @@ def store_blobs(tx: Transaction, contents: Mapping[str, bytes | Spool]) -> set[s
     new = insert_new(tx, blob, rows)
     tx.blobs.write(tx.connection, {digest: _chunks(contents[digest]) for digest in contents if digest in new})
     return new
+
+
+def _digest(content: bytes | Spool) -> str:
+    return digest_of(content) if isinstance(content, bytes) else content.digest
 
 
 def _size_bytes(content: bytes | Spool) -> int:

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 from sqlalchemy import (
     BigInteger,
     ColumnElement,
+    LargeBinary,
     Row,
     Select,
     Text,
@@ -29,6 +30,7 @@ from sqlalchemy import (
     exists,
     func,
     insert,
+    or_,
     select,
     text,
     update,
@@ -36,6 +38,7 @@ from sqlalchemy import (
 from sqlalchemy.dialects.postgresql import ARRAY, array
 
 from marey_schemas.items import Event
+from marey_schemas.sizes import MIB
 from marey_server.access.roles import require_administrator
 from marey_server.errors import GoneProblem
 from marey_server.store import projects
@@ -46,6 +49,8 @@ from marey_server.store.transaction import Transaction, in_lists
 from marey_server.store.wakeups import events_topic, job_topic, work_topic
 
 MAX_EVENTS = 1000
+PAGE_BYTES = 4 * MIB
+"""Greatest size of the bodies of the events in a page; a longer body is a page of its own."""
 NUMBERED_AT_ONCE = 10_000
 """Greatest number of events that get their numbers in one transaction."""
 
@@ -59,28 +64,54 @@ DELETED_AT_ONCE = 1000
 _UNNUMBERED = event.c.number.is_(None)
 
 
+class EventPage(NamedTuple):
+    """Page of the feed, and whether no events remained after the page when it was read."""
+
+    items: list[Event]
+    complete: bool
+
+
 def list_events(
     tx: Transaction, project_name: str | None = None, *, after: int = 0, limit: int = 100, subject: str | None = None
-) -> list[Event]:
+) -> EventPage:
     """List the events after the one numbered `after`: of a project, or, for administrators, of the whole server.
 
-    With `subject`, only events of that object are listed. On Postgres, call `number_events` first. Raises `GoneProblem`
-    if events after `after` were deleted, unless `after` is 0, which means the oldest stored event.
+    With `subject`, only events of that object are listed. A page has at most `limit` events and `PAGE_BYTES`, but at
+    least one event if there is any. On Postgres, call `number_events` first. Raises `GoneProblem` if events after
+    `after` were deleted, unless `after` is 0, which means the oldest stored event.
     """
     require_kept(tx, after)
-    after = start_of_feed(tx, after)
-    number = number_of(tx)
-    statement = select(*_COLUMNS, number.label("number"), project.c.name.label("project")).select_from(
-        event.outerjoin(project, project.c.id == event.c.project_id)
-    )
+    conditions = [follows(tx, start_of_feed(tx, after))]
     if project_name is None:
         require_administrator(tx.principal)
     else:
-        statement = statement.where(event.c.project_id == projects.require(tx, project_name).id)
+        conditions.append(event.c.project_id == projects.require(tx, project_name).id)
     if subject is not None:
-        statement = statement.where(event.c.subject == subject)
-    rows = tx.execute(statement.where(follows(tx, after)).order_by(number).limit(min(limit, MAX_EVENTS)))
-    return [_shown(row) for row in rows]
+        conditions.append(event.c.subject == subject)
+    most = min(limit, MAX_EVENTS)
+    placed = _placed(tx, conditions, most).subquery()
+    statement = (
+        select(*_COLUMNS, number_of(tx).label("number"), project.c.name.label("project"), placed.c.found)
+        .select_from(event.join(placed, placed.c.seq == event.c.seq))
+        .outerjoin(project, project.c.id == event.c.project_id)
+        .where(or_(placed.c.until_bytes <= PAGE_BYTES, placed.c.until_bytes == placed.c.size_bytes))
+    )
+    rows = tx.execute(statement.order_by(number_of(tx))).all()
+    return EventPage([_shown(row) for row in rows], not rows or len(rows) == rows[0].found < most)
+
+
+def _placed(tx: Transaction, conditions: Sequence[ColumnElement[bool]], most: int) -> Select[Any]:
+    """Select the first `most` events that meet the conditions, each with the sum of the sizes up to its own.
+
+    `found` is the number of these events. The bodies are not selected, because not all of them may fit into a page.
+    """
+    text_size = func.octet_length(cast(event.c.body, Text))
+    size_bytes = text_size if tx.is_postgres else func.length(cast(event.c.body, LargeBinary))
+    number = number_of(tx)
+    first = select(event.c.seq, number.label("number"), size_bytes.label("size_bytes")).where(*conditions)
+    sized = first.order_by(number).limit(most).subquery()
+    until_bytes = func.sum(sized.c.size_bytes).over(order_by=sized.c.number)
+    return select(sized.c.seq, sized.c.size_bytes, until_bytes.label("until_bytes"), func.count().over().label("found"))
 
 
 def require_kept(tx: Transaction, after: int) -> None:

@@ -7,21 +7,17 @@ import binascii
 import hashlib
 import hmac
 import json
-import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, Select, UnaryExpression, and_, or_, select
+from sqlalchemy import ColumnElement, Row, Select, UnaryExpression, and_, or_
 
 from marey_schemas.encoding.canonical import canonical_json
 from marey_server.errors import BadRequestProblem
-from marey_server.store.database.prepared import Prepared
-from marey_server.store.tables import server_state
+from marey_server.store.credentials.server_key import read_server_key
 from marey_server.store.transaction import Transaction
 
-_KEY_NAME = "cursor_key"
-_CURSOR_KEY = Prepared(select(server_state.c.value).where(server_state.c.key == _KEY_NAME))
 _MAC_BYTES = 16
 DEFAULT_LIMIT = 50
 MAX_LIMIT = 1000
@@ -106,14 +102,7 @@ def _fingerprint(identity: Any) -> str:
 
 
 def _mac(tx: Transaction, payload: bytes) -> bytes:
-    (key,) = tx.run(_CURSOR_KEY, {})
-    return hmac.digest(bytes.fromhex(key.value), payload, "sha256")[:_MAC_BYTES]
-
-
-def make_cursor_key(tx: Transaction) -> None:
-    """Create the key that signs cursors, unless the database already contains one."""
-    row = {"key": _KEY_NAME, "value": secrets.token_hex(32)}
-    tx.execute(tx.insert_or_ignore(server_state, row))
+    return hmac.digest(read_server_key(tx), payload, "sha256")[:_MAC_BYTES]
 
 
 def read_page(

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Column, Row, Select, bindparam, exists, func, or_, select, text, update
+from sqlalchemy import Column, Row, Select, and_, bindparam, exists, func, or_, select, text, update
 
 from marey_schemas.access import QuotaChange, QuotasInUse, QuotaUse, Role
 from marey_server.errors import QuotaExceededProblem
@@ -21,6 +21,7 @@ from marey_server.store.invitations.validity import is_unspent
 from marey_server.store.rate_limits import DailyAmount, key_of
 from marey_server.store.tables import (
     UNFINISHED,
+    blob,
     document,
     holding,
     invitation,
@@ -31,6 +32,7 @@ from marey_server.store.tables import (
     revision_part,
     token,
     upload,
+    upload_chunk,
 )
 from marey_server.store.transaction import Transaction
 
@@ -47,7 +49,10 @@ _DELETE = "Delete items that nobody needs, or ask an administrator for a higher 
 
 _RULES = {
     "user_uploads": _Rule("open uploads", "Finish or delete one of them, such as {oldest}."),
-    "user_upload_bytes": _Rule("bytes announced by open uploads", "Finish or delete one of them, such as {oldest}."),
+    "user_upload_bytes": _Rule(
+        "bytes of uploads that are open, or whose pieces are not deleted yet",
+        "Finish or delete one of them, such as {oldest}.",
+    ),
     "user_tokens": _Rule("valid tokens", "Revoke one that you do not need; see `marey token ls`."),
     "user_projects": _Rule("projects that you own", "Delete one, or let another owner take over."),
     "user_jobs": _Rule("unfinished jobs", "Wait until some have ended, or cancel some; see `marey job ls`."),
@@ -74,9 +79,15 @@ def require_room(tx: Transaction, quota: str, more: int = 1) -> None:
     used, limit = int(tx.execute(_used(tx, quota, user_id)).scalar_one()), getattr(tx.quotas, quota)
     if used + more <= limit:
         return
-    oldest = tx.execute(select(upload.c.id).where(*_open(user_id)).order_by(upload.c.created_us).limit(1)).scalar()
-    remedy = _RULES[quota].remedy.format(oldest=oldest) if used else f"The operator can raise the setting `{quota}`."
+    remedy = _remedy(tx, quota, user_id) if used else f"The operator can raise the setting `{quota}`."
     raise _exceeded("You have", quota, _RULES[quota].noun, used, limit, more, remedy)
+
+
+def _remedy(tx: Transaction, quota: str, user_id: str) -> str:
+    oldest = tx.execute(select(upload.c.id).where(*_open(user_id)).order_by(upload.c.created_us).limit(1)).scalar()
+    if quota == "user_upload_bytes" and oldest is None:
+        return "Wait until the server has deleted the pieces of finished uploads, which it does every hour."
+    return _RULES[quota].remedy.format(oldest=oldest)
 
 
 def _exceeded(
@@ -92,7 +103,8 @@ def _used(tx: Transaction, quota: str, user_id: str) -> Select[Any]:
     if quota == "user_uploads":
         return select(func.count()).select_from(upload).where(*_open(user_id))
     if quota == "user_upload_bytes":
-        return select(func.coalesce(func.sum(upload.c.length), 0)).where(*_open(user_id))
+        taking_space = or_(and_(*_open(user_id)), and_(*_useless(user_id)))
+        return select(func.coalesce(func.sum(upload.c.length), 0)).where(taking_space)
     if quota == "user_tokens":
         valid = or_(token.c.expires_us.is_(None), token.c.expires_us > tx.now_us)
         counted = token.c.user_id == user_id, ~token.c.session, token.c.rotation_hash.is_(None), valid
@@ -109,25 +121,49 @@ def _open(user_id: str) -> tuple[Any, ...]:
     return upload.c.user_id == user_id, upload.c.finished_digest.is_(None), upload.c.dropped.is_(False)
 
 
+def _useless(user_id: str) -> tuple[Any, ...]:
+    """Return the conditions for finished uploads whose pieces no blob needs, and which are not deleted yet.
+
+    Their bytes were stored already, so they do not count towards `user_daily_bytes`.
+    """
+    has_pieces = exists().where(upload_chunk.c.upload_id == upload.c.id)
+    has_blob = exists().where(blob.c.upload_id == upload.c.id)
+    return upload.c.user_id == user_id, upload.c.finished_digest.is_not(None), has_pieces, ~has_blob
+
+
 # -- bytes that users send --------------------------------------------------------------------------------------------
+
+
+def require_sendable(tx: Transaction, size_bytes: int) -> None:
+    """Check that the caller may send new bytes at present, but do not count them; use `count_sent` as well.
+
+    Raises `QuotaExceededProblem`.
+    """
+    if (limit := _part_of_day(tx, size_bytes)) is not None:
+        _require_daily(tx, size_bytes, rate_limits.wait_s(tx, limit))
 
 
 def count_sent(tx: Transaction, size_bytes: int) -> None:
     """Count new bytes that the caller sends; they take space for a day, even if no item ever uses them.
 
-    The server and attempts of jobs have no quotas. Raises `QuotaExceededProblem` if the caller has sent too many bytes.
+    Call this once, at the end of a transaction: until the transaction ends, other counts of the same user wait. The
+    server and attempts of jobs have no quotas. Raises `QuotaExceededProblem` if the caller has sent too many bytes.
     """
-    if (limit := _part_of_day(tx, size_bytes)) is None:
-        return
+    if (limit := _part_of_day(tx, size_bytes)) is not None:
+        _require_daily(tx, size_bytes, 0 if size_bytes > tx.quotas.user_daily_bytes else rate_limits.count(tx, limit))
+
+
+def _require_daily(tx: Transaction, size_bytes: int, wait_s: int) -> None:
+    """Raise `QuotaExceededProblem` if the caller must wait before sending bytes, or has a quota that is too small."""
     most = tx.quotas.user_daily_bytes
-    wait_s = None if size_bytes > most else rate_limits.count(tx, limit)
-    if wait_s == 0:
+    never = size_bytes > most
+    if wait_s == 0 and not never:
         return
     remedy = "The operator can raise the setting `user_daily_bytes`."
     raise QuotaExceededProblem(
         f"You may send {most:,} new bytes per day, and this request needs {size_bytes:,} more. "
-        + (remedy if wait_s is None else f"Send the data in {wait_s} s. {remedy}"),
-        context={"quota": "user_daily_bytes", "limit": most, "wait_s": wait_s},
+        + (remedy if never else f"Send the data in {wait_s} s. {remedy}"),
+        context={"quota": "user_daily_bytes", "limit": most, "wait_s": None if never else wait_s},
     )
 
 

@@ -66,13 +66,13 @@ def create_upload(tx: Transaction, length: int, *, digest: str | None = None) ->
         raise TooLargeProblem(f"The size of an upload must be 1 to {MAX_UPLOAD_BYTES} bytes.")
     require_room(tx, "user_uploads")
     require_room(tx, "user_upload_bytes", length)
-    count_sent(tx, length)
     upload_id = new_id("upload")
     row = {
         "id": upload_id, **sender, "length": length, "offset": 0, "digest": digest,
         "created_us": tx.now_us, "updated_us": tx.now_us,
     }  # fmt: skip
     tx.execute(insert(upload), row)
+    count_sent(tx, length)
     return StoredUpload(upload_id, length, 0, None)
 
 
@@ -136,11 +136,12 @@ def finish(tx: Transaction, upload_id: str, digest: str, copy: Path | None) -> S
     if tx.execute(claimed.values(finished_digest=digest, updated_us=tx.now_us)).rowcount:
         row = {"digest": digest, "size_bytes": found.length, "created_us": tx.now_us}
         row["upload_id"] = upload_id if copy is None else None
-        if not blobs.insert_new(tx, blob, [row]):
-            take_back_sent(tx, found.length)
-        elif copy is not None:
+        is_new = bool(blobs.insert_new(tx, blob, [row]))
+        if is_new and copy is not None:
             tx.blobs.adopt(copy, digest)
         blobs.add_holder(tx, digest, _places(found))
+        if not is_new:
+            take_back_sent(tx, found.length)
     faults.point("upload.finish.before_commit")
     tx.after_commit(lambda: faults.point("upload.finish.after_commit"))
     return _shown(_find(tx, upload_id))

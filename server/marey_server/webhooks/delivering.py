@@ -211,14 +211,18 @@ class Deliverer:
             await self._write(outbox.move_on, webhook_id, position, newest)
 
     async def _send(self, batch: Batch, delivery: Delivery, before: tuple[int, int]) -> Outcome | None:
-        """Send a delivery, record the result, and return the outcome; None if this process is no longer the leader."""
+        """Send a delivery, record the result, and return the outcome.
+
+        Returns None if this process is no longer the leader, or if the webhook has changed since the batch was read.
+        """
         share = self._shares.get(batch.sharer) or asyncio.Semaphore(MOST_OF_ONE_USER)
         self._shares[batch.sharer] = share
         async with share, self._places:
+            destination = await self._read(outbox.read_destination, delivery, before)
             lead = self._lead
-            if lead is None or not self._leads():
+            if destination is None or lead is None or not self._leads():
                 return None
-            result = await self._sender.send(batch, delivery)
+            result = await self._sender.send(destination, delivery)
         faults.point("webhook.before_record")
         days = self._services.settings.webhook_failing_days
         recorded = await self._write(outbox.record, lead, delivery, result, before, days)

@@ -24,7 +24,7 @@ from tornado.simple_httpclient import HTTPStreamClosedError, HTTPTimeoutError, S
 from marey_schemas.sizes import KIB
 from marey_server.access.network_addresses import Network, may_connect
 from marey_server.access.webhook_signatures import signed_headers
-from marey_server.store.webhooks.outbox import Batch, Delivery, DeliveryResult
+from marey_server.store.webhooks.outbox import Delivery, DeliveryResult, Destination
 
 TIMEOUT_S = 10.0
 MOST_ANSWER_BYTES = 64 * KIB
@@ -89,13 +89,13 @@ class Sender:
         )
         self._agent = f"marey/{version('marey')}"
 
-    async def send(self, batch: Batch, delivery: Delivery) -> DeliveryResult:
+    async def send(self, destination: Destination, delivery: Delivery) -> DeliveryResult:
         """Send a delivery once, and return the result. A status from 200 to 299 is a success."""
         body = delivery.body.encode()
-        headers = signed_headers(batch.secrets, delivery.id, delivery.kind, int(time.time()), body)
+        headers = signed_headers(destination.secrets, delivery.id, delivery.kind, int(time.time()), body)
         first_lines: list[str] = []
         request = HTTPRequest(
-            batch.url,
+            destination.url,
             method="POST",
             headers={"Content-Type": "application/json", "User-Agent": self._agent, **headers},
             body=body,

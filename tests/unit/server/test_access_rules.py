@@ -7,7 +7,15 @@ from hypothesis import strategies as st
 from marey_schemas.access import Role
 from marey_server.access import passwords, roles, scopes
 from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
-from marey_server.access.secret_tokens import attempt_secret, issue_attempt_token, issue_user_token, split_user_token
+from marey_server.access.secret_tokens import (
+    attempt_secret,
+    is_sealed,
+    issue_attempt_token,
+    issue_user_token,
+    sealed,
+    split_user_token,
+    token_hash,
+)
 from marey_server.store.ids import is_id, new_id
 
 
@@ -68,6 +76,18 @@ def test_tokens_of_users_and_attempts_are_told_apart() -> None:
     assert split_user_token(attempt.text) is None
     assert attempt_secret(attempt.text)
     assert attempt_secret(user.text) is None
+
+
+def test_a_seal_shows_that_a_server_with_the_same_key_issued_a_token() -> None:
+    attempt, key = issue_attempt_token(), b"k" * 32
+    text = sealed(attempt, key)
+    assert is_sealed(text, key)
+    assert attempt_secret(text) == attempt_secret(attempt.text)
+    assert token_hash(text) == token_hash(attempt.text) == token_hash(f"{attempt.text}_invented") == attempt.secret_hash
+    user = issue_user_token().text
+    for other in (attempt.text, f"{text[:-1]}x", f"{text}é", user, "mareyjob_", "mareyjob__", text[9:]):
+        assert not is_sealed(other, key)
+    assert not is_sealed(text, b"x" * 32)
 
 
 def test_the_name_of_a_user_is_required_of_users_only() -> None:

@@ -15,7 +15,8 @@ from marey_schemas.sizes import MIB
 from marey_server.access.principal import Principal
 from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem, UnauthenticatedProblem
 from marey_server.store import blobs, items, projects
-from marey_server.store.blobs import GRACE_US, SPOOLED_BYTES, Spool, digest_of
+from marey_server.store.blob_backings import SPOOLED_BYTES, Spool
+from marey_server.store.blobs import GRACE_US, digest_of
 
 FILE = b"HIERARCHY ROOT hips"
 DIGEST = digest_of(FILE)

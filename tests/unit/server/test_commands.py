@@ -162,7 +162,7 @@ def test_a_disk_without_room_for_the_tables_is_told(
     def full(_tx: Transaction) -> None:
         raise StorageFullProblem("The disk has no space left.")
 
-    monkeypatch.setattr("marey_server.store.database.schema.make_cursor_key", full)
+    monkeypatch.setattr("marey_server.store.database.schema.make_server_key", full)
     with pytest.raises((commands.CommandFailed, DatabaseUnusable), match="for writing: The disk has no space"):
         command(data=tmp_path)
 

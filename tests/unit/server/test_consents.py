@@ -67,7 +67,7 @@ def complete(desk: Desk, lease: Lease) -> None:
 
 def overrides(desk: Desk) -> list[Any]:
     desk.database.write(SYSTEM, events.number_events)
-    found = desk.database.read(desk.user, events.list_events, "lab", limit=1000)
+    found = desk.database.read(desk.user, events.list_events, "lab", limit=1000).items
     return [one for one in found if one.kind == "consent.overridden"]
 
 

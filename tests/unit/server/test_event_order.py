@@ -61,7 +61,7 @@ class Overlap:
 
     def follow(self) -> None:
         """Read the events of the feed that follow the last received event."""
-        for one in self.lab.read(events.list_events, "lab", after=self.last):
+        for one in self.lab.read(events.list_events, "lab", after=self.last).items:
             assert one.seq > self.last
             self.last = one.seq
             self.received.append(one.subject)

@@ -44,6 +44,35 @@ def test_the_feed_goes_on_after_the_last_event_received(lab: Lab) -> None:
     assert lab.events(after=whole[-1]) == []
 
 
+def test_a_page_is_bounded_by_the_bytes_of_its_events(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Texts of two-byte characters show that bytes are counted, and the longest body is longer than a page."""
+    monkeypatch.setattr(events, "PAGE_BYTES", 10_000)
+    sizes = [100, 4_000, 3_000, 30_000, 10, 2_000, 9_000, 1, 1]
+    before = lab.events()[-1].seq
+    lab.write(lambda tx: [tx.emit("project.changed", "s", project_id=project_id(tx), note="é" * n) for n in sizes])
+    lab.write(events.number_events)
+    pages, after, complete = [], before, False
+    while not complete:
+        page, complete = lab.read(events.list_events, "lab", after=after, limit=4)
+        pages.append([len(one.body["note"]) for one in page])
+        after = page[-1].seq
+    assert [size for page in pages for size in page] == sizes
+    whole = [sum(2 * size for size in page) <= 10_000 or len(page) == 1 for page in pages]
+    assert all(whole), pages
+    assert len(pages) < len(sizes)
+
+
+def project_id(tx: Transaction) -> str:
+    return projects.require(tx, "lab").id
+
+
+def test_a_page_is_complete_if_no_event_remains(lab: Lab) -> None:
+    whole = lab.events()
+    assert lab.read(events.list_events, "lab", limit=len(whole) + 1).complete
+    assert not lab.read(events.list_events, "lab", limit=len(whole)).complete  # the limit hides whether more follow
+    assert lab.read(events.list_events, "lab", after=whole[-1].seq) == ([], True)
+
+
 def test_what_failed_did_not_happen(lab: Lab) -> None:
     before = lab.events()
     with pytest.raises(ConflictProblem):
@@ -59,11 +88,11 @@ def test_events_are_for_members_and_administrators(lab: Lab) -> None:
     with pytest.raises(ForbiddenProblem):
         lab.read(events.list_events, "lab", who=lab.stranger, required=required)
     lab.write(events.number_events)
-    assert lab.read(events.list_events, "lab", who=lab.reader, required=required)
+    assert lab.read(events.list_events, "lab", who=lab.reader, required=required).items
     with pytest.raises(ForbiddenProblem):
         lab.read(events.list_events, who=lab.owner)
     chief = lab.sign_up("chief", administrator=True)
-    kinds = {event.kind for event in lab.read(events.list_events, who=chief)}
+    kinds = {event.kind for event in lab.read(events.list_events, who=chief).items}
     assert {"user.created", "project.created", "project.changed"} <= kinds
 
 

@@ -38,7 +38,7 @@ class Follower:
 
     def read(self) -> None:
         try:
-            page = self.lab.read(events.list_events, "lab", after=self.last, limit=2)
+            page = self.lab.read(events.list_events, "lab", after=self.last, limit=2).items
         except GoneProblem as refusal:
             after = refusal.context["after"]
             assert after > self.last

@@ -530,7 +530,7 @@ def test_events_and_lineage_name_the_commit(gaits: CommittingDesk) -> None:
     made = gaits.submit(into="made")
     gaits.work("a")
     gaits.desk.database.write(SYSTEM, events.number_events)
-    told = {one.kind: one for one in gaits.read(events.list_events, "lab", after=0, limit=1000)}
+    told = {one.kind: one for one in gaits.read(events.list_events, "lab", after=0, limit=1000).items}
     assert told["branch.moved"].body["job"] == made
     assert told["branch.moved"].body["commit"] == told["job.succeeded"].body["commit"] == gaits.head()
     (output,) = gaits.desk.outputs(made)

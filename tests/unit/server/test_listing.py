@@ -13,7 +13,8 @@ from tests.support.tiers import examples
 from marey_schemas.items import Page
 from marey_schemas.kinds import Kind
 from marey_server.errors import BadRequestProblem, InvalidProblem
-from marey_server.store import items, listing
+from marey_server.store import items
+from marey_server.store.credentials import server_key
 from marey_server.store.database.connections import Database
 from marey_server.store.items import ItemFilters
 from marey_server.store.transaction import Transaction
@@ -199,7 +200,7 @@ def test_cursors_of_one_server_are_worth_nothing_on_another(filled: FilledLab) -
 
     def forget(tx: Transaction) -> None:
         tx.connection.exec_driver_sql("DELETE FROM server_state WHERE key = 'cursor_key'")
-        listing.make_cursor_key(tx)
+        server_key.make_server_key(tx)
 
     filled.write(forget)
     with pytest.raises(BadRequestProblem):

@@ -103,7 +103,7 @@ class House:
 
     def events(self, subject: str) -> list[Event]:
         self.desk.database.write(SYSTEM, events.number_events)
-        found: list[Event] = self.read(events.list_events, "lab", after=0, subject=subject, limit=1000)
+        found: list[Event] = self.read(events.list_events, "lab", after=0, subject=subject, limit=1000).items
         return found
 
     def collect(self) -> garbage.Collected:

@@ -87,7 +87,7 @@ def test_a_purged_dataset_leaves_no_version_branch_tag_or_proposal(gaits: Commit
     assert answer.freed_bytes > 0
     assert count(gaits, *tables) == [0] * len(tables)
     gaits.desk.database.write(SYSTEM, events.number_events)
-    found = gaits.read(events.list_events, "lab", after=0, subject=dataset_id, limit=100)
+    found = gaits.read(events.list_events, "lab", after=0, subject=dataset_id, limit=100).items
     assert (found[-1].kind, found[-1].actor) == ("dataset.purged", "ann")
     assert gaits.read(items.read_item, "lab", Kind.STUDY, walk).name == "walk"
     assert sound(gaits)

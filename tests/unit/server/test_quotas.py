@@ -2,22 +2,30 @@
 
 import os
 import random
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from typing import Any
 
 import pytest
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.queue_desk import Desk
-from tests.support.store_fixtures import Lab
+from tests.support.store_fixtures import Lab, skeleton_tree
 
 from marey_schemas.access import ProjectCreate, TokenCreate
+from marey_schemas.kinds import Kind
 from marey_schemas.queue.jobs import ItemInput, JobCreate
 from marey_server.errors import QuotaExceededProblem
+from marey_server.motions import importing
+from marey_server.motions.importing import PreparedImport, SourceFile
 from marey_server.process.settings import Settings
-from marey_server.store import blobs, projects, uploads
+from marey_server.store import blobs, items, projects, uploads
 from marey_server.store.blobs import digest_of
 from marey_server.store.credentials import tokens
+from marey_server.store.database import connections
+from marey_server.store.garbage import collect_garbage
+from marey_server.store.items import Draft
 from marey_server.store.jobs import reading
 from marey_server.store.transaction import Quotas, Transaction
 
@@ -154,6 +162,103 @@ def test_an_upload_of_bytes_that_are_there_does_not_count(lab: Lab) -> None:
     lab.write(blobs.put_blob, data)
     lab.write(uploads.finish, first.id, digest_of(data), None)
     lab.write(blobs.put_blob, b"b" * 600)
+
+
+def test_pieces_of_an_upload_that_is_not_needed_count_until_they_are_deleted(lab: Lab) -> None:
+    """Otherwise a user who uploads the same bytes again and again fills the disk without using up any quota."""
+    lab.database.quotas = Quotas(user_upload_bytes=1000)
+    data = b"a" * 600
+    for again in (False, True):
+        made = lab.write(uploads.create_upload, len(data))
+        lab.write(uploads.append, made.id, 0, data)
+        lab.write(uploads.finish, made.id, digest_of(data), None)
+        if not again:  # the pieces of the first upload are the blob
+            lab.write(uploads.abandon, lab.write(uploads.create_upload, 1000).id)
+    with pytest.raises(QuotaExceededProblem, match="Wait until the server has deleted the pieces"):
+        lab.write(uploads.create_upload, 401)
+    open_one = lab.write(uploads.create_upload, 400)
+    with pytest.raises(QuotaExceededProblem, match=f"such as {open_one.id}"):
+        lab.write(uploads.create_upload, 1)
+    collect_garbage(lab.database)
+    lab.write(uploads.create_upload, 600)
+
+
+def read_file(name: str, *contents: bytes) -> PreparedImport:
+    """Return the result of reading a file whose bytes were sent in several parts, and which contains one skeleton."""
+    sources = tuple(SourceFile(name, digest_of(data), len(data), data) for data in contents)
+    rig = Draft(name, Kind.SKELETON, name, {"hierarchy": skeleton_tree(bone_m=1 + len(name))}, reuse="by_name")
+    return PreparedImport(name, sources, (rig,))
+
+
+def test_files_of_an_import_that_exceed_the_day_are_refused_and_the_others_are_stored(lab: Lab) -> None:
+    lab.database.quotas = Quotas(user_daily_bytes=1000)
+    names = ("a", "bb", "ccc", "dddd")
+    files = [read_file(name, name.encode() * size) for name, size in zip(names, (500, 150, 150, 100), strict=True)]
+    entries = lab.write(importing.publish, "lab", files)
+    assert [entry.error and entry.error.code for entry in entries] == [None, None, "quota-exceeded", "quota-exceeded"]
+    lab.write(importing.publish, "lab", files)  # what is stored already does not count again
+    with pytest.raises(QuotaExceededProblem):
+        lab.write(blobs.put_blob, b"x" * 201)
+    lab.write(blobs.put_blob, b"x" * 199)
+
+
+def test_an_import_that_is_being_stored_does_not_delay_other_uploads_of_the_user(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On SQLite, writes follow one another in any case."""
+    if lab.database.is_sqlite:
+        return
+    storing, go_on = threading.Event(), threading.Event()
+    publish = items.publish
+
+    def slow_publish(*args: Any, **kwargs: Any) -> Any:
+        storing.set()
+        assert go_on.wait(60)
+        return publish(*args, **kwargs)
+
+    monkeypatch.setattr(items, "publish", slow_publish)
+    with ThreadPoolExecutor() as pool:
+        importing_files = pool.submit(lab.write, importing.publish, "lab", [read_file("rig", b"a" * 100)])
+        assert storing.wait(60)
+        try:
+            upload = pool.submit(lab.write, uploads.create_upload, 7).result(30)
+            pool.submit(lab.write, uploads.append, upload.id, 0, b"example").result(30)
+            pool.submit(lab.write, uploads.finish, upload.id, digest_of(b"example"), None).result(30)
+            pool.submit(lab.write, blobs.put_blob, b"b" * 100).result(30)
+        finally:
+            go_on.set()
+        assert importing_files.result(60)[0].error is None
+
+
+def test_concurrent_uploads_of_one_user_do_not_deadlock_and_all_of_them_count(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Imports store files that they share in different orders, beside other uploads of the same user."""
+    monkeypatch.setattr(connections, "WRITE_TRIES", 1)  # so that a deadlock is an error
+    lab.database.quotas = Quotas(user_daily_bytes=1_000_000)
+    shared = [b"%d" % number * 1000 for number in range(10)]
+    draw = random.Random(7)
+
+    def import_files(number: int) -> Any:
+        mine = [b"%d" % number * 500, *draw.sample(shared, len(shared))]
+        files = [read_file(f"{number}-{place}", data) for place, data in enumerate(mine)]
+        return lab.write(importing.publish, "lab", files)
+
+    def upload(number: int) -> Any:
+        data = b"u%d" % number * 500
+        begun = lab.write(uploads.create_upload, len(data))
+        lab.write(uploads.append, begun.id, 0, data)
+        lab.write(uploads.finish, begun.id, digest_of(data), None)
+        lab.write(blobs.put_blob, shared[number % len(shared)])
+
+    with ThreadPoolExecutor(8) as pool:
+        works = [pool.submit(work, 10 + number) for number in range(12) for work in (import_files, upload)]
+        for work in works:
+            work.result(120)
+    sent_bytes = 12 * 2 * 500 + 12 * 3 * 500 + 10 * 1000
+    with pytest.raises(QuotaExceededProblem):
+        lab.write(blobs.put_blob, b"x" * (1_000_001 - sent_bytes + 2_000))
+    lab.write(blobs.put_blob, b"x" * (1_000_000 - sent_bytes - 2_000))
 
 
 def test_every_quota_is_a_setting_with_the_same_default() -> None:

@@ -193,7 +193,7 @@ def test_an_upgrade_that_fails_leaves_the_database_as_it_was(tmp_path: Path, mon
     def fail(_tx: Transaction) -> None:
         raise RuntimeError("power cut")
 
-    monkeypatch.setattr(schema, "make_cursor_key", fail)
+    monkeypatch.setattr(schema, "make_server_key", fail)
     with pytest.raises(RuntimeError):
         schema.upgrade_schema(f"sqlite:///{tmp_path}/half.db")
     database = Database(f"sqlite:///{tmp_path}/half.db")

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 from sqlalchemy import delete, update
@@ -13,7 +16,7 @@ from tests.support.database_fixtures import AdjustableClock
 from tests.support.store_fixtures import Lab, declared
 
 from marey_schemas.items import CollectionCreate, Page
-from marey_schemas.webhooks import NewWebhook, WebhookChange, WebhookCreate
+from marey_schemas.webhooks import NewWebhook, WebhookChange, WebhookCreate, WebhookRotation
 from marey_server.access.principal import SYSTEM
 from marey_server.store import collections, events, leader, projects, retention
 from marey_server.store.fsck import check_store
@@ -22,7 +25,7 @@ from marey_server.store.retention import Retention
 from marey_server.store.tables import webhook, webhook_delivery
 from marey_server.store.transaction import Transaction
 from marey_server.store.webhooks import deliveries, managing, outbox
-from marey_server.store.webhooks.outbox import Batch, DeliveryResult, Outcome, Recorded
+from marey_server.store.webhooks.outbox import Batch, DeliveryResult, Destination, Outcome, Recorded
 from marey_server.webhooks import delivering
 from marey_server.webhooks.sending import MOST_OF_ONE_USER
 
@@ -278,18 +281,40 @@ def test_a_position_moves_past_events_that_do_not_concern_the_webhook(desk: Desk
 
 
 class Silence:
-    """Sender whose receivers never answer; it records the webhooks with an unanswered request."""
+    """Sender whose receivers answer only when `answering` is set; it records where requests were sent."""
 
     def __init__(self) -> None:
-        self.asked: list[str] = []
+        self.asked: dict[str, Destination] = {}
+        self.answering = asyncio.Event()
 
-    async def send(self, _batch: Batch, delivery: outbox.Delivery) -> DeliveryResult:
-        self.asked.append(delivery.webhook_id)
-        await asyncio.Event().wait()
-        return FAILED
+    async def send(self, destination: Destination, delivery: outbox.Delivery) -> DeliveryResult:
+        self.asked[delivery.webhook_id] = destination
+        await self.answering.wait()
+        return ADDED
 
     def close(self) -> None:
         """Do nothing."""
+
+
+@asynccontextmanager
+async def delivering_with(lab: Lab, sender: Silence) -> AsyncIterator[None]:
+    """Deliver with this sender; the test fails after 30 s."""
+    metrics = SimpleNamespace(webhook_deliveries=MagicMock(), webhook_delay=MagicMock())
+    settings = SimpleNamespace(webhook_networks=(), webhook_failing_days=0)
+    services: Any = SimpleNamespace(settings=settings, database=lab.database, metrics=metrics)
+    deliverer: Any = delivering.Deliverer(services)
+    deliverer._sender.close()
+    deliverer._sender = sender
+    running = asyncio.create_task(deliverer.run())
+    async with asyncio.timeout(30):
+        yield
+    running.cancel()
+    await deliverer.close()
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    while not condition():
+        await asyncio.sleep(0.01)
 
 
 def test_a_user_whose_receivers_do_not_answer_does_not_delay_others(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -303,20 +328,53 @@ def test_a_user_whose_receivers_do_not_answer_does_not_delay_others(lab: Lab, mo
     sender = Silence()
 
     async def deliver() -> None:
-        services: Any = SimpleNamespace(settings=SimpleNamespace(webhook_networks=()), database=lab.database)
-        deliverer: Any = delivering.Deliverer(services)
-        deliverer._sender.close()
-        deliverer._sender = sender
-        running = asyncio.create_task(deliverer.run())
-        async with asyncio.timeout(30):
-            while len(sender.asked) < MOST_OF_ONE_USER:
-                await asyncio.sleep(0.01)
+        async with delivering_with(lab, sender):
+            await until(lambda: len(sender.asked) == MOST_OF_ONE_USER)
             await asyncio.to_thread(lab.add_skeleton)
             await asyncio.to_thread(lab.database.write, SYSTEM, events.number_events)
-            while other not in sender.asked:
-                await asyncio.sleep(0.01)
-        running.cancel()
-        await deliverer.close()
+            await until(lambda: other in sender.asked)
 
     asyncio.run(deliver())
     assert len(sender.asked) == MOST_OF_ONE_USER + 1
+
+
+@pytest.mark.parametrize("change", [WebhookChange(url="https://example.net/"), WebhookChange(paused=True)])
+def test_a_change_while_a_delivery_waits_for_its_share_counts(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, change: WebhookChange
+) -> None:
+    monkeypatch.setattr(delivering, "STOP_S", 0.0)
+    desks = [Desk(lab) for _ in range(MOST_OF_ONE_USER + 1)]
+    lab.database.write(SYSTEM, leader.give_up_lead, "webhooks", "a")
+    desks[0].add_folders("one")
+    sender = Silence()
+
+    async def deliver() -> None:
+        async with delivering_with(lab, sender):
+            await until(lambda: len(sender.asked) == MOST_OF_ONE_USER)
+            [waiting] = [one for one in desks if one.hook.id not in sender.asked]
+            await asyncio.to_thread(
+                lab.write, managing.change_webhook, "lab", waiting.hook.id, change, (), required=OWNER
+            )
+            rotated = await asyncio.to_thread(
+                lab.write, managing.rotate_secret, "lab", waiting.hook.id, WebhookRotation(grace_s=0), required=OWNER
+            )
+            sender.answering.set()
+            if change.paused:
+                await until(lambda: all(one.ids() == [] for one in desks))
+                assert waiting.hook.id not in sender.asked
+            else:
+                await until(lambda: waiting.hook.id in sender.asked)
+                assert sender.asked[waiting.hook.id] == Destination("https://example.net/", (rotated.secret,))
+
+    asyncio.run(deliver())
+
+
+def test_a_delivery_that_was_read_before_the_wanted_kinds_changed_is_not_sent(desk: Desk) -> None:
+    desk.add_folders("one")
+    batch = desk.batch()
+    assert batch is not None
+    [delivery], before = batch.deliveries, (batch.position, batch.attempts)
+    assert desk.lab.database.read(SYSTEM, outbox.read_destination, delivery, before) is not None
+    change = WebhookChange(kinds=("job.failed",))
+    desk.lab.write(managing.change_webhook, "lab", desk.hook.id, change, (), required=OWNER)
+    assert desk.lab.database.read(SYSTEM, outbox.read_destination, delivery, before) is None

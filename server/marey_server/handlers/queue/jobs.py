@@ -251,7 +251,11 @@ class JobEvents(Resource):
 
     @reads(access=Access.READER, query=JobEventsQuery, answer=Event, paged=True, public=False)
     async def get(self, job: str, query: JobEventsQuery) -> Rendered:
-        """Return the events of a job in the order of their commits."""
+        """Return the events of a job in the order of their commits.
+
+        A page may have fewer events than `limit`, because the bodies of its events have at most 4 MiB; only a page
+        without events means that there are no more.
+        """
         await self.services.number_events()
         return await self.answer(reading.list_job_events, job, query.after, query.limit)
 

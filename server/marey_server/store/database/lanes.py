@@ -1,8 +1,9 @@
 """Lanes: groups of threads with a limited queue, in which clients take turns.
 
 A client that sends many requests delays only its own requests: the queue alternates between known and unknown clients,
-and between the clients within each group. A client is known if the server has accepted its token before. The length of
-a queue is limited, for each of the two groups and for each client.
+and between the clients within each group. A client is known if the server has accepted its token before, or if the
+token was issued to an attempt of a job. The length of a queue is limited, for each of the two groups and for each
+client.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ RETRY_AFTER_S = 2
 
 @dataclass(frozen=True, slots=True)
 class Client:
-    """Owner of a call: a user, worker or attempt whose token was accepted before, or an unknown client's address."""
+    """Owner of a call: a user, worker or attempt whose token is known, or an unknown client's address."""
 
     key: str
     known: bool = True
-    """Whether the server accepted the client's token before, and has not often refused the client's requests lately."""
+    """Whether the client's token was accepted before, or is that of an attempt, and was not often refused lately."""
     is_gone: Callable[[], bool] = bool
     """Returns whether nobody waits for the result any more; such a call is not begun."""
 

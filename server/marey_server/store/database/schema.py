@@ -12,8 +12,8 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Connection
 
 from marey_server.access.principal import SYSTEM
+from marey_server.store.credentials.server_key import make_server_key
 from marey_server.store.database.connections import Database
-from marey_server.store.listing import make_cursor_key
 from marey_server.store.transaction import Transaction
 
 _INSTALLED = Path(__file__).parents[2] / "migrations"
@@ -34,7 +34,7 @@ def _upgrade(tx: Transaction) -> None:
     config = _config()
     config.attributes["connection"] = tx.connection
     command.upgrade(config, "head")
-    make_cursor_key(tx)
+    make_server_key(tx)
 
 
 def schema_at_head(connection: Connection) -> bool:

@@ -38,8 +38,9 @@ from marey_schemas.queue.worker_protocol import (
 from marey_server import faults
 from marey_server.access.labels import first_outside, keys_within
 from marey_server.access.principal import Principal
-from marey_server.access.secret_tokens import IssuedToken, derive_attempt_token, issue_attempt_token
+from marey_server.access.secret_tokens import IssuedToken, derive_attempt_token, issue_attempt_token, sealed
 from marey_server.errors import ForbiddenProblem, InvalidProblem, LeaseLostProblem
+from marey_server.store.credentials.server_key import read_seal_key
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs.events import emit_job_events
 from marey_server.store.jobs.exports import lease_inputs
@@ -328,9 +329,15 @@ def _claim_rows(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], p
 def _leases(
     tx: Transaction, rows: Sequence[Row[Any]], tokens: Sequence[IssuedToken], policy: QueuePolicy
 ) -> list[Lease]:
-    sizes = _sizes(tx, rows)
+    sizes, seal_key = _sizes(tx, rows), read_seal_key(tx)
     return [
-        _lease(row, lease_inputs(tx, row.kind, row.inputs), sizes.get(row.parent_id, row.size), token, policy)
+        _lease(
+            row,
+            lease_inputs(tx, row.kind, row.inputs),
+            sizes.get(row.parent_id, row.size),
+            sealed(token, seal_key),
+            policy,
+        )
         for row, token in zip(rows, tokens, strict=True)
     ]
 
@@ -343,9 +350,7 @@ def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
     return {one.id: one.size for one in tx.execute(select(job.c.id, job.c.size).where(job.c.id.in_(parents)))}
 
 
-def _lease(
-    row: Row[Any], inputs: Mapping[str, Any], size: int | None, token: IssuedToken, policy: QueuePolicy
-) -> Lease:
+def _lease(row: Row[Any], inputs: Mapping[str, Any], size: int | None, token: str, policy: QueuePolicy) -> Lease:
     return Lease(
         job=row.id,
         project=row.project_name,
@@ -359,7 +364,7 @@ def _lease(
         resources=Resources(time_limit_s=row.time_limit_s, memory_limit_mb=row.memory_limit_mb),
         fence=row.fence,
         attempt=row.attempt,
-        attempt_token=token.text,
+        attempt_token=token,
         lease_ttl_s=policy.lease_ttl_s,
         heartbeat_s=policy.heartbeat_s,
     )

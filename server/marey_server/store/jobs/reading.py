@@ -127,7 +127,7 @@ def list_results(tx: Transaction, job_id: str, cursor: str | None = None, limit:
 def list_job_events(tx: Transaction, job_id: str, after: int = 0, limit: int = 100) -> Page:
     """Return the events of a job, for members of its project."""
     _, project = find_job(tx, job_id)
-    return Page(items=tuple(events.list_events(tx, project.name, after=after, limit=limit, subject=job_id)))
+    return Page(items=tuple(events.list_events(tx, project.name, after=after, limit=limit, subject=job_id).items))
 
 
 def read_job_log(tx: Transaction, job_id: str, offset: int = 0, limit: int = MOST_READ_BYTES) -> LogPage:

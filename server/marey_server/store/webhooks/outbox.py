@@ -92,12 +92,10 @@ class Delivery:
 
 @dataclass(frozen=True)
 class Batch:
-    """Next deliveries of a webhook in order, with the URL and the secrets for sending them."""
+    """Next deliveries of a webhook in order."""
 
     sharer: str
     """Id of the user who created the webhook, or of the webhook if the user is unknown."""
-    url: str = field(repr=False)
-    secrets: tuple[str, ...] = field(repr=False)
     position: int
     attempts: int
     deliveries: tuple[Delivery, ...]
@@ -107,31 +105,57 @@ class Batch:
     """Whether events wait because the next retry of the webhook is not due yet."""
 
 
+@dataclass(frozen=True)
+class Destination:
+    """URL of a webhook, and the secrets with which a request to it is signed."""
+
+    url: str = field(repr=False)
+    secrets: tuple[str, ...] = field(repr=False)
+
+
 def next_batch(tx: Transaction, webhook_id: str, scanned: int) -> Batch | None:
     """Return the next deliveries of a webhook, or None if the webhook is paused or deleted, or its project is deleted.
 
     The search for events begins after the position of the webhook, or after the event numbered `scanned` if that is
     later: the caller knows that no event in between concerns the webhook.
     """
-    statement = select(webhook, project.c.name.label("project")).join(project, project.c.id == webhook.c.project_id)
-    alive = webhook.c.paused.is_(False), project.c.deleted_us.is_(None)
-    row = tx.execute(statement.where(webhook.c.id == webhook_id, *alive)).first()
+    row = _find_active(tx, webhook_id)
     if row is None:
         return None
     found = _requested(tx, webhook_id)
     if row.next_us > tx.now_us:
-        return _batch(tx, row, found, complete=True, waits=True)
+        return _batch(row, found, complete=True, waits=True)
     if row.missed:
         found.append(_missed(row, tx.now_us))
     start = events.start_of_feed(tx, max(row.position, scanned))
     following = [] if len(found) >= BATCH else _events(tx, row, start)
     complete = len(found) < BATCH and len(following) < BATCH
-    return _batch(tx, row, [*found, *following], complete=complete, waits=False)
+    return _batch(row, [*found, *following], complete=complete, waits=False)
 
 
-def _batch(tx: Transaction, row: Row[Any], found: list[Delivery], *, complete: bool, waits: bool) -> Batch:
-    sharer = row.creator_id or row.id
-    return Batch(sharer, row.url, _secrets(row, tx.now_us), row.position, row.attempts, tuple(found), complete, waits)
+def read_destination(tx: Transaction, delivery: Delivery, before: tuple[int, int]) -> Destination | None:
+    """Return where to send a delivery, or None if it must not be sent any more.
+
+    Call this right before sending, because a delivery may wait for a long time. In this time, the webhook may get
+    another URL, another secret or other kinds of events, or may be paused or deleted. `before` is the position of the
+    webhook and its number of attempts when the delivery was read.
+    """
+    row = _find_active(tx, delivery.webhook_id)
+    if row is None:
+        return None
+    wanted = (row.position, row.attempts) == before and delivery.kind in (*row.kinds, MISSED_KIND)
+    return Destination(row.url, _secrets(row, tx.now_us)) if delivery.requested or wanted else None
+
+
+def _find_active(tx: Transaction, webhook_id: str) -> Row[Any] | None:
+    """Return the row of a webhook, or None if it is paused or deleted, or its project is deleted."""
+    statement = select(webhook, project.c.name.label("project")).join(project, project.c.id == webhook.c.project_id)
+    active = webhook.c.paused.is_(False), project.c.deleted_us.is_(None)
+    return tx.execute(statement.where(webhook.c.id == webhook_id, *active)).first()
+
+
+def _batch(row: Row[Any], found: list[Delivery], *, complete: bool, waits: bool) -> Batch:
+    return Batch(row.creator_id or row.id, row.position, row.attempts, tuple(found), complete, waits)
 
 
 def _secrets(row: Row[Any], now_us: int) -> tuple[str, ...]:

@@ -1,0 +1,32 @@
+"""Secret key of all servers that share a database: it shows that a server has issued a cursor or a token."""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+
+from sqlalchemy import select
+
+from marey_server.store.database.prepared import Prepared
+from marey_server.store.tables import server_state
+from marey_server.store.transaction import Transaction
+
+_KEY_NAME = "cursor_key"  # because it signed only cursors in earlier versions
+_SERVER_KEY = Prepared(select(server_state.c.value).where(server_state.c.key == _KEY_NAME))
+
+
+def read_server_key(tx: Transaction) -> bytes:
+    """Return the key."""
+    (row,) = tx.run(_SERVER_KEY, {})
+    return bytes.fromhex(row.value)
+
+
+def read_seal_key(tx: Transaction) -> bytes:
+    """Return the key with which the tokens of attempts are sealed."""
+    return hmac.digest(read_server_key(tx), b"tokens of attempts", "sha256")
+
+
+def make_server_key(tx: Transaction) -> None:
+    """Create the key, unless the database already contains one."""
+    row = {"key": _KEY_NAME, "value": secrets.token_hex(32)}
+    tx.execute(tx.insert_or_ignore(server_state, row))
