@@ -62,6 +62,21 @@ class NewJob:
         return self.submission.request.cache
 
     @property
+    def labels_key(self) -> str:
+        """The labels that a worker must have."""
+        return self.submission.labels_key
+
+    @property
+    def priority(self) -> int:
+        """The priority of the job in the queue."""
+        return self.submission.request.priority
+
+    @property
+    def concurrency_key(self) -> str | None:
+        """The key of the request; jobs with the same key run one after the other."""
+        return self.submission.request.concurrency_key
+
+    @property
     def unbound(self) -> bool:
         """Whether some inputs are outputs of jobs that have not succeeded yet."""
         return self.submission.unbound

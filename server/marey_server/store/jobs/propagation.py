@@ -55,7 +55,7 @@ def make_ready(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
     return ended
 
 
-READY_COLUMNS = (job.c.id, job.c.project_id, job.c.kind, job.c.size, job.c.unbound, job.c.cache_key, job.c.cache_mode)
+READY_COLUMNS = (*result_cache.CANDIDATE_COLUMNS, job.c.kind, job.c.size, job.c.unbound)
 
 _ENDINGS: dict[str, OrdinaryEventKind] = {
     JobState.SUCCEEDED: "job.succeeded",

@@ -19,6 +19,7 @@ from sqlalchemy import and_, delete, insert, or_, select, update
 
 from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.queue.job_kinds import KindDeclaration
+from marey_server.access.labels import is_within
 from marey_server.errors import ApiProblem
 from marey_server.store import blobs
 from marey_server.store.jobs import commits, exports, staging
@@ -41,10 +42,35 @@ MEASURED_PER_OUTPUT = 5
 
 
 class SharedResult(NamedTuple):
-    """Job whose result another job shares."""
+    """Job whose result other jobs share, now or as soon as it has finished.
+
+    `leased` says whether a worker runs the job. The other fields are those that decide when a queued job runs.
+    """
 
     id: str
     finished: bool
+    leased: bool
+    labels_key: str
+    priority: int
+    concurrency_key: str | None
+
+    @classmethod
+    def of(cls, one: Any, *, finished: bool = False, leased: bool = False) -> SharedResult:
+        """Return a job, given as a row or as a new job, as the source of a result."""
+        return cls(one.id, finished, leased, one.labels_key, one.priority, one.concurrency_key)
+
+    def is_no_later_than(self, other: Any) -> bool:
+        """Return whether this job has finished, or starts no later than the queued job `other` would.
+
+        A job that needs a label which `other` does not need may never start. This also holds if a worker runs it now,
+        because the worker may be lost.
+        """
+        if self.finished:
+            return True
+        if not is_within(self.labels_key, other.labels_key):
+            return False
+        waits_for_no_rival = self.concurrency_key in (None, other.concurrency_key)
+        return self.leased or (self.priority >= other.priority and waits_for_no_rival)
 
 
 # -- the key ----------------------------------------------------------------------------------------------------------
@@ -120,14 +146,25 @@ def _content(pin: Pin, read: Collection[str], parts: Mapping[str, str]) -> list[
 
 # -- deciding ---------------------------------------------------------------------------------------------------------
 
+CANDIDATE_COLUMNS = (
+    job.c.id,
+    job.c.project_id,
+    job.c.cache_key,
+    job.c.cache_mode,
+    job.c.labels_key,
+    job.c.priority,
+    job.c.concurrency_key,
+)
+
 
 def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult]:
     """Find, for each of `candidates`, the job whose result it can share.
 
-    A candidate is a row with `id`, `project_id`, `cache_key` and `cache_mode`. Candidates that cannot share a result
-    are omitted. Of several identical candidates, the first computes the result and the others share it. In each
-    project, this function runs for one transaction at a time. It locks the jobs that it finds, so that none of them
-    ends before the transaction has recorded who shares its result.
+    A candidate is a new job, or a row with `CANDIDATE_COLUMNS`. Candidates that cannot share a result are omitted. Of
+    several identical candidates, the first computes the result and the others share it. But a candidate never waits for
+    a job that may start later than the candidate itself would. In each project, this function runs for one transaction
+    at a time. It locks the jobs that it finds, so that none of them ends before the transaction has recorded who shares
+    its result.
     """
     asking = [one for one in candidates if one.cache_key is not None and one.cache_mode in ("use", "refresh")]
     if not asking:
@@ -137,41 +174,42 @@ def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult
     known = _known_sources(tx, asking)
     sources: dict[str, SharedResult] = {}
     for one in asking:
-        place = (one.project_id, one.cache_key)
-        source = known.get(place)
+        identical = known.setdefault((one.project_id, one.cache_key), [])
+        source = next((other for other in identical if other.is_no_later_than(one)), None)
         if one.cache_mode == "use" and source is not None:
             sources[one.id] = source
         else:
-            known[place] = SharedResult(one.id, finished=False)
+            identical.insert(0, SharedResult.of(one))
     return sources
 
 
-def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, str], SharedResult]:
-    """Return, for each project and cache key, the newest succeeded job, or else the oldest queued or running job."""
+def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, str], list[SharedResult]]:
+    """Return, for each project and cache key, the newest succeeded job, then the queued and running jobs.
+
+    Of these, jobs that a worker runs come first, then the others in the order of their priority.
+    """
     keys = sorted({one.cache_key for one in asking if one.cache_mode == "use"})
     projects = sorted({one.project_id for one in asking})
-    active = or_(job.c.state == QUEUED, job.c.state == RUNNING)
-    finished: dict[tuple[str, str], SharedResult] = {}
-    under_way: dict[tuple[str, str], SharedResult] = {}
+    states = or_(job.c.state == QUEUED, job.c.state == RUNNING, job.c.state == "succeeded")
+    finished: dict[tuple[str, str], list[SharedResult]] = {}
+    under_way: dict[tuple[str, str], list[SharedResult]] = {}
     for some in in_lists(keys):
         rows = tx.execute(
-            select(job.c.id, job.c.project_id, job.c.cache_key, job.c.state)
-            .where(
-                job.c.project_id.in_(projects),
-                job.c.cache_key.in_(some),
-                job.c.cached_from.is_(None),
-                or_(active, job.c.state == "succeeded"),
-            )
+            select(*CANDIDATE_COLUMNS, job.c.state, job.c.lease_expires_us)
+            .where(job.c.project_id.in_(projects), job.c.cache_key.in_(some), job.c.cached_from.is_(None), states)
             .order_by(job.c.id)
             .with_for_update(read=True)
         )
         for row in rows:
             place = (row.project_id, row.cache_key)
             if row.state == "succeeded":
-                finished[place] = SharedResult(row.id, finished=True)
+                finished[place] = [SharedResult.of(row, finished=True)]
             else:
-                under_way.setdefault(place, SharedResult(row.id, finished=False))
-    return under_way | finished
+                leased = row.lease_expires_us is not None
+                under_way.setdefault(place, []).append(SharedResult.of(row, leased=leased))
+    for sources in under_way.values():
+        sources.sort(key=lambda source: (not source.leased, -source.priority))
+    return {place: [*finished.get(place, ()), *under_way.get(place, ())] for place in {*finished, *under_way}}
 
 
 # -- sharing ----------------------------------------------------------------------------------------------------------
