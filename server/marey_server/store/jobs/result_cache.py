@@ -1,24 +1,17 @@
 """Result cache: identical jobs share one computation, finished or still running.
 
-Jobs are identical if kind, version of the kind, parameters, seed and inputs are equal. Inputs are equal if the item,
-its name, its path, and the content of the documents that the kind reads are equal, because results are named after
-inputs and refer to them. A kind can also require that the collection of the results is equal, or the newest revision of
-an item that the parameters name. Jobs whose result depends on data that is read while they run have no cache key. For
-each job, shared results are published again, into the job's own collection. Jobs of different projects share no
-results. An exported archive is not shared after the consent for one of its clips has ended.
+Jobs are identical if they have the same cache key (`layout`). For each job, shared results are published again, into
+the job's own collection. Jobs of different projects share no results. An exported archive is not shared after the
+consent for one of its clips has ended.
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from sqlalchemy import and_, delete, insert, or_, select, update
 
-from marey_schemas.encoding.canonical import canonical_json
-from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_server.access.labels import is_within
 from marey_server.errors import ApiProblem
 from marey_server.store import blobs
@@ -26,9 +19,9 @@ from marey_server.store.jobs import commits, exports, staging
 from marey_server.store.jobs.endings import Ended, end_jobs
 from marey_server.store.jobs.events import wake_workers
 from marey_server.store.jobs.fencing import QUEUED, RUNNING, WAITING
-from marey_server.store.jobs.inputs import NamingJob, Pin, PinnedInputs, record_named_items
+from marey_server.store.jobs.inputs import NamingJob, record_named_items
 from marey_server.store.purge_lock import hold_off_purges
-from marey_server.store.tables import job, job_dependency, revision_part, staged_output
+from marey_server.store.tables import job, job_dependency, staged_output
 from marey_server.store.transaction import Transaction, in_lists
 
 SHARED_AT_ONCE = 64
@@ -71,77 +64,6 @@ class SharedResult(NamedTuple):
             return False
         waits_for_no_rival = self.concurrency_key in (None, other.concurrency_key)
         return self.leased or (self.priority >= other.priority and waits_for_no_rival)
-
-
-# -- the key ----------------------------------------------------------------------------------------------------------
-
-
-def cache_key(
-    kind: KindDeclaration,
-    params: Mapping[str, Any],
-    seed: int,
-    inputs: Any,
-    task: tuple[int | None, int] | None = None,
-    *,
-    into: str = "",
-    newest: Mapping[str, int] = MappingProxyType({}),
-) -> str:
-    """Return the digest that identifies a computation.
-
-    `inputs` is the result of `input_contents`; `task` is the index of a task and the number of tasks; `into` is the
-    collection of the results; `newest` holds the newest revisions of `named_items`.
-    """
-    tree = {"kind": kind.code_version, "params": params, "seed": seed, "inputs": inputs}
-    if task is not None:
-        tree["task"] = task
-    if kind.place_counts:
-        tree["into"] = into
-    if kind.newest_of:
-        tree["newest"] = [[item, newest.get(item)] for item in named_items(kind, params)]
-    return f"sha256:{hashlib.sha256(canonical_json(tree)).hexdigest()}"
-
-
-def has_key(kind: KindDeclaration, params: Mapping[str, Any], inputs: Collection[str]) -> bool:
-    """Return whether jobs of the kind with these parameters and inputs have a cache key.
-
-    A job has a cache key if its result depends only on the values from which the key is computed.
-    """
-    in_place = kind.in_place is not None and params.get(kind.in_place)
-    by_names = not set(kind.never_cached_without) <= set(inputs)
-    if kind.never_cached_for is not None:
-        by_names = by_names or kind.never_cached_for(params)
-    return kind.deterministic and not in_place and not by_names
-
-
-def named_items(kind: KindDeclaration, params: Mapping[str, Any]) -> list[str]:
-    """Return the ids of items that the parameters name and whose newest revisions the job reads."""
-    return [params[name] for name in kind.newest_of if params.get(name)]
-
-
-def part_digests(tx: Transaction, inputs: Iterable[PinnedInputs]) -> dict[tuple[str, int], dict[str, str]]:
-    """Return the digests of the parts of all pinned inputs: by item and revision number, then by name of the part."""
-    items = sorted({pin["item"] for pins in inputs for many in pins.values() for pin in many})
-    found: dict[tuple[str, int], dict[str, str]] = {}
-    for some in in_lists(items):
-        statement = select(revision_part).where(revision_part.c.item_id.in_(some))
-        for row in tx.execute(statement):
-            found.setdefault((row.item_id, row.number), {})[row.part] = row.document_digest
-    return found
-
-
-def input_contents(
-    kind: KindDeclaration, pins: Mapping[str, Any], parts: Mapping[tuple[str, int], dict[str, str]]
-) -> dict[str, Any]:
-    """Return the content of a job's inputs, independent of their revision numbers."""
-    return {
-        name: [_content(pin, kind.inputs[name].parts, parts[pin["item"], pin["revision"]]) for pin in many]
-        for name, many in pins.items()
-    }
-
-
-def _content(pin: Pin, read: Collection[str], parts: Mapping[str, str]) -> list[Any]:
-    place = [pin["collection"], *([pin["below"]] if "below" in pin else ())]
-    return [pin["item"], *place, pin["name"], sorted(item for item in parts.items() if not read or item[0] in read)]
 
 
 # -- deciding ---------------------------------------------------------------------------------------------------------
