@@ -1,11 +1,18 @@
 """Jobs that wait for the result of an identical job: for which job, and what they do if they cannot have the result."""
 
+from collections import Counter
 from typing import Any
 
 import pytest
+from sqlalchemy import select, update
 from tests.support.queue_desk import Desk
 
 from marey_schemas.queue.jobs import JobCreate
+from marey_server.access.principal import SYSTEM
+from marey_server.store.jobs.reaper import share_waiting
+from marey_server.store.jobs.result_cache import SHARED_AT_ONCE
+from marey_server.store.tables import staged_output
+from marey_server.store.transaction import Transaction
 
 GPU = {"gpu": "a100"}
 BIG_GPU = {"gpu": "a100", "memory": "large"}
@@ -99,3 +106,62 @@ def test_a_job_becomes_ready_and_does_not_wait_for_one_with_labels(desk: Desk) -
     submit(desk, labels=GPU)
     desk.complete(desk.claim())
     assert source(desk, behind) is None
+
+
+# -- results that a job cannot have -----------------------------------------------------------------------------------
+
+
+LONG_PATH = "/".join(["long" * 50] * 5)
+"""Path of a folder that is so long that a subfolder with a name of 20 letters would exceed the limit for paths."""
+
+
+def states(desk: Desk, jobs: list[str]) -> dict[str, int]:
+    """Return the number of the jobs in each state."""
+    return Counter(map(desk.state, jobs))
+
+
+def share_rest(desk: Desk) -> None:
+    """Let the server give waiting jobs the results that exist."""
+    while desk.database.write(SYSTEM, share_waiting):
+        pass
+
+
+def change_drafts(desk: Desk, **values: Any) -> None:
+    """Overwrite members of the staged drafts that other jobs would share."""
+
+    def act(tx: Transaction) -> None:
+        for row in tx.execute(select(staged_output)).all():
+            of_row = (staged_output.c.job_id == row.job_id, staged_output.c.name == row.name)
+            tx.execute(update(staged_output).where(*of_row).values(draft=row.draft | values))
+
+    desk.database.write(SYSTEM, act)
+
+
+def test_of_jobs_that_cannot_have_a_shared_result_one_computes_and_the_others_wait_for_it(desk: Desk) -> None:
+    submit(desk)
+    misplaced = [submit(desk, into=LONG_PATH) for _ in range(3)]
+    lease = desk.claim()
+    desk.stage(lease, "total", collection="deep" * 5)
+    desk.complete(lease)
+    assert states(desk, misplaced) == {"queued": 1, "waiting": 2}
+    (lease,) = desk.claim_many()
+    desk.stage(lease, "total")
+    desk.complete(lease)
+    assert states(desk, misplaced) == {"succeeded": 3}
+    assert [desk.job(job).cached_from for job in misplaced].count(lease.job) == 2
+
+
+def test_of_jobs_whose_shared_result_was_deleted_one_computes_and_the_others_wait_for_it(desk: Desk) -> None:
+    submit(desk)
+    waiting = [submit(desk, into=f"place{number}") for number in range(SHARED_AT_ONCE + 3)]
+    lease = desk.claim()
+    desk.stage(lease, "total")
+    desk.complete(lease)
+    change_drafts(desk, parts={"study": f"sha256:{'0' * 64}"})
+    share_rest(desk)
+    assert states(desk, waiting) == {"succeeded": SHARED_AT_ONCE, "queued": 1, "waiting": 2}
+    assert states(desk, [submit(desk, into="new")]) == {"waiting": 1}
+    lease = desk.claim()
+    desk.stage(lease, "total")
+    desk.complete(lease)
+    assert states(desk, waiting) == {"succeeded": len(waiting)}

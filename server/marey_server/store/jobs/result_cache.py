@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from sqlalchemy import and_, delete, insert, or_, select, update
+from sqlalchemy import and_, delete, insert, or_, select, tuple_, update
 
 from marey_server.access.labels import is_within
 from marey_server.errors import ApiProblem
@@ -77,23 +77,25 @@ CANDIDATE_COLUMNS = (
     job.c.priority,
     job.c.concurrency_key,
 )
+READY_COLUMNS = (*CANDIDATE_COLUMNS, job.c.kind, job.c.size, job.c.unbound, job.c.cached_from)
+"""Columns of waiting jobs that are to be queued."""
 
 
-def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult]:
+def decide(tx: Transaction, candidates: Sequence[Any], *, finished: bool = True) -> dict[str, SharedResult]:
     """Find, for each of `candidates`, the job whose result it can share.
 
     A candidate is a new job, or a row with `CANDIDATE_COLUMNS`. Candidates that cannot share a result are omitted. Of
     several identical candidates, the first computes the result and the others share it. But a candidate never waits for
     a job that may start later than the candidate itself would. In each project, this function runs for one transaction
     at a time. It locks the jobs that it finds, so that none of them ends before the transaction has recorded who shares
-    its result.
+    its result. Results of finished jobs are used only if `finished` is true.
     """
     asking = [one for one in candidates if one.cache_key is not None and one.cache_mode in ("use", "refresh")]
     if not asking:
         return {}
     for project_id in sorted({one.project_id for one in asking}):
         tx.lock(f"job-cache:{project_id}")
-    known = _known_sources(tx, asking)
+    known = _known_sources(tx, asking, finished=finished)
     sources: dict[str, SharedResult] = {}
     for one in asking:
         identical = known.setdefault((one.project_id, one.cache_key), [])
@@ -105,15 +107,17 @@ def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult
     return sources
 
 
-def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, str], list[SharedResult]]:
+def _known_sources(
+    tx: Transaction, asking: Sequence[Any], *, finished: bool
+) -> dict[tuple[str, str], list[SharedResult]]:
     """Return, for each project and cache key, the newest succeeded job, then the queued and running jobs.
 
     Of these, jobs that a worker runs come first, then the others in the order of their priority.
     """
     keys = sorted({one.cache_key for one in asking if one.cache_mode == "use"})
     projects = sorted({one.project_id for one in asking})
-    states = or_(job.c.state == QUEUED, job.c.state == RUNNING, job.c.state == "succeeded")
-    finished: dict[tuple[str, str], list[SharedResult]] = {}
+    states = or_(job.c.state == QUEUED, job.c.state == RUNNING, and_(finished, job.c.state == "succeeded"))
+    succeeded: dict[tuple[str, str], list[SharedResult]] = {}
     under_way: dict[tuple[str, str], list[SharedResult]] = {}
     for some in in_lists(keys):
         rows = tx.execute(
@@ -125,13 +129,13 @@ def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, st
         for row in rows:
             place = (row.project_id, row.cache_key)
             if row.state == "succeeded":
-                finished[place] = [SharedResult.of(row, finished=True)]
+                succeeded[place] = [SharedResult.of(row, finished=True)]
             else:
                 leased = row.lease_expires_us is not None
                 under_way.setdefault(place, []).append(SharedResult.of(row, leased=leased))
     for sources in under_way.values():
         sources.sort(key=lambda source: (not source.leased, -source.priority))
-    return {place: [*finished.get(place, ()), *under_way.get(place, ())] for place in {*finished, *under_way}}
+    return {place: [*succeeded.get(place, ()), *under_way.get(place, ())] for place in {*succeeded, *under_way}}
 
 
 # -- sharing ----------------------------------------------------------------------------------------------------------
@@ -160,14 +164,19 @@ def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
     """Give waiting jobs the results of the finished jobs that their `cached_from` names; return the jobs that ended.
 
     A transaction serves a limited number of jobs and outputs; the leading server process serves the remaining jobs
-    later. If the result is no longer stored, or cannot be published again, the waiting job is queued instead. Only the
-    `id` of the rows is read.
+    later. If the result is no longer stored, or cannot be published again, the waiting job is queued, or waits for
+    another identical job. Only the `id` of the rows is read.
     """
     ended: list[Ended] = []
+    unserved: list[str] = []
     for row in rows[:SHARED_AT_ONCE]:
         if tx.shared_outputs >= MOST_SHARED_OUTPUTS:
             break
-        ended += _share_one(tx, row.id)
+        of_row = _share_one(tx, row.id)
+        ended += of_row
+        if not of_row:
+            unserved.append(row.id)
+    _compute_again(tx, unserved)
     return ended
 
 
@@ -190,18 +199,15 @@ def share_waiting(tx: Transaction) -> list[Ended]:
 
 
 def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
-    """Give one job the result it waits for, or queue it if that is impossible; return the jobs that have ended.
+    """Give one job the result it waits for; return the jobs that ended, or an empty list if that is impossible.
 
-    A refusal that concerns this job must not affect the job that computed the result, or others that wait for it.
+    An error that concerns this job must not affect the job that computed the result, or others that wait for it.
     """
     try:
         with tx.connection.begin_nested():
-            ended = _publish_shared(tx, job_id)
+            return _publish_shared(tx, job_id)
     except ApiProblem:
-        ended = []
-    if not ended:
-        _compute_again(tx, job_id)
-    return ended
+        return []
 
 
 def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
@@ -250,17 +256,42 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     )
 
 
-def _compute_again(tx: Transaction, job_id: str) -> None:
-    """Queue a job that waited to share a result, and remove its dependency on the job with that result."""
-    row = tx.execute(select(job.c.kind, job.c.cached_from).where(job.c.id == job_id)).one()
-    waited = and_(job_dependency.c.job_id == job_id, job_dependency.c.on_job_id == row.cached_from)
-    tx.execute(delete(job_dependency).where(waited))
-    tx.execute(
-        update(job)
-        .where(job.c.id == job_id, job.c.state == WAITING)
-        .values(state="queued", cached_from=None, dependencies_left=0, rev=job.c.rev + 1)
-    )
-    wake_workers(tx, [row.kind])
+def _compute_again(tx: Transaction, job_ids: Sequence[str]) -> None:
+    """Let jobs compute a result that they waited to share: of identical jobs, one is queued and the others wait for it.
+
+    Finished results are not used, because the jobs could not have them.
+    """
+    statement = select(*READY_COLUMNS).where(job.c.state == WAITING).order_by(job.c.id)
+    for some in in_lists(job_ids):
+        rows = tx.execute(statement.where(job.c.id.in_(some))).all()
+        stop_sharing(tx, rows)
+        admit(tx, rows, finished=False)
+
+
+def stop_sharing(tx: Transaction, rows: Sequence[Any]) -> None:
+    """Remove the links from waiting jobs to the jobs whose results they would have shared; then `admit` the jobs."""
+    if rows:
+        ids = [row.id for row in rows]
+        tx.execute(update(job).where(job.c.id.in_(ids)).values(cached_from=None, dependencies_left=0))
+        pairs = [(row.id, row.cached_from) for row in rows]
+        tx.execute(delete(job_dependency).where(tuple_(job_dependency.c.job_id, job_dependency.c.on_job_id).in_(pairs)))
+
+
+def admit(tx: Transaction, rows: Sequence[Any], *, finished: bool = True) -> list[Ended]:
+    """Queue waiting jobs without unfinished dependencies, or let them share results; return the ended jobs.
+
+    The rows hold `READY_COLUMNS`. Results of finished jobs are used only if `finished` is true.
+    """
+    decisions = decide(tx, rows, finished=finished)
+    queued = [row for row in rows if row.id not in decisions]
+    if queued:
+        tx.execute(
+            update(job)
+            .where(job.c.id.in_([row.id for row in queued]), job.c.state == WAITING)
+            .values(state="queued", dependencies_left=0, rev=job.c.rev + 1)
+        )
+        wake_workers(tx, {row.kind for row in queued})
+    return join(tx, [(row, decisions[row.id]) for row in rows if row.id in decisions])
 
 
 # -- forgetting -------------------------------------------------------------------------------------------------------
@@ -275,5 +306,4 @@ def forget_results(tx: Transaction, job_ids: Sequence[str]) -> None:
         tx.execute(delete(staged_output).where(staged_output.c.job_id.in_(some)))
         tx.execute(update(job).where(job.c.id.in_(some)).values(cache_key=None))
         waiting = select(job.c.id).where(job.c.state == WAITING, job.c.cached_from.in_(some)).order_by(job.c.id)
-        for job_id in tx.execute(waiting).scalars().all():
-            _compute_again(tx, job_id)
+        _compute_again(tx, tx.execute(waiting).scalars().all())
