@@ -11,6 +11,7 @@ from marey_schemas.queue.jobs import JobCreate
 from marey_server.access.principal import SYSTEM
 from marey_server.store.jobs.reaper import share_waiting
 from marey_server.store.jobs.result_cache import SHARED_AT_ONCE
+from marey_server.store.retention import Retention, retire
 from marey_server.store.tables import staged_output
 from marey_server.store.transaction import Transaction
 
@@ -165,3 +166,26 @@ def test_of_jobs_whose_shared_result_was_deleted_one_computes_and_the_others_wai
     desk.stage(lease, "total")
     desk.complete(lease)
     assert states(desk, waiting) == {"succeeded": len(waiting)}
+
+
+@pytest.mark.parametrize("draft", [{"reuse": None, "kind": "no-kind"}, {"sources": {"things": [["item_1", 1]]}}])
+def test_a_result_stored_in_a_form_that_cannot_be_read_is_computed_again(desk: Desk, draft: dict[str, Any]) -> None:
+    submit(desk)
+    waiting = [submit(desk, into=f"place{number}") for number in range(SHARED_AT_ONCE + 2)]
+    lease = desk.claim()
+    desk.stage(lease, "total")
+    desk.complete(lease)
+    change_drafts(desk, **draft)
+    share_rest(desk)
+    assert states(desk, waiting[SHARED_AT_ONCE:]) == {"queued": 1, "waiting": 1}
+
+
+def test_a_waiting_job_whose_source_was_deleted_because_it_was_old_computes_the_result(desk: Desk) -> None:
+    submit(desk)
+    desk.complete(desk.claim())
+    waiting = desk.submit_many(*[JobCreate(kind="sum")] * (SHARED_AT_ONCE + 2))[SHARED_AT_ONCE:]
+    assert states(desk, waiting) == {"waiting": 2}
+    desk.clock.advance(3 * 86400)
+    retire(desk.database, Retention(jobs_days=1))
+    share_rest(desk)
+    assert states(desk, waiting) == {"queued": 1, "waiting": 1}

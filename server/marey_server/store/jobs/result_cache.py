@@ -7,6 +7,7 @@ consent for one of its clips has ended.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -23,6 +24,9 @@ from marey_server.store.jobs.inputs import NamingJob, record_named_items
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import job, job_dependency, staged_output
 from marey_server.store.transaction import Transaction, in_lists
+from marey_versions.tree.chunks import DamagedChunk
+
+log = logging.getLogger(__name__)
 
 SHARED_AT_ONCE = 64
 """Greatest number of jobs that get a cached result at submission; the leading process serves the others later."""
@@ -181,12 +185,16 @@ def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
 
 
 def share_waiting(tx: Transaction) -> list[Ended]:
-    """Give at most `SHARED_AT_ONCE` waiting jobs the results that now exist; return the jobs that have ended."""
+    """Give at most `SHARED_AT_ONCE` waiting jobs the results that now exist; return the jobs that have ended.
+
+    This includes jobs that wait for a job which was deleted because it was old; they compute the result.
+    """
     source = job.alias("source")
     statement = (
         select(job.c.id, job.c.project_id)
-        .join(source, source.c.id == job.c.cached_from)
-        .where(job.c.state == WAITING, job.c.cached_from.is_not(None), source.c.state == "succeeded")
+        .outerjoin(source, source.c.id == job.c.cached_from)
+        .where(job.c.state == WAITING, job.c.cached_from.is_not(None))
+        .where(or_(source.c.state == "succeeded", source.c.id.is_(None)))
         .order_by(job.c.id)
         .limit(SHARED_AT_ONCE)
     )
@@ -198,6 +206,10 @@ def share_waiting(tx: Transaction) -> list[Ended]:
     return share(tx, tx.execute(chosen).all())
 
 
+_UNUSABLE = (ApiProblem, DamagedChunk, LookupError, TypeError, ValueError)
+"""Errors because of which a job cannot have a shared result: refusals, and stored data that cannot be read."""
+
+
 def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     """Give one job the result it waits for; return the jobs that ended, or an empty list if that is impossible.
 
@@ -206,7 +218,9 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
     try:
         with tx.connection.begin_nested():
             return _publish_shared(tx, job_id)
-    except ApiProblem:
+    except _UNUSABLE as error:
+        if not isinstance(error, ApiProblem):
+            log.exception("%s cannot share the result of an identical job", job_id)
         return []
 
 
@@ -230,8 +244,8 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
         select(*own, source.c.id.label("source_id"), *shared)
         .join(source, source.c.id == job.c.cached_from)
         .where(waits)
-    ).one()
-    if not exports.may_share(tx, row.kind, row.inputs, row.result):
+    ).one_or_none()
+    if row is None or not exports.may_share(tx, row.kind, row.inputs, row.result):
         return []
     place = (row.source_id, row.fence)
     drafts = staging.staged_drafts(tx, [place]).get(place, {})
