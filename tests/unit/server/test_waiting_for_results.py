@@ -189,3 +189,19 @@ def test_a_waiting_job_whose_source_was_deleted_because_it_was_old_computes_the_
     retire(desk.database, Retention(jobs_days=1))
     share_rest(desk)
     assert states(desk, waiting) == {"queued": 1, "waiting": 1}
+
+
+def test_a_task_whose_source_was_released_before_its_turn_gets_no_empty_result(desk: Desk) -> None:
+    desk.things(1)
+    fields: dict[str, Any] = {"params": {"number": 2}, "inputs": {"things": {"collection": "raw"}}}
+    gate = desk.submit()
+    surveys = [desk.submit("survey", after=[gate], into=f"place{n}", **fields) for n in range(SHARED_AT_ONCE + 2)]
+    desk.complete(desk.claim(job=gate))
+    for number, lease in enumerate(desk.claim_many()):
+        desk.stage(lease, f"piece{number}")
+        desk.complete(lease)
+    (late,) = [job for job in surveys if desk.job(job).children == {"waiting": 2}]
+    for lease in desk.claim_many():
+        desk.complete(lease)
+    share_rest(desk)
+    assert desk.job(late).children == {"queued": 2}

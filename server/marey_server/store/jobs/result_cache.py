@@ -227,8 +227,9 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
 def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     """Publish the shared result as the result of a waiting job; return the jobs that ended as a result.
 
-    The waiting job does not end if the shared result is no longer stored. It does not end either if the two jobs export
-    clips, and the clips whose consent has ended are not the same for both jobs. Raises the errors of `publish`.
+    The waiting job does not end if the other job has no cache key any more, because its result is not to be shared, or
+    if the result is no longer stored. It does not end either if the two jobs export clips, and the clips whose consent
+    has ended are not the same for both jobs. Raises the errors of `publish`.
     """
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")
@@ -243,7 +244,7 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     row = tx.execute(
         select(*own, source.c.id.label("source_id"), *shared)
         .join(source, source.c.id == job.c.cached_from)
-        .where(waits)
+        .where(waits, source.c.state == "succeeded", source.c.cache_key.is_not(None))
     ).one_or_none()
     if row is None or not exports.may_share(tx, row.kind, row.inputs, row.result):
         return []
