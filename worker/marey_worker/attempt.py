@@ -391,6 +391,7 @@ class RunningAttempt:
             result=done.result,
             code_version=find_kind(self._lease.kind).code_version,
             environment=environment(),
+            **({} if done.shareable else {"shareable": False}),  # servers of earlier versions do not know the field
         )
         faults.point("worker.before_complete")
         self._api.complete(request)

@@ -112,7 +112,7 @@ def run_job(run: Run, pipe: Connection) -> End:
         return Failed(code if isinstance(code, str) else "exception", text, signatures.of_exception(error), True)
     finally:
         allow_memory(None)
-    return Done(result)
+    return Done(result, context.shareable)
 
 
 def write_output_to(path: Path) -> None:

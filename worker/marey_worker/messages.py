@@ -131,9 +131,13 @@ class Made:
 
 @dataclass(frozen=True)
 class Done:
-    """Message that the job has computed all its results; the last results may not be stored yet."""
+    """Message that the job has computed all its results; the last results may not be stored yet.
+
+    `shareable` is false if the results depend on more than the kind, parameters, seed and inputs of the job.
+    """
 
     result: dict[str, Any]
+    shareable: bool = True
 
 
 @dataclass(frozen=True)

@@ -176,6 +176,11 @@ class CompleteRequest(Request):
     result: dict[str, Any] = Field(default_factory=dict)
     code_version: str | None = Field(None, max_length=255)
     environment: dict[str, str] = Field(default_factory=dict)
+    shareable: bool = Field(
+        True,
+        description="Whether identical jobs may share the result. False if the result depends on more than the kind, "
+        "parameters, seed and inputs of the job, for example on a file that could not be read.",
+    )
 
 
 class FailRequest(Request):

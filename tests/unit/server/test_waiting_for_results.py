@@ -191,6 +191,51 @@ def test_a_waiting_job_whose_source_was_deleted_because_it_was_old_computes_the_
     assert states(desk, waiting) == {"queued": 1, "waiting": 1}
 
 
+# -- results that depend on more than the inputs ----------------------------------------------------------------------
+
+
+def test_a_result_that_depends_on_more_than_the_inputs_is_not_shared_later(desk: Desk) -> None:
+    submit(desk)
+    lease = desk.claim()
+    desk.stage(lease, "total")
+    desk.complete(lease, shareable=False)
+    assert [one.name for one in desk.outputs(lease.job)] == ["total"]
+    again = submit(desk)
+    assert desk.job(again).cached_from is None
+    desk.complete(desk.claim())
+    assert desk.job(submit(desk)).cached_from == again
+
+
+def test_jobs_that_waited_for_a_result_that_is_not_shared_compute_it(desk: Desk) -> None:
+    submit(desk)
+    waiting = [submit(desk), submit(desk)]
+    lease = desk.claim()
+    desk.stage(lease, "total")
+    desk.complete(lease, shareable=False)
+    assert states(desk, waiting) == {"queued": 1, "waiting": 1}
+    lease = desk.claim()
+    desk.stage(lease, "total")
+    desk.complete(lease)
+    assert states(desk, waiting) == {"succeeded": 2}
+    assert {len(desk.outputs(job)) for job in waiting} == {1}
+
+
+@pytest.mark.parametrize("shareable", [False, True])
+def test_a_result_gathered_from_tasks_is_shared_only_if_the_results_of_all_tasks_may_be(
+    desk: Desk, shareable: bool
+) -> None:
+    desk.things(2)
+    fields: dict[str, Any] = {"params": {"number": 2}, "inputs": {"things": {"collection": "raw"}}}
+    first = desk.submit("survey", **fields)
+    one, two = desk.claim_many()
+    desk.complete(one)
+    desk.complete(two, shareable=shareable)
+    desk.complete(desk.claim())
+    assert desk.state(first) == "succeeded"
+    again = desk.job(desk.submit("survey", **fields))
+    assert (again.state, again.cached_from) == (("succeeded", first) if shareable else ("running", None))
+
+
 def test_a_task_whose_source_was_released_before_its_turn_gets_no_empty_result(desk: Desk) -> None:
     desk.things(1)
     fields: dict[str, Any] = {"params": {"number": 2}, "inputs": {"things": {"collection": "raw"}}}

@@ -339,6 +339,22 @@ def test_a_file_that_is_too_large_for_the_memory_limit_is_not_downloaded(shared_
     assert read["result"] == {"bytes": len(small)}
 
 
+def test_a_result_is_not_shared_if_something_could_not_be_read(shared_server: FakeServer) -> None:
+    small, large, gone = b"small", bytes((128 << 20) + 1), b"gone"
+    shared_server.blobs |= {digest_of(data): data for data in (small, large)}
+
+    def end(how: str = "do-without", **params: str) -> tuple[str, bool]:
+        job = shared_server.submit("misbehave", {"how": how, **params}, memory_limit_mb=512)
+        report = shared_server.ended(job)
+        return report["result"].get("lacks", ""), report.get("shareable", True)
+
+    assert end() == ("no-skeleton", False)
+    assert end(blob=digest_of(gone)) == ("no-blob", False)
+    assert end(blob=digest_of(large)) == ("file-too-large", False)
+    assert end(blob=digest_of(small)) == ("", True)
+    assert end("have-no-mapping") == ("", True)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("point", ["worker.after_claim", "worker.before_complete", "worker.after_complete"])
 def test_fault_points_kill_the_worker_where_they_say(server: FakeServer, start_worker: StartWorker, point: str) -> None:

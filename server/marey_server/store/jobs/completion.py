@@ -145,7 +145,7 @@ def _complete(
     if done:
         _record(tx, records)
         failed = {place for place, (end, _) in done.items() if not end.succeeded}
-        unshared = {(row.id, row.fence) for row in won if row.cache_key is None or (row.id, row.fence) in failed}
+        unshared = failed | _keep_from_sharing(tx, won, requests)
         unshared &= staged.keys()
         if unshared:
             staging.drop_staged(tx, unshared)
@@ -166,6 +166,24 @@ def _complete(
             ],
         )
     return done
+
+
+def _keep_from_sharing(
+    tx: Transaction, won: Collection[Any], requests: Mapping[_Place, CompleteRequest]
+) -> set[_Place]:
+    """Remove the cache keys of jobs whose results must not be shared; return the attempts without a cache key.
+
+    These are the jobs for which the worker says so, and the parent jobs of such jobs.
+    """
+    unshared = {(row.id, row.fence) for row in won if row.cache_key is None}
+    barred = {(row.id, row.fence) for row in won if not requests[row.id, row.fence].shareable}
+    if gathering := {row.id: (row.id, row.fence) for row in won if row.gathers}:
+        of_tasks = select(job.c.parent_id).where(job.c.parent_id.in_(gathering), job.c.cache_key.is_(None)).distinct()
+        barred |= {gathering[parent_id] for parent_id in tx.execute(of_tasks).scalars()}
+    if barred - unshared:
+        of_jobs = job.c.id.in_([job_id for job_id, _ in barred])
+        tx.execute(update(job).where(of_jobs).values(cache_key=None))
+    return unshared | barred
 
 
 def _fail_unpublished(tx: Transaction, row: Any, failure: dict[str, Any]) -> tuple[Ended, CompleteAnswer]:

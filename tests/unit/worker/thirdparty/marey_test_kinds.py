@@ -12,7 +12,7 @@ from marey_schemas.base import Request
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
-from marey_worker.context import Context, JobRefused
+from marey_worker.context import Context, JobRefused, Unreadable
 
 
 class AddParams(Request):
@@ -43,6 +43,10 @@ def misbehave(context: Context, params: MisbehaveParams) -> dict[str, Any]:
         "read-blob": lambda: {"bytes": len(context.blob(params.blob))},
         "read-late": lambda: _read_late(context, Path(params.folder)),
         "miss": lambda: context.document(Kind.SKELETON, "skeleton_gone", 1, "hierarchy"),
+        "do-without": lambda: _do_without(context, params.blob),
+        "have-no-mapping": lambda: {
+            "mapping": context.document(Kind.SKELETON, "skeleton_gone", 1, "mapping", required=False)
+        },
     }[params.how]()  # fmt: skip
 
 
@@ -105,6 +109,18 @@ def _give_up_early(context: Context) -> None:
     reading = context.documents([pin] * 20, "motion")
     next(reading)
     raise ArithmeticError("enough")
+
+
+def _do_without(context: Context, blob: str) -> dict[str, str]:
+    """Read a file, or a skeleton if `blob` is empty, and do without it if it cannot be read."""
+    try:
+        if blob:
+            context.blob(blob)
+        else:
+            context.document(Kind.SKELETON, "skeleton_gone", 1, "hierarchy")
+    except Unreadable as error:
+        return {"lacks": error.code}
+    return {"lacks": ""}
 
 
 def _put(context: Context) -> dict[str, str]:
