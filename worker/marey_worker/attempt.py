@@ -36,7 +36,14 @@ from marey_client.errors import (
 from marey_schemas.items import PartPlace
 from marey_schemas.processes.child_process import BadMessage, ChildProcess
 from marey_schemas.queue.job_kinds import find_kind
-from marey_schemas.queue.worker_protocol import CompleteRequest, FailRequest, Lease
+from marey_schemas.queue.worker_protocol import (
+    LONGEST_CODE,
+    LONGEST_DETAIL,
+    LONGEST_SIGNATURE,
+    CompleteRequest,
+    FailRequest,
+    Lease,
+)
 from marey_schemas.sizes import MIB
 from marey_worker import faults, signatures
 from marey_worker.attempt_api import AttemptApi
@@ -59,6 +66,7 @@ from marey_worker.messages import (
     pack,
     unpack,
 )
+from marey_worker.texts import storable
 
 LOG_PIECE_BYTES = 256 << 10
 LIBRARIES = ("marey", "numpy", "scipy", "numba")
@@ -404,9 +412,13 @@ class RunningAttempt:
             code, detail, retryable = end.value, self._watch.explain(end), end is not Stop.LOG
             signature = end.value if end in (Stop.MEMORY, Stop.LOG) else None
         return FailRequest(
-            write_id=uuid.uuid4().hex, code=(code or "exception")[:128], detail=detail[-20_000:], signature=signature,
-            retryable=retryable, interrupted=end is Stop.INTERRUPTED,
-        )  # fmt: skip
+            write_id=uuid.uuid4().hex,
+            code=storable(code, LONGEST_CODE) or "exception",
+            detail=storable(detail, LONGEST_DETAIL),
+            signature=None if signature is None else storable(signature, LONGEST_SIGNATURE),
+            retryable=retryable,
+            interrupted=end is Stop.INTERRUPTED,
+        )
 
     def _try_to_send_log(self) -> None:
         """Send new output; if this fails, log the failure only, so that no result is lost because of it."""

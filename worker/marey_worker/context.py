@@ -14,7 +14,7 @@ from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.items import Item, PartPlace
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.facets import ItemFacets
-from marey_schemas.queue.jobs import Progress
+from marey_schemas.queue.jobs import LONGEST_NOTE, Progress
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput, StageRequest
 from marey_worker.messages import (
     ChildReply,
@@ -31,6 +31,7 @@ from marey_worker.messages import (
     pack,
     unpack,
 )
+from marey_worker.texts import storable
 
 T = TypeVar("T")
 
@@ -208,9 +209,9 @@ class Context:
         """Report that `done` of `total` units of work are finished, for example clips; may be called often.
 
         `total` is greater than 0, or None if it is unknown; then users see no percentage. `note` names the current
-        step in at most 500 characters.
+        step; a note of more than 500 characters is shortened.
         """
-        self._pipe.send_bytes(pack(Made(Progress(done=done, total=total, note=note))))
+        self._pipe.send_bytes(pack(Made(Progress(done=done, total=total, note=storable(note, LONGEST_NOTE)))))
 
     def log(self, text: str) -> None:
         """Write a line to the job's log; `print` does the same."""

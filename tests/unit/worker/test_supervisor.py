@@ -12,6 +12,8 @@ from tests.support.fake_server import FakeServer
 
 from marey_client.blobs import digest_of
 from marey_client.credentials import write_private
+from marey_schemas.queue.jobs import Progress
+from marey_schemas.queue.worker_protocol import FailRequest
 
 
 def alive(pid: int) -> bool:
@@ -166,6 +168,25 @@ def test_each_way_to_fail_is_told_apart_and_the_worker_goes_on(
     assert (failed["code"], failed["retryable"], failed["interrupted"]) == (code, retryable, False)
     assert detail in failed["detail"]
     assert shared_server.ended(shared_server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
+
+
+@pytest.mark.parametrize(("how", "code"), [("raise-oddly", "exception"), ("refuse-oddly", f"{('odd' * 100)[:127]}…")])
+def test_a_failure_is_reported_however_long_or_odd_its_texts_are(
+    shared_server: FakeServer, how: str, code: str
+) -> None:
+    job = shared_server.submit("misbehave", {"how": how})
+    after = shared_server.submit("add", {"a": 1, "b": 1})
+    failed = FailRequest.model_validate(shared_server.ended(job))
+    assert failed.code == code
+    assert "a\\x00b\\udc80c" in failed.detail
+    assert shared_server.ended(after)["result"]["sum"] == 2
+
+
+def test_progress_is_reported_however_long_or_odd_its_note_is(shared_server: FakeServer) -> None:
+    job = shared_server.submit("misbehave", {"how": "report-oddly"}, heartbeat_s=0.3)
+    assert shared_server.ended(job)["result"] == {"reported": True}
+    (progress, *_) = filter(None, shared_server.heartbeats[job])
+    assert Progress.model_validate(progress).note.startswith("a\\x00b\\udc80ca")
 
 
 @pytest.mark.slow

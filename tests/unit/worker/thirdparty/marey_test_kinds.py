@@ -38,6 +38,7 @@ def misbehave(context: Context, params: MisbehaveParams) -> dict[str, Any]:
         "raise": _raise, "refuse": _refuse, "segfault": _segfault, "exit": _exit, "eat": _eat,
         "hoard": lambda: _hoard(Path(params.folder)), "wait": lambda: _wait(Path(params.folder)),
         "fork-and-raise": _fork_and_raise,
+        "raise-oddly": _raise_oddly, "refuse-oddly": _refuse_oddly, "report-oddly": lambda: _report_oddly(context),
         "sleep": lambda: _sleep(params.seconds),
         "give-up-early": lambda: _give_up_early(context), "put": lambda: _put(context),
         "read-blob": lambda: {"bytes": len(context.blob(params.blob))},
@@ -52,6 +53,21 @@ def misbehave(context: Context, params: MisbehaveParams) -> dict[str, Any]:
 
 def _raise() -> None:
     raise ArithmeticError("the numbers do not add up")
+
+
+def _raise_oddly() -> None:
+    """Raise an error with an extremely long class name, and characters in its text that a database does not store."""
+    raise type("Odd" * 200, (Exception,), {})("a\0b\udc80c")
+
+
+def _refuse_oddly() -> None:
+    raise JobRefused("odd" * 100, "a\0b\udc80c" * 10_000)
+
+
+def _report_oddly(context: Context) -> dict[str, bool]:
+    context.progress(1, 2, "a\0b\udc80c" * 1000)
+    time.sleep(2)
+    return {"reported": True}
 
 
 def _refuse() -> None:
