@@ -209,6 +209,8 @@ class RunningAttempt:
         self._watch = Watch(lease, self._keeper, stopping, self._job_log, time.monotonic())
         self._log_due = time.monotonic() + LOG_EVERY_S
         self._transfers = ThreadPoolExecutor(TRANSFERS_AT_ONCE, thread_name_prefix="marey-transfer")
+        self._log_sender = ThreadPoolExecutor(1, thread_name_prefix="marey-log")
+        self._log_sending: Future[None] | None = None
         self._staging: list[Future[ChildReply | None]] = []
 
     def run(self, child: ChildProcess) -> Done | Failed | Stop:
@@ -246,7 +248,8 @@ class RunningAttempt:
 
     def _close(self) -> None:
         self._keeper.stop()
-        self._transfers.shutdown(wait=False, cancel_futures=True)
+        for threads in (self._transfers, self._log_sender):
+            threads.shutdown(wait=False, cancel_futures=True)
         shutil.rmtree(self._scratch, ignore_errors=True)
 
     def _order(self) -> Run:
@@ -283,9 +286,13 @@ class RunningAttempt:
                 return stop
 
     def _check(self, child: ChildProcess | None) -> Stop | None:
-        """Send new output in a separate thread every `LOG_EVERY_S` seconds; return the reason to stop now, or None."""
-        if time.monotonic() > self._log_due:
-            self._transfers.submit(self._try_to_send_log)
+        """Send new output in a thread of its own every `LOG_EVERY_S` seconds; return the reason to stop now, or None.
+
+        While the server is away, one upload of the log waits for it, and delays neither inputs nor results.
+        """
+        sent = self._log_sending is None or self._log_sending.done()
+        if sent and time.monotonic() > self._log_due:
+            self._log_sending = self._log_sender.submit(self._try_to_send_log)
             self._log_due = time.monotonic() + LOG_EVERY_S
         return self._watch.verdict(child)
 
