@@ -31,6 +31,7 @@ from marey_client.errors import (
     ServerFailed,
     TooLarge,
 )
+from marey_schemas.encoding.codecs import CodecError
 from marey_schemas.items import PartPlace
 from marey_schemas.processes.child_process import BadMessage, ChildProcess
 from marey_schemas.queue.job_kinds import find_kind
@@ -49,6 +50,7 @@ from marey_worker.attempt_limits import LogUploader, Stop, Watch
 from marey_worker.heartbeats import LeaseKeeper
 from marey_worker.job_io.input_cache import InputCache
 from marey_worker.messages import (
+    UNPACKABLE,
     ChildReply,
     Done,
     Failed,
@@ -302,6 +304,8 @@ class RunningAttempt:
                 raise
             except _REFUSED as error:  # such as a quota that is exceeded; to compute the results again would not help
                 end = Failed(error.code, f"the results cannot be published: {error}", None, retryable=False)
+            except CodecError as error:
+                end = Failed(signatures.BAD_RESULT, f"the result cannot be sent: {error}", None, retryable=False)
             except ServerFailed as error:
                 end = Failed(error.code, f"the results could not be published: {error}", None, retryable=True)
         if not isinstance(end, Done):
@@ -357,6 +361,6 @@ def send_reply(child: ChildProcess, carried_out: Future[ChildReply | None]) -> N
         return
     try:
         data = pack(reply)
-    except (TypeError, ValueError, OverflowError) as error:  # the child waits for an answer, whatever happened
+    except UNPACKABLE as error:  # the child waits for an answer, whatever happened
         data = pack(ChildReply(reply.request, refusal=f"the answer cannot be sent to the child process: {error}"))
     child.send(data)

@@ -23,7 +23,7 @@ from marey_schemas.queue.job_kinds import KindDeclaration, find_kind
 from marey_schemas.queue.worker_protocol import LONGEST_CODE, LONGEST_DETAIL
 from marey_worker import signatures
 from marey_worker.context import Context, JobRefused, Unreadable
-from marey_worker.messages import Done, End, Failed, Run, pack, unpack
+from marey_worker.messages import UNPACKABLE, Done, End, Failed, Run, pack, unpack
 from marey_worker.texts import storable
 
 DETAIL_CHARACTERS = 1000
@@ -56,7 +56,7 @@ def main() -> None:
             os._exit(1)
         sys.stdout.flush()
         sys.stderr.flush()
-        pipe.send_bytes(pack(end))
+        pipe.send_bytes(_packed(end))
         garbage.collect()
 
 
@@ -113,6 +113,14 @@ def run_job(run: Run, pipe: Connection) -> End:
     finally:
         allow_memory(None)
     return Done(result, context.shareable)
+
+
+def _packed(end: End) -> bytes:
+    """Encode the end of a job; a result that cannot be sent is a failure."""
+    try:
+        return pack(end)
+    except UNPACKABLE as error:
+        return pack(_failed(signatures.BAD_RESULT, f"the result cannot be sent: {error}"))
 
 
 def _failed(code: str, detail: str, signature: str | None = None, *, retryable: bool = False) -> Failed:

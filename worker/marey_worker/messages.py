@@ -161,8 +161,12 @@ _FORMS = {
 }  # fmt: skip
 
 
+UNPACKABLE = (TypeError, ValueError, OverflowError)
+"""Errors of `pack`, for example for an integer of more than 64 bits."""
+
+
 def pack(message: Any) -> bytes:
-    """Encode a message. Raises `TypeError`, `ValueError` or `OverflowError` for values that cannot be encoded."""
+    """Encode a message. Raises one of the errors `UNPACKABLE` for values that cannot be encoded."""
     name = type(message).__name__
     fields = _FORMS[name].dump_python(message, by_alias=True)
     packed: bytes = msgpack.packb([name, fields], default=_plain)

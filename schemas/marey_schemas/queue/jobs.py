@@ -170,8 +170,8 @@ LONGEST_NOTE = 500
 class Progress(Request):
     """Progress of an attempt."""
 
-    done: float = Field(ge=0)
-    total: float | None = Field(None, gt=0)
+    done: float = Field(ge=0, allow_inf_nan=False)
+    total: float | None = Field(None, gt=0, allow_inf_nan=False)
     note: str = Field("", max_length=LONGEST_NOTE)
 
 

@@ -189,6 +189,17 @@ def test_progress_is_reported_however_long_or_odd_its_note_is(shared_server: Fak
     assert Progress.model_validate(progress).note.startswith("a\\x00b\\udc80ca")
 
 
+@pytest.mark.parametrize("number", ["nan", "inf", str(1 << 63), str(1 << 64), "half a character"])
+def test_a_result_that_no_request_can_contain_fails_its_job_and_not_the_worker(
+    shared_server: FakeServer, number: str
+) -> None:
+    job = shared_server.submit("misbehave", {"how": "answer-oddly", "blob": number})
+    after = shared_server.submit("add", {"a": 1, "b": 1})
+    failed = shared_server.ended(job)
+    assert (failed["code"], failed["retryable"]) == ("bad-result", False)
+    assert shared_server.ended(after)["result"]["sum"] == 2
+
+
 @pytest.mark.slow
 def test_the_same_crash_has_the_same_signature_and_another_has_another(shared_server: FakeServer) -> None:
     signatures = [

@@ -1,6 +1,7 @@
 """Job kinds of another Python package, as a worker finds them: kinds that work, and one that fails in many ways."""
 
 import ctypes
+import math
 import os
 import resource
 import time
@@ -27,6 +28,10 @@ class MisbehaveParams(Request):
     blob: str = ""
 
 
+ODD = {"nan": math.nan, "inf": math.inf, str(1 << 63): 1 << 63, str(1 << 64): 1 << 64, "half a character": "\udc80"}
+"""Values of which a result may not consist."""
+
+
 def add(context: Context, params: AddParams) -> dict[str, int]:
     context.log(f"adding {params.a} and {params.b}")
     context.progress(1, 2, "half way")
@@ -44,6 +49,7 @@ def misbehave(context: Context, params: MisbehaveParams) -> dict[str, Any]:
         "read-blob": lambda: {"bytes": len(context.blob(params.blob))},
         "read-late": lambda: _read_late(context, Path(params.folder)),
         "miss": lambda: context.document(Kind.SKELETON, "skeleton_gone", 1, "hierarchy"),
+        "answer-oddly": lambda: {"odd": ODD[params.blob]},
         "do-without": lambda: _do_without(context, params.blob),
         "have-no-mapping": lambda: {
             "mapping": context.document(Kind.SKELETON, "skeleton_gone", 1, "mapping", required=False)
