@@ -1,14 +1,17 @@
 """Jobs that wait for the result of an identical job: for which job, and what they do if they cannot have the result."""
 
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from sqlalchemy import select, update
 from tests.support.queue_desk import Desk
 
+from marey_schemas.access import MemberChange, Role, UserCreate
 from marey_schemas.queue.jobs import JobCreate
 from marey_server.access.principal import SYSTEM
+from marey_server.store import members, users
 from marey_server.store.jobs.reaper import share_waiting
 from marey_server.store.jobs.result_cache import SHARED_AT_ONCE
 from marey_server.store.retention import Retention, retire
@@ -250,3 +253,22 @@ def test_a_task_whose_source_was_released_before_its_turn_gets_no_empty_result(d
         desk.complete(lease)
     share_rest(desk)
     assert desk.job(late).children == {"queued": 2}
+
+
+def test_a_job_whose_author_lost_the_role_gets_no_shared_result(desk: Desk) -> None:
+    ann = desk.user
+    made = desk.database.write(SYSTEM, users.create_user, UserCreate(name="bob"))
+    desk.database.write(ann, members.put_member, "lab", "bob", MemberChange(role=Role.OWNER))
+    submit(desk)
+    desk.user = replace(ann, user_id=made.id, user_name="bob", token_id="token_bob")
+    waiting = submit(desk)
+    desk.user = ann
+    desk.database.write(ann, members.put_member, "lab", "bob", MemberChange(role=Role.READER))
+    desk.complete(desk.claim(), result={"secret": 7})
+    assert (desk.state(waiting), desk.job(waiting).result) == ("queued", None)
+    desk.claim()
+    desk.clock.advance(desk.policy.lease_ttl_s + 1)
+    desk.reap()
+    failure = desk.job(waiting).failure
+    assert failure is not None
+    assert failure.code == "author-lost-access"

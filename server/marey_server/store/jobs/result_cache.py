@@ -19,7 +19,7 @@ from marey_server.store import blobs
 from marey_server.store.jobs import commits, exports, staging
 from marey_server.store.jobs.endings import Ended, end_jobs
 from marey_server.store.jobs.events import wake_workers
-from marey_server.store.jobs.fencing import QUEUED, RUNNING, WAITING
+from marey_server.store.jobs.fencing import AUTHOR_MAY_RUN, QUEUED, RUNNING, WAITING
 from marey_server.store.jobs.inputs import NamingJob, record_named_items
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import job, job_dependency, staged_output
@@ -228,8 +228,9 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     """Publish the shared result as the result of a waiting job; return the jobs that ended as a result.
 
     The waiting job does not end if the other job has no cache key any more, because its result is not to be shared, or
-    if the result is no longer stored. It does not end either if the two jobs export clips, and the clips whose consent
-    has ended are not the same for both jobs. Raises the errors of `publish`.
+    if the result is no longer stored, or if the author of the waiting job may not run jobs any more. It does not end
+    either if the two jobs export clips, and the clips whose consent has ended are not the same for both jobs. Raises
+    the errors of `publish`.
     """
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")
@@ -244,7 +245,7 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     row = tx.execute(
         select(*own, source.c.id.label("source_id"), *shared)
         .join(source, source.c.id == job.c.cached_from)
-        .where(waits, source.c.state == "succeeded", source.c.cache_key.is_not(None))
+        .where(waits, AUTHOR_MAY_RUN, source.c.state == "succeeded", source.c.cache_key.is_not(None))
     ).one_or_none()
     if row is None or not exports.may_share(tx, row.kind, row.inputs, row.result):
         return []
