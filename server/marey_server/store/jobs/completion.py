@@ -80,7 +80,7 @@ def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> li
             refused[place] = error
     propagate_ends(tx, [end for end, _ in ended.values()])
     _pass_fault_points(tx)
-    answers = {place: answer for place, (_, answer) in ended.items()}
+    answers = {(place, requests[place].write_id): answer for place, (_, answer) in ended.items()}
     return [_result(tx, one, answers, refused, own) for one in completions]
 
 
@@ -270,7 +270,7 @@ def _staged(tx: Transaction, places: Collection[_Place]) -> set[_Place]:
 def _result(
     tx: Transaction,
     one: BatchCompletion,
-    answers: Mapping[_Place, CompleteAnswer],
+    answers: Mapping[tuple[_Place, str], CompleteAnswer],
     refused: Mapping[_Place, ApiProblem],
     own: Collection[_Place],
 ) -> BatchCompletionResult:
@@ -280,7 +280,7 @@ def _result(
             raise NotFoundProblem(f"You have not claimed attempt {one.fence} of the job {one.job}.")
         if place in refused:
             raise refused[place]
-        answer = answers.get(place) or _same_answer(tx, place, one.write_id)
+        answer = answers.get((place, one.write_id)) or _same_answer(tx, place, one.write_id)
     except ApiProblem as error:
         return BatchCompletionResult(job=one.job, fence=one.fence, code=error.error_code, detail=error.detail)
     return BatchCompletionResult(job=one.job, fence=one.fence, answer=answer)
