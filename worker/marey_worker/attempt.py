@@ -249,7 +249,10 @@ class RunningAttempt:
     def _read_blob(self, digest: str) -> bytes:
         """Return a blob from the cache or the server. Raises `BlobTooLarge` if the job's memory is too small for it."""
         most_bytes = min(MOST_BLOB_BYTES, self._lease.resources.memory_limit_mb * MIB // MEMORY_PER_BLOB)
-        return self._cache.get(self._cache_key(digest), lambda: self._api.read_blob(digest, most_bytes))
+        data = self._cache.get(self._cache_key(digest), lambda: self._api.read_blob(digest, most_bytes))
+        if len(data) > most_bytes:  # another job with a higher memory limit has read it
+            raise BlobTooLarge(digest, len(data), most_bytes)
+        return data
 
     def _read_parts(self, places: Sequence[PartPlace]) -> list[bytes | None]:
         """Return encoded documents from the cache or the server, and None for a document that does not exist.

@@ -371,6 +371,21 @@ def test_a_file_that_is_too_large_for_the_memory_limit_is_not_downloaded(shared_
     assert read["result"] == {"bytes": len(small)}
 
 
+def test_a_file_that_is_too_large_is_refused_even_if_the_worker_has_it_in_its_cache(
+    shared_server: FakeServer,
+) -> None:
+    digest = digest_of(data := bytes(128 << 20) + b"again")
+    shared_server.blobs[digest] = data
+    read, failed = (
+        shared_server.ended(
+            shared_server.submit("misbehave", {"how": "read-blob", "blob": digest}, memory_limit_mb=limit_mb)
+        )
+        for limit_mb in (4096, 512)
+    )
+    assert read["result"] == {"bytes": len(data)}
+    assert failed["code"] == "file-too-large"
+
+
 def test_a_result_is_not_shared_if_something_could_not_be_read(shared_server: FakeServer) -> None:
     small, large, gone = b"small", bytes((128 << 20) + 1), b"gone"
     shared_server.blobs |= {digest_of(data): data for data in (small, large)}
