@@ -120,7 +120,9 @@ def _known_sources(
     """
     keys = sorted({one.cache_key for one in asking if one.cache_mode == "use"})
     projects = sorted({one.project_id for one in asking})
-    states = or_(job.c.state == QUEUED, job.c.state == RUNNING, and_(finished, job.c.state == "succeeded"))
+    states = or_(job.c.state == QUEUED, job.c.state == RUNNING)
+    if finished:
+        states = or_(states, job.c.state == "succeeded")
     succeeded: dict[tuple[str, str], list[SharedResult]] = {}
     under_way: dict[tuple[str, str], list[SharedResult]] = {}
     for some in in_lists(keys):
