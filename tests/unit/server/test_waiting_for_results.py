@@ -223,6 +223,16 @@ def test_jobs_that_waited_for_a_result_that_is_not_shared_compute_it(desk: Desk)
     assert {len(desk.outputs(job)) for job in waiting} == {1}
 
 
+def test_the_result_of_a_worker_with_another_version_of_the_kind_is_not_shared(desk: Desk) -> None:
+    submit(desk)
+    waiting = submit(desk)
+    desk.complete(desk.claim(), code_version="sum@0")
+    lease = desk.claim()
+    assert lease.job == waiting
+    desk.complete(lease, code_version="sum@1")
+    assert desk.job(submit(desk)).cached_from == waiting
+
+
 @pytest.mark.parametrize("shareable", [False, True])
 def test_a_result_gathered_from_tasks_is_shared_only_if_the_results_of_all_tasks_may_be(
     desk: Desk, shareable: bool

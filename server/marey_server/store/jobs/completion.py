@@ -8,6 +8,7 @@ from typing import Any
 
 from sqlalchemy import and_, bindparam, exists, select, tuple_, update
 
+from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
 from marey_schemas.queue.jobs import JobOutput, JobState
 from marey_schemas.queue.worker_protocol import (
     BatchCompletion,
@@ -173,10 +174,11 @@ def _keep_from_sharing(
 ) -> set[_Place]:
     """Remove the cache keys of jobs whose results must not be shared; return the attempts without a cache key.
 
-    These are the jobs for which the worker says so, and the parent jobs of such jobs.
+    These are the jobs for which the worker says so, the jobs of workers with another version of the kind, and the
+    parent jobs of such jobs.
     """
     unshared = {(row.id, row.fence) for row in won if row.cache_key is None}
-    barred = {(row.id, row.fence) for row in won if not requests[row.id, row.fence].shareable}
+    barred = {(row.id, row.fence) for row in won if not _may_share(row.kind, requests[row.id, row.fence])}
     if gathering := {row.id: (row.id, row.fence) for row in won if row.gathers}:
         of_tasks = select(job.c.parent_id).where(job.c.parent_id.in_(gathering), job.c.cache_key.is_(None)).distinct()
         barred |= {gathering[parent_id] for parent_id in tx.execute(of_tasks).scalars()}
@@ -184,6 +186,15 @@ def _keep_from_sharing(
         of_jobs = job.c.id.in_([job_id for job_id, _ in barred])
         tx.execute(update(job).where(of_jobs).values(cache_key=None))
     return unshared | barred
+
+
+def _may_share(kind_name: str, request: CompleteRequest) -> bool:
+    """Return whether a result may be shared, and was computed with the version of the kind that this server knows."""
+    try:
+        known = find_kind(kind_name).code_version
+    except UnknownKindError:  # an earlier version of the server accepted the job
+        return False
+    return request.shareable and request.code_version in (None, known)
 
 
 def _fail_unpublished(tx: Transaction, row: Any, failure: dict[str, Any]) -> tuple[Ended, CompleteAnswer]:
