@@ -79,6 +79,14 @@ def require_room(tx: Transaction, quota: str, more: int = 1) -> None:
     raise _exceeded("You have", quota, _RULES[quota].noun, used, limit, more, remedy)
 
 
+def room_of(tx: Transaction, quota: str, user_id: str) -> int:
+    """Return how many things of a kind a user may still add; concurrent writes may take the same room.
+
+    Unlike `require_room`, this concerns a user who is not the caller, and locks nothing.
+    """
+    return int(getattr(tx.quotas, quota) - tx.execute(_used(tx, quota, user_id)).scalar_one())
+
+
 def _exceeded(
     subject: str, quota: str, noun: str, used: int, limit: int, more: int, remedy: str
 ) -> QuotaExceededProblem:

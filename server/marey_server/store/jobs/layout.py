@@ -139,14 +139,20 @@ def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_c
     return sources
 
 
+def count_tasks(submission: Submission) -> int:
+    """Return the number of tasks into which a job is split; 0 for a job that is not split."""
+    count = len(_shares(submission))
+    return count if count > 1 else 0
+
+
 def _spread(head: NewJob) -> list[NewJob]:
     """Make a job with several tasks a parent job, and return its tasks, which start together with it.
 
     A job with one task is unchanged, and the result is empty.
     """
-    shares = _shares(head.submission)
-    if len(shares) < 2:
+    if not count_tasks(head.submission):
         return []
+    shares = _shares(head.submission)
     kind = head.submission.kind
     head.size, head.gathers = len(shares), kind.gathering is not None
     if kind.fan_out is not None:
