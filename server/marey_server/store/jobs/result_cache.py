@@ -248,6 +248,7 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
         select(*own, source.c.id.label("source_id"), *shared)
         .join(source, source.c.id == job.c.cached_from)
         .where(waits, AUTHOR_MAY_RUN, source.c.state == "succeeded", source.c.cache_key.is_not(None))
+        .with_for_update(read=True, of=source)  # so that its outputs are not released before they are read
     ).one_or_none()
     if row is None or not exports.may_share(tx, row.kind, row.inputs, row.result):
         return []
