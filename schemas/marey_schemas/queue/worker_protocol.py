@@ -179,7 +179,12 @@ class CompleteRequest(Request):
 
     write_id: str = Field(min_length=8, max_length=64)
     result: dict[str, Any] = Field(default_factory=dict)
-    code_version: str | None = Field(None, max_length=255)
+    code_version: str | None = Field(
+        None,
+        max_length=255,
+        description="Kind and version of the code that computed the result, such as `retarget@2`. Identical jobs share "
+        "the result only if the server has the same version of the kind.",
+    )
     environment: dict[str, str] = Field(default_factory=dict)
     shareable: bool = Field(
         True,
