@@ -19,8 +19,9 @@ from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ApiProblem, ConflictProblem, LeaseLostProblem
 from marey_server.store import leader
 from marey_server.store.database.connections import Database
-from marey_server.store.jobs import completion, fencing, logs, queue, reading, staging, submission
-from marey_server.store.jobs.reaper import reap_page
+from marey_server.store.jobs import completion, exports, fencing, logs, queue, reading, staging, submission
+from marey_server.store.jobs.reaper import reap_page, share_waiting
+from marey_server.store.jobs.result_cache import SHARED_AT_ONCE
 from marey_server.store.tables import attempt, event, job
 from marey_server.store.transaction import Transaction
 
@@ -181,6 +182,37 @@ def test_two_identical_jobs_submitted_at_once_are_computed_once(desk: Desk, othe
     )
     interleave(one, two)
     assert len(desk.claim_many()) == 1
+
+
+def test_a_result_that_is_released_while_it_is_shared_is_shared_whole_or_not_at_all(
+    desk: Desk, other: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk.things(1)
+    gate = desk.submit()
+    fields: dict[str, Any] = {"params": {"number": 2}, "inputs": {"things": {"collection": "raw"}}, "after": [gate]}
+    surveys = [desk.submit("survey", into=f"place{number}", **fields) for number in range(SHARED_AT_ONCE + 2)]
+    desk.complete(desk.claim(job=gate))
+    for number, lease in enumerate(desk.claim_many()):
+        desk.stage(lease, f"piece{number}")
+        desk.complete(lease)
+    (late,) = [one for one in surveys if desk.job(one).children == {"waiting": 2}]
+    gathering = next(lease for lease in desk.claim_many() if lease.job == surveys[0])
+    released = threading.Event()
+    may_share = exports.may_share
+
+    def may_share_after_release(*arguments: Any) -> bool:
+        released.wait(5)
+        return may_share(*arguments)
+
+    def complete(tx: Transaction) -> None:
+        completion.complete(tx, gathering.job, gathering.fence, CompleteRequest(write_id="write-one"))
+        tx.after_commit(released.set)
+
+    monkeypatch.setattr(exports, "may_share", may_share_after_release)
+    interleave(Step(desk.database, desk._attempt_of(gathering), complete), Step(other, SYSTEM, share_waiting))
+    tasks = desk.database.read(desk.user, reading.list_jobs, "lab", reading.JobFilters(parent=late)).items
+    ended = [task.id for task in tasks if task.state == "succeeded"]
+    assert [len(desk.outputs(task)) for task in ended] == [1] * len(ended)
 
 
 def test_the_last_two_tasks_end_at_once_and_the_whole_ends_once(desk: Desk, other: Database) -> None:

@@ -37,10 +37,10 @@ class ProjectInMemory(Context):
     told: list[Any] = field(default_factory=list)
     into: str = ""
 
-    def document(self, kind: Kind, item: str, revision: int, part: str) -> dict[str, Any]:
-        if (item, revision, part) not in self.parts:
+    def document(self, kind: Kind, item: str, revision: int, part: str, *, required: bool = True) -> Any:
+        if required and (item, revision, part) not in self.parts:
             raise NoSuchThing(f"{item} has no {part}", f"no-{kind}")
-        return self.parts[item, revision, part]
+        return self.parts.get((item, revision, part))
 
     def documents(self, pins: Iterable[PinnedInput], part: str, *, required: bool = True) -> Iterator[tuple[Any, ...]]:
         for pin in pins:

@@ -14,8 +14,6 @@ import time
 import uuid
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
-from enum import Enum
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from itertools import accumulate
@@ -33,16 +31,26 @@ from marey_client.errors import (
     ServerFailed,
     TooLarge,
 )
+from marey_schemas.encoding.codecs import CodecError
 from marey_schemas.items import PartPlace
 from marey_schemas.processes.child_process import BadMessage, ChildProcess
 from marey_schemas.queue.job_kinds import find_kind
-from marey_schemas.queue.worker_protocol import CompleteRequest, FailRequest, Lease
+from marey_schemas.queue.worker_protocol import (
+    LONGEST_CODE,
+    LONGEST_DETAIL,
+    LONGEST_SIGNATURE,
+    CompleteRequest,
+    FailRequest,
+    Lease,
+)
 from marey_schemas.sizes import MIB
 from marey_worker import faults, signatures
 from marey_worker.attempt_api import AttemptApi
+from marey_worker.attempt_limits import LogUploader, Stop, Watch
 from marey_worker.heartbeats import LeaseKeeper
 from marey_worker.job_io.input_cache import InputCache
 from marey_worker.messages import (
+    UNPACKABLE,
     ChildReply,
     Done,
     Failed,
@@ -59,14 +67,12 @@ from marey_worker.messages import (
     pack,
     unpack,
 )
+from marey_worker.texts import storable
 
-LOG_PIECE_BYTES = 256 << 10
 LIBRARIES = ("marey", "numpy", "scipy", "numba")
 log = logging.getLogger(__name__)
 WATCH_EVERY_S = 0.1
-WEIGH_EVERY_S = 0.5
 LOG_EVERY_S = 2.0
-LOG_LIMIT_BYTES = 64 * MIB
 ANSWER_LIMIT_BYTES = 32 * MIB
 MOST_BLOB_BYTES = 1 << 30
 """Greatest size of a blob that a job may read, because this process, whose memory has no limit, holds it in memory."""
@@ -75,38 +81,6 @@ _REFUSED = (Conflict, Forbidden, Invalid, NotFound, TooLarge)
 MEMORY_PER_BLOB = 4
 """Least ratio of a job's memory limit to the size of a blob; the child needs several times the size of a file."""
 TRANSFERS_AT_ONCE = 4
-
-
-class LogUploader:
-    """Upload of the file that contains the output of a job.
-
-    The attempt's log on the server is a prefix of this file. The server returns the length of the log, which is the
-    offset of the next bytes to send, even if earlier answers were lost.
-    """
-
-    def __init__(self, api: AttemptApi, path: Path) -> None:
-        self.path = path
-        self.path.touch(mode=0o600)
-        self._api = api
-        self._sent = 0
-        self._full = False
-        self._sending = threading.Lock()
-
-    @property
-    def size_bytes(self) -> int:
-        """The number of bytes that the job has printed so far."""
-        return self.path.stat().st_size
-
-    def send(self) -> None:
-        """Send new output unless the log on the server is full. Raises the client's errors and `OSError`."""
-        with self._sending, self.path.open("rb") as file:
-            while not self._full:
-                file.seek(self._sent)
-                piece = file.read(LOG_PIECE_BYTES)
-                if not piece:
-                    return
-                answer = self._api.append_log(self._sent, piece)
-                self._sent, self._full = answer.offset, answer.capped
 
 
 @cache
@@ -119,62 +93,6 @@ def environment() -> dict[str, str]:
         except PackageNotFoundError:
             found[library] = "absent"
     return found
-
-
-class Stop(Enum):
-    """Reason to stop an attempt."""
-
-    LEASE_LOST = "lease-lost"
-    CANCELLED = "cancelled"
-    INTERRUPTED = "interrupted"
-    TIME = "time-limit"
-    MEMORY = "memory-limit"
-    LOG = "log-limit"
-
-
-@dataclass
-class Watch:
-    """Limits of one attempt: lease, time and memory."""
-
-    lease: Lease
-    keeper: LeaseKeeper
-    stopping: threading.Event
-    job_log: LogUploader
-    started: float
-    weighed: float = 0.0
-
-    def verdict(self, child: ChildProcess | None) -> Stop | None:
-        """Return the reason to stop the attempt now, or None if there is none.
-
-        `child` is None after the child process has computed all results.
-        """
-        if self.keeper.lost.is_set():
-            return Stop.LEASE_LOST
-        if self.keeper.cancelled.is_set():
-            return Stop.CANCELLED
-        if self.stopping.is_set():
-            return Stop.INTERRUPTED
-        if time.monotonic() - self.started > self.lease.resources.time_limit_s:
-            return Stop.TIME
-        if child is not None and time.monotonic() - self.weighed > WEIGH_EVERY_S:
-            self.weighed = time.monotonic()
-            if child.resident_bytes > self.lease.resources.memory_limit_mb * MIB:
-                return Stop.MEMORY
-        if self.job_log.size_bytes > LOG_LIMIT_BYTES:
-            return Stop.LOG
-        return None
-
-    def explain(self, stop: Stop) -> str:
-        """Return the reason for stopping in words, with the limit that was exceeded."""
-        resources = self.lease.resources
-        return {
-            Stop.LEASE_LOST: "the lease was lost",
-            Stop.CANCELLED: "the job was cancelled",
-            Stop.INTERRUPTED: "the worker is being stopped",
-            Stop.TIME: f"the job ran longer than its time limit of {resources.time_limit_s} s",
-            Stop.MEMORY: f"the job needs more memory than its limit of {resources.memory_limit_mb} MiB",
-            Stop.LOG: f"the job's log grew beyond its limit of {LOG_LIMIT_BYTES // MIB} MiB",
-        }[stop]
 
 
 class RunningAttempt:
@@ -201,6 +119,8 @@ class RunningAttempt:
         self._watch = Watch(lease, self._keeper, stopping, self._job_log, time.monotonic())
         self._log_due = time.monotonic() + LOG_EVERY_S
         self._transfers = ThreadPoolExecutor(TRANSFERS_AT_ONCE, thread_name_prefix="marey-transfer")
+        self._log_sender = ThreadPoolExecutor(1, thread_name_prefix="marey-log")
+        self._log_sending: Future[None] | None = None
         self._staging: list[Future[ChildReply | None]] = []
 
     def run(self, child: ChildProcess) -> Done | Failed | Stop:
@@ -238,7 +158,8 @@ class RunningAttempt:
 
     def _close(self) -> None:
         self._keeper.stop()
-        self._transfers.shutdown(wait=False, cancel_futures=True)
+        for threads in (self._transfers, self._log_sender):
+            threads.shutdown(wait=False, cancel_futures=True)
         shutil.rmtree(self._scratch, ignore_errors=True)
 
     def _order(self) -> Run:
@@ -275,9 +196,13 @@ class RunningAttempt:
                 return stop
 
     def _check(self, child: ChildProcess | None) -> Stop | None:
-        """Send new output in a separate thread every `LOG_EVERY_S` seconds; return the reason to stop now, or None."""
-        if time.monotonic() > self._log_due:
-            self._transfers.submit(self._try_to_send_log)
+        """Send new output in a thread of its own every `LOG_EVERY_S` seconds; return the reason to stop now, or None.
+
+        While the server is away, one upload of the log waits for it, and delays neither inputs nor results.
+        """
+        sent = self._log_sending is None or self._log_sending.done()
+        if sent and time.monotonic() > self._log_due:
+            self._log_sending = self._log_sender.submit(self._try_to_send_log)
             self._log_due = time.monotonic() + LOG_EVERY_S
         return self._watch.verdict(child)
 
@@ -324,7 +249,10 @@ class RunningAttempt:
     def _read_blob(self, digest: str) -> bytes:
         """Return a blob from the cache or the server. Raises `BlobTooLarge` if the job's memory is too small for it."""
         most_bytes = min(MOST_BLOB_BYTES, self._lease.resources.memory_limit_mb * MIB // MEMORY_PER_BLOB)
-        return self._cache.get(self._cache_key(digest), lambda: self._api.read_blob(digest, most_bytes))
+        data = self._cache.get(self._cache_key(digest), lambda: self._api.read_blob(digest, most_bytes))
+        if len(data) > most_bytes:  # another job with a higher memory limit has read it
+            raise BlobTooLarge(digest, len(data), most_bytes)
+        return data
 
     def _read_parts(self, places: Sequence[PartPlace]) -> list[bytes | None]:
         """Return encoded documents from the cache or the server, and None for a document that does not exist.
@@ -383,6 +311,8 @@ class RunningAttempt:
                 raise
             except _REFUSED as error:  # such as a quota that is exceeded; to compute the results again would not help
                 end = Failed(error.code, f"the results cannot be published: {error}", None, retryable=False)
+            except CodecError as error:
+                end = Failed(signatures.BAD_RESULT, f"the result cannot be sent: {error}", None, retryable=False)
             except ServerFailed as error:
                 end = Failed(error.code, f"the results could not be published: {error}", None, retryable=True)
         if not isinstance(end, Done):
@@ -395,6 +325,7 @@ class RunningAttempt:
             result=done.result,
             code_version=find_kind(self._lease.kind).code_version,
             environment=environment(),
+            **({} if done.shareable else {"shareable": False}),  # servers of earlier versions do not know the field
         )
         faults.point("worker.before_complete")
         self._api.complete(request)
@@ -407,9 +338,13 @@ class RunningAttempt:
             code, detail, retryable = end.value, self._watch.explain(end), end is not Stop.LOG
             signature = end.value if end in (Stop.MEMORY, Stop.LOG) else None
         return FailRequest(
-            write_id=uuid.uuid4().hex, code=(code or "exception")[:128], detail=detail[-20_000:], signature=signature,
-            retryable=retryable, interrupted=end is Stop.INTERRUPTED,
-        )  # fmt: skip
+            write_id=uuid.uuid4().hex,
+            code=storable(code, LONGEST_CODE) or "exception",
+            detail=storable(detail, LONGEST_DETAIL),
+            signature=None if signature is None else storable(signature, LONGEST_SIGNATURE),
+            retryable=retryable,
+            interrupted=end is Stop.INTERRUPTED,
+        )
 
     def _try_to_send_log(self) -> None:
         """Send new output; if this fails, log the failure only, so that no result is lost because of it."""
@@ -433,6 +368,6 @@ def send_reply(child: ChildProcess, carried_out: Future[ChildReply | None]) -> N
         return
     try:
         data = pack(reply)
-    except (TypeError, ValueError, OverflowError) as error:  # the child waits for an answer, whatever happened
+    except UNPACKABLE as error:  # the child waits for an answer, whatever happened
         data = pack(ChildReply(reply.request, refusal=f"the answer cannot be sent to the child process: {error}"))
     child.send(data)

@@ -20,9 +20,11 @@ from pydantic_core import to_jsonable_python
 from marey_schemas.processes.child_process import READY, connect_to_parent
 from marey_schemas.processes.limits import allow_memory
 from marey_schemas.queue.job_kinds import KindDeclaration, find_kind
+from marey_schemas.queue.worker_protocol import LONGEST_CODE, LONGEST_DETAIL
 from marey_worker import signatures
 from marey_worker.context import Context, JobRefused, Unreadable
-from marey_worker.messages import Done, End, Failed, Run, pack, unpack
+from marey_worker.messages import UNPACKABLE, Done, End, Failed, Run, pack, unpack
+from marey_worker.texts import storable
 
 DETAIL_CHARACTERS = 1000
 
@@ -54,7 +56,7 @@ def main() -> None:
             os._exit(1)
         sys.stdout.flush()
         sys.stderr.flush()
-        pipe.send_bytes(pack(end))
+        pipe.send_bytes(_packed(end))
         garbage.collect()
 
 
@@ -94,25 +96,36 @@ def run_job(run: Run, pipe: Connection) -> End:
     try:
         result = to_jsonable_python(_perform(find_kind(run.kind), context, run))
     except JobRefused as error:
-        return Failed(error.code, error.detail, None, retryable=False)
+        return _failed(error.code, error.detail)
     except Unreadable as error:  # inputs are pinned: what is not there now will not be there at the next try
-        return Failed(error.code, str(error), None, retryable=False)
+        return _failed(error.code, str(error))
     except ValidationError as error:
-        return Failed("invalid-params", str(error), None, retryable=False)
+        return _failed("invalid-params", str(error))
     except MemoryError:
-        limit_mb = run.memory_limit_bytes >> 20
-        return Failed(
-            "memory-limit", f"the job needs more memory than its limit of {limit_mb} MiB", "memory-limit", True
-        )
+        detail = f"the job needs more memory than its limit of {run.memory_limit_bytes >> 20} MiB"
+        return _failed("memory-limit", detail, "memory-limit", retryable=True)
     except Exception as error:  # noqa: BLE001 - whatever a kind raises ends this job, not the process
         sys.stderr.write("".join(traceback.format_exception(error)))
         what = "".join(traceback.format_exception_only(error)).strip()[:DETAIL_CHARACTERS]
-        text = f"{what}; the job's log shows where"
         code = getattr(error, "code", "exception")
-        return Failed(code if isinstance(code, str) else "exception", text, signatures.of_exception(error), True)
+        code = code if isinstance(code, str) else "exception"
+        return _failed(code, f"{what}; the job's log shows where", signatures.of_exception(error), retryable=True)
     finally:
         allow_memory(None)
-    return Done(result)
+    return Done(result, context.shareable)
+
+
+def _packed(end: End) -> bytes:
+    """Encode the end of a job; a result that cannot be sent is a failure."""
+    try:
+        return pack(end)
+    except UNPACKABLE as error:
+        return pack(_failed(signatures.BAD_RESULT, f"the result cannot be sent: {error}"))
+
+
+def _failed(code: str, detail: str, signature: str | None = None, *, retryable: bool = False) -> Failed:
+    """Return the message that a job has failed, with texts that can be sent and stored."""
+    return Failed(storable(code, LONGEST_CODE), storable(detail, LONGEST_DETAIL), signature, retryable)
 
 
 def write_output_to(path: Path) -> None:

@@ -14,7 +14,7 @@ from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.items import Item, PartPlace
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.facets import ItemFacets
-from marey_schemas.queue.jobs import Progress
+from marey_schemas.queue.jobs import LONGEST_NOTE, Progress
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput, StageRequest
 from marey_worker.messages import (
     ChildReply,
@@ -31,6 +31,7 @@ from marey_worker.messages import (
     pack,
     unpack,
 )
+from marey_worker.texts import storable
 
 T = TypeVar("T")
 
@@ -93,7 +94,13 @@ class Context:
 
     All methods send requests to the supervisor. While the job computes, parts are read in advance and results are
     staged.
+
+    `shareable` says whether identical jobs may share the result. It becomes false when an object cannot be read: the
+    object may be restored, or an identical job may have a greater memory limit. The functions of a job kind set it to
+    false if the result depends on anything else besides the kind, parameters, seed and inputs of the job.
     """
+
+    shareable = True
 
     def __init__(self, run: Run, pipe: Connection) -> None:
         self.inputs: Mapping[str, tuple[PinnedInput, ...]] = run.inputs
@@ -108,11 +115,15 @@ class Context:
 
     # -- reading --
 
-    def document(self, kind: Kind, item: str, revision: int, part: str) -> Any:
-        """Return a part of a revision, with arrays as numpy arrays. Raises `NoSuchThing` if it does not exist."""
+    def document(self, kind: Kind, item: str, revision: int, part: str, *, required: bool = True) -> Any:
+        """Return a part of a revision, with arrays as numpy arrays.
+
+        If the part does not exist, raises `NoSuchThing`, or returns None if the part is not required.
+        """
         ((_, document),) = self._read_ahead([(None, PartPlace(kind=kind, item=item, revision=revision, part=part))])
-        if document is None:
-            raise NoSuchThing(f"The {kind} {item!r} has no part {part!r} at revision {revision}.", f"no-{kind}")
+        if document is None and required:
+            detail = f"The {kind} {item!r} has no part {part!r} at revision {revision}."
+            raise self._unreadable(NoSuchThing(detail, f"no-{kind}"))
         return document
 
     def documents(
@@ -126,7 +137,7 @@ class Context:
         for pin, (document,) in self.documents_of_each(pins, part):
             if document is None and required:
                 detail = f"There is no part {part!r} of {pin.kind} {pin.item!r} at revision {pin.revision}."
-                raise NoSuchThing(detail, f"no-{pin.kind}")
+                raise self._unreadable(NoSuchThing(detail, f"no-{pin.kind}"))
             yield pin, document
 
     def documents_of_each(
@@ -203,9 +214,9 @@ class Context:
         """Report that `done` of `total` units of work are finished, for example clips; may be called often.
 
         `total` is greater than 0, or None if it is unknown; then users see no percentage. `note` names the current
-        step in at most 500 characters.
+        step; a note of more than 500 characters is shortened.
         """
-        self._pipe.send_bytes(pack(Made(Progress(done=done, total=total, note=note))))
+        self._pipe.send_bytes(pack(Made(Progress(done=done, total=total, note=storable(note, LONGEST_NOTE)))))
 
     def log(self, text: str) -> None:
         """Write a line to the job's log; `print` does the same."""
@@ -256,9 +267,16 @@ class Context:
         reply = self._replies.pop(request)
         if reply.refusal is not None:
             if reply.too_large:
-                raise FileTooLarge(reply.refusal)
-            raise NoSuchThing(reply.refusal, missing) if reply.missing else RequestRefused(reply.refusal)
+                raise self._unreadable(FileTooLarge(reply.refusal))
+            if reply.missing:
+                raise self._unreadable(NoSuchThing(reply.refusal, missing))
+            raise RequestRefused(reply.refusal)
         return reply.value
+
+    def _unreadable(self, error: Unreadable) -> Unreadable:
+        """Note that the result depends on an object that cannot be read; return the error to raise."""
+        self.shareable = False
+        return error
 
 
 def encode_outputs(outputs: Sequence[StagedOutput]) -> bytes:

@@ -131,9 +131,13 @@ class Made:
 
 @dataclass(frozen=True)
 class Done:
-    """Message that the job has computed all its results; the last results may not be stored yet."""
+    """Message that the job has computed all its results; the last results may not be stored yet.
+
+    `shareable` is false if the results depend on more than the kind, parameters, seed and inputs of the job.
+    """
 
     result: dict[str, Any]
+    shareable: bool = True
 
 
 @dataclass(frozen=True)
@@ -157,8 +161,12 @@ _FORMS = {
 }  # fmt: skip
 
 
+UNPACKABLE = (TypeError, ValueError, OverflowError)
+"""Errors of `pack`, for example for an integer of more than 64 bits."""
+
+
 def pack(message: Any) -> bytes:
-    """Encode a message. Raises `TypeError`, `ValueError` or `OverflowError` for values that cannot be encoded."""
+    """Encode a message. Raises one of the errors `UNPACKABLE` for values that cannot be encoded."""
     name = type(message).__name__
     fields = _FORMS[name].dump_python(message, by_alias=True)
     packed: bytes = msgpack.packb([name, fields], default=_plain)

@@ -9,8 +9,14 @@ import hashlib
 import signal
 import traceback
 
+NAME_CHARACTERS = 200
+"""Greatest number of characters of the name of an exception class; the digest concerns the whole name."""
+
 STAGING = "staging"
 """Signature of the failure that the server did not store results."""
+
+BAD_RESULT = "bad-result"
+"""Code of the failure that a result contains a value that no request can contain, such as a NaN."""
 
 
 def of_exception(error: BaseException) -> str:
@@ -18,7 +24,7 @@ def of_exception(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     places = [f"{frame.filename.rpartition('/')[2]}:{frame.name}:{frame.lineno}" for frame in frames]
     digest = hashlib.sha256("\n".join([type(error).__qualname__, *places]).encode()).hexdigest()
-    return f"exception:{type(error).__name__}:{digest[:16]}"
+    return f"exception:{type(error).__name__[:NAME_CHARACTERS]}:{digest[:16]}"
 
 
 def of_exit(status: int) -> str:

@@ -22,8 +22,9 @@ from marey_schemas.processes.child_process import ChildBroken, ChildProcess
 from marey_schemas.queue.job_kinds import job_kinds
 from marey_schemas.queue.worker_protocol import ClaimRequest, Lease
 from marey_worker import faults
-from marey_worker.attempt import RunningAttempt, Stop
+from marey_worker.attempt import RunningAttempt
 from marey_worker.attempt_api import AttemptApi, claim
+from marey_worker.attempt_limits import Stop
 from marey_worker.job_io.input_cache import InputCache
 from marey_worker.messages import Done, Failed
 

@@ -131,15 +131,16 @@ class _Import:
             require_receivable(digest, len(changes[digest]))
         for digest in known & changes.keys():
             self._note(put[digest])
+        head = self.archive.manifest.commit
         for done, (digest, record) in enumerate(history):
             self.on_progress("sending versions", done, len(history))
             if digest not in known:
                 self._ensure(put[digest])
-                self._send_commit(record, changes[digest], None)
-        self._add_facets()
-        head = self.archive.manifest.commit
-        if begins is not None:
-            self._send_commit(self.archive.commit(head), changes[head], begins)
+            if digest == head:
+                self._add_facets()
+            begun = begins if digest == head else None
+            if digest not in known or begun is not None:
+                self._send_commit(record, changes[digest], begun)
         return self.dataset.at(head)
 
     def _known(self, history: list[tuple[str, CommitRecord]]) -> set[str]:

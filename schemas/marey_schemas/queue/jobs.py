@@ -163,12 +163,16 @@ class JobCreate(Request):
     )
 
 
+LONGEST_NOTE = 500
+"""Greatest number of characters of a note on progress."""
+
+
 class Progress(Request):
     """Progress of an attempt."""
 
-    done: float = Field(ge=0)
-    total: float | None = Field(None, gt=0)
-    note: str = Field("", max_length=500)
+    done: float = Field(ge=0, allow_inf_nan=False)
+    total: float | None = Field(None, gt=0, allow_inf_nan=False)
+    note: str = Field("", max_length=LONGEST_NOTE)
 
 
 class JobFailure(Answer):

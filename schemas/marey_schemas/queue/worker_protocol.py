@@ -16,6 +16,11 @@ from marey_schemas.queue.jobs import ItemInput, JobOutput, JobState, Progress, R
 FAULT_VARIABLE = "MAREY_FAULT"
 """Environment variable with which tests make a server or worker fail at a named point."""
 
+LONGEST_CODE = 128
+LONGEST_DETAIL = 20_000
+LONGEST_SIGNATURE = 255
+"""Greatest numbers of characters of the texts of a `FailRequest`."""
+
 PROTOCOL_VERSION = 1
 """Version of the worker protocol; sent with every claim."""
 
@@ -174,19 +179,29 @@ class CompleteRequest(Request):
 
     write_id: str = Field(min_length=8, max_length=64)
     result: dict[str, Any] = Field(default_factory=dict)
-    code_version: str | None = Field(None, max_length=255)
+    code_version: str | None = Field(
+        None,
+        max_length=255,
+        description="Kind and version of the code that computed the result, such as `retarget@2`. Identical jobs share "
+        "the result only if the server has the same version of the kind.",
+    )
     environment: dict[str, str] = Field(default_factory=dict)
+    shareable: bool = Field(
+        True,
+        description="Whether identical jobs may share the result. False if the result depends on more than the kind, "
+        "parameters, seed and inputs of the job, for example on a file that could not be read.",
+    )
 
 
 class FailRequest(Request):
     """Report of a failed attempt."""
 
     write_id: str = Field(min_length=8, max_length=64)
-    code: str = Field(min_length=1, max_length=128)
-    detail: str = Field("", max_length=20_000)
+    code: str = Field(min_length=1, max_length=LONGEST_CODE)
+    detail: str = Field("", max_length=LONGEST_DETAIL)
     signature: str | None = Field(
         None,
-        max_length=255,
+        max_length=LONGEST_SIGNATURE,
         description="Signature of the failure; a job is not retried after two attempts with the same signature.",
     )
     retryable: bool = True

@@ -36,6 +36,11 @@ def keys_within(labels: Mapping[str, str]) -> list[str]:
     return [",".join(subset) for size in range(len(pairs) + 1) for subset in combinations(pairs, size)]
 
 
+def is_within(key: str, other: str) -> bool:
+    """Return whether the labels of one key are among those of another, so that the same workers satisfy them."""
+    return key == "" or set(key.split(",")) <= set(other.split(","))
+
+
 def first_outside(labels: Mapping[str, str], allowed: Mapping[str, str] | None) -> str | None:
     """Return the first label that is not allowed, as `name=value`, or None if all are allowed.
 

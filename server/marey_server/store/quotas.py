@@ -90,6 +90,14 @@ def _remedy(tx: Transaction, quota: str, user_id: str) -> str:
     return _RULES[quota].remedy.format(oldest=oldest)
 
 
+def room_of(tx: Transaction, quota: str, user_id: str) -> int:
+    """Return how many things of a kind a user may still add; concurrent writes may take the same room.
+
+    Unlike `require_room`, this concerns a user who is not the caller, and locks nothing.
+    """
+    return int(getattr(tx.quotas, quota) - tx.execute(_used(tx, quota, user_id)).scalar_one())
+
+
 def _exceeded(
     subject: str, quota: str, noun: str, used: int, limit: int, more: int, remedy: str
 ) -> QuotaExceededProblem:

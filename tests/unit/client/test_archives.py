@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -11,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import httpx
 import pytest
 
 from marey_client.archives import receiving
@@ -215,6 +217,32 @@ def test_a_commit_that_no_server_receives_is_archived_but_not_imported(tmp_path:
         pytest.raises(LargeCommit, match=f"{large.digest} changes 2 .* 1"),
     ):
         send_versions(receiver, Archive(file), ignore_progress)
+
+
+@pytest.mark.parametrize("branch", [None, "main"])
+@pytest.mark.parametrize("known", [1, 2])
+def test_each_commit_is_sent_once_and_the_newest_with_the_branch_that_begins_with_it(
+    tmp_path: Path, known: int, branch: str | None
+) -> None:
+    dataset = ListedDataset([entry("a"), entry("b")], [entry("a")])
+    written(dataset, tmp_path / "gaits.tar")
+    sent: list[Any] = []
+
+    def send(method: str, url: str, *, content: bytes) -> httpx.Response:
+        sent.append(json.loads(content))
+        return httpx.Response(201, content=dataset.commits[-1].model_dump_json())
+
+    receiver = SimpleNamespace(
+        has=[one.digest for one in dataset.commits[:known]].__contains__,
+        at=dataset.at,
+        url="/gaits",
+        transport=SimpleNamespace(send=send),
+    )
+    with (tmp_path / "gaits.tar").open("rb") as file:
+        send_versions(cast(ReceivingDataset, receiver), Archive(file), ignore_progress, begins=branch)
+    expected = [] if known == 2 and branch is None else [branch]
+    assert [one.get("begins") for one in sent] == expected
+    assert all(len(one["changes"]) == 1 for one in sent)
 
 
 @pytest.mark.usefixtures("one_change_is_received", "transfers")

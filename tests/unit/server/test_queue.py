@@ -401,6 +401,18 @@ def test_many_jobs_are_claimed_and_completed_at_once_each_with_its_own_answer(de
     assert desk.database.write(desk.user, completion.complete_many, asked) == results
 
 
+def test_of_two_completions_of_a_job_in_one_batch_only_the_first_is_accepted(desk: Desk) -> None:
+    desk.submit()
+    lease = desk.claim()
+    first, same, other = (
+        BatchCompletion(job=lease.job, fence=lease.fence, write_id=write_id, result={"number": number})
+        for write_id, number in (("write-one", 1), ("write-one", 1), ("write-two", 2))
+    )
+    results = desk.database.write(desk.user, completion.complete_many, [first, same, other])
+    assert [one.code for one in results] == [None, None, "lease-lost"]
+    assert desk.job(lease.job).result == {"number": 1, "outputs": 0}
+
+
 def test_many_completions_find_their_attempts_by_index(desk: Desk) -> None:
     if not desk.database.is_sqlite:
         return  # Postgres chooses a plan by the sizes of tables, and small ones it reads whole

@@ -126,6 +126,26 @@ def test_unfinished_jobs_and_their_tasks_count_until_they_end(desk: Desk) -> Non
     desk.submit()
 
 
+def test_tasks_of_a_job_that_gets_its_inputs_later_count_as_well(desk: Desk) -> None:
+    desk.database.quotas = Quotas(user_jobs=7)
+    maker = desk.submit("sum")
+    late = desk.submit_many(
+        *(JobCreate(kind="square", inputs={"things": {"job": maker}}, into=f"{n}") for n in range(3))
+    )
+    lease = desk.claim()
+    desk.stage(lease, *(f"thing{number}" for number in range(4)))
+    desk.complete(lease)  # each of the three jobs needs two tasks, but there is room for four
+    states = [desk.state(job) for job in late]
+    assert sorted(states) == ["failed", "running", "running"]
+    failure = desk.job(late[states.index("failed")]).failure
+    assert failure is not None
+    assert (failure.code, failure.detail) == (
+        "quota-exceeded",
+        "The job would have 2 tasks, but its author may have only 0 more unfinished jobs (quota `user_jobs`). Retry "
+        "the job when some have ended.",
+    )
+
+
 def test_new_bytes_are_limited_per_day_and_become_free_with_time(lab: Lab, clock: AdjustableClock) -> None:
     lab.database.quotas = Quotas(user_daily_bytes=1000)
     lab.write(blobs.put_blob, b"a" * 600)

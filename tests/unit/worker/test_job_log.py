@@ -7,9 +7,9 @@ import pytest
 
 from marey_client.errors import Unreachable
 from marey_schemas.queue.worker_protocol import LogAnswer
-from marey_worker import attempt
-from marey_worker.attempt import LogUploader
+from marey_worker import attempt_limits
 from marey_worker.attempt_api import AttemptApi
+from marey_worker.attempt_limits import LogUploader
 
 ARRIVES, NEVER_ARRIVES, ANSWER_IS_LOST = "arrives", "never arrives", "answer is lost"
 
@@ -37,7 +37,7 @@ class Api:
 
 @pytest.fixture
 def api(monkeypatch: pytest.MonkeyPatch) -> Api:
-    monkeypatch.setattr(attempt, "LOG_PIECE_BYTES", 10)
+    monkeypatch.setattr(attempt_limits, "LOG_PIECE_BYTES", 10)
     return Api()
 
 

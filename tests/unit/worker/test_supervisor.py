@@ -12,6 +12,8 @@ from tests.support.fake_server import FakeServer
 
 from marey_client.blobs import digest_of
 from marey_client.credentials import write_private
+from marey_schemas.queue.jobs import Progress
+from marey_schemas.queue.worker_protocol import FailRequest
 
 
 def alive(pid: int) -> bool:
@@ -166,6 +168,36 @@ def test_each_way_to_fail_is_told_apart_and_the_worker_goes_on(
     assert (failed["code"], failed["retryable"], failed["interrupted"]) == (code, retryable, False)
     assert detail in failed["detail"]
     assert shared_server.ended(shared_server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
+
+
+@pytest.mark.parametrize(("how", "code"), [("raise-oddly", "exception"), ("refuse-oddly", f"{('odd' * 100)[:127]}…")])
+def test_a_failure_is_reported_however_long_or_odd_its_texts_are(
+    shared_server: FakeServer, how: str, code: str
+) -> None:
+    job = shared_server.submit("misbehave", {"how": how})
+    after = shared_server.submit("add", {"a": 1, "b": 1})
+    failed = FailRequest.model_validate(shared_server.ended(job))
+    assert failed.code == code
+    assert "a\\x00b\\udc80c" in failed.detail
+    assert shared_server.ended(after)["result"]["sum"] == 2
+
+
+def test_progress_is_reported_however_long_or_odd_its_note_is(shared_server: FakeServer) -> None:
+    job = shared_server.submit("misbehave", {"how": "report-oddly"}, heartbeat_s=0.3)
+    assert shared_server.ended(job)["result"] == {"reported": True}
+    (progress, *_) = filter(None, shared_server.heartbeats[job])
+    assert Progress.model_validate(progress).note.startswith("a\\x00b\\udc80ca")
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", str(1 << 63), str(1 << 64), "half a character"])
+def test_a_result_that_no_request_can_contain_fails_its_job_and_not_the_worker(
+    shared_server: FakeServer, number: str
+) -> None:
+    job = shared_server.submit("misbehave", {"how": "answer-oddly", "blob": number})
+    after = shared_server.submit("add", {"a": 1, "b": 1})
+    failed = shared_server.ended(job)
+    assert (failed["code"], failed["retryable"]) == ("bad-result", False)
+    assert shared_server.ended(after)["result"]["sum"] == 2
 
 
 @pytest.mark.slow
@@ -337,6 +369,37 @@ def test_a_file_that_is_too_large_for_the_memory_limit_is_not_downloaded(shared_
     assert (failed["code"], failed["retryable"]) == ("file-too-large", False)
     assert all(told in failed["detail"] for told in (digest_of(large), str(len(large)), "memory_limit_mb"))
     assert read["result"] == {"bytes": len(small)}
+
+
+def test_a_file_that_is_too_large_is_refused_even_if_the_worker_has_it_in_its_cache(
+    shared_server: FakeServer,
+) -> None:
+    digest = digest_of(data := bytes(128 << 20) + b"again")
+    shared_server.blobs[digest] = data
+    read, failed = (
+        shared_server.ended(
+            shared_server.submit("misbehave", {"how": "read-blob", "blob": digest}, memory_limit_mb=limit_mb)
+        )
+        for limit_mb in (4096, 512)
+    )
+    assert read["result"] == {"bytes": len(data)}
+    assert failed["code"] == "file-too-large"
+
+
+def test_a_result_is_not_shared_if_something_could_not_be_read(shared_server: FakeServer) -> None:
+    small, large, gone = b"small", bytes((128 << 20) + 1), b"gone"
+    shared_server.blobs |= {digest_of(data): data for data in (small, large)}
+
+    def end(how: str = "do-without", **params: str) -> tuple[str, bool]:
+        job = shared_server.submit("misbehave", {"how": how, **params}, memory_limit_mb=512)
+        report = shared_server.ended(job)
+        return report["result"].get("lacks", ""), report.get("shareable", True)
+
+    assert end() == ("no-skeleton", False)
+    assert end(blob=digest_of(gone)) == ("no-blob", False)
+    assert end(blob=digest_of(large)) == ("file-too-large", False)
+    assert end(blob=digest_of(small)) == ("", True)
+    assert end("have-no-mapping") == ("", True)
 
 
 @pytest.mark.slow

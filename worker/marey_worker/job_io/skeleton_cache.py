@@ -13,7 +13,7 @@ from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
-from marey_worker.context import Context, NoSuchThing
+from marey_worker.context import Context
 
 MOST_KEPT = 512
 
@@ -65,9 +65,8 @@ def plan_between(context: Context, source: Rig, target: Rig, scale: float | None
 def _read(context: Context, rig: Rig) -> Rigged:
     hierarchy = context.document(Kind.SKELETON, rig.skeleton.item, rig.skeleton.revision, "hierarchy")
     skeleton = documents.skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
-    try:
-        stored = context.document(Kind.SKELETON, rig.mapping.item, rig.mapping.revision, "mapping")
-    except NoSuchThing:
+    stored = context.document(Kind.SKELETON, rig.mapping.item, rig.mapping.revision, "mapping", required=False)
+    if stored is None:
         mapping = require_trust(map_joints(skeleton))
         return Rigged(skeleton, mapping, guess_axes(skeleton, mapping))
     mapping, axes = documents.mapping_from_document(SkeletonMapping.model_validate(stored), skeleton)

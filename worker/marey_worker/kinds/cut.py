@@ -22,7 +22,7 @@ from marey_schemas.queue.job_params import CutParams
 from marey_schemas.queue.jobs import ItemInput
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_schemas.wording import counted
-from marey_worker.context import Context, JobRefused, NoSuchThing
+from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import ResultPlaces
 from marey_worker.job_io.staged_results import StagedResults
@@ -195,9 +195,8 @@ class _Cutting:
 
     def _info(self, clip: RevisionRef) -> ClipInfo:
         """Return the part `info` of the clip without its checks, which do not apply to the pieces."""
-        try:
-            stored = self._context.document(Kind.CLIP, clip.item, clip.revision, "info")
-        except NoSuchThing:
+        stored = self._context.document(Kind.CLIP, clip.item, clip.revision, "info", required=False)
+        if stored is None:
             return ClipInfo()
         return ClipInfo.model_validate(stored).model_copy(update={"checks": ()})
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from sqlalchemy import and_, bindparam, exists, select, tuple_, update
 
+from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
 from marey_schemas.queue.jobs import JobOutput, JobState
 from marey_schemas.queue.worker_protocol import (
     BatchCompletion,
@@ -80,7 +81,7 @@ def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> li
             refused[place] = error
     propagate_ends(tx, [end for end, _ in ended.values()])
     _pass_fault_points(tx)
-    answers = {place: answer for place, (_, answer) in ended.items()}
+    answers = {(place, requests[place].write_id): answer for place, (_, answer) in ended.items()}
     return [_result(tx, one, answers, refused, own) for one in completions]
 
 
@@ -146,7 +147,7 @@ def _complete(
     if done:
         _record(tx, records)
         failed = {place for place, (end, _) in done.items() if not end.succeeded}
-        unshared = {(row.id, row.fence) for row in won if row.cache_key is None or (row.id, row.fence) in failed}
+        unshared = failed | _keep_from_sharing(tx, won, requests)
         unshared &= staged.keys()
         if unshared:
             staging.drop_staged(tx, unshared)
@@ -167,6 +168,34 @@ def _complete(
             ],
         )
     return done
+
+
+def _keep_from_sharing(
+    tx: Transaction, won: Collection[Any], requests: Mapping[_Place, CompleteRequest]
+) -> set[_Place]:
+    """Remove the cache keys of jobs whose results must not be shared; return the attempts without a cache key.
+
+    These are the jobs for which the worker says so, the jobs of workers with another version of the kind, and the
+    parent jobs of such jobs.
+    """
+    unshared = {(row.id, row.fence) for row in won if row.cache_key is None}
+    barred = {(row.id, row.fence) for row in won if not _may_share(row.kind, requests[row.id, row.fence])}
+    if gathering := {row.id: (row.id, row.fence) for row in won if row.gathers}:
+        of_tasks = select(job.c.parent_id).where(job.c.parent_id.in_(gathering), job.c.cache_key.is_(None)).distinct()
+        barred |= {gathering[parent_id] for parent_id in tx.execute(of_tasks).scalars()}
+    if barred - unshared:
+        of_jobs = job.c.id.in_([job_id for job_id, _ in barred])
+        tx.execute(update(job).where(of_jobs).values(cache_key=None))
+    return unshared | barred
+
+
+def _may_share(kind_name: str, request: CompleteRequest) -> bool:
+    """Return whether a result may be shared, and was computed with the version of the kind that this server knows."""
+    try:
+        known = find_kind(kind_name).code_version
+    except UnknownKindError:  # an earlier version of the server accepted the job
+        return False
+    return request.shareable and request.code_version in (None, known)
 
 
 def _fail_unpublished(tx: Transaction, row: Any, failure: dict[str, Any]) -> tuple[Ended, CompleteAnswer]:
@@ -253,7 +282,7 @@ def _staged(tx: Transaction, places: Collection[_Place]) -> set[_Place]:
 def _result(
     tx: Transaction,
     one: BatchCompletion,
-    answers: Mapping[_Place, CompleteAnswer],
+    answers: Mapping[tuple[_Place, str], CompleteAnswer],
     refused: Mapping[_Place, ApiProblem],
     own: Collection[_Place],
 ) -> BatchCompletionResult:
@@ -263,7 +292,7 @@ def _result(
             raise NotFoundProblem(f"You have not claimed attempt {one.fence} of the job {one.job}.")
         if place in refused:
             raise refused[place]
-        answer = answers.get(place) or _same_answer(tx, place, one.write_id)
+        answer = answers.get((place, one.write_id)) or _same_answer(tx, place, one.write_id)
     except ApiProblem as error:
         return BatchCompletionResult(job=one.job, fence=one.fence, code=error.error_code, detail=error.detail)
     return BatchCompletionResult(job=one.job, fence=one.fence, answer=answer)

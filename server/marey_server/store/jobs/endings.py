@@ -9,11 +9,10 @@ from typing import Any
 from sqlalchemy import ColumnElement, Row, bindparam, update
 
 from marey_schemas.queue.jobs import FailureReason, JobFailure
+from marey_schemas.queue.worker_protocol import LONGEST_DETAIL
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.tables import attempt, job
 from marey_server.store.transaction import Transaction
-
-LONGEST_DETAIL = 20_000
 
 
 @dataclass(frozen=True, slots=True)

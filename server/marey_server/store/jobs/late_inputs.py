@@ -17,6 +17,7 @@ from marey_schemas.queue.job_kinds import KindDeclaration, UnknownKindError, fin
 from marey_schemas.queue.jobs import FailureReason, InputSpec
 from marey_schemas.wording import without_prefix
 from marey_server import faults
+from marey_server.errors import QuotaExceededProblem
 from marey_server.store.jobs import commits, layout, result_cache
 from marey_server.store.jobs.endings import Ended, end_jobs, failure_document
 from marey_server.store.jobs.events import emit_job_events, wake_workers
@@ -24,6 +25,7 @@ from marey_server.store.jobs.fencing import WAITING
 from marey_server.store.jobs.inputs import MOST_INPUTS, Pin, PinnedInputs, items_by_id, pin, record_named_items
 from marey_server.store.jobs.layout import NewJob, Submission
 from marey_server.store.jobs.result_places import find_clash
+from marey_server.store.quotas import room_of
 from marey_server.store.tables import job
 from marey_server.store.transaction import Transaction, in_lists
 
@@ -46,9 +48,12 @@ def pin_late_inputs(tx: Transaction, ids: Sequence[str]) -> list[Ended]:
         return []
     heads: list[NewJob] = []
     ended: list[Ended] = []
+    room: dict[str, int] = {}
     for row in _ready_for_inputs(tx, ids):
         try:
-            heads.append(_with_late_inputs(tx, row))
+            head = _with_late_inputs(tx, row)
+            _take_room(tx, head.submission, room)
+            heads.append(head)
         except LateInputError as error:
             failure = failure_document(FailureReason.ERROR, error.code, str(error))
             ended += end_jobs(tx, and_(job.c.id == row.id, job.c.state == WAITING), "failed", failure=failure)
@@ -103,6 +108,25 @@ def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
         commit_to=commits.with_new_base(tx, row.commit_to),
     )
     return NewJob(row.id, row.project_id, submission, pins)
+
+
+def _take_room(tx: Transaction, submission: Submission, room: dict[str, int]) -> None:
+    """Count the tasks of a job against the quota of its author; `room` holds what is left for each author.
+
+    Raises `LateInputError` if the quota would be exceeded.
+    """
+    tasks, author_id = layout.count_tasks(submission), submission.author_id
+    if not tasks or author_id is None:
+        return
+    if author_id not in room:
+        room[author_id] = room_of(tx, "user_jobs", author_id)
+    if tasks > room[author_id]:
+        detail = (
+            f"The job would have {tasks} tasks, but its author may have only {max(0, room[author_id])} more unfinished "
+            "jobs (quota `user_jobs`). Retry the job when some have ended."
+        )
+        raise LateInputError(QuotaExceededProblem.code, detail)
+    room[author_id] -= tasks
 
 
 def _write(tx: Transaction, heads: Sequence[NewJob], tasks: Sequence[NewJob]) -> None:

@@ -1,13 +1,22 @@
-"""Rows for checked submissions: one job, or a parent job with its tasks."""
+"""Rows for checked submissions: one job, or a parent job with its tasks; and the cache keys of jobs.
+
+Jobs with the same cache key are identical: kind, version of the kind, parameters, seed and inputs are equal. Inputs are
+equal if the item, its name, its path, and the content of the documents that the kind reads are equal, because results
+are named after inputs and refer to them. A kind can also require that the collection of the results is equal, or the
+newest revision of an item that the parameters name. Jobs whose result depends on data that is read while they run have
+no cache key.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import hashlib
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from sqlalchemy import Row
+from sqlalchemy import Row, select
 
+from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.jobs import JobCreate, Resources, commits_of
 from marey_schemas.sizes import batched
@@ -15,8 +24,9 @@ from marey_server.store.ids import new_id
 from marey_server.store.jobs import result_cache
 from marey_server.store.jobs.commits import Target
 from marey_server.store.jobs.endings import Ended
-from marey_server.store.jobs.inputs import NamingJob, PinnedInputs, items_by_id
-from marey_server.store.transaction import Transaction
+from marey_server.store.jobs.inputs import NamingJob, Pin, PinnedInputs, items_by_id
+from marey_server.store.tables import revision_part
+from marey_server.store.transaction import Transaction, in_lists
 
 
 @dataclass(frozen=True)
@@ -60,6 +70,21 @@ class NewJob:
     def cache_mode(self) -> str:
         """The setting of the request that says whether a cached result may be used."""
         return self.submission.request.cache
+
+    @property
+    def labels_key(self) -> str:
+        """The labels that a worker must have."""
+        return self.submission.labels_key
+
+    @property
+    def priority(self) -> int:
+        """The priority of the job in the queue."""
+        return self.submission.request.priority
+
+    @property
+    def concurrency_key(self) -> str | None:
+        """The key of the request; jobs with the same key run one after the other."""
+        return self.submission.request.concurrency_key
 
     @property
     def unbound(self) -> bool:
@@ -114,14 +139,20 @@ def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_c
     return sources
 
 
+def count_tasks(submission: Submission) -> int:
+    """Return the number of tasks into which a job is split; 0 for a job that is not split."""
+    count = len(_shares(submission))
+    return count if count > 1 else 0
+
+
 def _spread(head: NewJob) -> list[NewJob]:
     """Make a job with several tasks a parent job, and return its tasks, which start together with it.
 
     A job with one task is unchanged, and the result is empty.
     """
-    shares = _shares(head.submission)
-    if len(shares) < 2:
+    if not count_tasks(head.submission):
         return []
+    shares = _shares(head.submission)
     kind = head.submission.kind
     head.size, head.gathers = len(shares), kind.gathering is not None
     if kind.fan_out is not None:
@@ -144,43 +175,6 @@ def _shares(submission: Submission) -> list[PinnedInputs]:
         return [submission.pins] * submission.task_count
     pins, size = submission.pins.get(fanned, []), submission.kind.batch_size
     return [{**submission.pins, fanned: some} for some in batched(pins, size)]
-
-
-def _set_cache_keys(tx: Transaction, jobs: Sequence[NewJob]) -> None:
-    cached = [one for one in jobs if one.cache_mode != "off" and _has_key(one.submission)]
-    parts = result_cache.part_digests(tx, {id(one.submission): one.submission.pins for one in cached}.values())
-    newest = _newest_revisions(tx, cached)
-    for one in cached:
-        submission = one.submission
-        contents = result_cache.input_contents(submission.kind, one.pins, parts)
-        task = None if one.parent_id is None or submission.kind.fan_out else (one.position, submission.task_count)
-        one.cache_key = result_cache.cache_key(
-            submission.kind,
-            submission.params,
-            submission.request.seed,
-            contents,
-            task,
-            into=submission.request.into,
-            newest=newest,
-        )
-
-
-def _has_key(submission: Submission) -> bool:
-    given = [name for name, pins in submission.pins.items() if pins]
-    return result_cache.has_key(submission.kind, submission.params, given)
-
-
-def _newest_revisions(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, int]:
-    """Return, by item id, the number of the newest revision of each item that parameters of jobs name.
-
-    Items that are not in the project are omitted.
-    """
-    wanted: dict[str, set[str]] = {}
-    for one in jobs:
-        named = result_cache.named_items(one.submission.kind, one.submission.params)
-        wanted.setdefault(one.project_id, set()).update(named)
-    found = (items_by_id(tx, project_id, ids) for project_id, ids in wanted.items())
-    return {item: one.head for items in found for item, one in items.items()}
 
 
 def new_row(tx: Transaction, one: NewJob) -> dict[str, Any]:
@@ -232,3 +226,89 @@ def layout_columns(tx: Transaction, one: NewJob) -> dict[str, Any]:
 def naming(one: NewJob) -> NamingJob:
     """Return a new job as a `NamingJob`, with the inputs and parameters that may name items."""
     return NamingJob(one.id, one.pins, {} if one.parent_id is not None else one.submission.params)
+
+
+# -- cache keys -------------------------------------------------------------------------------------------------------
+
+
+def _set_cache_keys(tx: Transaction, jobs: Sequence[NewJob]) -> None:
+    cached = [one for one in jobs if one.cache_mode != "off" and _has_key(one.submission)]
+    parts = _part_digests(tx, {id(one.submission): one.submission.pins for one in cached}.values())
+    newest = _newest_revisions(tx, cached)
+    for one in cached:
+        one.cache_key = _cache_key(one, parts, newest)
+
+
+def _has_key(submission: Submission) -> bool:
+    """Return whether a job has a cache key.
+
+    A job has a cache key if its result depends only on the values from which the key is computed.
+    """
+    kind, params = submission.kind, submission.params
+    given = {name for name, pins in submission.pins.items() if pins}
+    in_place = kind.in_place is not None and params.get(kind.in_place)
+    by_names = not set(kind.never_cached_without) <= given
+    if kind.never_cached_for is not None:
+        by_names = by_names or kind.never_cached_for(params)
+    return kind.deterministic and not in_place and not by_names
+
+
+def _cache_key(one: NewJob, parts: Mapping[tuple[str, int], dict[str, str]], newest: Mapping[str, int]) -> str:
+    """Return the digest that identifies a computation.
+
+    `parts` is the result of `_part_digests`; `newest` holds the newest revisions of `_named_items`.
+    """
+    submission, kind, params = one.submission, one.submission.kind, one.submission.params
+    inputs = _input_contents(kind, one.pins, parts)
+    tree = {"kind": kind.code_version, "params": params, "seed": submission.request.seed, "inputs": inputs}
+    if one.parent_id is not None and kind.fan_out is None:
+        tree["task"] = (one.position, submission.task_count)
+    if kind.place_counts:
+        tree["into"] = submission.request.into
+    if kind.newest_of:
+        tree["newest"] = [[item, newest.get(item)] for item in _named_items(kind, params)]
+    return f"sha256:{hashlib.sha256(canonical_json(tree)).hexdigest()}"
+
+
+def _newest_revisions(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, int]:
+    """Return, by item id, the number of the newest revision of each item that parameters of jobs name.
+
+    Items that are not in the project are omitted.
+    """
+    wanted: dict[str, set[str]] = {}
+    for one in jobs:
+        named = _named_items(one.submission.kind, one.submission.params)
+        wanted.setdefault(one.project_id, set()).update(named)
+    found = (items_by_id(tx, project_id, ids) for project_id, ids in wanted.items())
+    return {item: one.head for items in found for item, one in items.items()}
+
+
+def _named_items(kind: KindDeclaration, params: Mapping[str, Any]) -> list[str]:
+    """Return the ids of items that the parameters name and whose newest revisions the job reads."""
+    return [params[name] for name in kind.newest_of if params.get(name)]
+
+
+def _part_digests(tx: Transaction, inputs: Iterable[PinnedInputs]) -> dict[tuple[str, int], dict[str, str]]:
+    """Return the digests of the parts of all pinned inputs: by item and revision number, then by name of the part."""
+    items = sorted({pin["item"] for pins in inputs for many in pins.values() for pin in many})
+    found: dict[tuple[str, int], dict[str, str]] = {}
+    for some in in_lists(items):
+        statement = select(revision_part).where(revision_part.c.item_id.in_(some))
+        for row in tx.execute(statement):
+            found.setdefault((row.item_id, row.number), {})[row.part] = row.document_digest
+    return found
+
+
+def _input_contents(
+    kind: KindDeclaration, pins: Mapping[str, Any], parts: Mapping[tuple[str, int], dict[str, str]]
+) -> dict[str, Any]:
+    """Return the content of a job's inputs, independent of their revision numbers."""
+    return {
+        name: [_content(pin, kind.inputs[name].parts, parts[pin["item"], pin["revision"]]) for pin in many]
+        for name, many in pins.items()
+    }
+
+
+def _content(pin: Pin, read: Collection[str], parts: Mapping[str, str]) -> list[Any]:
+    place = [pin["collection"], *([pin["below"]] if "below" in pin else ())]
+    return [pin["item"], *place, pin["name"], sorted(item for item in parts.items() if not read or item[0] in read)]

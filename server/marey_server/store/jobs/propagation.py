@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Sequence
 from itertools import islice
 from typing import Any
 
-from sqlalchemy import Row, and_, bindparam, delete, false, select, tuple_, update
+from sqlalchemy import Row, and_, bindparam, false, select, update
 
 from marey_schemas.event_kinds import OrdinaryEventKind
 from marey_schemas.queue.jobs import JobState
@@ -19,9 +19,10 @@ from marey_schemas.sizes import batched
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs import late_inputs, result_cache
 from marey_server.store.jobs.endings import Ended, dependency_failure, end_jobs
-from marey_server.store.jobs.events import emit_job_events, wake_watchers, wake_workers
+from marey_server.store.jobs.events import emit_job_events, wake_watchers
 from marey_server.store.jobs.fan_out import gather
 from marey_server.store.jobs.fencing import RUNNING, WAITING
+from marey_server.store.jobs.result_cache import READY_COLUMNS
 from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import Transaction
 
@@ -51,11 +52,9 @@ def make_ready(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
             ended += _open_fan_out(tx, row)
     single = [row for row in rows if row.size is None and not row.unbound]
     for page in batched(single, PAGE):
-        ended += _admit(tx, page)
+        ended += result_cache.admit(tx, page)
     return ended
 
-
-READY_COLUMNS = (job.c.id, job.c.project_id, job.c.kind, job.c.size, job.c.unbound, job.c.cache_key, job.c.cache_mode)
 
 _ENDINGS: dict[str, OrdinaryEventKind] = {
     JobState.SUCCEEDED: "job.succeeded",
@@ -104,7 +103,7 @@ def _move_dependants(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 
 
 def _waiting(tx: Transaction, ids: Sequence[str]) -> Sequence[Row[Any]]:
-    columns = (*READY_COLUMNS, job.c.dependencies_left, job.c.on_failure, job.c.cached_from)
+    columns = (*READY_COLUMNS, job.c.dependencies_left, job.c.on_failure)
     statement = select(*columns).where(job.c.id.in_(ids), job.c.state == WAITING).order_by(job.c.id).with_for_update()
     return tx.execute(statement).all()
 
@@ -130,7 +129,7 @@ def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[En
     _store_counts(tx, left)
     following += make_ready(tx, [row for row in rows if left.get(row.id) == 0])
     following += result_cache.share(tx, shared)
-    _stop_sharing(tx, orphans)
+    result_cache.stop_sharing(tx, orphans)
     return following + make_ready(tx, orphans)
 
 
@@ -199,32 +198,3 @@ def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[E
     idle = and_(job.c.parent_id.in_(gathered), job.c.state.in_(("queued", "waiting")))
     tx.execute(select(job.c.id).where(idle).order_by(job.c.id).with_for_update()).all()  # in the order of all others
     return end_jobs(tx, idle, "cancelled")
-
-
-# -- into the queue ---------------------------------------------------------------------------------------------------
-
-
-def _admit(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
-    decisions = result_cache.decide(tx, rows)
-    queued = [row for row in rows if row.id not in decisions]
-    if queued:
-        tx.execute(
-            update(job)
-            .where(job.c.id.in_([row.id for row in queued]), job.c.state == WAITING)
-            .values(state="queued", dependencies_left=0, rev=job.c.rev + 1)
-        )
-        wake_workers(tx, {row.kind for row in queued})
-    joining = [(row, decisions[row.id]) for row in rows if row.id in decisions]
-    return result_cache.join(tx, joining)
-
-
-def _stop_sharing(tx: Transaction, rows: Sequence[Row[Any]]) -> None:
-    """Remove the link from waiting jobs to an unsuccessful job whose result they would have shared.
-
-    `make_ready` then queues one of the waiting jobs, and the others wait for its result.
-    """
-    if rows:
-        ids = [row.id for row in rows]
-        tx.execute(update(job).where(job.c.id.in_(ids)).values(cached_from=None, dependencies_left=0))
-        pairs = [(row.id, row.cached_from) for row in rows]
-        tx.execute(delete(job_dependency).where(tuple_(job_dependency.c.job_id, job_dependency.c.on_job_id).in_(pairs)))

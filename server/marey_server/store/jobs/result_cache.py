@@ -1,34 +1,32 @@
 """Result cache: identical jobs share one computation, finished or still running.
 
-Jobs are identical if kind, version of the kind, parameters, seed and inputs are equal. Inputs are equal if the item,
-its name, its path, and the content of the documents that the kind reads are equal. Name and path count because results
-are named after inputs and refer to them. A kind can also require that the collection of the results is equal, or the
-newest revision of an item that the parameters name. Jobs whose result depends on data that is read while they run have
-no cache key. For each job, shared results are published again, into the job's own collection. Jobs of different
-projects share no results. An exported archive is not shared after the consent for one of its clips has ended.
+Jobs are identical if they have the same cache key (`layout`). For each job, shared results are published again, into
+the job's own collection. Jobs of different projects share no results. An exported archive is not shared after the
+consent for one of its clips has ended.
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from types import MappingProxyType
+import logging
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from sqlalchemy import and_, delete, insert, or_, select, update
+from sqlalchemy import and_, delete, insert, or_, select, tuple_, update
 
-from marey_schemas.encoding.canonical import canonical_json
-from marey_schemas.queue.job_kinds import KindDeclaration
+from marey_server.access.labels import is_within
 from marey_server.errors import ApiProblem
 from marey_server.store import blobs
 from marey_server.store.jobs import commits, exports, staging
 from marey_server.store.jobs.endings import Ended, end_jobs
 from marey_server.store.jobs.events import wake_workers
-from marey_server.store.jobs.fencing import QUEUED, RUNNING, WAITING
-from marey_server.store.jobs.inputs import NamingJob, Pin, PinnedInputs, record_named_items
+from marey_server.store.jobs.fencing import AUTHOR_MAY_RUN, QUEUED, RUNNING, WAITING
+from marey_server.store.jobs.inputs import NamingJob, record_named_items
 from marey_server.store.purge_lock import hold_off_purges
-from marey_server.store.tables import job, job_dependency, revision_part, staged_output
+from marey_server.store.tables import job, job_dependency, staged_output
 from marey_server.store.transaction import Transaction, in_lists
+from marey_versions.tree.chunks import DamagedChunk
+
+log = logging.getLogger(__name__)
 
 SHARED_AT_ONCE = 64
 """Greatest number of jobs that get a cached result at submission; the leading process serves the others later."""
@@ -41,137 +39,109 @@ MEASURED_PER_OUTPUT = 5
 
 
 class SharedResult(NamedTuple):
-    """Job whose result another job shares."""
+    """Job whose result other jobs share, now or as soon as it has finished.
+
+    `leased` says whether a worker runs the job. The other fields are those that decide when a queued job runs.
+    """
 
     id: str
     finished: bool
+    leased: bool
+    labels_key: str
+    priority: int
+    concurrency_key: str | None
 
+    @classmethod
+    def of(cls, one: Any, *, finished: bool = False, leased: bool = False) -> SharedResult:
+        """Return a job, given as a row or as a new job, as the source of a result."""
+        return cls(one.id, finished, leased, one.labels_key, one.priority, one.concurrency_key)
 
-# -- the key ----------------------------------------------------------------------------------------------------------
+    def is_no_later_than(self, other: Any) -> bool:
+        """Return whether this job has finished, or starts no later than the queued job `other` would.
 
-
-def cache_key(
-    kind: KindDeclaration,
-    params: Mapping[str, Any],
-    seed: int,
-    inputs: Any,
-    task: tuple[int | None, int] | None = None,
-    *,
-    into: str = "",
-    newest: Mapping[str, int] = MappingProxyType({}),
-) -> str:
-    """Return the digest that identifies a computation.
-
-    `inputs` is the result of `input_contents`; `task` is the index of a task and the number of tasks; `into` is the
-    collection of the results; `newest` holds the newest revisions of `named_items`.
-    """
-    tree = {"kind": kind.code_version, "params": params, "seed": seed, "inputs": inputs}
-    if task is not None:
-        tree["task"] = task
-    if kind.place_counts:
-        tree["into"] = into
-    if kind.newest_of:
-        tree["newest"] = [[item, newest.get(item)] for item in named_items(kind, params)]
-    return f"sha256:{hashlib.sha256(canonical_json(tree)).hexdigest()}"
-
-
-def has_key(kind: KindDeclaration, params: Mapping[str, Any], inputs: Collection[str]) -> bool:
-    """Return whether jobs of the kind with these parameters and inputs have a cache key.
-
-    A job has a cache key if its result depends only on the values from which the key is computed.
-    """
-    in_place = kind.in_place is not None and params.get(kind.in_place)
-    by_names = not set(kind.never_cached_without) <= set(inputs)
-    if kind.never_cached_for is not None:
-        by_names = by_names or kind.never_cached_for(params)
-    return kind.deterministic and not in_place and not by_names
-
-
-def named_items(kind: KindDeclaration, params: Mapping[str, Any]) -> list[str]:
-    """Return the ids of items that the parameters name and whose newest revisions the job reads."""
-    return [params[name] for name in kind.newest_of if params.get(name)]
-
-
-def part_digests(tx: Transaction, inputs: Iterable[PinnedInputs]) -> dict[tuple[str, int], dict[str, str]]:
-    """Return the digests of the parts of all pinned inputs: by item and revision number, then by name of the part."""
-    items = sorted({pin["item"] for pins in inputs for many in pins.values() for pin in many})
-    found: dict[tuple[str, int], dict[str, str]] = {}
-    for some in in_lists(items):
-        statement = select(revision_part).where(revision_part.c.item_id.in_(some))
-        for row in tx.execute(statement):
-            found.setdefault((row.item_id, row.number), {})[row.part] = row.document_digest
-    return found
-
-
-def input_contents(
-    kind: KindDeclaration, pins: Mapping[str, Any], parts: Mapping[tuple[str, int], dict[str, str]]
-) -> dict[str, Any]:
-    """Return the content of a job's inputs, independent of their revision numbers."""
-    return {
-        name: [_content(pin, kind.inputs[name].parts, parts[pin["item"], pin["revision"]]) for pin in many]
-        for name, many in pins.items()
-    }
-
-
-def _content(pin: Pin, read: Collection[str], parts: Mapping[str, str]) -> list[Any]:
-    place = [pin["collection"], *([pin["below"]] if "below" in pin else ())]
-    return [pin["item"], *place, pin["name"], sorted(item for item in parts.items() if not read or item[0] in read)]
+        A job that needs a label which `other` does not need may never start. This also holds if a worker runs it now,
+        because the worker may be lost.
+        """
+        if self.finished:
+            return True
+        if not is_within(self.labels_key, other.labels_key):
+            return False
+        waits_for_no_rival = self.concurrency_key in (None, other.concurrency_key)
+        return self.leased or (self.priority >= other.priority and waits_for_no_rival)
 
 
 # -- deciding ---------------------------------------------------------------------------------------------------------
 
+CANDIDATE_COLUMNS = (
+    job.c.id,
+    job.c.project_id,
+    job.c.cache_key,
+    job.c.cache_mode,
+    job.c.labels_key,
+    job.c.priority,
+    job.c.concurrency_key,
+)
+READY_COLUMNS = (*CANDIDATE_COLUMNS, job.c.kind, job.c.size, job.c.unbound, job.c.cached_from)
+"""Columns of waiting jobs that are to be queued."""
 
-def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult]:
+
+def decide(tx: Transaction, candidates: Sequence[Any], *, finished: bool = True) -> dict[str, SharedResult]:
     """Find, for each of `candidates`, the job whose result it can share.
 
-    A candidate is a row with `id`, `project_id`, `cache_key` and `cache_mode`. Candidates that cannot share a result
-    are omitted. Of several identical candidates, the first computes the result and the others share it. In each
-    project, this function runs for one transaction at a time. The found jobs are locked: none of them ends before the
-    transaction has recorded which jobs share its result.
+    A candidate is a new job, or a row with `CANDIDATE_COLUMNS`. Candidates that cannot share a result are omitted. Of
+    several identical candidates, the first computes the result and the others share it. But a candidate never waits for
+    a job that may start later than the candidate itself would. In each project, this function runs for one transaction
+    at a time. The found jobs are locked: none of them ends before the transaction has recorded which jobs share its
+    result. Results of finished jobs are used only if `finished` is true.
     """
     asking = [one for one in candidates if one.cache_key is not None and one.cache_mode in ("use", "refresh")]
     if not asking:
         return {}
     for project_id in sorted({one.project_id for one in asking}):
         tx.lock(f"job-cache:{project_id}")
-    known = _known_sources(tx, asking)
+    known = _known_sources(tx, asking, finished=finished)
     sources: dict[str, SharedResult] = {}
     for one in asking:
-        place = (one.project_id, one.cache_key)
-        source = known.get(place)
+        identical = known.setdefault((one.project_id, one.cache_key), [])
+        source = next((other for other in identical if other.is_no_later_than(one)), None)
         if one.cache_mode == "use" and source is not None:
             sources[one.id] = source
         else:
-            known[place] = SharedResult(one.id, finished=False)
+            identical.insert(0, SharedResult.of(one))
     return sources
 
 
-def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, str], SharedResult]:
-    """Return, for each project and cache key, the newest succeeded job, or else the oldest queued or running job."""
+def _known_sources(
+    tx: Transaction, asking: Sequence[Any], *, finished: bool
+) -> dict[tuple[str, str], list[SharedResult]]:
+    """Return, for each project and cache key, the newest succeeded job, then the queued and running jobs.
+
+    Of these, jobs that a worker runs come first, then the others in the order of their priority.
+    """
     keys = sorted({one.cache_key for one in asking if one.cache_mode == "use"})
     projects = sorted({one.project_id for one in asking})
-    active = or_(job.c.state == QUEUED, job.c.state == RUNNING)
-    finished: dict[tuple[str, str], SharedResult] = {}
-    under_way: dict[tuple[str, str], SharedResult] = {}
+    states = or_(job.c.state == QUEUED, job.c.state == RUNNING)
+    if finished:
+        states = or_(states, job.c.state == "succeeded")
+    succeeded: dict[tuple[str, str], list[SharedResult]] = {}
+    under_way: dict[tuple[str, str], list[SharedResult]] = {}
     for some in in_lists(keys):
         rows = tx.execute(
-            select(job.c.id, job.c.project_id, job.c.cache_key, job.c.state)
-            .where(
-                job.c.project_id.in_(projects),
-                job.c.cache_key.in_(some),
-                job.c.cached_from.is_(None),
-                or_(active, job.c.state == "succeeded"),
-            )
+            select(*CANDIDATE_COLUMNS, job.c.state, job.c.lease_expires_us)
+            .where(job.c.project_id.in_(projects), job.c.cache_key.in_(some), job.c.cached_from.is_(None), states)
             .order_by(job.c.id)
             .with_for_update(read=True)
         )
         for row in rows:
             place = (row.project_id, row.cache_key)
             if row.state == "succeeded":
-                finished[place] = SharedResult(row.id, finished=True)
+                succeeded[place] = [SharedResult.of(row, finished=True)]
             else:
-                under_way.setdefault(place, SharedResult(row.id, finished=False))
-    return under_way | finished
+                leased = row.lease_expires_us is not None
+                under_way.setdefault(place, []).append(SharedResult.of(row, leased=leased))
+    for sources in under_way.values():
+        sources.sort(key=lambda source: (not source.leased, -source.priority))
+    return {place: [*succeeded.get(place, ()), *under_way.get(place, ())] for place in {*succeeded, *under_way}}
 
 
 # -- sharing ----------------------------------------------------------------------------------------------------------
@@ -201,24 +171,33 @@ def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
     """Give waiting jobs the results of the finished jobs that their `cached_from` names; return the jobs that ended.
 
     A transaction serves a limited number of jobs and outputs; the leading server process serves the remaining jobs
-    later. If the result is no longer stored, or cannot be published again, the waiting job is queued instead. Only the
-    `id` of the rows is read.
+    later. If the result is no longer stored, or cannot be published again, the waiting job is queued, or waits for
+    another identical job. Only the `id` of the rows is read.
     """
     ended: list[Ended] = []
+    unserved: list[str] = []
     for row in rows[:SHARED_AT_ONCE]:
         if tx.shared_outputs >= MOST_SHARED_OUTPUTS:
             break
-        ended += _share_one(tx, row.id)
+        of_row = _share_one(tx, row.id)
+        ended += of_row
+        if not of_row:
+            unserved.append(row.id)
+    _compute_again(tx, unserved)
     return ended
 
 
 def share_waiting(tx: Transaction) -> list[Ended]:
-    """Give at most `SHARED_AT_ONCE` waiting jobs the results that now exist; return the jobs that have ended."""
+    """Give at most `SHARED_AT_ONCE` waiting jobs the results that now exist; return the jobs that have ended.
+
+    This includes jobs that wait for a job which was deleted because it was old; they compute the result.
+    """
     source = job.alias("source")
     statement = (
         select(job.c.id, job.c.project_id)
-        .join(source, source.c.id == job.c.cached_from)
-        .where(job.c.state == WAITING, job.c.cached_from.is_not(None), source.c.state == "succeeded")
+        .outerjoin(source, source.c.id == job.c.cached_from)
+        .where(job.c.state == WAITING, job.c.cached_from.is_not(None))
+        .where(or_(source.c.state == "succeeded", source.c.id.is_(None)))
         .order_by(job.c.id)
         .limit(SHARED_AT_ONCE)
     )
@@ -230,27 +209,31 @@ def share_waiting(tx: Transaction) -> list[Ended]:
     return share(tx, tx.execute(chosen).all())
 
 
-def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
-    """Give one job the result it waits for, or queue it if that is impossible; return the jobs that have ended.
+_UNUSABLE = (ApiProblem, DamagedChunk, LookupError, TypeError, ValueError)
+"""Errors because of which a job cannot have a shared result: refusals, and stored data that cannot be read."""
 
-    A refusal of this job must not affect the job that computed the result, nor other jobs that wait for the result.
+
+def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
+    """Give one job the result it waits for; return the jobs that ended, or an empty list if that is impossible.
+
+    An error that concerns this job must not affect the job that computed the result, or others that wait for it.
     """
     try:
         with tx.connection.begin_nested():
-            ended = _publish_shared(tx, job_id)
-    except ApiProblem:
-        ended = []
-    if not ended:
-        _compute_again(tx, job_id)
-    return ended
+            return _publish_shared(tx, job_id)
+    except _UNUSABLE as error:
+        if not isinstance(error, ApiProblem):
+            log.exception("%s cannot share the result of an identical job", job_id)
+        return []
 
 
 def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     """Publish the shared result as the result of a waiting job; return the jobs that ended as a result.
 
-    The waiting job does not end if the shared result is no longer stored. For jobs that export clips, the clips whose
-    consent has ended must be the same for both jobs; otherwise, the waiting job does not end either. Raises the errors
-    of `publish`.
+    The waiting job does not end if the other job has no cache key any more, because its result is not to be shared. It
+    does not end either if the result is no longer stored, or if the author of the waiting job may not run jobs any
+    more. For jobs that export clips, the clips whose consent has ended must be the same for both jobs; otherwise, the
+    waiting job does not end. Raises the errors of `publish`.
     """
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")
@@ -265,9 +248,10 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     row = tx.execute(
         select(*own, source.c.id.label("source_id"), *shared)
         .join(source, source.c.id == job.c.cached_from)
-        .where(waits)
-    ).one()
-    if not exports.may_share(tx, row.kind, row.inputs, row.result):
+        .where(waits, AUTHOR_MAY_RUN, source.c.state == "succeeded", source.c.cache_key.is_not(None))
+        .with_for_update(read=True, of=source)  # so that its outputs are not released before they are read
+    ).one_or_none()
+    if row is None or not exports.may_share(tx, row.kind, row.inputs, row.result):
         return []
     place = (row.source_id, row.fence)
     drafts = staging.staged_drafts(tx, [place]).get(place, {})
@@ -292,17 +276,42 @@ def _publish_shared(tx: Transaction, job_id: str) -> list[Ended]:
     )
 
 
-def _compute_again(tx: Transaction, job_id: str) -> None:
-    """Queue a job that waited to share a result, and remove its dependency on the job with that result."""
-    row = tx.execute(select(job.c.kind, job.c.cached_from).where(job.c.id == job_id)).one()
-    waited = and_(job_dependency.c.job_id == job_id, job_dependency.c.on_job_id == row.cached_from)
-    tx.execute(delete(job_dependency).where(waited))
-    tx.execute(
-        update(job)
-        .where(job.c.id == job_id, job.c.state == WAITING)
-        .values(state="queued", cached_from=None, dependencies_left=0, rev=job.c.rev + 1)
-    )
-    wake_workers(tx, [row.kind])
+def _compute_again(tx: Transaction, job_ids: Sequence[str]) -> None:
+    """Let jobs compute a result that they waited to share: of identical jobs, one is queued and the others wait for it.
+
+    Finished results are not used, because the jobs could not have them.
+    """
+    statement = select(*READY_COLUMNS).where(job.c.state == WAITING).order_by(job.c.id)
+    for some in in_lists(job_ids):
+        rows = tx.execute(statement.where(job.c.id.in_(some))).all()
+        stop_sharing(tx, rows)
+        admit(tx, rows, finished=False)
+
+
+def stop_sharing(tx: Transaction, rows: Sequence[Any]) -> None:
+    """Remove the links from waiting jobs to the jobs whose results they would have shared; then `admit` the jobs."""
+    if rows:
+        ids = [row.id for row in rows]
+        tx.execute(update(job).where(job.c.id.in_(ids)).values(cached_from=None, dependencies_left=0))
+        pairs = [(row.id, row.cached_from) for row in rows]
+        tx.execute(delete(job_dependency).where(tuple_(job_dependency.c.job_id, job_dependency.c.on_job_id).in_(pairs)))
+
+
+def admit(tx: Transaction, rows: Sequence[Any], *, finished: bool = True) -> list[Ended]:
+    """Queue waiting jobs without unfinished dependencies, or let them share results; return the ended jobs.
+
+    The rows hold `READY_COLUMNS`. Results of finished jobs are used only if `finished` is true.
+    """
+    decisions = decide(tx, rows, finished=finished)
+    queued = [row for row in rows if row.id not in decisions]
+    if queued:
+        tx.execute(
+            update(job)
+            .where(job.c.id.in_([row.id for row in queued]), job.c.state == WAITING)
+            .values(state="queued", dependencies_left=0, rev=job.c.rev + 1)
+        )
+        wake_workers(tx, {row.kind for row in queued})
+    return join(tx, [(row, decisions[row.id]) for row in rows if row.id in decisions])
 
 
 # -- forgetting -------------------------------------------------------------------------------------------------------
@@ -317,5 +326,4 @@ def forget_results(tx: Transaction, job_ids: Sequence[str]) -> None:
         tx.execute(delete(staged_output).where(staged_output.c.job_id.in_(some)))
         tx.execute(update(job).where(job.c.id.in_(some)).values(cache_key=None))
         waiting = select(job.c.id).where(job.c.state == WAITING, job.c.cached_from.in_(some)).order_by(job.c.id)
-        for job_id in tx.execute(waiting).scalars().all():
-            _compute_again(tx, job_id)
+        _compute_again(tx, tx.execute(waiting).scalars().all())

@@ -1,6 +1,7 @@
 """Job kinds of another Python package, as a worker finds them: kinds that work, and one that fails in many ways."""
 
 import ctypes
+import math
 import os
 import resource
 import time
@@ -12,7 +13,7 @@ from marey_schemas.base import Request
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
-from marey_worker.context import Context, JobRefused
+from marey_worker.context import Context, JobRefused, Unreadable
 
 
 class AddParams(Request):
@@ -27,6 +28,10 @@ class MisbehaveParams(Request):
     blob: str = ""
 
 
+ODD = {"nan": math.nan, "inf": math.inf, str(1 << 63): 1 << 63, str(1 << 64): 1 << 64, "half a character": "\udc80"}
+"""Values of which a result may not consist."""
+
+
 def add(context: Context, params: AddParams) -> dict[str, int]:
     context.log(f"adding {params.a} and {params.b}")
     context.progress(1, 2, "half way")
@@ -38,16 +43,37 @@ def misbehave(context: Context, params: MisbehaveParams) -> dict[str, Any]:
         "raise": _raise, "refuse": _refuse, "segfault": _segfault, "exit": _exit, "eat": _eat,
         "hoard": lambda: _hoard(Path(params.folder)), "wait": lambda: _wait(Path(params.folder)),
         "fork-and-raise": _fork_and_raise,
+        "raise-oddly": _raise_oddly, "refuse-oddly": _refuse_oddly, "report-oddly": lambda: _report_oddly(context),
         "sleep": lambda: _sleep(params.seconds),
         "give-up-early": lambda: _give_up_early(context), "put": lambda: _put(context),
         "read-blob": lambda: {"bytes": len(context.blob(params.blob))},
         "read-late": lambda: _read_late(context, Path(params.folder)),
         "miss": lambda: context.document(Kind.SKELETON, "skeleton_gone", 1, "hierarchy"),
+        "answer-oddly": lambda: {"odd": ODD[params.blob]},
+        "do-without": lambda: _do_without(context, params.blob),
+        "have-no-mapping": lambda: {
+            "mapping": context.document(Kind.SKELETON, "skeleton_gone", 1, "mapping", required=False)
+        },
     }[params.how]()  # fmt: skip
 
 
 def _raise() -> None:
     raise ArithmeticError("the numbers do not add up")
+
+
+def _raise_oddly() -> None:
+    """Raise an error with an extremely long class name, and characters in its text that a database does not store."""
+    raise type("Odd" * 200, (Exception,), {})("a\0b\udc80c")
+
+
+def _refuse_oddly() -> None:
+    raise JobRefused("odd" * 100, "a\0b\udc80c" * 10_000)
+
+
+def _report_oddly(context: Context) -> dict[str, bool]:
+    context.progress(1, 2, "a\0b\udc80c" * 1000)
+    time.sleep(2)
+    return {"reported": True}
 
 
 def _refuse() -> None:
@@ -105,6 +131,18 @@ def _give_up_early(context: Context) -> None:
     reading = context.documents([pin] * 20, "motion")
     next(reading)
     raise ArithmeticError("enough")
+
+
+def _do_without(context: Context, blob: str) -> dict[str, str]:
+    """Read a file, or a skeleton if `blob` is empty, and do without it if it cannot be read."""
+    try:
+        if blob:
+            context.blob(blob)
+        else:
+            context.document(Kind.SKELETON, "skeleton_gone", 1, "hierarchy")
+    except Unreadable as error:
+        return {"lacks": error.code}
+    return {"lacks": ""}
 
 
 def _put(context: Context) -> dict[str, str]:
