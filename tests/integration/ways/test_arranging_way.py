@@ -114,7 +114,7 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, la
         (["rm", "lab/raw"], 2, "remove 3 items (lab/raw/)? This needs a confirmation"),
         (["rm", "lab/raw/a", "lab/raw", "--yes"], 2, "lab/raw/a is inside lab/raw, and the command names both"),
         (["rm", "lab/raw/a", "lab/raw/a", "--yes"], 2, "lab/raw/a is named twice"),
-        (["rm", "lab/raw/a/", "--yes"], 2, "there is no item or folder at lab/raw/a"),
+        (["rm", "lab/raw/a/", "--yes"], 2, "there is no folder at lab/raw/a;"),
         (["restore", "lab/raw/a"], 2, "no deleted item or folder at lab/raw/a; `marey ls --deleted lab` lists"),
         (["tag", "lab/raw/a"], 2, "give them with --add"),
         (["tag", "lab/raw", "--add", "x"], 2, "lab/raw is a folder, and folders have no tags"),
