@@ -825,7 +825,7 @@ def test_contents_of_other_projects_and_unknown_ones_are_null(owner: httpx.Clien
     content = revision_content(entry["kind"], entry["parts"])
     ok(owner.post("/projects", json={"name": "other"}), 201)
     wanted: dict[str, Any] = {"revisions": [content], "documents": [{"content": content, "part": "hierarchy"}]}
-    nothing = {"revisions": [None], "documents": [None], "facets": [{}]}
+    nothing = {"revisions": [None], "documents": [None], "facets": [{}], "tiles": []}
     assert contents(owner, "/projects/other", **wanted) == nothing
     assert contents(owner, **wanted)["revisions"] != [None]
     unknown: dict[str, Any] = {
