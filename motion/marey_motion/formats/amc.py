@@ -119,8 +119,9 @@ def _fill_motion(source: SourceMotion, skeleton: AsfSkeleton, values: NDArray[np
     angles = values if degrees else np.degrees(values)
     rotations = np.empty((len(values), len(skeleton.bones), 4), np.float64)
     rotations_from_euler(angles, turns, axes, rotations)
-    frames = np.array([bone.frame for bone in skeleton.bones])
-    turned = quaternions.multiply(quaternions.multiply(frames, rotations), quaternions.conjugate(frames))
-    turned[:, 0] = quaternions.multiply(skeleton.root_orientation, turned[:, 0])
-    source.rotations = turned.astype(np.float32)
+    for joint, bone in enumerate(skeleton.bones):  # one by one, because products of all joints would fill memory
+        turned = quaternions.multiply(bone.frame, rotations[:, joint])
+        rotations[:, joint] = quaternions.multiply(turned, quaternions.conjugate(bone.frame))
+    rotations[:, 0] = quaternions.multiply(skeleton.root_orientation, rotations[:, 0])
+    source.rotations = rotations.astype(np.float32)
     source.root_positions = skeleton.root_position + quaternions.rotate_vectors(skeleton.root_orientation, root_moves)

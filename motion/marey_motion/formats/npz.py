@@ -49,6 +49,7 @@ _SKELETON_MEMBERS = (
 )
 _MOTION_MEMBERS = ("frame_rate_hz", "poses")
 _OPTIONAL_MEMBERS = ("translated_joints", "translations")
+_STORED_BYTES = 4  # of a number of a clip
 # Methods whose members `zipfile` unpacks only up to the declared size.
 _BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 # All that a damaged or hostile archive raises; RuntimeError stands for encryption and for unknown compression, too.
@@ -166,6 +167,8 @@ def _source(arrays: dict[str, NDArray[Any]], file: str, frame_rate_hz: float | N
         source.warnings.append(CheckWarning("no-frames", message))
     if frames:
         poses = _array(arrays, "poses", "f", (frames, 3 + 4 * joints), file)
+        if (size := poses.size * _STORED_BYTES) > MOST_UNPACKED_BYTES:  # in half precision, the archive has less
+            raise FormatLimit(f"the poses need {size} bytes; at most {MOST_UNPACKED_BYTES} are accepted", file=file)
         quaternions = poses[:, 3:].reshape(frames, joints, 4)
         source.root_positions = poses[:, :3].astype(np.float64)
         source.rotations = as_rotations(quaternions, names, file, source.warnings).astype(np.float32)

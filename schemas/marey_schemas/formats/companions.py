@@ -118,14 +118,14 @@ def _pairings_of_predecessor(files: _Files) -> Iterator[Pairing]:
     skeletons = {_skeleton_stem(stem).lower(): path for stem, path in known if is_skeleton_name(path)}
     others = [(stem, path) for stem, path in known if not is_skeleton_name(path)]
     models: dict[str, str] = {}
-    for stem, path in others:
+    for stem, path in sorted(others, key=lambda one: model_name(one[0]) == one[0]):  # first those called models
         models.setdefault(model_name(stem), path)
     trees = {_without(stem, _TREE_ENDINGS): path for stem, path in others if _without(stem, _TREE_ENDINGS) != stem}
     for stem, path in others:
-        model = model_name(stem)
+        model, bare = model_name(stem), _without(stem, _TREE_ENDINGS)
         if model in trees and models[model] == path:
             yield Pairing(path, trees[model], (trees[model],))
-        elif skeletons and model == stem and models.get(_without(stem, _TREE_ENDINGS), path) == path:
+        elif skeletons and model == stem and (bare == stem or bare not in models):
             yield Pairing(path, *_best(stem, skeletons), shared=True)
 
 

@@ -138,6 +138,18 @@ def test_an_archive_that_unpacks_to_too_much_is_refused_unopened(
         read_motion(bomb, "bomb.npz")
 
 
+def test_poses_in_half_precision_are_limited_like_those_in_single_precision(
+    archive: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poses = np.load(io.BytesIO(archive["poses.npy"])).astype(np.float16)
+    archive["poses.npy"] = member(poses)
+    assert read_motion(packed(archive), "take.npz").clip is not None
+    monkeypatch.setattr(npz, "MOST_UNPACKED_BYTES", poses.nbytes * 2 - 1)
+    assert sum(map(len, archive.values())) < poses.nbytes * 2
+    with pytest.raises(FormatLimit, match="the poses need"):
+        read_motion(packed(archive), "take.npz")
+
+
 def test_no_more_is_unpacked_than_the_archive_declares(archive: dict[str, bytes]) -> None:
     """The sizes in the archive are false: of 64 MiB, it declares 100 bytes."""
     archive["format.npy"] = bytes(64 << 20)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from collections.abc import Callable
 
 import pytest
@@ -10,6 +11,7 @@ from tests.support.motion_files import AMC, ASF, POSITIONS, ZXY, bvh, nested
 
 from marey_motion.errors import FormatLimit
 from marey_motion.formats import ImportOptions, read_motion, unpacking, write_motion, write_predecessor_skeleton
+from marey_motion.formats.amc import read_amc
 from marey_motion.gait import generate_gait
 
 File = tuple[str, bytes, bytes | None]
@@ -51,3 +53,20 @@ def test_a_motion_of_joints_that_the_file_says_nothing_of_is_limited(
 def test_a_motion_whose_numbers_are_all_in_the_file_may_be_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(unpacking, "MOST_UNPACKED_BYTES", 1)
     assert read_motion(write_motion(generate_gait(1.2, 0.0, 1.0, 30.0), "bvh"), "walk.bvh").clip is not None
+
+
+def test_an_amc_needs_little_more_memory_than_its_rotations() -> None:
+    name, data, companion = of_amc(400)
+    header, _, rest = data.decode().partition("1\n")
+    frame = rest.partition("\n2\n")[0]
+    long = (header + "".join(f"{number}\n{frame}\n" for number in range(1, 1001))).encode()
+    read_amc(data, name, companion=companion)  # compiles the kernels, and parses the ASF
+    tracemalloc.start()
+    try:
+        rotations = read_amc(long, name, companion=companion).rotations
+        peak_bytes = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert rotations is not None
+    assert rotations.shape == (1000, 404, 4)
+    assert peak_bytes < 4 * rotations.nbytes

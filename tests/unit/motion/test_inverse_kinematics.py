@@ -505,6 +505,29 @@ def test_an_orientation_turns_the_end_of_a_limb_alone_unless_a_limit_stops_it(
         assert limited.reached.all()
 
 
+@pytest.mark.parametrize("solver", ["ccd", "least_squares"])
+def test_a_limb_helps_its_end_only_in_frames_that_the_end_cannot_reach_alone(
+    body: Skeleton, solver: Literal["ccd", "least_squares"]
+) -> None:
+    still = _moved(body, frames=1)
+    frames, limb = 101, limb_of(body, "LeftArm", "LeftForeArm", "LeftHand")
+    roots, rotations = (np.repeat(part, frames, axis=0) for part in (still.root_translations, still.rotations))
+    motion = Motion(roots, rotations, np.zeros((frames, 0, 3)), ())
+    turns = quaternions.from_rotation_vector(np.linspace(0.0, 1.2, frames)[:, None] * (0.6, 0.0, 0.8))
+    target = OrientationTarget(limb.end, quaternions.multiply(turns, _spins(body, motion, limb.end)))
+    axes = JointAxes((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    limits = {limb.end: JointLimit.cone(axes, 0.5, (-0.5, 0.5), reference=still.rotations[0, limb.end])}
+    asked = Freedom(limb.joints, limits=limits)
+    alone = solve(body, motion, [target], freedom=replace(asked, joints=(limb.end,)), solver=solver)
+    solved = solve(body, motion, [target], freedom=asked, limb=limb, solver=solver)
+    assert solved.reached.all()
+    assert 20 < alone.reached.sum() < 80
+    reached = alone.reached
+    assert quaternions.angle_between(solved.motion.rotations, alone.motion.rotations)[reached].max() < 1e-6
+    assert quaternions.angle_between(solved.motion.rotations[1:], solved.motion.rotations[:-1]).max() < 0.1
+    assert np.array_equal(solved.residual_before, alone.residual_before)
+
+
 def test_damping_keeps_a_stretching_limb_from_snapping_straight(body: Skeleton) -> None:
     frames = 101
     rest = Motion(

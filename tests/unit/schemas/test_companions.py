@@ -56,6 +56,18 @@ def test_a_model_has_its_tree_and_no_skeleton() -> None:
     assert pairs(*names) == {"walk_1.5_mm.json": "walk_1.5_cluster_tree.json"}
 
 
+def test_a_clip_that_is_called_like_a_model_takes_no_tree_from_it() -> None:
+    assert pairs("skeleton.json", "walk.json", "walk_mm.json", "walk_cluster_tree.json") == {
+        "walk.json": "skeleton.json",
+        "walk_mm.json": "walk_cluster_tree.json",
+    }
+
+
+def test_clips_that_differ_only_in_the_ending_all_have_a_skeleton() -> None:
+    clips = ("walk.bson", "walk.bson.bz2", "walk.json")
+    assert pairs("skeleton.json", *clips) == dict.fromkeys(clips, "skeleton.json")
+
+
 def test_a_clip_that_is_only_called_like_a_tree_has_a_skeleton() -> None:
     assert pairs("skeleton.json", "climb_tree.bson") == {"climb_tree.bson": "skeleton.json"}
 

@@ -144,7 +144,8 @@ def solve(
         joints have no limits, and the targets are a position of the limb's end in all axes and, optionally, an
         orientation of this end. Otherwise, "auto" uses least squares. It also uses least squares if the limb is too
         short in any frame, and other joints or the root may move. If all targets are orientations of the limb's end,
-        only this end turns, unless it cannot reach the targets in some frame, for example because of its limits.
+        this end turns first. Other joints turn, too, only in frames in which the end alone cannot reach the targets,
+        for example because of its limits.
     options : SolverOptions    tolerances and iterations
 
     Returns
@@ -177,6 +178,9 @@ def solve(
             turned = chosen(skeleton, motion, targets, freedom=alone, options=options)
             if turned.reached.all() or freedom.joints == alone.joints:
                 return turned
+            helped = chosen(skeleton, turned.motion, targets, freedom=freedom, options=options)
+            iterations = turned.iterations + helped.iterations
+            return replace(helped, residual_before=turned.residual_before, iterations=iterations)
     return chosen(skeleton, motion, targets, freedom=freedom, options=options)
 
 
