@@ -349,7 +349,7 @@ def _combined(sides: _Sides, taken: Mapping[str, Side]) -> DatasetEntry | None:
     of_base: Mapping[str, str] = {} if base is None else base.parts
     parts = {
         name: digest
-        for name in sorted(ours.parts.keys() | theirs.parts.keys())
+        for name in sorted(of_base.keys() | ours.parts.keys() | theirs.parts.keys())
         if (digest := chosen[name].parts.get(name) if name in chosen else _newer(name, of_base, ours, theirs))
         is not None
     }

@@ -348,6 +348,13 @@ def test_a_resolution_of_a_part_decides_what_was_made_from_it() -> None:
     assert merge(*sides, [(key, Side.OURS, "model"), (key, Side.THEIRS, "tree")])[1].unused != []
 
 
+def test_a_part_that_both_sides_removed_is_taken_from_the_base_with_what_it_was_made_from() -> None:
+    key = key_of("a", "model")
+    sides = {key: model("1", None, "1")}, {key: model("2", None)}, {key: model("1", None)}
+    assert merge(*sides)[1].conflicts[0].parts == ("model", "report")
+    assert merge(*sides, [(key, Side.BASE, "report")])[0] == sides[0]
+
+
 @settings(max_examples=examples(300), deadline=None)
 @given(states, states, states, st.sampled_from([Side.OURS, Side.THEIRS]))
 @example(
