@@ -84,6 +84,16 @@ def test_a_checkout_during_a_commit_of_the_folder_lets_no_later_commit_undo_it(g
     assert record(gaits, prepare(gaits)).entries == 4
 
 
+def test_a_selection_is_not_checked_out_in_another_dataset_with_the_same_name(gaits: Lab) -> None:
+    request = CheckoutRequest(paths=("a",), discard=True)
+    selected = gaits.read(datasets.select_entries, *GAITS, request, required=MAINTAIN)
+    gaits.write(datasets.delete_dataset, *GAITS, expected_rev=None, required=MAINTAIN)
+    gaits.write(datasets.create_dataset, "lab", DatasetCreate(name="gaits", collection="gaits"))
+    with pytest.raises(ConflictProblem) as refused:
+        gaits.write(datasets.check_out, *GAITS, request, selected, required=MAINTAIN)
+    assert refused.value.error_code == "branch-moved"
+
+
 def both(lab: Lab, other: Database, first: Callable[..., Any], second: Callable[..., Any]) -> tuple[Any, Any]:
     """Interleave two writes of the owner; return their results or errors."""
     one, two = requiring(MAINTAIN, first), requiring(MAINTAIN, second)
