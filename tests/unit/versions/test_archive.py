@@ -400,6 +400,13 @@ def test_facets_are_read_and_belong_to_revisions_of_the_archive() -> None:
             checked(with_facets(tree))
 
 
+def test_a_number_that_no_double_can_represent_is_no_json_of_an_archive() -> None:
+    made, data = example(), b'{"usage":1%s}' % (b"0" * 400)
+    made.members[ArchiveMember(MemberKind.FACETS, digest_of(data))] = data
+    with pytest.raises(BadArchive, match=r"^facets/.* is not JSON"):
+        checked(made.write())
+
+
 def test_only_archives_with_facets_have_the_newer_schema() -> None:
     """A program that does not know facets then says that it must be updated, and not that a member is damaged."""
     content = next(member.digest for member in example().members if member.kind is MemberKind.REVISION)
