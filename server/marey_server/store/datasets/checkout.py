@@ -58,6 +58,7 @@ def check_out(
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
     rights = rights_of_caller(tx, project_row)
+    tx.lock(f"checkout {project_row.id} {name}")  # so that no other checkout changes the folder after it was read
     found = find_dataset(tx, project_row, name)
     rights.require_below(found.path or "", Role.MAINTAINER)
     manifest = _wanted(tx, project_row, found, request, selected)
