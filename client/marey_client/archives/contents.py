@@ -9,7 +9,6 @@ from marey_client.errors import UnexpectedAnswer
 from marey_client.transport import BLOCKS, MAX_ANSWER_BYTES, as_json
 from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree
-from marey_schemas.sizes import batched
 
 if TYPE_CHECKING:
     from marey_client.transport import Transport
@@ -30,13 +29,10 @@ def request_contents(
 
 
 def read_facets(transport: Transport, project_url: str, contents: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Return the facets of revisions of a project by content digest; revisions without facets are left out."""
-    facets: dict[str, dict[str, float]] = {}
-    for some in batched(contents, MOST_CONTENTS):
-        found = request_contents(transport, project_url, ContentsRequest(revisions=tuple(some)))
-        named = zip(some, found.get("facets", ()), strict=False)  # servers of earlier versions send none
-        facets.update((content, values) for content, values in named if values)
-    return facets
+    """Return the facets of at most `MOST_CONTENTS` revisions of a project; revisions without facets are left out."""
+    found = request_contents(transport, project_url, ContentsRequest(revisions=tuple(contents)))
+    named = zip(contents, found.get("facets", ()), strict=False)  # servers of earlier versions send none
+    return {content: values for content, values in named if values}
 
 
 def first_documents(
