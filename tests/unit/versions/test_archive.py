@@ -394,7 +394,8 @@ def test_facets_are_read_and_belong_to_revisions_of_the_archive() -> None:
     stranger = digest_of(b"another revision")
     with pytest.raises(BadArchive, match=f"^facets/.*no version in the archive contains {stranger}"):
         checked(with_facets({stranger: {"usage": 0.5}}))
-    wrong: list[Any] = [[], {content: 1}, {content: {"usage": "much"}}, {content: {"usage": True}}, {"no digest": {}}]
+    wrong: list[Any] = [[], {content: 1}, {"no digest": {}}]
+    wrong += [{content: values} for values in ({"usage": "much"}, {"usage": True}, {"No name": 1.0}, {"usage\n": 1.0})]
     for tree in wrong:
         with pytest.raises(BadArchive, match="not a list of facets"):
             checked(with_facets(tree))
