@@ -18,7 +18,7 @@ from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.roles import RequiredRole
-from marey_server.errors import ConflictProblem
+from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import datasets, items
 from marey_server.store.database.connections import Database
 from marey_server.store.transaction import Transaction
@@ -84,10 +84,38 @@ def test_a_checkout_during_a_commit_of_the_folder_lets_no_later_commit_undo_it(g
     assert record(gaits, prepare(gaits)).entries == 4
 
 
+def test_a_selection_is_not_checked_out_in_another_dataset_with_the_same_name(gaits: Lab) -> None:
+    request = CheckoutRequest(paths=("a",), discard=True)
+    selected = gaits.read(datasets.select_entries, *GAITS, request, required=MAINTAIN)
+    gaits.write(datasets.delete_dataset, *GAITS, expected_rev=None, required=MAINTAIN)
+    gaits.write(datasets.create_dataset, "lab", DatasetCreate(name="gaits", collection="gaits"))
+    with pytest.raises(ConflictProblem) as refused:
+        gaits.write(datasets.check_out, *GAITS, request, selected, required=MAINTAIN)
+    assert refused.value.error_code == "branch-moved"
+
+
 def both(lab: Lab, other: Database, first: Callable[..., Any], second: Callable[..., Any]) -> tuple[Any, Any]:
     """Interleave two writes of the owner; return their results or errors."""
     one, two = requiring(MAINTAIN, first), requiring(MAINTAIN, second)
     return interleave(Step(lab.database, lab.owner, one), Step(other, lab.owner, two))
+
+
+@on_postgres
+@pytest.mark.parametrize("paths", [((), ("a",)), (("a",), ()), (("a",), ("b",))], ids=["part", "whole", "another part"])
+def test_of_two_checkouts_the_folder_has_all_entries_of_the_second(
+    gaits: Lab, other: Database, paths: tuple[tuple[str, ...], tuple[str, ...]]
+) -> None:
+    """Otherwise, the next commit of the folder would remove the entries that the first checkout has taken away."""
+
+    def checking_out(only: tuple[str, ...]) -> Callable[[Transaction], Any]:
+        request = CheckoutRequest(paths=only, discard=True)
+        selected = gaits.read(datasets.select_entries, *GAITS, request, required=MAINTAIN)
+        return lambda tx: datasets.check_out(tx, *GAITS, request, selected)
+
+    both(gaits, other, *map(checking_out, paths))
+    with pytest.raises(InvalidProblem) as refused:
+        prepare(gaits)
+    assert refused.value.error_code == "no-changes"
 
 
 @on_postgres

@@ -14,6 +14,7 @@ from tests.support.rest_server import Server
 from tests.support.store_fixtures import motion_tree, skeleton_tree
 
 from marey_client import Marey
+from marey_client.archives import writing
 from marey_client.blobs import Blobs
 from marey_client.errors import RequestFailed
 from marey_client.handles.versions import DatasetHandle
@@ -27,6 +28,8 @@ from marey_server.access.principal import SYSTEM
 from marey_server.store import projects
 from marey_server.store.items.facets import publish_facets
 from marey_server.store.transaction import Transaction
+from marey_versions.archive.members import MemberKind
+from marey_versions.archive.reading import Archive
 
 
 @pytest.fixture
@@ -154,6 +157,24 @@ def test_facets_come_with_a_copy_and_with_an_archive(
         copy.datasets.at("gaits").check_out()
         assert facets_of(copy) == {"walk": {"usage": 0.5, "used_frames": 1.0}}
         assert [one.item.name for one in copy.clips.list(query="facet.usage = 0.5")] == ["walk"]
+
+
+def test_no_member_of_an_archive_has_the_facets_of_all_revisions(
+    server: Server, lab: ProjectHandle, gaits: DatasetHandle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Members of more than 256 MiB are refused, and a version may have a million clips."""
+    clip = make_clip(lab, make_rig(lab))
+    measure(server, clip, usage=0.5)
+    commit(gaits, walk=clip)
+    clip.put_part("info", {"schema": "marey/clip-info@1", "comment": "second"})
+    measure(server, clip, usage=0.75)
+    commit(gaits, walk=clip)
+    monkeypatch.setattr(writing, "MOST_CONTENTS", 1)
+    gaits.archive(tmp_path / "gaits.tar")
+    with (tmp_path / "gaits.tar").open("rb") as file:
+        archive = Archive(file)
+        assert sum(member.kind is MemberKind.FACETS for member in archive.members) == 2
+        assert sorted(archive.facets().values(), key=str) == [{"usage": 0.5}, {"usage": 0.75}]
 
 
 def test_a_copy_adds_facets_to_content_that_the_project_has_and_replaces_none(

@@ -315,15 +315,21 @@ def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: Datas
 
     If a part is computed from another part, the two count as one. If one side has changed the first part and the other
     side the second part, both parts are returned. For example, our sample tree does not fit the model of their side.
+    Then everything else that was computed from the model is returned, too, because it must come from the same side.
     """
     if ours is None or theirs is None:
         return ("entry",)
     of_base: Mapping[str, str] = {} if base is None else base.parts
     names = sorted(of_base.keys() | ours.parts.keys() | theirs.parts.keys())
     clashing = {name for name in names if _excludes(of_base.get(name), ours.parts.get(name), theirs.parts.get(name))}
+    versions = of_base, ours.parts, theirs.parts
+    differing = {name for name in names if len({parts.get(name) for parts in versions}) > 1}
     for pair in _made_together(ours.kind):
-        if _excludes(*(tuple(parts.get(name) for name in pair) for parts in (of_base, ours.parts, theirs.parts))):
+        if _excludes(*(tuple(parts.get(name) for name in pair) for parts in versions)):
             clashing.update(pair)
+    for made_from, made in _made_together(ours.kind):
+        if made_from in clashing & differing and made in differing:
+            clashing.add(made)
     moved = base is not None and _excludes(base.path, ours.path, theirs.path)
     crowded = len(_merged_tags(base, ours, theirs)) > MOST_TAGS
     return (*(("path",) if moved else ()), *sorted(clashing), *(("tags",) if crowded else ()))
@@ -349,7 +355,7 @@ def _combined(sides: _Sides, taken: Mapping[str, Side]) -> DatasetEntry | None:
     of_base: Mapping[str, str] = {} if base is None else base.parts
     parts = {
         name: digest
-        for name in sorted(ours.parts.keys() | theirs.parts.keys())
+        for name in sorted(of_base.keys() | ours.parts.keys() | theirs.parts.keys())
         if (digest := chosen[name].parts.get(name) if name in chosen else _newer(name, of_base, ours, theirs))
         is not None
     }

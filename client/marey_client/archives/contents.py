@@ -35,13 +35,10 @@ def request_contents(
 
 
 def read_facets(transport: Transport, project_url: str, contents: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Return the facets of revisions of a project by content digest; revisions without facets are left out."""
-    facets: dict[str, dict[str, float]] = {}
-    for some in batched(contents, MOST_CONTENTS):
-        found = request_contents(transport, project_url, ContentsRequest(revisions=tuple(some)))
-        named = zip(some, found.get("facets", ()), strict=False)  # servers of earlier versions send none
-        facets.update((content, values) for content, values in named if values)
-    return facets
+    """Return the facets of at most `MOST_CONTENTS` revisions of a project; revisions without facets are left out."""
+    found = request_contents(transport, project_url, ContentsRequest(revisions=tuple(contents)))
+    named = zip(contents, found.get("facets", ()), strict=False)  # servers of earlier versions send none
+    return {content: values for content, values in named if values}
 
 
 def first_documents(

@@ -334,11 +334,14 @@ class _Making:
                 self.writer.add(ArchiveMember(MemberKind.REVISION, content), canonical_json(one))
 
     def _add_facets(self) -> None:
-        """Add the facets of all revisions, which jobs may have published after the revisions were committed."""
-        facets = read_facets(self.dataset.transport, self.dataset.project_url, sorted(self.known))
-        if facets:
-            data = canonical_json(facets)
-            self.writer.add(ArchiveMember(MemberKind.FACETS, digest_of(data)), data)
+        """Add the facets of all revisions, which jobs may have published after the revisions were committed.
+
+        Each member has those of a few revisions, because readers refuse members of more than `MOST_BYTES`.
+        """
+        for some in batched(sorted(self.known), MOST_CONTENTS):
+            if facets := read_facets(self.dataset.transport, self.dataset.project_url, some):
+                data = canonical_json(facets)
+                self.writer.add(ArchiveMember(MemberKind.FACETS, digest_of(data)), data)
 
     def _add_file(self, member: ArchiveMember) -> None:
         if member in self.writer:

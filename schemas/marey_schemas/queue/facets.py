@@ -32,9 +32,14 @@ class ItemFacets(Request):
     values: dict[FacetName, FacetValue] = Field(min_length=1, max_length=MOST_FACETS)
 
 
+def is_facet_name(text: str) -> bool:
+    """Return whether a text can be the name of a facet, so that a query can contain it."""
+    return re.fullmatch(_NAME_PATTERN, text) is not None
+
+
 def require_facet_names(kind: str, names: Collection[str]) -> None:
     """Raise `ValueError` if the job kind `kind` declares too many facets, or a name that a query cannot contain."""
-    if len(names) > MOST_FACETS or not all(re.fullmatch(_NAME_PATTERN, name) for name in names):
+    if len(names) > MOST_FACETS or not all(map(is_facet_name, names)):
         raise ValueError(
             f"job kind {kind}: declare at most {MOST_FACETS} facets, with names of at most 64 lower-case letters, "
             "digits and underscores that begin with a letter"

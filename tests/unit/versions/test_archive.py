@@ -394,10 +394,18 @@ def test_facets_are_read_and_belong_to_revisions_of_the_archive() -> None:
     stranger = digest_of(b"another revision")
     with pytest.raises(BadArchive, match=f"^facets/.*no version in the archive contains {stranger}"):
         checked(with_facets({stranger: {"usage": 0.5}}))
-    wrong: list[Any] = [[], {content: 1}, {content: {"usage": "much"}}, {content: {"usage": True}}, {"no digest": {}}]
+    wrong: list[Any] = [[], {content: 1}, {"no digest": {}}]
+    wrong += [{content: values} for values in ({"usage": "much"}, {"usage": True}, {"No name": 1.0}, {"usage\n": 1.0})]
     for tree in wrong:
         with pytest.raises(BadArchive, match="not a list of facets"):
             checked(with_facets(tree))
+
+
+def test_a_number_that_no_double_can_represent_is_no_json_of_an_archive() -> None:
+    made, data = example(), b'{"usage":1%s}' % (b"0" * 400)
+    made.members[ArchiveMember(MemberKind.FACETS, digest_of(data))] = data
+    with pytest.raises(BadArchive, match=r"^facets/.* is not JSON"):
+        checked(made.write())
 
 
 def test_only_archives_with_facets_have_the_newer_schema() -> None:

@@ -348,6 +348,24 @@ def test_a_resolution_of_a_part_decides_what_was_made_from_it() -> None:
     assert merge(*sides, [(key, Side.OURS, "model"), (key, Side.THEIRS, "tree")])[1].unused != []
 
 
+def test_everything_that_was_made_from_a_model_is_decided_together_with_it() -> None:
+    """Our side has a new model with its tree, and their side another report of the model in the base."""
+    key = key_of("a", "model")
+    base, ours, theirs = {key: model("1", "1", "1")}, {key: model("2", "2", "1")}, {key: model("1", "1", "2")}
+    assert merge(base, ours, theirs)[1].conflicts[0].parts == ("model", "report", "tree")
+    for part in (None, "model", "report", "tree"):
+        assert merge(base, ours, theirs, [(key, Side.OURS, part)])[0] == ours
+        assert merge(base, ours, theirs, [(key, Side.THEIRS, part)])[0] == theirs
+        assert merge(base, ours, theirs, [(key, Side.BASE, part)])[0] == base
+
+
+def test_a_part_that_both_sides_removed_is_taken_from_the_base_with_what_it_was_made_from() -> None:
+    key = key_of("a", "model")
+    sides = {key: model("1", None, "1")}, {key: model("2", None)}, {key: model("1", None)}
+    assert merge(*sides)[1].conflicts[0].parts == ("model", "report")
+    assert merge(*sides, [(key, Side.BASE, "report")])[0] == sides[0]
+
+
 @settings(max_examples=examples(300), deadline=None)
 @given(states, states, states, st.sampled_from([Side.OURS, Side.THEIRS]))
 @example(

@@ -113,7 +113,7 @@ def canonical_tree(member: ArchiveMember, data: bytes) -> Any:
     try:
         tree = json.loads(data)
         same = canonical_json(tree) == data
-    except (ValueError, RecursionError, TypeError) as error:
+    except (ValueError, RecursionError, TypeError, OverflowError) as error:
         raise BadArchive(f"{member.name}: the content of the member is not JSON: {error}") from error
     if not same:
         raise BadArchive(f"{member.name}: the JSON is not in canonical form")

@@ -11,6 +11,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.names import is_digest
+from marey_schemas.queue.facets import is_facet_name
 from marey_versions.archive.members import (
     MANIFEST,
     MOST_BYTES,
@@ -232,8 +233,9 @@ def _manifest(data: bytes) -> Manifest:
 def _facets(member: ArchiveMember, tree: Any) -> dict[str, dict[str, float]]:
     by_content = tree.items() if isinstance(tree, dict) else [("", None)]
     for content, values in by_content:
-        numbers = values.values() if isinstance(values, dict) and is_digest(content) else [None]
-        if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in numbers):
+        named: dict[str, Any] = values if isinstance(values, dict) and is_digest(content) else {"": None}
+        numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in named.values())
+        if not numbers or not all(map(is_facet_name, named)):
             raise BadArchive(f"{member.name}: the content of the member is not a list of facets")
     return dict(by_content)
 

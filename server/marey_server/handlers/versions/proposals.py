@@ -28,7 +28,7 @@ from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store.datasets import proposals
-from marey_server.store.datasets.committing import BRANCH_MOVED
+from marey_server.store.datasets.naming import BRANCH_MOVED
 
 TRIES = 3
 """Greatest number of times that a merge is prepared, because a branch may move in the meantime."""

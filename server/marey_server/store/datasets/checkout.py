@@ -23,7 +23,7 @@ from marey_server.store.datasets.chunks import StoredChunks, store_chunks
 from marey_server.store.datasets.folders import FolderState, read_folder
 from marey_server.store.datasets.history import revisions_with, tree_of
 from marey_server.store.datasets.manifests import FolderManifest, read_manifest, store_manifest
-from marey_server.store.datasets.naming import find_dataset, resolve
+from marey_server.store.datasets.naming import dataset_replaced, find_dataset, resolve
 from marey_server.store.datasets.selecting import SelectedEntries
 from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.items import Draft, StoredDocument
@@ -51,12 +51,14 @@ def check_out(
     of this entry is restored if possible; otherwise a new item is created.
 
     Raises `ForbiddenProblem` unless the caller is a maintainer in all folders of the dataset. Raises `InvalidProblem`
-    if too many entries differ. Raises `ConflictProblem` if another request changes the folder. Unless the request
-    discards them, changes in the folder that no commit has recorded are a `ConflictProblem`, too.
+    if too many entries differ. Raises `ConflictProblem` if another request changes the folder, or if the dataset
+    was replaced since the entries were selected. Unless the request discards them, changes in the folder that no commit
+    has recorded are a `ConflictProblem`, too.
     """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
     rights = rights_of_caller(tx, project_row)
+    tx.lock(f"checkout {project_row.id} {name}")  # so that no other checkout changes the folder after it was read
     found = find_dataset(tx, project_row, name)
     rights.require_below(found.path or "", Role.MAINTAINER)
     manifest = _wanted(tx, project_row, found, request, selected)
@@ -99,6 +101,8 @@ def _wanted(
         digest = resolve(tx, found.id, request.version)
         return FolderManifest(digest, tree_of(tx, found.id, digest))
     assert selected is not None, "entries are selected before they are checked out"
+    if selected.dataset_id != found.id:
+        raise dataset_replaced(found.name)
     require_no_purge_since(tx, project_row.id, selected.last_purge)
     store_chunks(tx, selected.chunks)
     return FolderManifest(selected.commit, selected.tree, request.query, request.paths)

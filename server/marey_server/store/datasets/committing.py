@@ -32,7 +32,7 @@ from marey_server.store.datasets.contents import Contents, find_contents_of, sto
 from marey_server.store.datasets.folders import read_folder, tags_of
 from marey_server.store.datasets.history import read_commit, tree_of
 from marey_server.store.datasets.manifests import FolderManifest, read_manifest, store_manifest
-from marey_server.store.datasets.naming import find_dataset, find_ref, is_tag
+from marey_server.store.datasets.naming import branch_moved, find_dataset, find_ref, is_tag
 from marey_server.store.datasets.protection import Mover, require_move
 from marey_server.store.datasets.revisions import store_combined
 from marey_server.store.documents import PreparedDocument
@@ -46,9 +46,6 @@ from marey_versions.tree.building import build
 from marey_versions.tree.chunks import Value
 from marey_versions.tree.editing import change
 from marey_versions.tree.reading import Tree
-
-BRANCH_MOVED = "branch-moved"
-"""Code of the error for a branch whose newest commit is not the expected one."""
 
 
 @dataclass(frozen=True)
@@ -213,18 +210,6 @@ def head_of(tx: Transaction, dataset_id: str, branch: str, expected: str | None)
     if expected is not None and expected != head:
         raise branch_moved(branch, head)
     return head
-
-
-def branch_moved(branch: str, head: str | None) -> ConflictProblem:
-    """Return the error for a branch whose newest commit is not the expected one.
-
-    `head` is the digest of the newest commit; the client finds this digest in `context.commit`.
-    """
-    return ConflictProblem(
-        f"The branch {branch!r} has moved. Read it again, then repeat the commit.",
-        code=BRANCH_MOVED,
-        context={"commit": head},
-    )
 
 
 def _insert(tx: Transaction, prepared: PreparedCommit, author: str) -> str:

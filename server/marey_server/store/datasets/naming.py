@@ -37,6 +37,8 @@ MOST_DATASETS = 1000
 """Greatest number of datasets in a project."""
 MOST_REFS = 10_000
 """Greatest number of branches and tags in a dataset."""
+BRANCH_MOVED = "branch-moved"
+"""Code of the error for a branch whose newest commit is not the expected one."""
 
 _VERSION = re.compile(r"([A-Za-z0-9][A-Za-z0-9._:-]{0,127})(?:~([0-9]{1,4}))?")
 _DIGITS = re.compile(r"(?:sha256:)?([0-9a-f]{8,64})")
@@ -237,6 +239,26 @@ def move_branch(
 def is_tag(name: str) -> InvalidProblem:
     """Return the error for a request that names a tag where a branch is required."""
     return InvalidProblem(f"{name!r} is a tag, which never moves; name a branch.", code="is-tag")
+
+
+def branch_moved(branch: str, head: str | None) -> ConflictProblem:
+    """Return the error for a branch whose newest commit is not the expected one.
+
+    `head` is the digest of the newest commit; the client finds this digest in `context.commit`.
+    """
+    return ConflictProblem(
+        f"The branch {branch!r} has moved. Read it again, then repeat the commit.",
+        code=BRANCH_MOVED,
+        context={"commit": head},
+    )
+
+
+def dataset_replaced(name: str) -> ConflictProblem:
+    """Return the error for a dataset that was deleted and created again since the request was prepared."""
+    return ConflictProblem(
+        f"The dataset {name!r} was deleted, and another one with its name was created; send the request again.",
+        code=BRANCH_MOVED,
+    )
 
 
 def delete_ref(tx: Transaction, project: str, name: str, ref: str, *, expected_rev: ExpectedRev) -> None:

@@ -19,7 +19,6 @@ from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import items, projects
 from marey_server.store.datasets.chunks import StoredChunks, store_chunks
 from marey_server.store.datasets.committing import (
-    BRANCH_MOVED,
     PreparedCommit,
     author_of,
     head_of,
@@ -27,7 +26,7 @@ from marey_server.store.datasets.committing import (
     move_branch_to,
 )
 from marey_server.store.datasets.history import read_commit, revisions_with, tree_of
-from marey_server.store.datasets.naming import find_dataset, find_ref
+from marey_server.store.datasets.naming import dataset_replaced, find_dataset, find_ref
 from marey_server.store.datasets.partial_contents import Bases, bases_named_in, load_bases, restored
 from marey_server.store.datasets.protection import Mover
 from marey_server.store.datasets.revisions import item_name, publish_contents, require_contents
@@ -226,10 +225,7 @@ def record_receipt(
     hold_off_purges(tx, project_row.id)
     found = find_dataset(tx, project_row, name)
     if found.id != prepared.dataset_id:
-        raise ConflictProblem(
-            f"The dataset {name!r} was deleted, and another one with its name was created; send the request again.",
-            code=BRANCH_MOVED,
-        )
+        raise dataset_replaced(name)
     digest = prepared.record.digest
     tx.lock(f"commit {found.id} {digest}")  # so that another sender of the same commit waits, and finds it
     if not _is_known(tx, found, digest):

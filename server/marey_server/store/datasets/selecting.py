@@ -45,6 +45,7 @@ OF_ENTRIES = frozenset({"name", "path", "folder", "tag"})
 class SelectedEntries:
     """Part of a version; nothing of it is stored yet."""
 
+    dataset_id: str
     commit: str
     tree: str
     """Root of the tree of the selected entries."""
@@ -76,7 +77,7 @@ def select_entries(tx: Transaction, project: str, name: str, request: CheckoutRe
             code="empty-selection",
         )
     tree = build(store, chosen)
-    return SelectedEntries(commit, tree, store.new, last)
+    return SelectedEntries(found.id, commit, tree, store.new, last)
 
 
 def _at_paths(tree: Tree, paths: Sequence[str]) -> Iterator[tuple[str, Value]]:

@@ -21,9 +21,8 @@ from marey_schemas.datasets.protection import Protection
 from marey_server.access import roles
 from marey_server.errors import ApiProblem, ConflictProblem, InvalidProblem
 from marey_server.store import projects
-from marey_server.store.datasets.committing import BRANCH_MOVED, branch_moved
 from marey_server.store.datasets.merging import LARGE_MERGE, PreparedMerge, prepare_merge, record_merge
-from marey_server.store.datasets.naming import find_dataset, find_ref
+from marey_server.store.datasets.naming import BRANCH_MOVED, branch_moved, find_dataset, find_ref
 from marey_server.store.datasets.proposals.opening import (
     end,
     find_proposal,
