@@ -104,6 +104,17 @@ def test_the_tasks_of_a_divided_job_are_no_longer_waited_for_than_single_jobs(de
     assert source(desk, low) == plain
 
 
+def test_a_divided_job_is_not_waited_for_if_its_tasks_wait_for_a_concurrency_key(desk: Desk) -> None:
+    desk.things(2)
+    fields: dict[str, Any] = {"params": {"number": 2}, "inputs": {"things": {"collection": "raw"}}}
+    submit(desk, concurrency_key="press")
+    desk.claim()
+    keyed = desk.submit("survey", concurrency_key="press", **fields)
+    plain = desk.submit("survey", **fields)
+    assert desk.job(plain).children == {"queued": 2}
+    assert source(desk, desk.submit("survey", concurrency_key="press", **fields)) in (keyed, plain)
+
+
 def test_a_job_becomes_ready_and_does_not_wait_for_one_with_labels(desk: Desk) -> None:
     gate = desk.submit()
     behind = submit(desk, after=[gate])

@@ -11,7 +11,7 @@ import logging
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from sqlalchemy import and_, delete, insert, or_, select, tuple_, update
+from sqlalchemy import and_, case, delete, insert, or_, select, tuple_, update
 
 from marey_server.access.labels import is_within
 from marey_server.errors import ApiProblem
@@ -72,17 +72,25 @@ class SharedResult(NamedTuple):
 
 # -- deciding ---------------------------------------------------------------------------------------------------------
 
-CANDIDATE_COLUMNS = (
+_COMMON_COLUMNS = (
     job.c.id,
     job.c.project_id,
     job.c.cache_key,
     job.c.cache_mode,
     job.c.labels_key,
     job.c.priority,
-    job.c.concurrency_key,
 )
+CANDIDATE_COLUMNS = (*_COMMON_COLUMNS, job.c.concurrency_key)
 READY_COLUMNS = (*CANDIDATE_COLUMNS, job.c.kind, job.c.size, job.c.unbound, job.c.cached_from)
 """Columns of waiting jobs that are to be queued."""
+
+_task = job.alias("task")
+_KEY_OF_TASKS = select(_task.c.concurrency_key).where(_task.c.parent_id == job.c.id).limit(1).scalar_subquery()
+_KEY_OF_SOURCE = case(
+    (and_(job.c.size.is_not(None), job.c.state == RUNNING), _KEY_OF_TASKS), else_=job.c.concurrency_key
+).label("concurrency_key")
+"""Concurrency key of a job, or of the tasks of a parent job, whose own row has no key, while these tasks run."""
+_SOURCE_COLUMNS = (*_COMMON_COLUMNS, _KEY_OF_SOURCE, job.c.state, job.c.lease_expires_us)
 
 
 def decide(tx: Transaction, candidates: Sequence[Any], *, finished: bool = True) -> dict[str, SharedResult]:
@@ -127,7 +135,7 @@ def _known_sources(
     under_way: dict[tuple[str, str], list[SharedResult]] = {}
     for some in in_lists(keys):
         rows = tx.execute(
-            select(*CANDIDATE_COLUMNS, job.c.state, job.c.lease_expires_us)
+            select(*_SOURCE_COLUMNS)
             .where(job.c.project_id.in_(projects), job.c.cache_key.in_(some), job.c.cached_from.is_(None), states)
             .order_by(job.c.id)
             .with_for_update(read=True)
