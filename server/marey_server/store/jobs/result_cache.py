@@ -84,6 +84,9 @@ CANDIDATE_COLUMNS = (*_COMMON_COLUMNS, job.c.concurrency_key)
 READY_COLUMNS = (*CANDIDATE_COLUMNS, job.c.kind, job.c.size, job.c.unbound, job.c.cached_from)
 """Columns of waiting jobs that are to be queued."""
 
+_BY_ID = job.c.id.concat("")
+"""The id, for ORDER BY. For the plain column, SQLite would read all jobs in the order of an index of ids."""
+
 _task = job.alias("task")
 _KEY_OF_TASKS = select(_task.c.concurrency_key).where(_task.c.parent_id == job.c.id).limit(1).scalar_subquery()
 _KEY_OF_SOURCE = case(
@@ -137,7 +140,7 @@ def _known_sources(
         rows = tx.execute(
             select(*_SOURCE_COLUMNS)
             .where(job.c.project_id.in_(projects), job.c.cache_key.in_(some), job.c.cached_from.is_(None), states)
-            .order_by(job.c.id)
+            .order_by(_BY_ID)
             .with_for_update(read=True)
         )
         for row in rows:
@@ -206,7 +209,7 @@ def share_waiting(tx: Transaction) -> list[Ended]:
         .outerjoin(source, source.c.id == job.c.cached_from)
         .where(job.c.state == WAITING, job.c.cached_from.is_not(None))
         .where(or_(source.c.state == "succeeded", source.c.id.is_(None)))
-        .order_by(job.c.id)
+        .order_by(_BY_ID)
         .limit(SHARED_AT_ONCE)
     )
     projects = {row.project_id for row in tx.execute(statement)}
@@ -302,7 +305,8 @@ def stop_sharing(tx: Transaction, rows: Sequence[Any]) -> None:
         ids = [row.id for row in rows]
         tx.execute(update(job).where(job.c.id.in_(ids)).values(cached_from=None, dependencies_left=0))
         pairs = [(row.id, row.cached_from) for row in rows]
-        tx.execute(delete(job_dependency).where(tuple_(job_dependency.c.job_id, job_dependency.c.on_job_id).in_(pairs)))
+        links = tuple_(job_dependency.c.job_id, job_dependency.c.on_job_id).in_(pairs)  # SQLite finds pairs by no index
+        tx.execute(delete(job_dependency).where(job_dependency.c.job_id.in_(ids), links))
 
 
 def admit(tx: Transaction, rows: Sequence[Any], *, finished: bool = True) -> list[Ended]:
