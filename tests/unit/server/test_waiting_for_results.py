@@ -12,6 +12,7 @@ from marey_schemas.access import MemberChange, Role, UserCreate
 from marey_schemas.queue.jobs import JobCreate
 from marey_server.access.principal import SYSTEM
 from marey_server.store import members, users
+from marey_server.store.jobs import result_cache
 from marey_server.store.jobs.reaper import share_waiting
 from marey_server.store.jobs.result_cache import SHARED_AT_ONCE
 from marey_server.store.retention import Retention, retire
@@ -102,6 +103,17 @@ def test_the_tasks_of_a_divided_job_are_no_longer_waited_for_than_single_jobs(de
     assert desk.job(plain).children == {"queued": 2}
     low = desk.submit("survey", priority=-1, **fields)
     assert source(desk, low) == plain
+
+
+def test_a_divided_job_is_not_waited_for_if_its_tasks_wait_for_a_concurrency_key(desk: Desk) -> None:
+    desk.things(2)
+    fields: dict[str, Any] = {"params": {"number": 2}, "inputs": {"things": {"collection": "raw"}}}
+    submit(desk, concurrency_key="press")
+    desk.claim()
+    keyed = desk.submit("survey", concurrency_key="press", **fields)
+    plain = desk.submit("survey", **fields)
+    assert desk.job(plain).children == {"queued": 2}
+    assert source(desk, desk.submit("survey", concurrency_key="press", **fields)) in (keyed, plain)
 
 
 def test_a_job_becomes_ready_and_does_not_wait_for_one_with_labels(desk: Desk) -> None:
@@ -282,3 +294,25 @@ def test_a_job_whose_author_lost_the_role_gets_no_shared_result(desk: Desk) -> N
     failure = desk.job(waiting).failure
     assert failure is not None
     assert failure.code == "author-lost-access"
+
+
+def test_sharing_reads_no_jobs_but_those_that_share_results(desk: Desk) -> None:
+    if not desk.database.is_sqlite:
+        return  # Postgres chooses a plan by the sizes of tables, and small ones it reads whole
+    submit(desk)
+    waiting = [submit(desk) for _ in range(3)]
+    assert None not in {source(desk, one) for one in waiting}
+    run: list[str] = []
+
+    def share(tx: Transaction) -> list[str]:
+        driver: Any = tx.connection.connection.driver_connection
+        driver.set_trace_callback(run.append)
+        share_waiting(tx)
+        result_cache._compute_again(tx, waiting)
+        driver.set_trace_callback(None)
+        read = [text for text in run if text.startswith(("SELECT", "UPDATE", "DELETE"))]
+        return [str(step[3]) for text in read for step in driver.execute(f"EXPLAIN QUERY PLAN {text}")]
+
+    plan = desk.database.write(SYSTEM, share)
+    assert any("ix_job_cache" in step for step in plan)
+    assert not [step for step in plan if step.startswith("SCAN job") or "ix_job_listing" in step]

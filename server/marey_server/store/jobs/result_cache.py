@@ -11,7 +11,7 @@ import logging
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from sqlalchemy import and_, delete, insert, or_, select, tuple_, update
+from sqlalchemy import and_, case, delete, insert, or_, select, tuple_, update
 
 from marey_server.access.labels import is_within
 from marey_server.errors import ApiProblem
@@ -72,17 +72,28 @@ class SharedResult(NamedTuple):
 
 # -- deciding ---------------------------------------------------------------------------------------------------------
 
-CANDIDATE_COLUMNS = (
+_COMMON_COLUMNS = (
     job.c.id,
     job.c.project_id,
     job.c.cache_key,
     job.c.cache_mode,
     job.c.labels_key,
     job.c.priority,
-    job.c.concurrency_key,
 )
+CANDIDATE_COLUMNS = (*_COMMON_COLUMNS, job.c.concurrency_key)
 READY_COLUMNS = (*CANDIDATE_COLUMNS, job.c.kind, job.c.size, job.c.unbound, job.c.cached_from)
 """Columns of waiting jobs that are to be queued."""
+
+_BY_ID = job.c.id.concat("")
+"""The id, for ORDER BY. For the plain column, SQLite would read all jobs in the order of an index of ids."""
+
+_task = job.alias("task")
+_KEY_OF_TASKS = select(_task.c.concurrency_key).where(_task.c.parent_id == job.c.id).limit(1).scalar_subquery()
+_KEY_OF_SOURCE = case(
+    (and_(job.c.size.is_not(None), job.c.state == RUNNING), _KEY_OF_TASKS), else_=job.c.concurrency_key
+).label("concurrency_key")
+"""Concurrency key of a job, or of the tasks of a parent job, whose own row has no key, while these tasks run."""
+_SOURCE_COLUMNS = (*_COMMON_COLUMNS, _KEY_OF_SOURCE, job.c.state, job.c.lease_expires_us)
 
 
 def decide(tx: Transaction, candidates: Sequence[Any], *, finished: bool = True) -> dict[str, SharedResult]:
@@ -127,9 +138,9 @@ def _known_sources(
     under_way: dict[tuple[str, str], list[SharedResult]] = {}
     for some in in_lists(keys):
         rows = tx.execute(
-            select(*CANDIDATE_COLUMNS, job.c.state, job.c.lease_expires_us)
+            select(*_SOURCE_COLUMNS)
             .where(job.c.project_id.in_(projects), job.c.cache_key.in_(some), job.c.cached_from.is_(None), states)
-            .order_by(job.c.id)
+            .order_by(_BY_ID)
             .with_for_update(read=True)
         )
         for row in rows:
@@ -198,7 +209,7 @@ def share_waiting(tx: Transaction) -> list[Ended]:
         .outerjoin(source, source.c.id == job.c.cached_from)
         .where(job.c.state == WAITING, job.c.cached_from.is_not(None))
         .where(or_(source.c.state == "succeeded", source.c.id.is_(None)))
-        .order_by(job.c.id)
+        .order_by(_BY_ID)
         .limit(SHARED_AT_ONCE)
     )
     projects = {row.project_id for row in tx.execute(statement)}
@@ -294,7 +305,8 @@ def stop_sharing(tx: Transaction, rows: Sequence[Any]) -> None:
         ids = [row.id for row in rows]
         tx.execute(update(job).where(job.c.id.in_(ids)).values(cached_from=None, dependencies_left=0))
         pairs = [(row.id, row.cached_from) for row in rows]
-        tx.execute(delete(job_dependency).where(tuple_(job_dependency.c.job_id, job_dependency.c.on_job_id).in_(pairs)))
+        links = tuple_(job_dependency.c.job_id, job_dependency.c.on_job_id).in_(pairs)  # SQLite finds pairs by no index
+        tx.execute(delete(job_dependency).where(job_dependency.c.job_id.in_(ids), links))
 
 
 def admit(tx: Transaction, rows: Sequence[Any], *, finished: bool = True) -> list[Ended]:
