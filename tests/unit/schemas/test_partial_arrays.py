@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Mapping
 from typing import Any
 
@@ -93,3 +94,20 @@ def test_a_partial_array_that_does_not_fit_its_base_is_refused() -> None:
     expect_error(encoded, partial, shape=[1 << 30, 1 << 9])
     expect_error(encoded, partial, dtype="<f8")
     expect_error(encoded, partial, bytes=partial["bytes"].decode()[::-1])
+
+
+@pytest.mark.parametrize("shape", [[1], [1000 * 16384]])
+def test_repeated_tiles_do_not_take_more_memory_than_the_array(shape: list[int]) -> None:
+    """A short list of tiles would otherwise become gigabytes, because it can name a large tile many times."""
+    base = EncodedArray.of(np.random.default_rng(1).integers(0, 255, size=(256, 1024), dtype=np.uint8))
+    partial = {
+        "base": BASE, "pointer": "", "dtype": "|u1", "shape": shape, "tiles": np.zeros(1000, "<i4"),
+        "sizes": np.empty(0, "<i4"), "bytes": np.empty(0, np.uint8),
+    }  # fmt: skip
+    tracemalloc.start()
+    try:
+        with pytest.raises(ArrayError, match=r"too long|do not match"):
+            completed(partial, base)
+        assert tracemalloc.get_traced_memory()[1] < 8 * len(base.data)
+    finally:
+        tracemalloc.stop()
