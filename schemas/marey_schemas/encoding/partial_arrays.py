@@ -59,16 +59,17 @@ def partial_array(array: EncodedArray, base: str, pointer: str, held: Sequence[s
     }
 
 
-def completed(partial: Mapping[str, Any], base: EncodedArray) -> NDArray[Any] | EncodedArray:
+def completed(partial: Mapping[str, Any], held: Sequence[bytes]) -> NDArray[Any] | EncodedArray:
     """Return the array that a partial array describes, checked as if it had been sent whole.
 
+    `held` are the tiles of the base, as `blocks.split` returns them: many partial arrays can have one base.
     Raises `ArrayError` if the members of the partial array do not match each other or the base.
     """
     spec = ArraySpec.parse(partial["dtype"], partial["shape"])
     count = blocks.count_tiles(spec)
     most_bytes = 2 * spec.nbytes + _MOST_OVERHEAD * count
     tiles, sizes = (_flat(partial, name, count).astype(np.int64) for name in ("tiles", "sizes"))
-    sent, held = _flat(partial, "bytes", most_bytes), blocks.split(base.data)
+    sent = _flat(partial, "bytes", most_bytes)
     if any(not _SENT <= number < len(held) for number in tiles.tolist()) or (sizes < 0).any():
         raise ArrayError("bad-array", "a partial array names a tile that its base does not have")
     if int(sizes.sum()) != len(sent) or len(sizes) != int((tiles == _SENT).sum()):
