@@ -11,6 +11,7 @@ import pytest
 from sqlalchemy import select
 
 from marey_schemas.datasets.naming import MAIN
+from marey_schemas.encoding import blocks
 from marey_schemas.encoding.canonical import document_digest
 from marey_server.access.principal import SYSTEM
 from marey_server.store import datasets
@@ -289,3 +290,29 @@ def test_a_partial_array_takes_nothing_from_another_project(client: httpx.Client
     }}  # fmt: skip
     answer = client.post(f"{GAITS}/contents", json={"revisions": [{**first, "parts": {"motion": motion}}]})
     refused(answer, 409, "missing-contents")
+
+
+def test_a_base_is_divided_into_tiles_once_for_many_partial_arrays(
+    client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise a request with many small partial arrays of one large base takes an hour of processor time."""
+    rig = skeleton("Hips")
+    first = clip("Hips", rig["content"])
+    send(client, rig)
+    send(client, first)
+    partial = {
+        "base": first["content"], "pointer": "/poses", "dtype": "<f4", "shape": [1, 7],
+        "tiles": numbers("<i4", 0), "sizes": numbers("<i4"), "bytes": numbers("|u1"),
+    }  # fmt: skip
+    motion = {**first["parts"]["motion"], "poses": partial, "more": dict.fromkeys("abcdefgh", partial)}
+    divided: list[bytes] = []
+    split = blocks.split
+
+    def counted(data: bytes) -> list[bytes]:
+        divided.append(data)
+        return split(data)
+
+    monkeypatch.setattr(blocks, "split", counted)
+    sent = {**first, "content": "sha256:" + "3" * 64, "parts": {"motion": motion}}
+    client.post(f"{GAITS}/contents", json={"revisions": [sent]})
+    assert len(divided) == 1

@@ -130,6 +130,12 @@ def split(data: bytes) -> list[bytes]:
     return [data[here:there] for here, there in pairwise(starts)]
 
 
+def count_tiles(spec: ArraySpec) -> int:
+    """Return the number of tiles of an array in the layout that `encode` uses."""
+    layout = _layout_of(spec)
+    return layout.blocks * layout.groups
+
+
 def join(spec: ArraySpec, packed: list[bytes]) -> bytes:
     """Return an encoded array that has the given tiles, in the layout that `encode` uses."""
     return _assembled(_layout_of(spec), packed)

@@ -9,6 +9,7 @@ tiles that are sent; and `bytes`: these tiles.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -22,6 +23,8 @@ from marey_schemas.encoding.arrayspec import ArrayError, ArraySpec
 _SENT = -1
 _MEMBERS = frozenset({"base", "pointer", "dtype", "shape", "tiles", "sizes", "bytes"})
 _DIGEST_CHARACTERS = 32
+_MOST_OVERHEAD = 64
+"""Bytes by which a tile may exceed twice its values; the bound keeps repeated tiles from filling the memory."""
 
 
 def tile_digests(array: EncodedArray) -> list[str]:
@@ -56,14 +59,17 @@ def partial_array(array: EncodedArray, base: str, pointer: str, held: Sequence[s
     }
 
 
-def completed(partial: Mapping[str, Any], base: EncodedArray) -> NDArray[Any] | EncodedArray:
+def completed(partial: Mapping[str, Any], held: Sequence[bytes]) -> NDArray[Any] | EncodedArray:
     """Return the array that a partial array describes, checked as if it had been sent whole.
 
+    `held` are the tiles of the base, as `blocks.split` returns them: many partial arrays can have one base.
     Raises `ArrayError` if the members of the partial array do not match each other or the base.
     """
     spec = ArraySpec.parse(partial["dtype"], partial["shape"])
-    tiles, sizes, sent = (_flat(partial, name) for name in ("tiles", "sizes", "bytes"))
-    held = blocks.split(base.data)
+    count = blocks.count_tiles(spec)
+    most_bytes = 2 * spec.nbytes + _MOST_OVERHEAD * count
+    tiles, sizes = (_flat(partial, name, count).astype(np.int64) for name in ("tiles", "sizes"))
+    sent = _flat(partial, "bytes", most_bytes)
     if any(not _SENT <= number < len(held) for number in tiles.tolist()) or (sizes < 0).any():
         raise ArrayError("bad-array", "a partial array names a tile that its base does not have")
     if int(sizes.sum()) != len(sent) or len(sizes) != int((tiles == _SENT).sum()):
@@ -77,15 +83,20 @@ def completed(partial: Mapping[str, Any], base: EncodedArray) -> NDArray[Any] | 
             start = end
         else:
             joined.append(held[number])
+    if len(joined) != count or sum(map(len, joined)) > most_bytes:
+        raise ArrayError("bad-array", f"the tiles of a partial array do not match its shape {list(spec.shape)}")
     leaf = {
         "dtype": spec.dtype, "shape": spec.shape, "encoding": "blocks", "data": blocks.join(spec, joined),
     }  # fmt: skip
     return with_blocks(leaf, array_from_leaf(leaf))
 
 
-def _flat(partial: Mapping[str, Any], name: str) -> Any:
+def _flat(partial: Mapping[str, Any], name: str, longest: int) -> NDArray[Any]:
+    """Return a member of a partial array; its length is checked before any memory is allocated for it."""
     found = partial[name]
+    if isinstance(found, EncodedArray | np.ndarray) and math.prod(found.shape) > longest:
+        raise ArrayError("bad-array", f"the member {name!r} of a partial array is too long for the array's shape")
     array = found.decode() if isinstance(found, EncodedArray) else found
     if not isinstance(array, np.ndarray) or array.ndim != 1 or array.dtype.kind not in "iu":
         raise ArrayError("bad-array", f"the member {name!r} of a partial array must be a list of integers")
-    return array.astype(np.int64)
+    return array

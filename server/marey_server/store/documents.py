@@ -192,7 +192,9 @@ def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> di
     ]
     new = blobs.insert_new(tx, document, rows)
     added = [one for one in by_digest.values() if one.digest in new]
-    blobs.store_blobs(tx, {digest: data for one in added for digest, data in one.arrays.values()})
+    arrays = {digest: data for one in added for digest, data in one.arrays.values()}
+    new_arrays = blobs.store_blobs(tx, arrays)
+    tx.new_document_bytes += sum(map(_text_bytes, added)) + sum(len(arrays[digest]) for digest in new_arrays)
     _refer(
         tx,
         [
@@ -203,6 +205,11 @@ def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> di
     )
     _refer_to_items(tx, {one.digest: one.body for one in added})
     return {one.digest: one.size_bytes + _file_bytes(one, file_sizes) for one in added}
+
+
+def _text_bytes(one: PreparedDocument) -> int:
+    """Return the size of a document without its arrays."""
+    return one.size_bytes - sum(map(len, dict(one.arrays.values()).values()))
 
 
 def _file_bytes(one: PreparedDocument, sizes: Mapping[str, int]) -> int:

@@ -78,6 +78,8 @@ class Transaction:
         """Rights that this transaction has read, by project and user; see `store.folder_roles.rights`."""
         self.shared_outputs = 0
         """Number of outputs that this transaction has published from the cache; many facets count as outputs, too."""
+        self.new_document_bytes = 0
+        """Number of bytes of new documents and arrays that this transaction has stored."""
         self._clock = clock
         self._now_us: int | None = None
         self._after_commit: list[Callable[[], None]] = []

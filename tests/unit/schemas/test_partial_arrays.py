@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.tiers import examples
 
+from marey_schemas.encoding import blocks
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.arrayspec import ArrayError
 from marey_schemas.encoding.canonical import array_digest
@@ -37,7 +39,7 @@ def received(partial: Mapping[str, Any]) -> Any:
 
 def expect_error(base: EncodedArray, partial: Mapping[str, Any], **changed: Any) -> None:
     with pytest.raises(ArrayError):
-        completed({**partial, **changed}, base)
+        completed({**partial, **changed}, blocks.split(base.data))
 
 
 @settings(max_examples=examples(20), deadline=None)
@@ -55,7 +57,7 @@ def test_a_partial_array_becomes_the_array_again(edits: list[tuple[int, int]], f
     if partial is None:
         return
     assert is_partial(partial)
-    whole = completed(received(partial), EncodedArray.of(base))
+    whole = completed(received(partial), blocks.split(EncodedArray.of(base).data))
     assert array_digest(whole) == array_digest(array)
 
 
@@ -93,3 +95,21 @@ def test_a_partial_array_that_does_not_fit_its_base_is_refused() -> None:
     expect_error(encoded, partial, shape=[1 << 30, 1 << 9])
     expect_error(encoded, partial, dtype="<f8")
     expect_error(encoded, partial, bytes=partial["bytes"].decode()[::-1])
+
+
+@pytest.mark.parametrize("shape", [[1], [1000 * 16384]])
+def test_repeated_tiles_do_not_take_more_memory_than_the_array(shape: list[int]) -> None:
+    """A short list of tiles would otherwise become gigabytes, because it can name a large tile many times."""
+    base = EncodedArray.of(np.random.default_rng(1).integers(0, 255, size=(256, 1024), dtype=np.uint8))
+    partial = {
+        "base": BASE, "pointer": "", "dtype": "|u1", "shape": shape, "tiles": np.zeros(1000, "<i4"),
+        "sizes": np.empty(0, "<i4"), "bytes": np.empty(0, np.uint8),
+    }  # fmt: skip
+    tiles = blocks.split(base.data)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ArrayError, match=r"too long|do not match"):
+            completed(partial, tiles)
+        assert tracemalloc.get_traced_memory()[1] < 8 * len(base.data)
+    finally:
+        tracemalloc.stop()

@@ -14,6 +14,7 @@ from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import Lab, skeleton_tree
 
 from marey_schemas.access import ProjectCreate, TokenCreate
+from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.jobs import ItemInput, JobCreate
 from marey_server.errors import QuotaExceededProblem
@@ -24,6 +25,7 @@ from marey_server.store import blobs, items, projects, uploads
 from marey_server.store.blobs import digest_of
 from marey_server.store.credentials import tokens
 from marey_server.store.database import connections
+from marey_server.store.documents import prepare_document
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.items import Draft
 from marey_server.store.jobs import reading
@@ -162,6 +164,27 @@ def test_new_bytes_are_limited_per_day_and_become_free_with_time(lab: Lab, clock
     clock.advance(10 * 86400)
     with pytest.raises(QuotaExceededProblem):
         lab.write(blobs.put_blob, b"d" * 1001)
+
+
+def make_skeleton(tx: Transaction, name: str, bone_m: float) -> Item:
+    parts = {"hierarchy": skeleton_tree(bone_m=bone_m)}
+    return items.create_item(tx, "lab", Kind.SKELETON, ItemCreate(name=name, parts=parts))
+
+
+def test_documents_of_items_count_for_the_day_even_if_the_items_are_deleted(lab: Lab) -> None:
+    """Otherwise a user who creates and deletes items in turn fills the disk without using up any quota."""
+    size_bytes = prepare_document(skeleton_tree(bone_m=1.0)).size_bytes
+    lab.database.quotas = Quotas(user_daily_bytes=int(2.5 * size_bytes))
+    first = lab.write(make_skeleton, "first", 1.0)
+    lab.write(make_skeleton, "again", 1.0)  # the server has its document already
+    lab.write(items.delete_item, "lab", Kind.SKELETON, first.id, expected_rev=first.rev)
+    second = lab.write(make_skeleton, "second", 2.0)
+    with pytest.raises(QuotaExceededProblem, match="new bytes per day"):
+        lab.write(make_skeleton, "third", 3.0)
+    changed = "lab", Kind.SKELETON, second.id, "hierarchy", skeleton_tree(bone_m=4.0)
+    with pytest.raises(QuotaExceededProblem, match="new bytes per day"):
+        lab.write(items.put_part, *changed, expected_rev=second.rev)
+    lab.write(make_skeleton, "third", 3.0, who=lab.contributor)  # the quota of somebody else
 
 
 def test_bytes_of_a_cancelled_upload_count_if_they_were_received(lab: Lab) -> None:

@@ -9,6 +9,7 @@ from sqlalchemy import func, select
 
 from marey_schemas.datasets.contents import ReceivedRevision
 from marey_schemas.documents.blob_references import members_of
+from marey_schemas.encoding import blocks
 from marey_schemas.encoding.arrays import MAX_ARRAY_BYTES, EncodedArray
 from marey_schemas.encoding.arrayspec import ArrayError, ArraySpec
 from marey_schemas.encoding.partial_arrays import completed, is_partial
@@ -27,7 +28,8 @@ class BasePlace(NamedTuple):
     pointer: str
 
 
-Bases = Mapping[BasePlace, EncodedArray]
+Bases = Mapping[BasePlace, Sequence[bytes]]
+"""Tiles of the bases of partial arrays."""
 
 
 def bases_named_in(received: Sequence[ReceivedRevision]) -> set[BasePlace]:
@@ -51,8 +53,10 @@ def bases_named_in(received: Sequence[ReceivedRevision]) -> set[BasePlace]:
 
 def load_bases(
     tx: Transaction, places: set[BasePlace], stored: Mapping[str, Mapping[str, str]]
-) -> dict[BasePlace, EncodedArray]:
-    """Load the bases of partial arrays; `stored` maps content digests and parts to the digests of documents.
+) -> dict[BasePlace, list[bytes]]:
+    """Load the tiles of the bases of partial arrays.
+
+    `stored` maps content digests and parts to the digests of documents.
 
     Raises `InvalidProblem` if a document has no array at a place, or if the bases together are too large.
     """
@@ -61,15 +65,16 @@ def load_bases(
     total = select(func.coalesce(func.sum(document.c.size_bytes), 0))
     _require_size(sum(tx.execute(total.where(document.c.digest.in_(some))).scalar_one() for some in in_lists(wanted)))
     trees = documents.load_documents(tx, wanted)
-    arrays = {
-        (digest, pointer): value
+    named = {(digest, place.pointer) for place, digest in digests.items()}
+    tiles = {
+        (digest, pointer): blocks.split(value.data)
         for digest, tree in trees.items()
         for pointer, value in members_of(tree)
-        if isinstance(value, EncodedArray)
+        if isinstance(value, EncodedArray) and (digest, pointer) in named
     }
-    found: dict[BasePlace, EncodedArray] = {}
+    found: dict[BasePlace, list[bytes]] = {}
     for place, digest in digests.items():
-        base = None if digest is None else arrays.get((digest, place.pointer))
+        base = None if digest is None else tiles.get((digest, place.pointer))
         if base is None:
             raise _bad_array(f"the revision {place.content} has no array at {place.pointer!r} of {place.part!r}")
         found[place] = base

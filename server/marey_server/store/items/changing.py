@@ -62,7 +62,10 @@ def prepare_part(kind: Kind, part: str, tree: Any) -> PreparedDocument:
 
 
 def create_item(tx: Transaction, project: str, kind: Kind, request: ItemCreate) -> Item:
-    """Create an item. Raises `ConflictProblem` if the name is taken in its collection."""
+    """Create an item, and count the bytes of its documents that were not stored before.
+
+    Raises `ConflictProblem` if the name is taken in its collection, and `QuotaExceededProblem`.
+    """
     project_row = projects.require(tx, project)
     hold_off_purges(tx, project_row.id)
     draft = Draft(
@@ -71,6 +74,7 @@ def create_item(tx: Transaction, project: str, kind: Kind, request: ItemCreate) 
     )  # fmt: skip
     rights = rights_of_caller(tx, project_row)
     made = publish(tx, project_row, [draft], author_id=tx.principal.user_id, rights=rights)[0]
+    quotas.count_sent(tx, tx.new_document_bytes)
     return _shown(tx, project_row, kind, made.item)
 
 
@@ -106,6 +110,7 @@ def put_part(
             made = NewRevision(item_id, found.head + 1, parts, message)
             write_revisions(tx, [made], author_id=tx.principal.user_id, job_id=None)
             quotas.hold(tx, project_row.id, {found.creator_id: Held(stored_bytes=added)})
+            quotas.count_sent(tx, tx.new_document_bytes)
             shown = _shown(tx, project_row, kind, item_id)
             tx.emit("item.revised", **event_of_item(project_row, shown), revision=shown.revision, job=None)
             return shown
