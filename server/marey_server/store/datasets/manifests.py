@@ -54,10 +54,7 @@ def read_manifests(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, Folde
     named = {row.id: row.folder_commit for row in rows if row.folder_commit is not None}
     found: dict[str, FolderManifest] = {}
     for some in in_lists(sorted(named)):
-        is_commit = and_(
-            dataset_commit.c.dataset_id == dataset.c.id, dataset_commit.c.digest == dataset.c.folder_commit
-        )
-        whole = select(dataset.c.id, dataset_commit.c.digest, dataset_commit.c.tree).join(dataset_commit, is_commit)
+        whole = select(dataset.c.id, dataset_commit.c.digest, dataset_commit.c.tree).join(dataset_commit, _IS_COMMIT)
         for row in tx.execute(whole.where(dataset.c.id.in_(some))):
             found[row.id] = FolderManifest(row.digest, row.tree)
     reader = ChunkReader(StoredChunks(tx))

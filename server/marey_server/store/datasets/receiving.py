@@ -157,9 +157,7 @@ def store_revisions(
     """
     project_row = projects.require(tx, project)
     require_no_purge_since(tx, project_row.id, local.last_purge)
-    tx.lock(
-        f"received revisions {project_row.id}"
-    )  # so that another sender of the same revisions waits, and finds them
+    tx.lock(f"received revisions {project_row.id}")  # another sender of the same revisions waits, and then finds them
     folder = find_dataset(tx, project_row, name).path or ""
     placed = {
         content: replace(draft, collection=folder) if draft.hidden else draft for content, draft in drafts.items()

@@ -73,7 +73,7 @@ def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> li
     publishing = {place for place in own if any(staging.named_blobs(requests[place].result))} | _staged(tx, own)
     ended = _complete(tx, {place: requests[place] for place in own - publishing})
     refused: dict[_Place, ApiProblem] = {}
-    for place in sorted(publishing):  # what one of them may not publish must not keep the others from it
+    for place in sorted(publishing):  # each in a savepoint: a refusal does not undo the others
         try:
             with tx.connection.begin_nested():
                 ended |= _complete(tx, {place: requests[place]})
@@ -147,8 +147,7 @@ def _complete(
     if done:
         _record(tx, records)
         failed = {place for place, (end, _) in done.items() if not end.succeeded}
-        unshared = failed | _keep_from_sharing(tx, won, requests)
-        unshared &= staged.keys()
+        unshared = (failed | _keep_from_sharing(tx, won, requests)) & staged.keys()
         if unshared:
             staging.drop_staged(tx, unshared)
         if gathered := [row.id for row in won if row.gathers and (row.id, row.fence) not in failed]:
