@@ -199,7 +199,7 @@ def test_followers_and_waiting_workers_read_nothing_while_nothing_happens(server
 def test_followers_receive_everything_although_each_page_is_short(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing but the pages themselves tells a follower to read on: the feed is quiet."""
+    """A follower gets all events although no notification of new events arrives while it reads."""
     monkeypatch.setattr(events, "PAGE_BYTES", 1)
     token = server.make_project()
     made = [server.client(token).post("/projects/lab/jobs", json={"kind": "errand"}).json() for _ in range(5)]
