@@ -4,11 +4,13 @@ import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 
 from marey_motion.warm_up import discard_outdated_kernels
+from marey_schemas.processes.memory import loading_modules
 
 pytest_plugins = (
     "tests.support.database_fixtures",
@@ -30,6 +32,13 @@ def pytest_configure(config: pytest.Config) -> None:
         keep_files_in_memory()
         name_runtime_folder()
     keep_bytecode()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Collect the tests, whose objects live until the end, without the garbage collector."""
+    with loading_modules():
+        return (yield)
 
 
 def keep_files_in_memory() -> None:

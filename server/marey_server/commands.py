@@ -19,6 +19,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from marey_schemas.processes.memory import loading_modules
 from marey_schemas.queue.log_lines import usual_form
 from marey_schemas.wording import without_prefix
 from marey_server.process.settings import Settings
@@ -30,10 +31,11 @@ class CommandFailed(Exception):
 
 def serve(**settings: Any) -> None:
     """Run a server and the requested number of workers until SIGTERM or SIGINT."""
-    from marey_server.app import CannotListen
-    from marey_server.app import serve as serve_until_stopped
-    from marey_server.process.computing import leave
-    from marey_server.store.database.opening import DatabaseUnusable
+    with loading_modules():
+        from marey_server.app import CannotListen
+        from marey_server.app import serve as serve_until_stopped
+        from marey_server.process.computing import leave
+        from marey_server.store.database.opening import DatabaseUnusable
 
     chosen = read_settings(**settings)
     comfort = {"local_workers": 1, "log_form": usual_form()}

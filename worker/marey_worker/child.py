@@ -19,6 +19,7 @@ from pydantic_core import to_jsonable_python
 
 from marey_schemas.processes.child_process import READY, connect_to_parent
 from marey_schemas.processes.limits import allow_memory
+from marey_schemas.processes.memory import loading_modules
 from marey_schemas.queue.job_kinds import KindDeclaration, find_kind
 from marey_schemas.queue.worker_protocol import LONGEST_CODE, LONGEST_DETAIL
 from marey_worker import signatures
@@ -37,7 +38,8 @@ def main() -> None:
     """
     pipe = connect_to_parent()
     process = os.getpid()
-    load(sys.argv[2:])
+    with loading_modules():
+        load(sys.argv[2:])
     try:
         pipe.send_bytes(READY)
     except BrokenPipeError:  # the supervisor was stopped while this loaded

@@ -28,7 +28,7 @@ from marey_schemas.problems import FieldError
 from marey_schemas.processes.child_process import READY, BadMessage, connect_to_parent
 from marey_schemas.processes.forking import fork_children
 from marey_schemas.processes.limits import allow_memory, allow_processor_time
-from marey_schemas.processes.memory import keep_freed_memory
+from marey_schemas.processes.memory import keep_freed_memory, loading_modules
 from marey_server.errors import ApiProblem, TooLargeProblem
 
 FORK_SERVER, SINGLE = "fork-server", "single"
@@ -128,8 +128,9 @@ def main() -> None:
     pipe = connect_to_parent()
     memory_bytes, forks, functions = int(sys.argv[2]), sys.argv[3] == FORK_SERVER, sys.argv[4:]
     keep_freed_memory()
-    for name in functions:
-        _function(name)()
+    with loading_modules():
+        for name in functions:
+            _function(name)()
     try:
         pipe.send_bytes(READY)
     except BrokenPipeError:  # the server ended while this loaded

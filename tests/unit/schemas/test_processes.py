@@ -1,6 +1,11 @@
-"""Child processes get a clean environment."""
+"""The environment of child processes, and the garbage collector while a process loads modules."""
+
+import gc
+
+import pytest
 
 from marey_schemas.processes.environment import EXTRA_VARIABLE, clean_environment
+from marey_schemas.processes.memory import loading_modules
 
 SECRETS = {
     "MAREY_DATABASE_URL": "postgresql://marey:hunter2@db/marey",
@@ -30,3 +35,18 @@ def test_an_operator_may_pass_on_further_variables() -> None:
 def test_threads_of_numeric_libraries_are_limited_where_the_environment_does_not() -> None:
     limited = clean_environment({"OMP_NUM_THREADS": "4"}, threads=1)
     assert (limited["OMP_NUM_THREADS"], limited["NUMBA_NUM_THREADS"]) == ("4", "1")
+
+
+def test_objects_of_loaded_modules_are_not_searched_for_garbage() -> None:
+    before = gc.get_freeze_count()
+    with loading_modules():
+        assert not gc.isenabled()
+        module: list[list[int]] = [[] for _ in range(1000)]
+    assert gc.isenabled()
+    assert gc.get_freeze_count() >= before + len(module)
+
+
+def test_an_import_that_fails_leaves_the_garbage_collector_on() -> None:
+    with pytest.raises(ImportError), loading_modules():
+        import marey_no_such_module  # type: ignore[import-not-found]  # noqa: F401
+    assert gc.isenabled()
