@@ -72,9 +72,10 @@ def _accept(_contents: Sequence[str]) -> None:
 
 
 def transfers_folder() -> Path:
-    """Return the folder for archives of running copies, below `XDG_CACHE_HOME` or `~/.cache`; delete its old content.
+    """Return the folder for archives of datasets that are being copied, below `XDG_CACHE_HOME` or `~/.cache`.
 
-    A copy that was killed leaves its archive. In earlier versions, it also left the folder of its downloaded files.
+    Old content of the folder is deleted: a copy command that is killed leaves its archive. In earlier versions, it also
+    left the folder of its downloaded files.
     """
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "marey" / "transfers"
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)

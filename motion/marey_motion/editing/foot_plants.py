@@ -180,10 +180,10 @@ def _slide(positions: Floats, feet: Sequence[Foot], contacts: Sequence[FootConta
 
 
 def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, blend: int) -> _Plan:
-    """Compute the targets of a foot: planted toes and heels stay in place, and the ankle follows the toe otherwise.
+    """Compute the targets of a foot, in which planted toes and heels stay in place.
 
-    `positions` (F, J, 3) and `spins` (F, J, 4) are the positions and rotations of the joints in the world. The targets
-    are blended in and out over `blend` frames.
+    While no heel is planted, the ankle follows the toe. `positions` (F, J, 3) and `spins` (F, J, 4) are the positions
+    and rotations of the joints in the world. The targets are blended in and out over `blend` frames.
     """
     ankle, toe = positions[:, foot.leg.end], positions[:, foot.toe]
     places = toe.copy()

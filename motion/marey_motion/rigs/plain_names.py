@@ -47,9 +47,10 @@ def readings(names: Sequence[str]) -> tuple[Names, ...]:
 
 
 def _marked(names: Names) -> Names:
-    """List the names that must all have a mark before the mark is removed: the names of all joints except the root.
+    """List the names of all joints except the root.
 
-    Exporters often add a root with a name of its own.
+    A mark is removed only if all these names have it. The root does not count, because exporters often add a root whose
+    name has no mark.
     """
     return names[1:]
 

@@ -81,7 +81,7 @@ class CheckReport(Request):
     name: CheckName
     state: CheckState
     commit: Version | None = Field(
-        None, description="Commit that was checked; null: the newest one. Any commit other than the newest is refused."
+        None, description="Commit that was checked; null: the newest one. If it is no longer the newest, it is refused."
     )
     job: ItemId | None = Field(
         None,

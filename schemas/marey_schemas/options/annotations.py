@@ -68,7 +68,7 @@ class StepsProposal(_Proposal):
         0.2, ge=0, le=10, allow_inf_nan=False, description="Least distance that the hips travel in a step, in metres."
     )
     most_turn_deg: Degrees = Field(
-        45.0, description="Greatest turn of the body in a step that is labelled, in degrees."
+        45.0, description="A step is labelled only if the body turns by at most this angle in it, in degrees."
     )
     most_aside_deg: Degrees = Field(
         45.0,

@@ -67,10 +67,10 @@ class PinnedInput(Answer):
 
     @property
     def folder(self) -> str:
-        """The path of the folder below the job's `into` in which results of this input are stored.
+        """The path, relative to the job's `into`, of the folder in which results of this input are stored.
 
-        This is the path of the input's folder in the project. If the input was given as an output of another job, it is
-        the folder's path below the `into` of that job.
+        It equals the path of the input's folder in the project or, if the input was given as an output of another job,
+        the path of the input's folder relative to the `into` of that job.
         """
         return self.collection if self.below is None else self.below
 

@@ -137,5 +137,5 @@ def attempt_secret(text: str) -> str | None:
 
 
 def token_hash(text: str) -> str:
-    """Return a hash that identifies a bearer token; that of an attempt's token does not depend on the seal."""
+    """Return a hash that identifies a bearer token; the seal of an attempt's token is left out of the hash."""
     return hash_secret(attempt_secret(text) or text)

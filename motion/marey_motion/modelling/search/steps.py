@@ -35,7 +35,7 @@ class Step:
 
     Parameters
     ----------
-    standard_joints : joint index by standard name; several steps need hips and shoulders, which give the direction
+    standard_joints : joint index by standard name; a sequence of steps needs hips and shoulders, for the direction
         the body faces
     """
 
@@ -279,9 +279,10 @@ def _link(step: Step, ends: Sequence[Tracked], first: int) -> _Link:
 def _carry_on(points: Floats, slopes: Floats, link: _Link, stacked: Floats) -> tuple[Floats, Floats]:
     """Place a step so that it begins where the previous step ended.
 
-    The first two of `points` (2 or more, 3) are the pelvis of the previous step at its end, and the axis of its body
-    from right to left; `slopes` (2 or more, 3, W) are their derivatives with respect to the latent vectors `stacked`
-    (W,) of all steps. Returns the placement (3,) of the step, as heading, x and z, and its derivatives (3, W).
+    Row 0 of `points` (2 or more, 3) is the position of the pelvis at the end of the previous step, and row 1 the axis
+    of the body at that time, from right to left. `slopes` (2 or more, 3, W) are the derivatives of the rows with
+    respect to the latent vectors `stacked` (W,) of all steps. Returns the placement (3,) of the step, as heading, x and
+    z, and its derivatives (3, W).
     """
     width = len(stacked)
     begun, begun_slopes = np.empty((2, 3)), np.empty((2, 3, width))

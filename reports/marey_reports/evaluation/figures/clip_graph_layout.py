@@ -40,7 +40,7 @@ class Circle:
         return np.asarray(-(-np.arange(self.dots + 1) * self.frames // self.dots), dtype=np.int64)
 
     def middle_of(self, dots: Any) -> Any:
-        """Find the frame in the middle of each dot."""
+        """Return the middle of the range of frames that each dot stands for."""
         bounds = self.bounds
         return (bounds[dots] + bounds[np.asarray(dots) + 1]) // 2
 

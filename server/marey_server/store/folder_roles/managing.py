@@ -202,7 +202,7 @@ def _require_room(tx: Transaction, project_row: ProjectRow) -> None:
         )
     if held.all >= MOST_WITH_DELETED:
         raise ConflictProblem(
-            f"A project can have at most {MOST_WITH_DELETED:,} roles in folders, including deleted folders; "
+            f"A project can have at most {MOST_WITH_DELETED:,} roles in folders, and those in deleted folders count; "
             "restore a deleted folder and remove its roles first.",
             code="too-many-folder-roles",
         )

@@ -240,10 +240,11 @@ def _tag(condition: Condition, _: str) -> ColumnElement[bool]:
 
 
 def frames_in_range(condition: Condition, _: str) -> ColumnElement[bool]:
-    """Return the condition of `COMPARISONS` on the number of frames in a form for which a database uses the index.
+    """Return the condition on the number of frames, written so that a database can use the index of this column.
 
-    The column is compared with whole numbers. A list must not use this form, unless it reads only few items: SQLite
-    would prefer the index of frames to that of the order, and sort all items that it finds.
+    It selects the same items as the condition in `COMPARISONS`, but compares the column with whole numbers. A list must
+    not use this form, unless it reads only few items. Otherwise SQLite uses this index instead of the index by which
+    the list is sorted, and has to sort all items that it finds.
     """
     numbers = [max(0.0, min(float(str(one)), _MOST_FRAMES)) for one in condition.values]
     if condition.operator == "=":

@@ -285,7 +285,7 @@ _CLAIM_STATEMENTS = {
 
 
 def _require_worker(caller: Principal) -> list[str]:
-    """Return the caller's `work` scopes, for all or for named projects. Raises `ForbiddenProblem` if there are none."""
+    """Return the caller's `work` scopes, each for all projects or for one. Raises `ForbiddenProblem` without any."""
     scopes = [scope for scope in caller.scopes if scope.partition("!")[0] == "work"]
     if not scopes or caller.kind not in ("user", "system"):
         raise ForbiddenProblem("Claiming jobs needs a user's token with the scope `work`.", code="insufficient-scope")
