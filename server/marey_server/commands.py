@@ -21,7 +21,7 @@ from pydantic import ValidationError
 
 from marey_schemas.processes.memory import loading_modules
 from marey_schemas.queue.log_lines import usual_form
-from marey_schemas.wording import without_prefix
+from marey_schemas.wording import counted, without_prefix
 from marey_server.process.settings import Settings
 
 
@@ -141,7 +141,8 @@ def fsck(*, repair: bool = False, as_json: bool = False, **settings: Any) -> Non
     else:
         for finding in findings:
             _say(str(finding))
-        _say(f"checked {', '.join(f'{count:,} {what}' for what, count in checked.items()) or 'nothing'}")
+        amounts = ", ".join(counted(count, what.removesuffix("s")) for what, count in checked.items())
+        _say(f"checked {amounts or 'nothing'}")
     if findings:
         raise CommandFailed(f"the database has faults ({len(findings)}), which are listed above")
 
