@@ -418,6 +418,8 @@ def test_results_are_counted_as_people_count(capsys: pytest.CaptureFixture[str])
     }  # fmt: skip
     print_ended(a_job(id="job_1", result=result), False, _print_aligned)
     assert capsys.readouterr().out.splitlines()[-1] == "1 clip of 1 frame at 30 Hz; 0 refused"
+    print_ended(a_job(id="job_1", state=JobState.SUCCEEDED, result={"clips": 1, "frames": 86_000}), False)
+    assert capsys.readouterr().out == "job_1 succeeded: 1 clip, 86,000 frames; 0 refused\n"
 
 
 @pytest.mark.parametrize("as_json", [False, True])

@@ -14,7 +14,7 @@ from marey_client.cli.revisions import find_revision, find_version
 from marey_client.cli.terminal.failures import Refused, WrongUsage
 from marey_client.cli.terminal.output import Advance, print_json, print_message, print_refused, progress
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf
-from marey_schemas.wording import without_prefix
+from marey_schemas.wording import counted, without_prefix
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
@@ -176,7 +176,11 @@ def commit_text(ended: Job) -> str:
 
 def _shown_counts(ended: Job, refused: Sequence[Any]) -> Callable[[dict[str, Any]], None]:
     def show(result: dict[str, Any]) -> None:
-        counts = ", ".join(f"{value} {name}" for name, value in result.items() if isinstance(value, int))
+        counts = ", ".join(
+            counted(value, name.removesuffix("s")) if name.endswith("s") else f"{value:,} {name}"
+            for name, value in result.items()
+            if isinstance(value, int)
+        )
         typer.echo(f"{ended.id} {ended.state}" + (f": {counts}" if counts else "") + f"; {len(refused)} refused")
 
     return show
