@@ -19,7 +19,8 @@ from pydantic_core import to_jsonable_python
 
 from marey_schemas.processes.child_process import READY, connect_to_parent
 from marey_schemas.processes.limits import allow_memory
-from marey_schemas.queue.job_kinds import KindDeclaration, find_kind
+from marey_schemas.queue.job_kinds import find_kind
+from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_schemas.queue.worker_protocol import LONGEST_CODE, LONGEST_DETAIL
 from marey_worker import signatures
 from marey_worker.context import Context, JobRefused, Unreadable
