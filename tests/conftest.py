@@ -29,7 +29,16 @@ def pytest_configure(config: pytest.Config) -> None:
         discard_outdated_kernels()
         keep_files_in_memory()
         name_runtime_folder()
+    keep_folders_together(config)
     keep_bytecode()
+
+
+def keep_folders_together(config: pytest.Config) -> None:
+    """Sort the arguments by their paths, so that the tests of a folder follow each other.
+
+    Otherwise, pytest 9.1 does not find the fixtures of a folder to which it comes back (pytest issue 14635).
+    """
+    config.args.sort(key=lambda argument: argument.partition("::")[0])
 
 
 def keep_files_in_memory() -> None:
