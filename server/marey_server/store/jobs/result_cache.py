@@ -104,6 +104,9 @@ def decide(tx: Transaction, candidates: Sequence[Any], *, finished: bool = True)
     a job that may start later than the candidate itself would. In each project, this function runs for one transaction
     at a time. The found jobs are locked: none of them ends before the transaction has recorded which jobs share its
     result. Results of finished jobs are used only if `finished` is true.
+
+    A transaction that ends a job has locked this job before it calls this function, and a submission locks it here. So
+    the two can deadlock; `Database.write` then runs one of them again.
     """
     asking = [one for one in candidates if one.cache_key is not None and one.cache_mode in ("use", "refresh")]
     if not asking:
