@@ -18,13 +18,8 @@ from benchmarks.material import with_fingers
 from benchmarks.timing import Row, time_in_turn
 from marey_motion import kinematics, quaternions
 from marey_motion.editing.constraining import Constraint, constrain_motion
-from marey_motion.editing.inverse_kinematics.solving import (
-    SolvedPoses,
-    limb_ending_at,
-    solve_ccd,
-    solve_least_squares,
-    solve_two_bone,
-)
+from marey_motion.editing.inverse_kinematics.limbs import limb_ending_at
+from marey_motion.editing.inverse_kinematics.solving import SolvedPoses, solve_ccd, solve_least_squares, solve_two_bone
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     LookAtTarget,

@@ -31,6 +31,7 @@ def pytest_configure(config: pytest.Config) -> None:
         discard_outdated_kernels()
         keep_files_in_memory()
         name_runtime_folder()
+    keep_folders_together(config)
     keep_bytecode()
 
 
@@ -39,6 +40,14 @@ def pytest_collection() -> Generator[None, object, object]:
     """Collect the tests, whose objects live until the end, without the garbage collector."""
     with loading_modules():
         return (yield)
+
+
+def keep_folders_together(config: pytest.Config) -> None:
+    """Sort the arguments by their paths, so that the tests of a folder follow each other.
+
+    Otherwise, pytest 9.1 does not find the fixtures of a folder to which it comes back (pytest issue 14635).
+    """
+    config.args.sort(key=lambda argument: argument.partition("::")[0])
 
 
 def keep_files_in_memory() -> None:

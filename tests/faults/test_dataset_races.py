@@ -146,7 +146,7 @@ def received(path: str | None = None) -> ReceivedRevision:
 @pytest.mark.parametrize("path", ["rig", None])
 def test_of_two_senders_of_a_revision_one_adds_it(gaits: Lab, other: Database, path: str | None) -> None:
     revisions = (received(path),)
-    local = gaits.read(datasets.find_local, "lab", revisions, required=MAINTAIN)
+    local = gaits.read(datasets.find_local, "lab", revisions, [].append, required=MAINTAIN)
 
     def store(tx: Transaction) -> int:
         return datasets.store_revisions(tx, *GAITS, datasets.prepare_revisions(revisions, local), local).added
@@ -157,7 +157,7 @@ def test_of_two_senders_of_a_revision_one_adds_it(gaits: Lab, other: Database, p
 @on_postgres
 def test_two_senders_of_a_commit_get_the_same_answer(gaits: Lab, other: Database) -> None:
     revisions, parts = (received("rig"),), {"hierarchy": document_digest(skeleton_tree(2))}
-    local = gaits.read(datasets.find_local, "lab", revisions, required=MAINTAIN)
+    local = gaits.read(datasets.find_local, "lab", revisions, [].append, required=MAINTAIN)
     drafts = datasets.prepare_revisions(revisions, local)
     gaits.write(datasets.store_revisions, *GAITS, drafts, local, required=MAINTAIN)
     tree = build(ChunksInMemory(), [(key_of("rig", "skeleton"), {"parts": parts, "tags": []})])

@@ -13,9 +13,9 @@ from tests.support.another_loader import files_to_compare, positions_by_another_
 
 from marey_motion.errors import AmbiguousUnits, FormatError, MotionError
 from marey_motion.formats import ImportedMotion, read_motion, write_bvh
+from marey_motion.importing.body_measures import hip_heights
 from marey_motion.importing.checks import CODES
 from marey_motion.importing.landmarks import find_landmarks
-from marey_motion.importing.units import hip_heights
 from marey_motion.kinematics import global_positions, global_rotations
 from marey_motion.quaternions import angle_between
 from marey_schemas.formats.companions import pair_companions

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from threading import current_thread
 from typing import Any
 
 import httpx
@@ -14,12 +15,14 @@ from marey_schemas.datasets.naming import MAIN
 from marey_schemas.encoding import blocks
 from marey_schemas.encoding.canonical import document_digest
 from marey_server.access.principal import SYSTEM
+from marey_server.process.computing import THREAD_NAME
+from marey_server.process.memory import Holding
 from marey_server.store import datasets
 from marey_server.store.database.connections import Database
 from marey_server.store.datasets import receiving
 from marey_server.store.datasets.chunks import store_chunks
 from marey_server.store.fsck import check_store
-from marey_server.store.tables import dataset_ref
+from marey_server.store.tables import dataset_ref, document
 from marey_server.store.transaction import Transaction
 from marey_versions.records import CommitRecord, key_of, revision_content
 from marey_versions.tree.building import build
@@ -284,12 +287,49 @@ def test_a_partial_array_takes_nothing_from_another_project(client: httpx.Client
     for one in (rig, first):
         ok(client.post("/projects/other/datasets/gaits/contents", json={"revisions": [one]}))
     send(client, rig)
+    answer = client.post(f"{GAITS}/contents", json={"revisions": [partial_clip(first)]})
+    refused(answer, 409, "missing-contents")
+
+
+def partial_clip(first: dict[str, Any]) -> dict[str, Any]:
+    """Return a clip whose array of poses has all tiles of that of the clip `first`."""
     motion = {**first["parts"]["motion"], "poses": {
         "base": first["content"], "pointer": "/poses", "dtype": "<f4", "shape": [1, 7],
         "tiles": numbers("<i4", 0), "sizes": numbers("<i4"), "bytes": numbers("|u1"),
     }}  # fmt: skip
-    answer = client.post(f"{GAITS}/contents", json={"revisions": [{**first, "parts": {"motion": motion}}]})
-    refused(answer, 409, "missing-contents")
+    return {**first, "content": "sha256:" + "3" * 64, "parts": {"motion": motion}}
+
+
+def test_partial_arrays_and_their_bases_take_from_the_memory_of_requests(
+    client: httpx.Client, database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = skeleton("Hips")
+    first = clip("Hips", rig["content"])
+    send(client, rig)
+    send(client, first)
+    statement = select(document.c.size_bytes).where(document.c.schema == "marey/motion@1")
+    base_bytes = database.read(SYSTEM, lambda tx: tx.execute(statement).scalar_one())
+    taken: list[int] = []
+    monkeypatch.setattr(Holding, "grow", lambda _, more: taken.append(more))
+    client.post(f"{GAITS}/contents", json={"revisions": [partial_clip(first)]})
+    assert {POSES.nbytes, base_bytes} <= set(taken)
+
+
+def test_tiles_are_hashed_when_no_transaction_is_open(client: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = skeleton("Hips")
+    first = clip("Hips", rig["content"])
+    send(client, rig)
+    send(client, first)
+    threads: list[str] = []
+    split = blocks.split
+
+    def noted(data: bytes) -> list[bytes]:
+        threads.append(current_thread().name)
+        return split(data)
+
+    monkeypatch.setattr(blocks, "split", noted)
+    ok(client.post(f"{LAB}/contents", json={"tiles": [{"content": first["content"], "part": "motion"}]}))
+    assert [name.startswith(THREAD_NAME) for name in threads] == [True]
 
 
 def test_a_base_is_divided_into_tiles_once_for_many_partial_arrays(
@@ -300,11 +340,9 @@ def test_a_base_is_divided_into_tiles_once_for_many_partial_arrays(
     first = clip("Hips", rig["content"])
     send(client, rig)
     send(client, first)
-    partial = {
-        "base": first["content"], "pointer": "/poses", "dtype": "<f4", "shape": [1, 7],
-        "tiles": numbers("<i4", 0), "sizes": numbers("<i4"), "bytes": numbers("|u1"),
-    }  # fmt: skip
-    motion = {**first["parts"]["motion"], "poses": partial, "more": dict.fromkeys("abcdefgh", partial)}
+    sent = partial_clip(first)
+    motion = sent["parts"]["motion"]
+    motion["more"] = dict.fromkeys("abcdefgh", motion["poses"])
     divided: list[bytes] = []
     split = blocks.split
 
@@ -313,6 +351,5 @@ def test_a_base_is_divided_into_tiles_once_for_many_partial_arrays(
         return split(data)
 
     monkeypatch.setattr(blocks, "split", counted)
-    sent = {**first, "content": "sha256:" + "3" * 64, "parts": {"motion": motion}}
     client.post(f"{GAITS}/contents", json={"revisions": [sent]})
     assert len(divided) == 1

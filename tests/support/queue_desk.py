@@ -15,8 +15,8 @@ from marey_schemas.base import Request
 from marey_schemas.kinds import Kind
 from marey_schemas.queue import job_kinds
 from marey_schemas.queue.facets import ItemFacets
-from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.jobs import InputSpec, Job, JobCreate, Progress
+from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_schemas.queue.worker_protocol import (
     ClaimRequest,
     CompleteAnswer,

@@ -50,12 +50,13 @@ from marey_worker.attempt_limits import LogUploader, Stop, Watch
 from marey_worker.heartbeats import LeaseKeeper
 from marey_worker.job_io.input_cache import InputCache
 from marey_worker.messages import (
+    BAD_RESULT,
     UNPACKABLE,
     ChildReply,
     Done,
     Failed,
     FindItems,
-    Made,
+    ProgressMade,
     PutFile,
     ReadBlob,
     ReadItem,
@@ -188,7 +189,7 @@ class RunningAttempt:
                 return Failed("bad-message", str(error), "bad-message", retryable=True)
             if isinstance(message, Done | Failed):
                 return message
-            if isinstance(message, Made):
+            if isinstance(message, ProgressMade):
                 self._keeper.set_progress(message.progress)
             elif message is not None:
                 self._serve(message, child)
@@ -312,7 +313,7 @@ class RunningAttempt:
             except _REFUSED as error:  # such as a quota that is exceeded; to compute the results again would not help
                 end = Failed(error.code, f"the results cannot be published: {error}", None, retryable=False)
             except CodecError as error:
-                end = Failed(signatures.BAD_RESULT, f"the result cannot be sent: {error}", None, retryable=False)
+                end = Failed(BAD_RESULT, f"the result cannot be sent: {error}", None, retryable=False)
             except ServerFailed as error:
                 end = Failed(error.code, f"the results could not be published: {error}", None, retryable=True)
         if not isinstance(end, Done):

@@ -20,11 +20,12 @@ from pydantic_core import to_jsonable_python
 from marey_schemas.processes.child_process import READY, connect_to_parent
 from marey_schemas.processes.limits import allow_memory
 from marey_schemas.processes.memory import loading_modules
-from marey_schemas.queue.job_kinds import KindDeclaration, find_kind
+from marey_schemas.queue.job_kinds import find_kind
+from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_schemas.queue.worker_protocol import LONGEST_CODE, LONGEST_DETAIL
 from marey_worker import signatures
 from marey_worker.context import Context, JobRefused, Unreadable
-from marey_worker.messages import UNPACKABLE, Done, End, Failed, Run, pack, unpack
+from marey_worker.messages import BAD_RESULT, UNPACKABLE, Done, End, Failed, Run, pack, unpack
 from marey_worker.texts import storable
 
 DETAIL_CHARACTERS = 1000
@@ -122,7 +123,7 @@ def _packed(end: End) -> bytes:
     try:
         return pack(end)
     except UNPACKABLE as error:
-        return pack(_failed(signatures.BAD_RESULT, f"the result cannot be sent: {error}"))
+        return pack(_failed(BAD_RESULT, f"the result cannot be sent: {error}"))
 
 
 def _failed(code: str, detail: str, signature: str | None = None, *, retryable: bool = False) -> Failed:

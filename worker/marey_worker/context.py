@@ -19,7 +19,7 @@ from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput, Stage
 from marey_worker.messages import (
     ChildReply,
     FindItems,
-    Made,
+    ProgressMade,
     PutFile,
     ReadBlob,
     ReadItem,
@@ -216,7 +216,7 @@ class Context:
         `total` is greater than 0, or None if it is unknown; then users see no percentage. `note` names the current
         step; a note of more than 500 characters is shortened.
         """
-        self._pipe.send_bytes(pack(Made(Progress(done=done, total=total, note=storable(note, LONGEST_NOTE)))))
+        self._pipe.send_bytes(pack(ProgressMade(Progress(done=done, total=total, note=storable(note, LONGEST_NOTE)))))
 
     def log(self, text: str) -> None:
         """Write a line to the job's log; `print` does the same."""

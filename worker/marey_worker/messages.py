@@ -123,7 +123,7 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Made:
+class ProgressMade:
     """Message that reports the progress of the job."""
 
     progress: Progress
@@ -138,6 +138,10 @@ class Done:
 
     result: dict[str, Any]
     shareable: bool = True
+
+
+BAD_RESULT = "bad-result"
+"""Code of `Failed` if a result contains a value that no request can contain, such as a NaN."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +160,8 @@ End = Done | Failed
 _FORMS = {
     one.__name__: TypeAdapter(one)
     for one in (
-        Run, ChildReply, ReadParts, ReadItem, FindItems, ReadBlob, ReadResults, PutFile, Stage, Made, Done, Failed,
+        Run, ChildReply, ReadParts, ReadItem, FindItems, ReadBlob, ReadResults, PutFile, Stage, ProgressMade,
+        Done, Failed,
     )
 }  # fmt: skip
 

@@ -15,9 +15,6 @@ NAME_CHARACTERS = 200
 STAGING = "staging"
 """Signature of the failure that the server did not store results."""
 
-BAD_RESULT = "bad-result"
-"""Code of the failure that a result contains a value that no request can contain, such as a NaN."""
-
 
 def of_exception(error: BaseException) -> str:
     """Return the signature of an exception: its type, and a digest of its type and traceback, but not of its text."""

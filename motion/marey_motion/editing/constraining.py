@@ -16,7 +16,8 @@ from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Floats, Ints
 from marey_motion.editing.compute_budget import PER_MEETING, PER_MET_NUMBER, ComputeBudget
 from marey_motion.editing.displacement import displace, windows_around
-from marey_motion.editing.inverse_kinematics.solving import TwoBoneLimb, limb_targets, measure_residuals, solve
+from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb, limb_targets
+from marey_motion.editing.inverse_kinematics.solving import measure_residuals, solve
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     LookAtTarget,

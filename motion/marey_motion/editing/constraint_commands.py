@@ -14,7 +14,7 @@ from marey_motion.editing.compute_budget import PER_NUMBER, PER_PLANTED_NUMBER, 
 from marey_motion.editing.constraining import Constraint, constrain_motion, current_values
 from marey_motion.editing.foot_plants import Foot, FootContacts, find_contacts
 from marey_motion.editing.foot_plants import plant_feet as plant
-from marey_motion.editing.inverse_kinematics.solving import limb_ending_at
+from marey_motion.editing.inverse_kinematics.limbs import limb_ending_at
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     JointLimit,

@@ -50,7 +50,7 @@ def finish(
     skeleton : Skeleton    J joints
     motion : Motion    F frames, such as a sample brought close by search and refinement
     constraints : sequence of Constraint    C constraints with their frames and the joints that may turn
-        (`inverse_kinematics.solving.limb_ending_at` and `inverse_kinematics.targets.chain_of` find such joints)
+        (`inverse_kinematics.limbs.limb_ending_at` and `inverse_kinematics.targets.chain_of` find such joints)
     window_frames : int    number of frames before and after the constrained frames that may change
     freedom : Freedom, optional    limits and stiffness
     options : SolverOptions, optional    tolerances and iterations

@@ -21,7 +21,8 @@ from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Flags, Floats
 from marey_motion.editing.annotations.contacts import runs, without_short
 from marey_motion.editing.displacement import spread_displacements, windows_around
-from marey_motion.editing.inverse_kinematics.solving import TwoBoneLimb, solve_two_bone
+from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb
+from marey_motion.editing.inverse_kinematics.solving import solve_two_bone
 from marey_motion.editing.inverse_kinematics.targets import OrientationTarget, PositionTarget
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion

@@ -26,11 +26,15 @@ _LONG_TOKENS_PER_CALL = 1 << 14
 
 @dataclass(frozen=True)
 class BoneTable:
-    """Bones as arrays for compiled code: concatenated names, end of each name, first column of each bone."""
+    """Bones as arrays for compiled code: concatenated names, end of each name, first column of each bone.
+
+    `by_name` are the indices of the bones in the order of their names.
+    """
 
     names: NDArray[np.uint8]
     name_ends: NDArray[np.int64]
     first_columns: NDArray[np.int64]
+    by_name: NDArray[np.int64]
 
     @classmethod
     def of(cls, bones: list[Bone]) -> BoneTable:
@@ -50,6 +54,7 @@ class BoneTable:
             np.frombuffer(b"".join(names), np.uint8),
             np.cumsum([len(name) for name in names]),
             np.cumsum([0, *widths]),
+            np.array(sorted(range(len(names)), key=names.__getitem__), np.int64),
         )
 
 
@@ -76,6 +81,7 @@ def scan_frames(lines: TextLines, skeleton: AsfSkeleton) -> tuple[NDArray[np.flo
     # Sized by what the text can hold: a frame has a number, and a line for each bone with channels, but no others.
     lengths, widths = np.diff(table.name_ends, prepend=0), np.diff(table.first_columns)
     shortest = 2 + int(np.sum((lengths + 1 + 2 * widths)[widths > 0]))
+    called = table.names, table.name_ends, table.by_name
     values = np.zeros(((len(lines.data) - lines.position) // shortest + 1, int(table.first_columns[-1])))
     seen = np.full(len(skeleton.bones), -1, np.int64)
     long_tokens = np.empty((_LONG_TOKENS_PER_CALL, 5), np.int64)
@@ -83,7 +89,7 @@ def scan_frames(lines: TextLines, skeleton: AsfSkeleton) -> tuple[NDArray[np.flo
     state[_POSITION], state[_LINE], state[_FRAME] = lines.position, lines.number + 1, -1
     stopped = _BUFFER_FULL
     while stopped == _BUFFER_FULL:
-        stopped = _scan(text, table.names, table.name_ends, table.first_columns, values, seen, long_tokens, state)
+        stopped = _scan(text, called, table.first_columns, values, seen, long_tokens, state)
         lines.number = int(state[_LINE])
         _read_long_tokens(text, long_tokens[: state[_LONG_TOKENS]], values, skeleton, lines)
         state[_LONG_TOKENS] = 0
@@ -93,9 +99,9 @@ def scan_frames(lines: TextLines, skeleton: AsfSkeleton) -> tuple[NDArray[np.flo
 
 
 @compiled
-def _scan(text, names, name_ends, first_columns, values, seen, long_tokens, state):  # type: ignore[no-untyped-def]
+def _scan(text, called, first_columns, values, seen, long_tokens, state):  # type: ignore[no-untyped-def]
     end = text.size
-    bones = name_ends.size
+    bones = first_columns.size - 1
     moving = np.sum(first_columns[1:] > first_columns[:-1])
     while True:
         i = _next_word(text, state)
@@ -112,7 +118,7 @@ def _scan(text, names, name_ends, first_columns, values, seen, long_tokens, stat
                 return _MISSING_BONE
             _begin_frame(text, i, stop, state)
         else:
-            bone = _bone_called(text, i, stop, names, name_ends, state[_BONE])
+            bone = _bone_called(text[i:stop], called, state[_BONE])
             if bone < 0 or state[_FRAME] < 0:
                 return _UNKNOWN_BONE
             state[_BONE] = bone
@@ -166,24 +172,37 @@ def _begin_frame(text, start, stop, state):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _bone_called(text, start, stop, names, name_ends, expected):  # type: ignore[no-untyped-def]
-    """Return the index of the bone whose name is `text[start:stop]`, or -1; the search begins at bone `expected`."""
-    bones = name_ends.size
-    for step in range(bones):
-        bone = expected + step
-        if bone >= bones:
-            bone -= bones
-        first = name_ends[bone - 1] if bone > 0 else 0
-        if name_ends[bone] - first != stop - start:
-            continue
-        same = True
-        for k in range(stop - start):
-            if text[start + k] != names[first + k]:
-                same = False
-                break
-        if same:
-            return bone
+def _bone_called(word, called, expected):  # type: ignore[no-untyped-def]
+    """Return the index of the bone with the name `word`, or -1.
+
+    Most files list the bones in the order of the skeleton, so `expected` is compared first. The other bones are found
+    by bisection of the sorted names.
+    """
+    names, name_ends, by_name = called
+    if _compare(word, names, name_ends, expected) == 0:
+        return expected
+    low, high = 0, by_name.size
+    while low < high:
+        middle = (low + high) // 2
+        order = _compare(word, names, name_ends, by_name[middle])
+        if order == 0:
+            return by_name[middle]
+        if order < 0:
+            high = middle
+        else:
+            low = middle + 1
     return -1
+
+
+@compiled
+def _compare(word, names, name_ends, bone):  # type: ignore[no-untyped-def]
+    """Return a number below, equal to or above 0 if `word` is before, equal to or after the name of a bone."""
+    first = name_ends[bone - 1] if bone > 0 else 0
+    length = name_ends[bone] - first
+    for k in range(min(word.size, length)):
+        if word[k] != names[first + k]:
+            return np.int64(word[k]) - np.int64(names[first + k])
+    return word.size - length
 
 
 @compiled

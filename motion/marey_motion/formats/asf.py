@@ -41,9 +41,10 @@ _SPACED = bytes.maketrans(b",()", b"   ")
 class Bone:
     """A bone in the units and conventions of the file.
 
-    `vector` is the direction times the length, in the file's unit and world axes. `frame` is the quaternion of the
-    bone's `axis`. `channels` are the degrees of freedom in order ("rx", "tz"). `line` is the number of the bone's line
-    in the file. `written_name` is the name as bytes of the file, by which an AMC file calls the bone.
+    `vector` is the direction times the length, in the file's unit and world axes. `axis` are three angles, and the
+    order of the axes about which they turn; `frame` is the quaternion of these turns. `channels` are the degrees of
+    freedom in order ("rx", "tz"). `line` is the number of the bone's line in the file. `written_name` is the name as
+    bytes of the file, by which an AMC file calls the bone.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Bone:
     written_name: bytes = b""
     direction: list[float] | None = None
     length: float | None = None
+    axis: tuple[list[float], str] | None = None
     frame: NDArray[np.float64] = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
     channels: tuple[str, ...] = ()
 
@@ -263,9 +265,8 @@ class _AsfReader:
         elif keyword == b"length":
             bone.length = self.lines.numbers(words[1:], 1, "length", bone.name)[0]
         elif keyword == b"axis":
-            bone.frame = self._frame(
-                self.lines.numbers(words[1:4], 3, "axis", bone.name), self._order(words[4:], bone.name)
-            )
+            angles = self.lines.numbers(words[1:4], 3, "axis", bone.name)
+            bone.axis = angles, self._order(words[4:], bone.name)
         elif keyword == b"dof":
             bone.channels = self._channels(words[1:], bone.name)
             if any(channel[0] != "r" for channel in bone.channels):
@@ -288,6 +289,8 @@ class _AsfReader:
                 file=self.lines.file,
                 line=self.lines.number,
             )
+        if bone.axis is not None:  # only the last axis of the bone counts, so that many of them take no time
+            bone.frame = self._frame(*bone.axis)
         self.bones[bone.name] = bone
         self.bone = None
 

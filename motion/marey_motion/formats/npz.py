@@ -169,9 +169,8 @@ def _source(arrays: dict[str, NDArray[Any]], file: str, frame_rate_hz: float | N
         poses = _array(arrays, "poses", "f", (frames, 3 + 4 * joints), file)
         if (size := poses.size * _STORED_BYTES) > MOST_UNPACKED_BYTES:  # in half precision, the archive has less
             raise FormatLimit(f"the poses need {size} bytes; at most {MOST_UNPACKED_BYTES} are accepted", file=file)
-        quaternions = poses[:, 3:].reshape(frames, joints, 4)
         source.root_positions = poses[:, :3].astype(np.float64)
-        source.rotations = as_rotations(quaternions, names, file, source.warnings).astype(np.float32)
+        source.rotations = as_rotations(poses[:, 3:], names, file, source.warnings)
         source.frame_rate_hz = frame_rate_hz or float(_array(arrays, "frame_rate_hz", "f", (), file))
     if frames and "translations" in arrays and "translated_joints" in arrays:
         moved = _array(arrays, "translated_joints", "i", (arrays["translated_joints"].size,), file)

@@ -281,7 +281,7 @@ class DirectoryBlobs:
         return Path(name)
 
     def adopt(self, copy: Path, digest: str) -> None:
-        """Sync a copy and rename it to the file of the blob.
+        """Rename a copy, whose bytes are synced already, to the file of the blob.
 
         Does nothing if an earlier try of the same transaction has renamed the copy already.
         """

@@ -9,7 +9,7 @@ from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
 from marey_motion.editing.constraining import Constraint, constrain_motion
 from marey_motion.editing.finish import finish
-from marey_motion.editing.inverse_kinematics.solving import TwoBoneLimb, limb_ending_at
+from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb, limb_ending_at
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     JointLimit,

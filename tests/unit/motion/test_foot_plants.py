@@ -17,7 +17,7 @@ from marey_motion.editing.foot_plants import (
     foot_slide_m,
     plant_feet,
 )
-from marey_motion.editing.inverse_kinematics.solving import limb_ending_at
+from marey_motion.editing.inverse_kinematics.limbs import limb_ending_at
 from marey_motion.errors import EditError
 from marey_motion.formats import read_motion
 from marey_motion.gait import generate_gait

@@ -1,17 +1,22 @@
-"""Small files that describe a huge motion are refused before they fill memory."""
+"""Time and memory that odd or large files may cost; those that describe a huge motion are refused."""
 
 from __future__ import annotations
 
 import json
+import time
 import tracemalloc
 from collections.abc import Callable
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 from tests.support.motion_files import AMC, ASF, POSITIONS, ZXY, bvh, nested
 
 from marey_motion.errors import FormatLimit
 from marey_motion.formats import ImportOptions, read_motion, unpacking, write_motion, write_predecessor_skeleton
 from marey_motion.formats.amc import read_amc
+from marey_motion.formats.asf import _AsfReader, parse_asf
+from marey_motion.formats.npz import read_npz, write_npz
 from marey_motion.gait import generate_gait
 
 File = tuple[str, bytes, bytes | None]
@@ -70,3 +75,50 @@ def test_an_amc_needs_little_more_memory_than_its_rotations() -> None:
     assert rotations is not None
     assert rotations.shape == (1000, 404, 4)
     assert peak_bytes < 4 * rotations.nbytes
+
+
+def test_an_npz_needs_little_more_memory_than_its_arrays() -> None:
+    data = write_npz(generate_gait(1.2, 0.0, 60.0, 120.0))
+    read_npz(data, "walk.npz")
+    tracemalloc.start()
+    try:
+        rotations = read_npz(data, "walk.npz").rotations
+        peak_bytes = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert rotations is not None
+    assert peak_bytes < 3 * rotations.nbytes
+
+
+def test_the_lines_of_an_amc_may_have_any_order() -> None:
+    bones = 4000
+    moving = "".join(f"begin\n name b{n}\n direction 0 1 0\n length 1\n dof rx\nend\n" for n in range(bones))
+    names = " ".join(f"b{number}" for number in range(bones))
+    asf = ASF.replace(":hierarchy", f"{moving}:hierarchy", 1).replace("root thigh", f"root thigh {names}", 1).encode()
+    lines = ["root 1 2 3 4 5 6", "thigh 1 2 3", "shin 4", *(f"b{number} {number % 90}" for number in range(bones))]
+    head = AMC.partition("1")[0]
+    seconds, turns = [], []
+    for order in (lines, lines, lines[::-1]):  # the first reading compiles the kernels
+        text = head + "".join(f"{number}\n" + "\n".join(order) + "\n" for number in range(1, 41))
+        before = time.process_time()
+        turns.append(read_amc(text.encode(), "walk.amc", companion=asf).rotations)
+        seconds.append(time.process_time() - before)
+    assert turns[1] is not None
+    assert (turns[1] == turns[2]).all()
+    assert seconds[2] < 3 * seconds[1]
+
+
+def test_many_axes_of_one_bone_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    computed: list[str] = []
+    frame = _AsfReader._frame
+
+    def noted(self: _AsfReader, angles: list[float], order: str) -> NDArray[np.float64]:
+        computed.append(order)
+        return frame(self, angles, order)
+
+    monkeypatch.setattr(_AsfReader, "_frame", noted)
+    line = "    axis 0 0 20 XYZ\n"
+    assert line in ASF
+    skeleton = parse_asf(ASF.replace(line, "    axis 0 0 30 XYZ\n" * 1000 + line, 1).encode(), "body.asf")
+    assert (skeleton.bones[1].frame == parse_asf(ASF.encode(), "body.asf").bones[1].frame).all()
+    assert len(computed) < 20

@@ -12,10 +12,9 @@ from tests.support.constraint_derivatives import constraint_jacobian
 
 from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
+from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb, limb_ending_at
 from marey_motion.editing.inverse_kinematics.solving import (
     SolvedPoses,
-    TwoBoneLimb,
-    limb_ending_at,
     measure_residuals,
     solve,
     solve_ccd,
@@ -503,6 +502,23 @@ def test_an_orientation_turns_the_end_of_a_limb_alone_unless_a_limit_stops_it(
     for joints in (limb.joints, None):
         limited = solve(body, motion, [target], freedom=Freedom(joints, limits=limits), limb=limb, solver=solver)
         assert limited.reached.all()
+
+
+@pytest.mark.parametrize("solver", ["auto", "ccd", "least_squares"])
+@pytest.mark.parametrize("fixed", ["LeftHand", "LeftForeArm"])
+def test_a_limb_turns_no_joint_that_may_not_turn(
+    body: Skeleton, solver: Literal["auto", "ccd", "least_squares"], fixed: str
+) -> None:
+    motion = _moved(body, frames=3)
+    limb = limb_of(body, "LeftArm", "LeftForeArm", "LeftHand")
+    wanted = quaternions.multiply(quaternions.from_rotation_vector((0.3, -0.4, 0.5)), _spins(body, motion, limb.end))
+    near = motion.positions(body)[:, limb.start] + (0.3, 0.1, 0.1)
+    joints = tuple(joint for joint in limb.joints if joint != body.index_of(fixed))
+    targets: tuple[Target, ...] = (OrientationTarget(limb.end, wanted), PositionTarget(limb.end, near))
+    for target in targets:
+        solved = solve(body, motion, [target], freedom=Freedom(joints), limb=limb, solver=solver)
+        turned = quaternions.angle_between(solved.motion.rotations, motion.rotations).max(axis=0) > 1e-9
+        assert set(np.flatnonzero(turned).tolist()) <= set(joints)
 
 
 @pytest.mark.parametrize("solver", ["ccd", "least_squares"])

@@ -9,9 +9,10 @@ import pytest
 
 from marey_schemas.kinds import Kind
 from marey_schemas.queue import job_kinds
-from marey_schemas.queue.job_kinds import BUILT_IN, IMPORT, KindDeclaration, UnknownKindError, find_kind
+from marey_schemas.queue.job_kinds import BUILT_IN, IMPORT, UnknownKindError, find_kind
 from marey_schemas.queue.job_params import RetargetParams
 from marey_schemas.queue.jobs import InputSpec
+from marey_schemas.queue.kind_declaration import KindDeclaration
 
 
 def declare(**fields: object) -> KindDeclaration:

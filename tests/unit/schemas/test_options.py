@@ -9,8 +9,9 @@ from pydantic import BaseModel, ValidationError
 import marey_schemas.options as room
 from marey_schemas.base import Options
 from marey_schemas.options.annotations import StepsProposal, VelocityMinimaProposal, WristContactProposal
-from marey_schemas.queue.job_kinds import BUILT_IN, KindDeclaration
+from marey_schemas.queue.job_kinds import BUILT_IN
 from marey_schemas.queue.job_params import AnnotateParams
+from marey_schemas.queue.kind_declaration import KindDeclaration
 
 UNITS = {
     "_m_s": "metres per second", "_deg_s": "degrees per second", "_s": "second", "_hz": "hertz", "_cm": "centimetre",

@@ -88,6 +88,14 @@ def test_a_job_waits_for_none_that_runs_on_a_worker_with_other_labels(desk: Desk
     assert source(desk, submit(desk)) is None
 
 
+def test_a_job_does_not_wait_while_an_identical_one_waits_for_its_next_attempt(desk: Desk) -> None:
+    failed = submit(desk)
+    desk.fail(desk.claim())
+    assert source(desk, submit(desk, priority=-1)) is None
+    desk.clock.advance(desk.policy.longest_backoff_s)
+    assert source(desk, submit(desk)) == failed
+
+
 def test_of_several_identical_jobs_the_next_waits_for_the_one_that_runs_first(desk: Desk) -> None:
     submit(desk, labels=GPU)
     submit(desk)
@@ -221,16 +229,16 @@ def test_a_result_that_depends_on_more_than_the_inputs_is_not_shared_later(desk:
     assert desk.job(submit(desk)).cached_from == again
 
 
-def test_jobs_that_waited_for_a_result_that_is_not_shared_compute_it(desk: Desk) -> None:
+def test_jobs_that_waited_for_a_result_that_is_not_shared_compute_it_side_by_side(desk: Desk) -> None:
     submit(desk)
     waiting = [submit(desk), submit(desk)]
     lease = desk.claim()
     desk.stage(lease, "total")
     desk.complete(lease, shareable=False)
-    assert states(desk, waiting) == {"queued": 1, "waiting": 1}
-    lease = desk.claim()
-    desk.stage(lease, "total")
-    desk.complete(lease)
+    assert states(desk, waiting) == {"queued": 2}
+    for lease in desk.claim_many():
+        desk.stage(lease, "total")
+        desk.complete(lease, shareable=False)
     assert states(desk, waiting) == {"succeeded": 2}
     assert {len(desk.outputs(job)) for job in waiting} == {1}
 

@@ -15,7 +15,7 @@ from marey_schemas.processes.child_process import BadMessage, ChildProcess
 from marey_schemas.queue.jobs import Progress
 from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.attempt import send_reply
-from marey_worker.messages import ChildReply, Done, Made, PutFile, ReadParts, ReadResults, Run, pack, unpack
+from marey_worker.messages import ChildReply, Done, ProgressMade, PutFile, ReadParts, ReadResults, Run, pack, unpack
 
 PIN = PinnedInput(item="clip_1", revision=2, kind=Kind.CLIP, name="walk", collection="takes")
 RUN = Run("job_1", "align", {"window": 3}, {"clips": (PIN,)}, 7, 1 << 29, Path("/tmp/log"), Path("/tmp/job"), 2)
@@ -28,7 +28,7 @@ RUN = Run("job_1", "align", {"window": 3}, {"clips": (PIN,)}, 7, 1 << 29, Path("
         ReadParts(3, (PartPlace(kind=Kind.CLIP, item="clip_1", revision=2, part="motion"),)),
         ReadResults(4),
         PutFile(5, Path("/tmp/job/archive.zip")),
-        Made(Progress(done=1, total=3, note="reading")),
+        ProgressMade(Progress(done=1, total=3, note="reading")),
         Done({"clips": 3, "of": [0.5, None, "walk"]}),
         ChildReply(6, [b"\x00document", None]),
         ChildReply(7, refusal="gone", missing=True),

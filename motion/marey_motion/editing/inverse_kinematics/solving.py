@@ -8,7 +8,7 @@ brought within the limits before the comparison.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.arrays import Floats
+from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb, limb_targets
 from marey_motion.editing.inverse_kinematics.problem import IkProblem, SolverResult, pose_problem
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
@@ -26,7 +27,6 @@ from marey_motion.editing.inverse_kinematics.targets import (
 )
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion
-from marey_motion.rigs import JointAxes, JointMapping
 from marey_motion.skeleton import Skeleton
 from marey_schemas.editing.constraints import Solver
 
@@ -56,29 +56,6 @@ class SolvedPoses:
     reached: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class TwoBoneLimb:
-    """A chain of two bones, such as an arm or a leg; joints between its three joints keep their local rotations.
-
-    Parameters
-    ----------
-    start, middle, end : indices of shoulder, elbow, wrist, or hip, knee, ankle
-    hinge : unit axis about which the limb bends, in the frame of the middle joint. It is used where the limb is nearly
-        straight or a little overstretched, because such a pose does not define an axis; if None, an arbitrary axis is
-        used there
-    """
-
-    start: int
-    middle: int
-    end: int
-    hinge: tuple[float, float, float] | None = None
-
-    @property
-    def joints(self) -> tuple[int, int, int]:
-        """Indices of the three joints: end, middle, start."""
-        return self.end, self.middle, self.start
-
-
 class _LimbKernel(NamedTuple):
     """A limb whose joints are numbered as in the arrays of the kernels."""
 
@@ -89,36 +66,6 @@ class _LimbKernel(NamedTuple):
     hinge: Floats
     damping_zone: float
     ending: int
-
-
-def limb_ending_at(
-    skeleton: Skeleton, mapping: JointMapping, joint: int, axes: Mapping[str, JointAxes] | None = None
-) -> TwoBoneLimb | None:
-    """Find the arm or leg whose wrist or ankle is a given joint.
-
-    Parameters
-    ----------
-    skeleton : Skeleton    J joints
-    mapping : JointMapping    standard joints of the skeleton
-    joint : int    index of the joint
-    axes : mapping of str to JointAxes, optional    axes by joint name (`rigs.guess_axes`); if None, the bending
-        direction of straight limbs is unknown
-
-    Returns
-    -------
-    TwoBoneLimb or None    None if the joint is neither a wrist nor an ankle
-    """
-    for side in ("left", "right"):
-        for root, middle, end in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")):
-            names = [mapping.joints.get(f"{side}_{part}") for part in (root, middle, end)]
-            if None in names or skeleton.joint_names[joint] != names[2]:
-                continue
-            top, mid = (skeleton.index_of(str(name)) for name in names[:2])
-            swing = None if axes is None else axes[str(names[1])].swing
-            # Knees bend about their swing axis, elbows stretch about it.
-            hinge = swing if swing is None or middle == "elbow" else (-swing[0], -swing[1], -swing[2])
-            return TwoBoneLimb(top, mid, joint, hinge)
-    return None
 
 
 def solve(
@@ -139,7 +86,7 @@ def solve(
     motion : Motion    F frames, which stay unchanged
     targets : sequence of targets    C targets
     freedom : Freedom    joints that may turn; if `freedom.joints` is None and a limb is given, only the limb turns
-    limb : TwoBoneLimb, optional    a limb that may turn
+    limb : TwoBoneLimb, optional    a limb that may turn; it is ignored if `freedom.joints` lacks one of its joints
     solver : str    "auto", "ccd", "two_bone" or "least_squares". "auto" uses the two-bone solver if a limb is given,
         joints have no limits, and the targets are a position of the limb's end in all axes and, optionally, an
         orientation of this end. Otherwise, "auto" uses least squares. It also uses least squares if the limb is too
@@ -156,12 +103,14 @@ def solve(
     ------
     EditError    if a target is invalid (the error names it), or if the solver cannot be used for these targets
     """
+    if limb is not None and freedom.joints is not None and not set(limb.joints) <= set(freedom.joints):
+        limb = None
     asked = limb_targets(targets, limb)
     if solver == "two_bone" or (solver == "auto" and asked is not None and not freedom.limits):
         if asked is None or limb is None:
             raise EditError(
-                "the two-bone solver needs a limb and, for the end of the limb, one position target in all "
-                "axes and at most one orientation target; use another solver",
+                "the two-bone solver needs a limb whose joints may turn and, for the end of the limb, one position "
+                "target in all axes and at most one orientation target; use another solver",
                 code="solver-unfit",
                 where="solver",
             )
@@ -402,29 +351,6 @@ def measure_residuals(skeleton: Skeleton, motion: Motion, targets: Sequence[Targ
     found = problem.found
     _measure(problem, _OPTIONS, found.before, found)
     return found.before
-
-
-def limb_targets(
-    targets: Sequence[Target], limb: TwoBoneLimb | None
-) -> tuple[PositionTarget, OrientationTarget | None] | None:
-    """Select the targets that the closed form for two bones can meet: position and orientation of a limb's end.
-
-    Parameters
-    ----------
-    targets : sequence of targets    all targets
-    limb : TwoBoneLimb or None    the limb
-
-    Returns
-    -------
-    (PositionTarget, OrientationTarget or None) or None    None if there is no limb, if the position is not given in all
-        axes, or if there are other targets
-    """
-    positions = [target for target in targets if isinstance(target, PositionTarget)]
-    orientations = [target for target in targets if isinstance(target, OrientationTarget)]
-    fits = len(positions) == 1 and len(orientations) <= 1 and len(positions) + len(orientations) == len(targets)
-    if limb is None or not fits or len(set(positions[0].axes)) < 3 or {t.joint for t in targets} != {limb.end}:
-        return None
-    return positions[0], orientations[0] if orientations else None
 
 
 def _solved(motion: Motion, problem: IkProblem, found: SolverResult) -> SolvedPoses:

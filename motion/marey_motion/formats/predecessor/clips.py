@@ -198,6 +198,7 @@ def _fill_motion(source: SourceMotion, names: list[str], poses: NDArray[np.float
     require_unpackable(len(poses), len(indices), poses.size, file)
     given = poses[:, 3:].reshape(len(poses), len(names), 4) * MIRROR_ROTATION
     rotations = np.tile(source.rest_rotations, (len(poses), 1, 1))
-    rotations[:, [indices[name] for name in names]] = as_rotations(given, tuple(names), file, source.warnings)
+    rows = given.reshape(len(poses), 4 * len(names))
+    rotations[:, [indices[name] for name in names]] = as_rotations(rows, tuple(names), file, source.warnings)
     source.rotations = rotations.astype(np.float32)
     source.root_positions = poses[:, :3] * MIRROR_VECTOR + source.offsets[0]

@@ -9,7 +9,7 @@ import numpy as np
 
 from marey_motion.editing.constraining import Constraint as Constrained
 from marey_motion.editing.finish import finish
-from marey_motion.editing.inverse_kinematics.solving import limb_ending_at
+from marey_motion.editing.inverse_kinematics.limbs import limb_ending_at
 from marey_motion.editing.inverse_kinematics.targets import LookAtTarget, OrientationTarget, PositionTarget, Target
 from marey_motion.errors import MappingError
 from marey_motion.modelling.search.constraints import joint_index

@@ -40,7 +40,7 @@ class ProjectContents(Resource):
         them again.
         """
         found = await self.look_up(datasets.load_contents, project, body)
-        return await self.render_document(Reply(found))
+        return await self.render_document(Reply(await self.compute(datasets.contents_document, found)))
 
 
 class ExportChecks(Resource):
@@ -82,7 +82,7 @@ class ReceivedContents(Resource):
         created in the folder `imported`. Because quotas do not count deleted items, only maintainers may send this
         request.
         """
-        local = await self.look_up(datasets.find_local, project, body.revisions)
+        local = await self.look_up(datasets.find_local, project, body.revisions, self.holding.grow)
         drafts = await self.compute(datasets.prepare_revisions, body.revisions, local)
         return await self.answer(datasets.store_revisions, project, dataset, drafts, local)
 

@@ -23,7 +23,7 @@ from marey_server.store.datasets.naming import (
     read_dataset,
     read_ref,
 )
-from marey_server.store.datasets.portable import check_export, load_contents
+from marey_server.store.datasets.portable import check_export, contents_document, load_contents
 from marey_server.store.datasets.receiving import (
     find_local,
     prepare_receipt,
@@ -39,6 +39,7 @@ __all__ = [
     "check_export",
     "check_out",
     "compare_versions",
+    "contents_document",
     "create_dataset",
     "create_ref",
     "delete_dataset",

@@ -61,7 +61,7 @@ def check_out(
     tx.lock(f"checkout {project_row.id} {name}")  # so that no other checkout changes the folder after it was read
     found = find_dataset(tx, project_row, name)
     rights.require_below(found.path or "", Role.MAINTAINER)
-    manifest = _wanted(tx, project_row, found, request, selected)
+    manifest = _make_manifest(tx, project_row, found, request, selected)
     state = read_folder(tx, project_row, found)
     store = StoredChunks(tx)
     if not request.discard:
@@ -89,7 +89,7 @@ def check_out(
     )  # fmt: skip
 
 
-def _wanted(
+def _make_manifest(
     tx: Transaction,
     project_row: ProjectRow,
     found: Row[Any],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from sqlalchemy import func, select
@@ -32,10 +32,11 @@ Bases = Mapping[BasePlace, Sequence[bytes]]
 """Tiles of the bases of partial arrays."""
 
 
-def bases_named_in(received: Sequence[ReceivedRevision]) -> set[BasePlace]:
+def bases_named_in(received: Sequence[ReceivedRevision], take_bytes: Callable[[int], None]) -> set[BasePlace]:
     """Return the places of the bases of all partial arrays in received documents.
 
-    Raises `InvalidProblem` if a partial array is malformed, or if the arrays together are too large.
+    `take_bytes` is called with the size of the whole arrays, before they take memory. Raises `InvalidProblem` if a
+    partial array is malformed, or if the arrays together are too large.
     """
     found: set[BasePlace] = set()
     size_bytes = 0
@@ -48,22 +49,29 @@ def bases_named_in(received: Sequence[ReceivedRevision]) -> set[BasePlace]:
             raise _bad_array(str(error)) from error
         found.add(place)
     _require_size(size_bytes)
+    take_bytes(size_bytes)
     return found
 
 
 def load_bases(
-    tx: Transaction, places: set[BasePlace], stored: Mapping[str, Mapping[str, str]]
+    tx: Transaction,
+    places: set[BasePlace],
+    stored: Mapping[str, Mapping[str, str]],
+    take_bytes: Callable[[int], None],
 ) -> dict[BasePlace, list[bytes]]:
     """Load the tiles of the bases of partial arrays.
 
-    `stored` maps content digests and parts to the digests of documents.
+    `stored` maps content digests and parts to the digests of documents. `take_bytes` is called with the size of these
+    documents before they are loaded.
 
     Raises `InvalidProblem` if a document has no array at a place, or if the bases together are too large.
     """
     digests = {place: stored[place.content].get(place.part) for place in places}
     wanted = sorted({digest for digest in digests.values() if digest is not None})
     total = select(func.coalesce(func.sum(document.c.size_bytes), 0))
-    _require_size(sum(tx.execute(total.where(document.c.digest.in_(some))).scalar_one() for some in in_lists(wanted)))
+    size_bytes = sum(tx.execute(total.where(document.c.digest.in_(some))).scalar_one() for some in in_lists(wanted))
+    _require_size(size_bytes)
+    take_bytes(size_bytes)
     trees = documents.load_documents(tx, wanted)
     named = {(digest, place.pointer) for place, digest in digests.items()}
     tiles = {

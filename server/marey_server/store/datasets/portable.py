@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import select
@@ -47,7 +48,20 @@ def check_export(tx: Transaction, project: str, name: str, request: ExportCheck)
     return ExportPermission(ended=tuple(one.item for one in ended))
 
 
-def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> dict[str, Any]:
+@dataclass(frozen=True)
+class LoadedContents:
+    """Members of the answer to a request for contents, and the documents for whose arrays it lists the tiles."""
+
+    members: Mapping[str, Any]
+    tiled: Sequence[documents.Tree | None]
+
+
+def contents_document(loaded: LoadedContents) -> dict[str, Any]:
+    """Return the answer to a request for contents. It takes long for large arrays, so no transaction should be open."""
+    return {**loaded.members, "tiles": [_tiles_of(tree) for tree in loaded.tiled]}
+
+
+def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> LoadedContents:
     """Load the requested revisions of a project by content digest, their facets, and documents with encoded arrays.
 
     A revision or document that the project does not have is None. If the documents together are too large, the list of
@@ -57,12 +71,12 @@ def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> di
     wanted = {*request.revisions, *(one.content for one in (*request.documents, *request.tiles))}
     held = {one: RevisionKey(*key) for one, key in revisions_with(tx, project_row.id, wanted).items()}
     contents = find_contents_of(tx, project_row.id, held.values())
-    return {
+    members = {
         "revisions": _described(tx, held, contents, request),
         "documents": _portable(tx, project_row.id, _loaded(tx, held, request.documents)),
         "facets": _facets(tx, project_row.id, request),
-        "tiles": [_tiles_of(tree) for tree in _loaded(tx, held, request.tiles)],
     }
+    return LoadedContents(members, tiled=_loaded(tx, held, request.tiles))
 
 
 def _facets(tx: Transaction, project_id: str, request: ContentsRequest) -> list[dict[str, float]]:

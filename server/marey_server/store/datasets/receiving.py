@@ -7,7 +7,7 @@ entry, the item is hidden, and no folder shows it. Other items, such as the skel
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -72,8 +72,12 @@ class LocalRevisions:
     """Arrays that have the tiles which partial arrays of the request lack."""
 
 
-def find_local(tx: Transaction, project: str, received: Sequence[ReceivedRevision]) -> LocalRevisions:
+def find_local(
+    tx: Transaction, project: str, received: Sequence[ReceivedRevision], take_bytes: Callable[[int], None]
+) -> LocalRevisions:
     """Find the revisions that a request contains or refers to.
+
+    `take_bytes` is called with the sizes of partial arrays and of their bases, before these take memory.
 
     Raises `ConflictProblem` if the project lacks a revision that a received revision refers to. Raises `InvalidProblem`
     if a received revision refers to an item of this project by its id, and for a partial array without its base.
@@ -81,7 +85,7 @@ def find_local(tx: Transaction, project: str, received: Sequence[ReceivedRevisio
     project_row = projects.require(tx, project)
     last = last_purge(tx, project_row.id)
     _require_no_own_ids(tx, project_row.id, received)
-    places = bases_named_in(received)
+    places = bases_named_in(received, take_bytes)
     wanted = {content for one in received for content in contents_in(one.parts)} | {one.content for one in places}
     found = revisions_with(tx, project_row.id, wanted | {one.content for one in received})
     require_contents(wanted - found.keys())
@@ -89,7 +93,7 @@ def find_local(tx: Transaction, project: str, received: Sequence[ReceivedRevisio
     held = {content: RevisionKey(*key) for content, key in found.items()}
     stored = {content: parts[key] for content, key in held.items()}
     facets = {one.content: one.facets for one in received}
-    return LocalRevisions(held, stored, last, facets, load_bases(tx, places, stored))
+    return LocalRevisions(held, stored, last, facets, load_bases(tx, places, stored, take_bytes))
 
 
 def _require_no_own_ids(tx: Transaction, project_id: str, received: Sequence[ReceivedRevision]) -> None:

@@ -19,8 +19,8 @@ from marey_schemas.datasets.naming import RefKind
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
 from marey_schemas.queue.commits import MOST_COMMITTED, MOST_COMMITTED_AT_ONCE, JobCommit, OutputsCommit
-from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.jobs import FailureReason
+from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_server.access import roles, scopes
 from marey_server.access.folder_rights import FolderRoleProblem
 from marey_server.errors import (

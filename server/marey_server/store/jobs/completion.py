@@ -115,6 +115,7 @@ def _complete(
         return {}
     won = tx.run(_WIN, {"now": tx.now_us, **held_parameters(requests)})
     staged = staging.staged_drafts(tx, [(row.id, row.fence) for row in won]) if won else {}
+    keyless = _keep_from_sharing(tx, won, requests)
     done: dict[_Place, tuple[Ended, CompleteAnswer]] = {}
     records = []
     for row in sorted(won, key=lambda row: row.id):
@@ -143,12 +144,12 @@ def _complete(
             outputs=tuple(JobOutput(**output) for output in outputs),
             commit=published.commit,
         )
-        done[row.id, row.fence] = (replace(as_ended(row), commit=published.commit), answer)
+        shareable = (row.id, row.fence) not in keyless
+        done[row.id, row.fence] = (replace(as_ended(row), commit=published.commit, shareable=shareable), answer)
     if done:
         _record(tx, records)
         failed = {place for place, (end, _) in done.items() if not end.succeeded}
-        unshared = (failed | _keep_from_sharing(tx, won, requests)) & staged.keys()
-        if unshared:
+        if unshared := (failed | keyless) & staged.keys():
             staging.drop_staged(tx, unshared)
         if gathered := [row.id for row in won if row.gathers and (row.id, row.fence) not in failed]:
             release_tasks(tx, gathered)

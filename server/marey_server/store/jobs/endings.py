@@ -26,6 +26,8 @@ class Ended:
     failure: dict[str, Any] | None = None
     commit: str | None = None
     """Commit that has the outputs of the job."""
+    shareable: bool = True
+    """Whether jobs that wait for the result of this job may have it."""
 
     @property
     def succeeded(self) -> bool:

@@ -7,7 +7,8 @@ from typing import Any
 
 from marey_schemas.access import Role
 from marey_schemas.consents import ConsentOverride
-from marey_schemas.queue.job_kinds import KindDeclaration, UnknownKindError, find_kind
+from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
+from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_server.access import roles
 from marey_server.errors import ForbiddenProblem
 from marey_server.store.items.consents import EndedConsent, find_ended_consents, record_override

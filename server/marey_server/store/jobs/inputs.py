@@ -10,7 +10,6 @@ from sqlalchemy import ColumnElement, bindparam, func, insert, or_, select
 
 from marey_schemas.kinds import Kind
 from marey_schemas.problems import FieldError
-from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.jobs import (
     CollectionInput,
     DatasetInput,
@@ -20,6 +19,7 @@ from marey_schemas.queue.jobs import (
     JobInput,
     JobOutputsInput,
 )
+from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_schemas.wording import counted
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.store import datasets

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 from sqlalchemy import Row, and_, insert, select, update
 
-from marey_schemas.queue.job_kinds import KindDeclaration, UnknownKindError, find_kind
+from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
 from marey_schemas.queue.jobs import FailureReason, InputSpec
+from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_schemas.wording import without_prefix
 from marey_server import faults
 from marey_server.errors import QuotaExceededProblem

@@ -17,8 +17,8 @@ from typing import Any
 from sqlalchemy import Row, select
 
 from marey_schemas.encoding.canonical import canonical_json
-from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.jobs import JobCreate, Resources, commits_of
+from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_schemas.sizes import batched
 from marey_server.store.ids import new_id
 from marey_server.store.jobs import result_cache
@@ -91,8 +91,8 @@ class NewJob:
         """Whether some inputs are outputs of jobs that have not succeeded yet."""
         return self.submission.unbound
 
-    def end(self) -> Ended:
-        """Return the end of a job that never starts, because a job on which it depends failed or was cancelled."""
+    def as_ended(self) -> Ended:
+        """Return this job as an ended job; it never starts, because a job on which it depends did not succeed."""
         return Ended(self.id, self.project_id, self.state, self.parent_id, self.failure)
 
 
@@ -120,16 +120,16 @@ def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dic
     computed, or is computing, this result.
     """
     gathering = [one for one in heads if one.submission.kind.gathering is not None]
-    sources = _find_results(tx, gathering)
+    sources = _let_share(tx, gathering)
     tasks = [task for one in heads if one.id not in sources for task in _spread(one)]
     single = [one for one in (*heads, *tasks) if one.size is None and one.cache_key is None]
-    return tasks, sources | _find_results(tx, single)
+    return tasks, sources | _let_share(tx, single)
 
 
-def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_cache.SharedResult]:
-    """Set the cache keys of jobs, and find other jobs that have computed, or are computing, the same results.
+def _let_share(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_cache.SharedResult]:
+    """Set the cache keys of jobs, and let those jobs wait whose results other jobs have computed or are computing.
 
-    Each job for which another job is found changes to the state `waiting`.
+    Returns, by the id of each waiting job, the job whose result it will share.
     """
     _set_cache_keys(tx, jobs)
     sources = result_cache.decide(tx, [one for one in jobs if one.state == "queued"])

@@ -112,16 +112,18 @@ def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[En
     """Update waiting jobs after jobs on which they depend have ended.
 
     `upstream` lists the ended jobs by the id of the waiting job. Jobs whose dependencies have all succeeded are made
-    ready; jobs that can no longer run are ended. Returns the jobs that have ended.
+    ready; jobs that can no longer run are ended. If jobs waited for a result that must not be shared, all of them are
+    queued, because their own results can probably not be shared either. Returns the jobs that have ended.
     """
     following: list[Ended] = []
     left: dict[str, int] = {}
     shared: list[Row[Any]] = []
     orphans: list[Row[Any]] = []
+    alone: list[Row[Any]] = []
     for row in rows:
         missed = [end for end in upstream[row.id] if not end.succeeded]
         if row.cached_from is not None:
-            (orphans if missed else shared).append(row)
+            (orphans if missed else shared if upstream[row.id][0].shareable else alone).append(row)
         elif missed:
             following += _doom(tx, row, missed[0])
         else:
@@ -129,7 +131,8 @@ def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[En
     _store_counts(tx, left)
     following += make_ready(tx, [row for row in rows if left.get(row.id) == 0])
     following += result_cache.share(tx, shared)
-    result_cache.stop_sharing(tx, orphans)
+    result_cache.stop_sharing(tx, [*orphans, *alone])
+    result_cache.enqueue(tx, alone)
     return following + make_ready(tx, orphans)
 
 

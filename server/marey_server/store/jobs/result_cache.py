@@ -11,7 +11,7 @@ import logging
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from sqlalchemy import and_, case, delete, insert, or_, select, tuple_, update
+from sqlalchemy import and_, case, delete, insert, not_, or_, select, tuple_, update
 
 from marey_server.access.labels import is_within
 from marey_server.errors import ApiProblem
@@ -104,6 +104,9 @@ def decide(tx: Transaction, candidates: Sequence[Any], *, finished: bool = True)
     a job that may start later than the candidate itself would. In each project, this function runs for one transaction
     at a time. The found jobs are locked: none of them ends before the transaction has recorded which jobs share its
     result. Results of finished jobs are used only if `finished` is true.
+
+    A transaction that ends a job has locked this job before it calls this function, and a submission locks it here. So
+    the two can deadlock; `Database.write` then runs one of them again.
     """
     asking = [one for one in candidates if one.cache_key is not None and one.cache_mode in ("use", "refresh")]
     if not asking:
@@ -127,11 +130,13 @@ def _known_sources(
 ) -> dict[tuple[str, str], list[SharedResult]]:
     """Return, for each project and cache key, the newest succeeded job, then the queued and running jobs.
 
-    Of these, jobs that a worker runs come first, then the others in the order of their priority.
+    Of these, jobs that a worker runs come first, then the others in the order of their priority. Jobs that wait for
+    their next attempt after a failure are left out, because a candidate may start earlier.
     """
     keys = sorted({one.cache_key for one in asking if one.cache_mode == "use"})
     projects = sorted({one.project_id for one in asking})
-    states = or_(job.c.state == QUEUED, job.c.state == RUNNING)
+    rests = and_(job.c.fence > 0, job.c.run_at_us > tx.now_us)  # never claimed, it may be of a later transaction
+    states = or_(and_(job.c.state == QUEUED, not_(rests)), job.c.state == RUNNING)
     if finished:
         states = or_(states, job.c.state == "succeeded")
     succeeded: dict[tuple[str, str], list[SharedResult]] = {}
@@ -300,7 +305,10 @@ def _compute_again(tx: Transaction, job_ids: Sequence[str]) -> None:
 
 
 def stop_sharing(tx: Transaction, rows: Sequence[Any]) -> None:
-    """Remove the links from waiting jobs to the jobs whose results they would have shared; then `admit` the jobs."""
+    """Remove the links from waiting jobs to the jobs whose results they would have shared.
+
+    The caller must then `admit` or `enqueue` the jobs.
+    """
     if rows:
         ids = [row.id for row in rows]
         tx.execute(update(job).where(job.c.id.in_(ids)).values(cached_from=None, dependencies_left=0))
@@ -315,15 +323,19 @@ def admit(tx: Transaction, rows: Sequence[Any], *, finished: bool = True) -> lis
     The rows hold `READY_COLUMNS`. Results of finished jobs are used only if `finished` is true.
     """
     decisions = decide(tx, rows, finished=finished)
-    queued = [row for row in rows if row.id not in decisions]
-    if queued:
+    enqueue(tx, [row for row in rows if row.id not in decisions])
+    return join(tx, [(row, decisions[row.id]) for row in rows if row.id in decisions])
+
+
+def enqueue(tx: Transaction, rows: Sequence[Any]) -> None:
+    """Queue waiting jobs without unfinished dependencies; the rows hold `READY_COLUMNS`."""
+    if rows:
         tx.execute(
             update(job)
-            .where(job.c.id.in_([row.id for row in queued]), job.c.state == WAITING)
+            .where(job.c.id.in_([row.id for row in rows]), job.c.state == WAITING)
             .values(state="queued", dependencies_left=0, rev=job.c.rev + 1)
         )
-        wake_workers(tx, {row.kind for row in queued})
-    return join(tx, [(row, decisions[row.id]) for row in rows if row.id in decisions])
+        wake_workers(tx, {row.kind for row in rows})
 
 
 # -- forgetting -------------------------------------------------------------------------------------------------------

@@ -10,8 +10,8 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.job_params import ImportParams
+from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_server.errors import InvalidProblem
 from marey_server.store import collections
 from marey_server.store.jobs.inputs import Pin, PinnedInputs

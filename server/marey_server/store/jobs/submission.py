@@ -12,8 +12,9 @@ from sqlalchemy import insert, select
 
 from marey_schemas.access import Role
 from marey_schemas.problems import FieldError
-from marey_schemas.queue.job_kinds import MOST_TASKS, KindDeclaration, UnknownKindError, find_kind
+from marey_schemas.queue.job_kinds import MOST_TASKS, UnknownKindError, find_kind
 from marey_schemas.queue.jobs import Job, JobCreate, JobState
+from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_schemas.queue.pipelines import (
     Pipeline,
     PipelineCreate,
@@ -117,7 +118,7 @@ def submit_checked(
     events = [(one.project_id, one.id, {"kind": one.submission.kind.name}) for one in heads]
     emit_job_events(tx, "job.submitted", events)
     wake_workers(tx, {one.submission.kind.name for one in everything if one.state == "queued"})
-    ended = [one.end() for one in everything if one.state in ("failed", "cancelled")]
+    ended = [one.as_ended() for one in everything if one.state in ("failed", "cancelled")]
     ended += result_cache.join(tx, [(one, sources[one.id]) for one in everything if one.id in sources])
     bindable = [one.id for one in heads if one.unbound and one.state == "waiting" and not one.dependencies_left]
     ended += pin_late_inputs(tx, bindable)

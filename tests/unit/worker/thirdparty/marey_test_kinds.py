@@ -11,7 +11,7 @@ from typing import Any
 
 from marey_schemas.base import Request
 from marey_schemas.kinds import Kind
-from marey_schemas.queue.job_kinds import KindDeclaration
+from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused, Unreadable
 

@@ -1,0 +1,86 @@
+"""Limbs of two bones, such as arms and legs: found by their ends, and the targets that they alone can meet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from marey_motion.editing.inverse_kinematics.targets import OrientationTarget, PositionTarget, Target
+from marey_motion.rigs import JointAxes, JointMapping
+from marey_motion.skeleton import Skeleton
+
+
+@dataclass(frozen=True)
+class TwoBoneLimb:
+    """A chain of two bones, such as an arm or a leg; joints between its three joints keep their local rotations.
+
+    Parameters
+    ----------
+    start, middle, end : indices of shoulder, elbow, wrist, or hip, knee, ankle
+    hinge : unit axis about which the limb bends, in the frame of the middle joint. It is used where the limb is nearly
+        straight or a little overstretched, because such a pose does not define an axis; if None, an arbitrary axis is
+        used there
+    """
+
+    start: int
+    middle: int
+    end: int
+    hinge: tuple[float, float, float] | None = None
+
+    @property
+    def joints(self) -> tuple[int, int, int]:
+        """Indices of the three joints: end, middle, start."""
+        return self.end, self.middle, self.start
+
+
+def limb_ending_at(
+    skeleton: Skeleton, mapping: JointMapping, joint: int, axes: Mapping[str, JointAxes] | None = None
+) -> TwoBoneLimb | None:
+    """Find the arm or leg whose wrist or ankle is a given joint.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    mapping : JointMapping    standard joints of the skeleton
+    joint : int    index of the joint
+    axes : mapping of str to JointAxes, optional    axes by joint name (`rigs.guess_axes`); if None, the bending
+        direction of straight limbs is unknown
+
+    Returns
+    -------
+    TwoBoneLimb or None    None if the joint is neither a wrist nor an ankle
+    """
+    for side in ("left", "right"):
+        for root, middle, end in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")):
+            names = [mapping.joints.get(f"{side}_{part}") for part in (root, middle, end)]
+            if None in names or skeleton.joint_names[joint] != names[2]:
+                continue
+            top, mid = (skeleton.index_of(str(name)) for name in names[:2])
+            swing = None if axes is None else axes[str(names[1])].swing
+            # Knees bend about their swing axis, elbows stretch about it.
+            hinge = swing if swing is None or middle == "elbow" else (-swing[0], -swing[1], -swing[2])
+            return TwoBoneLimb(top, mid, joint, hinge)
+    return None
+
+
+def limb_targets(
+    targets: Sequence[Target], limb: TwoBoneLimb | None
+) -> tuple[PositionTarget, OrientationTarget | None] | None:
+    """Select the targets that the closed form for two bones can meet: position and orientation of a limb's end.
+
+    Parameters
+    ----------
+    targets : sequence of targets    all targets
+    limb : TwoBoneLimb or None    the limb
+
+    Returns
+    -------
+    (PositionTarget, OrientationTarget or None) or None    None if there is no limb, if the position is not given in all
+        axes, or if there are other targets
+    """
+    positions = [target for target in targets if isinstance(target, PositionTarget)]
+    orientations = [target for target in targets if isinstance(target, OrientationTarget)]
+    fits = len(positions) == 1 and len(orientations) <= 1 and len(positions) + len(orientations) == len(targets)
+    if limb is None or not fits or len(set(positions[0].axes)) < 3 or {t.joint for t in targets} != {limb.end}:
+        return None
+    return positions[0], orientations[0] if orientations else None

@@ -1,0 +1,184 @@
+"""The axis of a file that points up, inferred from the body: the head is above the feet, or feet keep to the ground."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.errors import AmbiguousUnits
+from marey_motion.importing.body_measures import (
+    BodyMeasures,
+    heights_along,
+    hip_height_of,
+    lengths_of,
+    mean_point,
+    walks_on_hands,
+)
+from marey_motion.importing.checks import CheckWarning
+from marey_motion.importing.landmarks import Landmarks
+from marey_motion.importing.order_statistics import low_quantile, median
+from marey_motion.importing.source import SourceMotion
+from marey_schemas.options.imports import ImportOptions, UpAxis
+
+_CLEAR_COSINE = 0.8
+# Legs and trunk that point the same way: no pose of a body, but bones all put on one line.
+_FOLDED_COSINE = -0.9
+_FOLDED = "rest pose that is none of a body, with legs and trunk pointing the same way"
+_FLAT_GROUND = 0.1
+_CLEARLY_FLATTER = 3.0
+
+
+def choose_up_axis(source: SourceMotion, body: BodyMeasures, options: ImportOptions) -> UpAxis:
+    """Determine the upward axis from the options, or else from the format, or else from the body.
+
+    Parameters
+    ----------
+    source : SourceMotion    the file in its own unit and axes
+    body : BodyMeasures    measures of the file; receives the evidence and warnings
+    options : ImportOptions    facts given by the user
+
+    Returns
+    -------
+    str    axis, with a sign if it points down
+
+    Raises
+    ------
+    AmbiguousUnits    naming the option to set and the candidates, when the body does not decide
+    """
+    if options.up_axis is not None:
+        body.evidence.append(f"up axis {options.up_axis}: given by the user")
+        return options.up_axis
+    if source.up_axis is not None:
+        body.evidence.append(f"up axis {source.up_axis}: fixed by the format")
+        return source.up_axis
+    if body.leg is None:
+        body.evidence.append("up axis y: the usual one, assumed because no feet were found")
+        body.warnings.append(
+            CheckWarning("up-axis-assumed", "no feet were found that show which axis points up; y is assumed")
+        )
+        return "y"
+    standing, flat = _body_axis(body.positions, body.landmarks), _flat_axis(body)
+    if flat is not None and flat[0] != standing[0] and _stands_on_all_fours(body, flat[0]):
+        body.evidence.append(f"up axis {flat[0]}: hands and feet are below the hips; {flat[1]}")
+        return flat[0]
+    if standing[0] == "y" and standing[1] >= _CLEAR_COSINE:
+        body.evidence.append(
+            f"up axis y: head above feet, mean cosine {standing[1]:.2f} over {body.positions.shape[1]} frames"
+        )
+        return "y"
+    return _settle_up_axis(body, *standing, flat)
+
+
+def _settle_up_axis(body: BodyMeasures, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
+    """Choose the upward axis if the body is not upright along y.
+
+    The body may lie or climb, or another axis may point up.
+
+    `axis` is the axis nearest to the direction from feet to head, and `cosine` is the cosine of the angle between this
+    axis and the direction. `flat` is the result of `_flat_axis`.
+    """
+    rest_axis, rest_cosine = _body_axis(body.rest[:, None], body.landmarks)
+    standing, resting = f"mean direction from feet to head is {axis} with cosine {cosine:.2f}", _FOLDED
+    if rest_cosine > 0.0:
+        resting = f"rest pose points along {rest_axis} with cosine {rest_cosine:.2f}"
+    if cosine == 0.0:
+        standing = f"the motion keeps to a {_FOLDED}"
+    if cosine >= _CLEAR_COSINE and rest_axis == axis and rest_cosine >= _CLEAR_COSINE:
+        body.evidence.append(f"up axis {axis}: {standing}; {resting}")
+        return axis
+    if flat is not None:
+        body.evidence.append(f"up axis {flat[0]}: {flat[1]}; {standing}")
+        return flat[0]
+    if cosine >= _CLEAR_COSINE:
+        grounded = [candidate for candidate in (axis, rest_axis) if _stands_on_origin(body, candidate)]
+        if len(set(grounded)) == 1:
+            body.evidence.append(
+                f"up axis {grounded[0]}: the ground through the origin bears the body; {standing}; {resting}"
+            )
+            return grounded[0]
+    raise AmbiguousUnits(
+        f"the file does not show clearly which axis points up ({standing}; {resting}); name the axis with "
+        f"--up-axis (up_axis), one of {_likely_axes((axis, cosine), (rest_axis, rest_cosine))}",
+        code="up-axis-ambiguous",
+        file=body.file,
+    )
+
+
+def _likely_axes(*axes: tuple[UpAxis, float]) -> str:
+    """List in words the axes for which there is evidence, or the usual axes if there is no evidence."""
+    likely = list(dict.fromkeys(axis for axis, cosine in axes if cosine > 0.0))
+    return " or ".join(likely if len(likely) > 1 else dict.fromkeys((*likely, "y", "z")))
+
+
+def _body_axis(positions: NDArray[np.float64], landmarks: Landmarks) -> tuple[UpAxis, float]:
+    """Find the signed coordinate axis nearest to the mean direction from the feet to the head (or hips).
+
+    Also returns the cosine of the angle between this axis and the direction. The cosine is 0 if legs and trunk are
+    folded onto each other, as in a rest pose with all bones on one line.
+    """
+    assert landmarks.feet is not None
+    assert landmarks.hips is not None
+    feet, hips = mean_point(positions, landmarks.feet), positions[landmarks.hips]
+    if landmarks.head is None:
+        (mean,), folded = _mean_directions((hips - feet)[None]), False
+    else:
+        head = positions[landmarks.head]
+        mean, trunk, legs = _mean_directions(np.stack((head - feet, head - hips, hips - feet)))
+        folded = float(trunk @ legs) < _FOLDED_COSINE
+    axis = int(np.argmax(np.abs(mean)))
+    return _axis_name(axis, mean[axis]), 0.0 if folded else float(abs(mean[axis]))
+
+
+def _mean_directions(ways: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Compute the mean direction (k, 3) of vectors (k, F, 3); vectors of length zero are ignored."""
+    lengths = lengths_of(ways)
+    lengths[lengths == 0] = 1.0
+    mean: NDArray[np.float64] = np.add.reduce(ways / lengths[..., None], axis=1) / ways.shape[1]
+    return mean
+
+
+def _flat_axis(body: BodyMeasures) -> tuple[UpAxis, str] | None:
+    """Find the axis along which the lowest point of feet and hands hardly moves.
+
+    Along the other axes, this point must move.
+
+    Returns the axis, and the evidence for it in words; returns None if there is no such axis.
+    """
+    limbs = [*body.landmarks.ground_joints, *(body.landmarks.hands or ())]
+    assert body.leg is not None
+    below = body.positions.take(limbs, axis=0)
+    middle = np.add.reduce(body.positions, axis=0) / len(body.positions)
+    signs = np.where(median(middle - np.add.reduce(below, axis=0) / len(limbs)) >= 0, 1.0, -1.0)
+    spread = _spread(np.minimum.reduce(below * signs, axis=0)) / body.leg
+    flattest, second = np.argsort(spread)[:2]
+    if spread[flattest] > _FLAT_GROUND or spread[second] < max(_CLEARLY_FLATTER * spread[flattest], _FLAT_GROUND):
+        return None
+    name = _axis_name(int(flattest), signs[flattest])
+    x, y, z = spread
+    return name, f"heights of the lowest limb spread by {x:.2f}, {y:.2f}, {z:.2f} leg lengths along x, y, z"
+
+
+def _stands_on_origin(body: BodyMeasures, axis: UpAxis) -> bool:
+    """Return whether the body stands on the plane through the origin that is perpendicular to `axis`."""
+    assert body.leg is not None
+    lowest = heights_along(body.positions, axis).min(axis=0)
+    return bool(abs(low_quantile(lowest)) <= _FLAT_GROUND * body.leg)
+
+
+def _axis_name(axis: int, sign: float) -> UpAxis:
+    names: tuple[UpAxis, ...] = ("x", "y", "z") if sign >= 0 else ("-x", "-y", "-z")
+    return names[axis]
+
+
+# With 64 poses, numpy's ufuncs are faster than its `std`, and give the same bits.
+def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Compute the standard deviation (k,) over the first axis of (F, k)."""
+    deviations = values - np.add.reduce(values, axis=0) / len(values)
+    spread: NDArray[np.float64] = np.sqrt(np.add.reduce(deviations * deviations, axis=0) / len(values))
+    return spread
+
+
+def _stands_on_all_fours(body: BodyMeasures, up_axis: UpAxis) -> bool:
+    """Return whether hands and feet are on one ground well below the hips; not if the body lies on its side."""
+    assert body.leg is not None
+    return walks_on_hands(body, up_axis) and hip_height_of(body, up_axis) > 0.5 * body.leg
