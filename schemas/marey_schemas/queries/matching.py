@@ -21,14 +21,17 @@ _ORDERS: dict[str, Callable[[Any, Any], bool]] = {"<": lt, "<=": le, ">": gt, ">
 
 @dataclass(frozen=True, slots=True)
 class QueriedFacts:
-    """Facts of a revision of an item that queries compare."""
+    """Facts of a revision of an item that queries compare.
+
+    If a fact is missing, no condition on it is met.
+    """
 
     name: str
     folder: str
     tags: Collection[str]
-    revision: int
-    created_at: datetime
-    updated_at: datetime
+    revision: int | None = None
+    created_at: datetime | None = None
+    updated_at: datetime | None = None
     summary: Mapping[str, Any] = field(default_factory=dict)
     frames: int = 0
     skeleton: str | None = None
@@ -87,10 +90,10 @@ def _day(value: object, condition: Condition) -> bool:
     return value in days
 
 
-def _time(value: datetime, condition: Condition) -> bool:
+def _time(value: datetime | None, condition: Condition) -> bool:
     """Compare a time; a day in the condition is compared as a whole, from midnight to midnight UTC."""
-    if condition.operator == "has":
-        return True
+    if value is None or condition.operator == "has":
+        return value is not None
     return any(_in_order(value, condition.operator, *_span(one)) for one in condition.values)
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marey_schemas.queries.fields import FIELDS
+from marey_schemas.queries.fields import FIELDS, OPERATORS
 from marey_schemas.queries.grammar import (
     DEEPEST,
     MOST_CHARACTERS,
@@ -22,6 +22,7 @@ from marey_schemas.queries.grammar import (
     parse,
     parts_of,
 )
+from marey_schemas.queries.matching import QueriedFacts, matches
 
 
 def plain(query: Query) -> object:
@@ -98,6 +99,15 @@ def test_an_error_names_the_place_and_what_is_expected(text: str, column: int, s
         parse(text)
     assert said in str(refused.value)
     assert refused.value.column == column
+
+
+@pytest.mark.parametrize("field", sorted(FIELDS.keys() - {"name", "path", "folder", "tag"}))
+def test_no_condition_on_a_missing_fact_is_met(field: str) -> None:
+    facts = QueriedFacts(name="walk", folder="raw", tags=("night",))
+    value = {"text": "''", "number": "1", "date": "2026-11-27"}[FIELDS[field].type]
+    operators = [one for one in OPERATORS[FIELDS[field].type] if one not in ("has", "in", "!=")]
+    for condition in (f"has {field}", f"{field} in ({value}, {value})", *(f"{field} {o} {value}" for o in operators)):
+        assert not matches(parse(condition), facts), condition
 
 
 def test_parts_are_what_and_joins() -> None:

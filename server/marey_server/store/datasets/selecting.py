@@ -139,8 +139,7 @@ def _limited(entries: Iterable[DatasetEntry]) -> Iterator[DatasetEntry]:
 
 def _facts_of(entry: DatasetEntry, folder: str, **more: Any) -> QueriedFacts:
     inside, _, name = "/".join(filter(None, (folder, entry.path))).rpartition("/")
-    known = {"revision": 0, "created_at": datetime_of(0), "updated_at": datetime_of(0), **more}
-    return QueriedFacts(name=name, folder=inside, tags=entry.tags, **known)
+    return QueriedFacts(name=name, folder=inside, tags=entry.tags, **more)
 
 
 def _facts(tx: Transaction, project_id: str, folder: str, entries: Sequence[DatasetEntry]) -> Iterator[QueriedFacts]:
