@@ -238,7 +238,7 @@ class Settings(BaseSettings):
         Quotas.project_proposal_bytes,
         ge=0,
         description="Greatest number of bytes of the descriptions, comments, reviews and checks of all proposals of a "
-        "project.",
+        "project; a quarter is reserved for maintainers.",
     )
     webhook_networks: tuple[IPv4Network | IPv6Network, ...] = Field(
         (),

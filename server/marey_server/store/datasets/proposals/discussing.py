@@ -39,7 +39,7 @@ def add_comment(tx: Transaction, project: str, name: str, number: int, request: 
     row = lock_open(tx, found.id, number)
     if request.path is not None and request.kind is not None:
         _require_entry(tx, row, request.path, request.kind)
-    require_room(tx, project_row.id, found.id, number, request.text)
+    require_room(tx, project_row, found.id, number, request.text)
     first, end = request.frames or (None, None)
     values = {
         "dataset_id": found.id, "proposal": number, "number": next_number(tx, proposal_comment, row, "comments"),

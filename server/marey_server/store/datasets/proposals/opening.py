@@ -139,7 +139,7 @@ def open_proposal(tx: Transaction, project: str, name: str, request: ProposalCre
     _require_room(tx, found.id)
     newest = select(func.coalesce(func.max(proposal.c.number), 0)).where(proposal.c.dataset_id == found.id)
     number = tx.execute(newest).scalar_one() + 1
-    require_room(tx, project_row.id, found.id, number, request.description)
+    require_room(tx, project_row, found.id, number, request.description)
     row = {
         "dataset_id": found.id, "number": number, "title": request.title,
         "description": request.description, "author_id": tx.principal.user_id, "source": request.source,

@@ -18,6 +18,7 @@ from marey_server.store.datasets.proposals.discussing import next_number
 from marey_server.store.datasets.proposals.opening import find_proposal, lock_open, require_newest, touch
 from marey_server.store.datasets.proposals.requirements import checks_of, select_reviews, shown_review
 from marey_server.store.datasets.proposals.texts import require_room
+from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import job, proposal_check, proposal_review
 from marey_server.store.transaction import Transaction
@@ -36,7 +37,7 @@ def add_review(
     found = find_dataset(tx, project_row, name)
     row = lock_open(tx, found.id, number)
     require_newest(tx, row, request.commit)
-    require_room(tx, project_row.id, found.id, number, request.text)
+    require_room(tx, project_row, found.id, number, request.text)
     values = {
         "dataset_id": found.id, "proposal": number, "number": next_number(tx, proposal_review, row, "reviews"),
         "author_id": tx.principal.user_id, "verdict": request.verdict.value, "text": request.text,
@@ -78,7 +79,7 @@ def report_check(
     require_newest(tx, row, request.commit)
     if request.job is not None:
         _require_job(tx, project_row.id, request.job, request.state, row.head_now)
-    _store_check(tx, project_row.id, row, request)
+    _store_check(tx, project_row, row, request)
     touch(tx, row)
     tx.emit(
         "proposal.checked", found.id, project_id=project_row.id, number=number, check=request.name,
@@ -110,7 +111,7 @@ def _require_job(tx: Transaction, project_id: str, job_id: str, state: CheckStat
         )
 
 
-def _store_check(tx: Transaction, project_id: str, row: Row[Any], request: CheckReport) -> None:
+def _store_check(tx: Transaction, project_row: ProjectRow, row: Row[Any], request: CheckReport) -> None:
     earlier = delete(proposal_check).where(
         proposal_check.c.dataset_id == row.dataset_id,
         proposal_check.c.proposal == row.number,
@@ -119,7 +120,7 @@ def _store_check(tx: Transaction, project_id: str, row: Row[Any], request: Check
     )
     tx.execute(earlier)
     next_number(tx, proposal_check, row, "checks")
-    require_room(tx, project_id, row.dataset_id, row.number, request.text)
+    require_room(tx, project_row, row.dataset_id, row.number, request.text)
     values = {
         "dataset_id": row.dataset_id, "proposal": row.number, "digest": row.head_now, "name": request.name,
         "state": request.state.value, "job_id": request.job, "link": request.link, "text": request.text,

@@ -1,6 +1,7 @@
 """Room for the texts of proposals: descriptions, comments, reviews and checks.
 
-Each text counts with its bytes in UTF-8 and with `BYTES_OF_ROW`, so that many short or empty texts are limited, too.
+Each text counts with its bytes in UTF-8 and with `BYTES_OF_ROW`, so that many short or empty texts are limited, too. A
+quarter of each limit is reserved for maintainers. Otherwise, others could prevent a review by filling a proposal.
 """
 
 from __future__ import annotations
@@ -9,7 +10,10 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, LargeBinary, Select, Table, cast, func, select
 
+from marey_schemas.access import Role
+from marey_server.access import roles
 from marey_server.errors import ConflictProblem, QuotaExceededProblem
+from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import dataset, proposal, proposal_check, proposal_comment, proposal_review
 from marey_server.store.transaction import Transaction
 
@@ -26,38 +30,43 @@ _TEXTS: tuple[tuple[Table, ColumnElement[Any], ColumnElement[int]], ...] = (
 """Tables with texts; for each, the column with the text, and the column with the number of the proposal."""
 
 
-def require_room(tx: Transaction, project_id: str, dataset_id: str, number: int, text: str) -> None:
-    """Check that a proposal, which may be a new one, can get a further text.
+def require_room(tx: Transaction, project_row: ProjectRow, dataset_id: str, number: int, text: str) -> None:
+    """Check that a proposal, which may be a new one, can get a further text from the caller.
 
     Concurrent checks of one project run one after another. Raises `ConflictProblem` if the texts of the proposal would
     be too long together, and `QuotaExceededProblem` if those of all proposals of the project would be.
     """
     more = len(text.encode()) + BYTES_OF_ROW
-    tx.lock(f"texts of proposals {project_id}")
+    tx.lock(f"texts of proposals {project_row.id}")
     used = sum(
         tx.execute(_size(tx, table, column).where(table.c.dataset_id == dataset_id, place == number)).scalar_one()
         for table, column, place in _TEXTS
     )
-    if used + more > MOST_TEXT_OF_PROPOSAL:
+    limit = _limit_for(project_row.role, MOST_TEXT_OF_PROPOSAL)
+    if used + more > limit:
         raise ConflictProblem(
-            f"The texts of a proposal have at most {MOST_TEXT_OF_PROPOSAL:,} bytes. Those of this one have {used:,}, "
-            f"and this needs {more:,} more. Close the proposal and open another, or write a shorter text.",
+            f"You can add texts to a proposal up to {limit:,} bytes in total. The texts of this one have {used:,}, and "
+            f"this needs {more:,} more. Close the proposal and open another, or write a shorter text.",
             code="long-proposal",
-            context={"used": used, "limit": MOST_TEXT_OF_PROPOSAL},
+            context={"used": used, "limit": limit},
         )
-    _require_room_in_project(tx, project_id, more)
+    _require_room_in_project(tx, project_row, more)
 
 
-def _require_room_in_project(tx: Transaction, project_id: str, more: int) -> None:
-    of_project = select(dataset.c.id).where(dataset.c.project_id == project_id)
+def _limit_for(role: Role, limit: int) -> int:
+    return limit if roles.includes(role, Role.MAINTAINER) else limit * 3 // 4
+
+
+def _require_room_in_project(tx: Transaction, project_row: ProjectRow, more: int) -> None:
+    of_project = select(dataset.c.id).where(dataset.c.project_id == project_row.id)
     used = sum(
         tx.execute(_size(tx, table, column).where(table.c.dataset_id.in_(of_project))).scalar_one()
         for table, column, _ in _TEXTS
     )
-    limit = tx.quotas.project_proposal_bytes
+    limit = _limit_for(project_row.role, tx.quotas.project_proposal_bytes)
     if used + more > limit:
         raise QuotaExceededProblem(
-            f"The texts of the project's proposals have {used:,} bytes, the limit is {limit:,}, and this needs "
+            f"The texts of the project's proposals have {used:,} bytes, your limit is {limit:,}, and this needs "
             f"{more:,} more. Purge deleted datasets, whose proposals count, or ask the operator to raise the setting "
             "`project_proposal_bytes`.",
             context={"quota": "project_proposal_bytes", "used": used, "limit": limit},
