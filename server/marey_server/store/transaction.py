@@ -74,6 +74,8 @@ class Transaction:
         """Role and scope that the request's operation declares; `projects.require` enforces them."""
         self.blobs = blobs
         self.quotas = quotas
+        self.before_statement: Callable[[], object] = bool
+        """Called before each statement of `execute`; an error that it raises stops the transaction."""
         self.folder_rights: dict[tuple[str, str | None], FolderRights] = {}
         """Rights that this transaction has read, by project and user; see `store.folder_roles.rights`."""
         self.shared_outputs = 0
@@ -95,7 +97,9 @@ class Transaction:
 
     def beside(self, principal: Principal) -> Transaction:
         """Return a transaction for another `principal` on the same connection; the two are committed together."""
-        return Transaction(self.connection, principal, self._clock, self.blobs, self.quotas)
+        other = Transaction(self.connection, principal, self._clock, self.blobs, self.quotas)
+        other.before_statement = self.before_statement
+        return other
 
     @property
     def is_postgres(self) -> bool:
@@ -104,6 +108,7 @@ class Transaction:
 
     def execute(self, statement: Executable, parameters: Any = None) -> CursorResult[Any]:
         """Run one SQL statement, and return its result."""
+        self.before_statement()
         return self.connection.execute(statement, parameters)
 
     def run(self, statement: Prepared, parameters: Mapping[str, Any]) -> list[Any]:

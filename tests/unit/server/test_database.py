@@ -12,9 +12,10 @@ from sqlalchemy import Column
 from sqlalchemy.engine.default import DefaultDialect
 
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import InvalidProblem, StorageFullProblem, UnavailableProblem
+from marey_server.errors import ClientGoneProblem, InvalidProblem, StorageFullProblem, UnavailableProblem
 from marey_server.store.database.clock import DatabaseClock
 from marey_server.store.database.connections import Database
+from marey_server.store.database.lanes import Client
 from marey_server.store.tables import server_state, user
 from marey_server.store.transaction import Transaction
 
@@ -73,6 +74,21 @@ def test_a_read_sees_one_state_throughout(database: Database) -> None:
 
     assert database.read(SYSTEM, look) == ([], [])
     assert database.read(SYSTEM, user_names) == ["u"]
+
+
+def test_a_read_for_a_client_that_has_gone_stops_before_its_next_statement(database: Database) -> None:
+    gone, one = threading.Event(), sqlalchemy.select(sqlalchemy.literal(1))
+
+    def read(tx: Transaction) -> None:
+        assert tx.execute(one).scalar_one() == 1
+        gone.set()
+        with pytest.raises(ClientGoneProblem):
+            tx.execute(one)
+        tx.beside(SYSTEM).execute(one)
+
+    reading = database.queue_read(Client("ada", is_gone=gone.is_set), SYSTEM, read)
+    with pytest.raises(ClientGoneProblem):
+        reading.result(60)
 
 
 def test_what_waits_for_the_commit_runs_once_after_it_and_not_after_a_failure(database: Database) -> None:

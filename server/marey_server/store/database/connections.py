@@ -210,10 +210,16 @@ class Database:
     ) -> Future[T]:
         """Run `self.read(principal, function)` for a client, in a thread for ordinary reads.
 
-        With `reserved`, use a thread for reserved reads. Raises `UnavailableProblem` if too many calls wait.
+        With `reserved`, use a thread for reserved reads. If the client closes the connection, the read is stopped
+        before its next statement. Raises `UnavailableProblem` if too many calls wait.
         """
+
+        def run(tx: Transaction) -> T:
+            tx.before_statement = client.require_present
+            return function(tx)
+
         lane = self._reserved if reserved else self._ordinary
-        return lane.submit(client, self.read, principal, function)
+        return lane.submit(client, self.read, principal, run)
 
     def queue_write(
         self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False

@@ -36,7 +36,12 @@ class Client:
     known: bool = True
     """Whether the client's token was accepted before, or is that of an attempt, and was not often refused lately."""
     is_gone: Callable[[], bool] = bool
-    """Returns whether nobody waits for the result any more; such a call is not begun."""
+    """Returns whether nobody waits for the result any more; such a call is not begun, and a read is stopped."""
+
+    def require_present(self) -> None:
+        """Raise `ClientGoneProblem` if nobody waits for the result any more."""
+        if self.is_gone():
+            raise ClientGoneProblem("The client closed the connection before the server could answer.")
 
 
 SERVER = Client("server")
@@ -60,8 +65,7 @@ class _QueuedCall:
             finish(self.future, self._call)
 
     def _call(self) -> Any:
-        if self.client.is_gone():
-            raise ClientGoneProblem("The client closed the connection before the server began to handle the request.")
+        self.client.require_present()
         return self.function()
 
 
