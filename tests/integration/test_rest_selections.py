@@ -140,12 +140,13 @@ def test_a_selection_that_is_behind_its_branch_is_named(owner: httpx.Client, gai
         ({"query": "tag = day"}, 422, "empty-selection"),
         ({"query": "tag ="}, 400, "bad-query"),
         ({"paths": ["raw", "ra"]}, 404, "no-entry"),
+        ({"paths": [f"{number:03}{'x' * 130}" for number in range(500)]}, 422, "invalid-body"),
         ({"paths": ["raw", "raw/z"]}, 404, "no-entry"),
         ({"paths": ["../raw"]}, 404, "no-entry"),
         ({"query": "joints = 1", "version": "nothing"}, 404, "no-version"),
     ],
 )
-def test_a_selection_of_nothing_is_refused(
+def test_a_selection_of_nothing_or_of_too_much_is_refused(
     owner: httpx.Client, gaits: Callable[..., Any], selection: dict[str, Any], status: int, code: str
 ) -> None:
     refused(owner.post(f"{GAITS}/checkout", json=selection), status, code)

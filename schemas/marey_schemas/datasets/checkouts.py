@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field, StringConstraints
+from pydantic import AfterValidator, Field, StringConstraints
 
 from marey_schemas.base import Answer, Request
 from marey_schemas.datasets.commits import EntryPath
@@ -13,6 +13,16 @@ from marey_schemas.queries.grammar import MOST_CHARACTERS
 
 MOST_PATHS = 1000
 """Greatest number of paths in one selection."""
+MOST_BYTES_OF_PATHS = 64 * 2**10
+"""Greatest number of bytes of these paths together in UTF-8; lists of datasets show the paths of each dataset."""
+
+
+def _not_too_long(paths: tuple[str, ...]) -> tuple[str, ...]:
+    if sum(len(path.encode()) for path in paths) > MOST_BYTES_OF_PATHS:
+        raise ValueError(
+            f"the paths have more than {MOST_BYTES_OF_PATHS:,} bytes together; select folders, or use a query"
+        )
+    return paths
 
 
 class CheckoutRequest(Request):
@@ -28,7 +38,7 @@ class CheckoutRequest(Request):
         description="Query that selects entries, as in lists of items. `path`, `folder`, `name` and `tag` are those of "
         "the entry in the folder of the dataset; the other fields are those of its content.",
     )
-    paths: tuple[EntryPath, ...] = Field(
+    paths: Annotated[tuple[EntryPath, ...], AfterValidator(_not_too_long)] = Field(
         (), max_length=MOST_PATHS, description="Entries, or folders whose entries are selected; empty: all entries."
     )
     discard: bool = Field(False, description="Discard changes in the folder that no commit has recorded.")
