@@ -55,7 +55,7 @@ def _of_peer(
     if program is None:
         return PeerTimes({}, dict.fromkeys((COMMIT, DIFFERENCE, BRANCH), f"{name} is not installed"))
     with tempfile.TemporaryDirectory(prefix="marey-bench-peer-") as folder:
-        times = measure(program, Path(folder), files)
+        times = measure(os.path.abspath(program), Path(folder), files)  # the peer runs in another folder
     medians = {job: statistics.median(some) for job, some in times.items()}
     shown = {job: f"{name}, {files:,} files: {median:.0f} ms" for job, median in medians.items()}
     if DIFFERENCE not in shown:
