@@ -85,15 +85,15 @@ def chain_skeleton(joints: int, rng: np.random.Generator) -> Skeleton:
     )
 
 
-def captured_walk(frames: int, joints: int, seed: int = 0) -> Clip:
-    """Return a generated walk at 120 Hz like one from a capture system: with fingers, and noise on every channel.
+def captured_walk(frames: int, joints: int, seed: int = 0, *, frame_rate_hz: float = 120.0) -> Clip:
+    """Return a generated walk like one from a capture system: with fingers, and noise on every channel.
 
     The number of finger joints is `joints` minus the number of joints of the generated body.
     """
-    walk = generate_gait(1.3, 0.2, frames / 120.0, 120.0)
+    walk = generate_gait(1.3, 0.2, frames / frame_rate_hz, frame_rate_hz)
     skeleton = with_fingers(walk.skeleton, joints, "LeftHand")
     rng = np.random.default_rng(seed)
-    seconds = np.arange(frames) / 120.0
+    seconds = np.arange(frames) / frame_rate_hz
     fingers = _harmonics(seconds, (joints - walk.skeleton.joint_count, 3), 0.1, rng)
     curled = quaternions.from_euler("zxy", fingers)
     shaken = quaternions.from_euler("zxy", rng.normal(scale=2e-4, size=(frames, joints, 3)))
@@ -101,7 +101,7 @@ def captured_walk(frames: int, joints: int, seed: int = 0) -> Clip:
     rotations = quaternions.unroll(quaternions.multiply(still, shaken))
     root = walk.root_translations + rng.normal(scale=5e-5, size=(frames, 3))
     poses = np.concatenate([root, rotations.reshape(frames, 4 * joints)], axis=1).astype(np.float32)
-    return Clip(skeleton, 120.0, poses)
+    return Clip(skeleton, frame_rate_hz, poses)
 
 
 def with_fingers(skeleton: Skeleton, joints: int, hand: str) -> Skeleton:

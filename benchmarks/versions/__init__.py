@@ -1,0 +1,1 @@
+"""Parts of the benchmark of versions of datasets; `benchmarks.bench_datasets` runs them."""
