@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
-from sqlalchemy import Row, select
+from sqlalchemy import Row, and_, select
 
 from marey_schemas.datasets.checkouts import CheckoutRequest
 from marey_schemas.kinds import Kind
+from marey_schemas.queries.fields import FACET_PREFIX
 from marey_schemas.queries.grammar import Query, conditions_of, operands_of
 from marey_schemas.queries.matching import QueriedFacts, matches
 from marey_schemas.sizes import batched
@@ -23,6 +24,7 @@ from marey_server.store.datasets.history import tree_of
 from marey_server.store.datasets.naming import find_dataset, resolve
 from marey_server.store.items.facets import facets_of_contents
 from marey_server.store.items.listing import read_query
+from marey_server.store.items.querying import sql_of
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.items.summaries import Summary, summarise
 from marey_server.store.purge_lock import last_purge
@@ -104,16 +106,48 @@ def _folders_above(path: str) -> list[str]:
 def _matching(
     tx: Transaction, project_id: str, folder: str, query: Query, entries: Iterable[tuple[str, Value]]
 ) -> Iterator[tuple[str, Value]]:
-    """Yield the entries that a query selects; conditions on path and tags are evaluated first, without a database."""
+    """Yield the entries that a query selects.
+
+    Conditions on path and tags are evaluated first, without a database. Then the database selects the contents that may
+    meet the other conditions. Only entries with these contents are compared with the whole query.
+    """
     operands = list(operands_of(query))
     early = [one for one in operands if {part.field for part in conditions_of(one)} <= OF_ENTRIES]
     found = _early(entries, early, folder)
     if len(early) == len(operands):
         yield from ((entry.key, entry.value) for entry in found)
         return
+    possible = _possible_contents(tx, project_id, [one for one in operands if _is_of_content(one)])
+    if possible is not None:
+        found = (entry for entry in found if entry.content in possible)
     for some in batched(_limited(found), SEARCHED_AT_ONCE):
-        facts = _facts(tx, project_id, folder, some)
-        yield from ((entry.key, entry.value) for entry, one in zip(some, facts, strict=True) if matches(query, one))
+        for entry, facts in _facts(tx, project_id, folder, some):
+            if matches(query, facts):
+                yield entry.key, entry.value
+
+
+def _is_of_content(query: Query) -> bool:
+    """Return whether all conditions of a query are on columns of items, and none on facts that entries have."""
+    fields = {part.field for part in conditions_of(query)}
+    return fields.isdisjoint(OF_ENTRIES) and not any(field.startswith(FACET_PREFIX) for field in fields)
+
+
+def _possible_contents(tx: Transaction, project_id: str, queries: Sequence[Query]) -> set[str] | None:
+    """Return the content digests of the revisions of a project that may meet all `queries`; None without `queries`.
+
+    The newest revisions are selected by the database, which has their facts. Older revisions are all returned.
+    """
+    if not queries:
+        return None
+    of_project = (
+        select(revision.c.content)
+        .join(item, item.c.id == revision.c.item_id)
+        .where(item.c.project_id == project_id, item.c.purged_us.is_(None))
+    )
+    selected = and_(*(sql_of(one, project_id) for one in queries))
+    newest = tx.execute(of_project.where(revision.c.number == item.c.head, selected)).scalars()
+    older = tx.execute(of_project.where(revision.c.number != item.c.head)).scalars()
+    return {*newest, *older}
 
 
 def _early(entries: Iterable[tuple[str, Value]], early: Sequence[Query], folder: str) -> Iterator[DatasetEntry]:
@@ -142,8 +176,13 @@ def _facts_of(entry: DatasetEntry, folder: str, **more: Any) -> QueriedFacts:
     return QueriedFacts(name=name, folder=inside, tags=entry.tags, **more)
 
 
-def _facts(tx: Transaction, project_id: str, folder: str, entries: Sequence[DatasetEntry]) -> Iterator[QueriedFacts]:
-    """Yield the facts of entries: their own ones, and those of a revision with the content of the entry."""
+def _facts(
+    tx: Transaction, project_id: str, folder: str, entries: Sequence[DatasetEntry]
+) -> Iterator[tuple[DatasetEntry, QueriedFacts]]:
+    """Yield entries with their facts: their own ones, and those of a revision with the content of the entry.
+
+    An entry whose content was purged is left out.
+    """
     contents = [entry.content for entry in entries]
     rows = _revisions(tx, project_id, contents)
     summaries = _summaries(tx, rows)
@@ -151,16 +190,16 @@ def _facts(tx: Transaction, project_id: str, folder: str, entries: Sequence[Data
     facets = facets_of_contents(tx, project_id, rows)
     for entry, content in zip(entries, contents, strict=True):
         if (row := rows.get(content)) is None:
-            yield _facts_of(entry, folder)
             continue
         summary = summaries[content]
         newest = row.head == row.number
-        yield _facts_of(
+        facts = _facts_of(
             entry, folder, revision=row.number, created_at=datetime_of(row.item_created_us),
             updated_at=datetime_of(row.updated_us if newest else row.created_us), summary=summary.shown,
             frames=summary.frames, skeleton=summary.skeleton_id, skeleton_name=names.get(summary.skeleton_id or ""),
             facets=facets.get(content, {}),
         )  # fmt: skip
+        yield entry, facts
 
 
 def _revisions(tx: Transaction, project_id: str, contents: Collection[str]) -> dict[str, Row[Any]]:
