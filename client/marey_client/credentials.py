@@ -147,13 +147,23 @@ def read_secret(path: Path) -> str:
         ) from error
     except OSError as error:
         raise BadCredentialFile(f"{path} cannot be read: {error.strerror}") from error
-    if os.name == "posix" and mode & 0o077:
+    if os.name == "posix" and mode & _forbidden_rights(path):
         raise BadCredentialFile(
             f"the token file {path} can be read by other users of this machine; run: chmod 600 {path}"
         )
     if not text or any(character.isspace() for character in text):
         raise BadCredentialFile(f"the token file {path} must contain one token and nothing else")
     return text
+
+
+def _forbidden_rights(path: Path) -> int:
+    """Return the rights that a token file must not give.
+
+    systemd gives a service read access to its credentials by an access control list. Its mask appears as the group's
+    right to read, although the group has no access.
+    """
+    credentials = os.environ.get("CREDENTIALS_DIRECTORY")
+    return 0o037 if credentials and path.absolute().parent == Path(credentials) else 0o077
 
 
 # -- what `marey login` stores --

@@ -3,18 +3,14 @@
 import re
 import shlex
 from pathlib import Path
-from typing import Any
 
 import pytest
 from docs.generate import REFERENCE, ROOT, pages
+from tests.support.told_commands import unknown_options
 from tests.support.who_may import table
-from typer import Context
-from typer.main import get_command
 
-from marey_client.cli.app import app
 from marey_server.process.observe import Metrics
 
-COMMANDS = get_command(app)
 WRITTEN = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
 
 
@@ -67,14 +63,4 @@ def told_commands() -> list[tuple[str, str]]:
 @pytest.mark.parametrize(("page", "line"), told_commands())
 def test_every_command_that_a_page_tells_exists_with_these_options(page: str, line: str) -> None:
     words = shlex.split(line.rstrip("&").replace("…", ""), comments=True)[1:]
-    command: Any = COMMANDS
-    of_all = {option: parameter for parameter in command.params for option in parameter.opts}
-    known = set(of_all)
-    while words and words[0] in of_all:  # options before the command's name
-        words = words[1 if of_all[words[0]].is_flag else 2 :]
-    while words and words[0] in getattr(command, "commands", {}):
-        command = command.commands[words.pop(0)]
-    assert not hasattr(command, "commands"), f"{page}: {line}"
-    known |= {option for one in command.get_params(Context(command)) for option in (*one.opts, *one.secondary_opts)}
-    given = {word.partition("=")[0] for word in words if re.match(r"--[a-z]|-[a-z]$", word)}
-    assert given <= known, f"{page}: {line}"
+    assert unknown_options(words) == set(), f"{page}: {line}"

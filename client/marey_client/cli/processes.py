@@ -26,11 +26,14 @@ DatabaseUrl = Annotated[
     ),
 ]
 
+READY_TIMEOUT_S = 10.0
+
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
     app.command()(serve)
     app.command()(worker)
+    app.command()(ready)
     app.command()(demo)
     app.add_typer(db, name="db")
 
@@ -94,6 +97,19 @@ def worker(
         cache_mb=cache_mb,
         log_form=log_form,
     )
+
+
+def ready(context: typer.Context) -> None:
+    """Check once whether a server is ready for requests; the exit status is 0 only if it is ready."""
+    from marey_client.cli.terminal.invocation import credential_of
+    from marey_client.cli.terminal.output import print_message
+    from marey_client.marey import Marey
+    from marey_client.retries import ONCE
+
+    url = credential_of(context).url
+    with Marey(url, retries=ONCE, timeout_s=READY_TIMEOUT_S) as marey:
+        marey.transport.send("GET", f"{marey.transport.url}/readyz")
+    print_message(f"{url} is ready")
 
 
 def demo(

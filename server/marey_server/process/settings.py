@@ -9,6 +9,7 @@ from dataclasses import fields
 from ipaddress import IPv4Network, IPv6Network
 from pathlib import Path
 from typing import Literal
+from urllib.parse import quote, urlsplit
 
 from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
@@ -38,6 +39,11 @@ class Settings(BaseSettings):
         None,
         description="SQLAlchemy URL of the database, such as postgresql://...; absent: the SQLite file marey.db in the "
         "data folder.",
+    )
+    database_password_file: Path | None = Field(
+        None,
+        description="File that contains the password of the database user and nothing else; instead of a password in "
+        "database_url.",
     )
     database_threads: int | None = Field(
         None,
@@ -273,6 +279,20 @@ class Settings(BaseSettings):
             raise ValueError(f"{data} is a file, but must be a folder; a folder that does not exist is created")
         return data
 
+    @field_validator("database_password_file")
+    @classmethod
+    def _check_database_password_file(cls, file: Path | None, others: ValidationInfo) -> Path | None:
+        url = urlsplit(others.data.get("database_url") or "")
+        if file is None:
+            return None
+        if not url.username or url.password is not None:
+            raise ValueError(
+                "database_url must contain a user and no password, as in postgresql://marey@db.internal/marey"
+            )
+        if not _read_password(file):
+            raise ValueError(f"{file} is empty, but must contain a password")
+        return file
+
     @field_validator("heartbeat_s")
     @classmethod
     def _check_heartbeat(cls, heartbeat_s: float, others: ValidationInfo) -> float:
@@ -339,7 +359,19 @@ class Settings(BaseSettings):
     @property
     def resolved_database_url(self) -> str:
         """Return the URL of the database, by default an SQLite file in the data folder."""
-        return self.database_url or f"sqlite:///{(self.data / 'marey.db').absolute()}"
+        url = self.database_url or f"sqlite:///{(self.data / 'marey.db').absolute()}"
+        if self.database_password_file is None:
+            return url
+        user, _, place = urlsplit(url).netloc.partition("@")
+        password = quote(_read_password(self.database_password_file), safe="")
+        return url.replace(f"{user}@{place}", f"{user}:{password}@{place}", 1)
+
+
+def _read_password(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8").rstrip("\r\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{file} cannot be read: {error}") from None
 
 
 def misspelt_variables(environment: Mapping[str, str]) -> dict[str, str]:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
@@ -714,3 +715,16 @@ def test_at_a_narrow_terminal_ids_stay_in_one_piece_and_moments_are_told_to_the_
     assert an_id in printed
     assert max(map(len, printed.splitlines())) <= 80
     assert "03:05:58Z" in printed
+
+
+def test_ready_tells_by_its_status_whether_the_server_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MAREY_URL", "http://server.test")
+    server = ScriptedServer()
+    server.answers = [httpx.Response(200, json={"status": "ready"}), problem(503, "not-ready", retry_after=5)]
+    with mock.patch("marey_client.marey.Marey", partial(Marey, http=httpx.MockTransport(server))):
+        ready, refused = run_here(["ready"]), run_here(["ready"])
+    assert (ready.returncode, ready.stderr) == (0, "http://server.test is ready\n")
+    assert refused.returncode == 1
+    assert "the reason" in refused.stderr
+    assert [request.url.path for request in server.requests] == ["/readyz", "/readyz"]
+    assert all("Authorization" not in request.headers for request in server.requests)

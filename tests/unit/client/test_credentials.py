@@ -193,3 +193,18 @@ def test_a_login_that_there_is_no_room_for_leaves_no_token_behind(tmp_path: Path
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert list(tmp_path.iterdir()) == [path]
     assert dict(credentials.read_logins(path).tokens) == {SERVER: "kept"}
+
+
+def test_a_credential_that_systemd_opened_to_its_service_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "worker-token"
+    file.write_text("marey_secret")
+    file.chmod(0o440)
+    with pytest.raises(errors.BadCredentialFile, match="can be read by other users"):
+        credentials.read_secret(file)
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
+    assert credentials.read_secret(file) == "marey_secret"
+    file.chmod(0o444)
+    with pytest.raises(errors.BadCredentialFile, match="can be read by other users"):
+        credentials.read_secret(file)

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 from pydantic import ValidationError
+from sqlalchemy import make_url
 
 from marey_server.process.settings import Settings, misspelt_variables
 
@@ -29,6 +30,36 @@ def test_a_data_folder_that_is_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "takes.zip").touch()
     with pytest.raises(ValueError, match=r"takes\.zip is a file, but must be a folder"):
         Settings(data=tmp_path / "takes.zip")
+
+
+def test_the_password_of_the_database_may_be_in_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "password"
+    file.write_text("p@ss/word:%\n")
+    settings = Settings(database_url="postgresql://marey@db:5433/marey?sslmode=require", database_password_file=file)
+    assert make_url(settings.resolved_database_url) == make_url("postgresql://marey@db:5433/marey?sslmode=require").set(
+        password="p@ss/word:%"
+    )
+    assert "p@ss" not in repr(settings)
+
+
+@pytest.mark.parametrize(
+    ("url", "password", "reason"),
+    [
+        ("postgresql://marey@db/marey", "", "is empty"),
+        ("postgresql://marey@db/marey", None, "cannot be read"),
+        ("postgresql://marey:other@db/marey", "secret", "database_url must contain a user and no password"),
+        ("postgresql://db/marey", "secret", "database_url must contain a user and no password"),
+        (None, "secret", "database_url must contain a user and no password"),
+    ],
+)
+def test_a_password_that_cannot_be_used_is_refused(
+    tmp_path: Path, url: str | None, password: str | None, reason: str
+) -> None:
+    file = tmp_path / "password"
+    if password is not None:
+        file.write_text(password)
+    with pytest.raises(ValidationError, match=reason):
+        Settings(database_url=url, database_password_file=file)
 
 
 @pytest.mark.parametrize("given", [{"lease_ttl_s": 20}, {"heartbeat_s": 31}, {"lease_ttl_s": 1, "heartbeat_s": 0.6}])

@@ -1,0 +1,29 @@
+"""Commands of `marey` that pages and files of the project name, compared with the command line."""
+
+import re
+from typing import Any
+
+from typer import Context
+from typer.main import get_command
+
+from marey_client.cli.app import app
+
+COMMANDS = get_command(app)
+
+
+def unknown_options(words: list[str]) -> set[str]:
+    """Return the options that the command in `words`, which follow `marey`, does not have.
+
+    Raises `AssertionError` if there is no such command.
+    """
+    command: Any = COMMANDS
+    told = list(words)
+    of_all = {option: parameter for parameter in command.params for option in parameter.opts}
+    known = set(of_all)
+    while told and told[0] in of_all:  # options before the command's name
+        told = told[1 if of_all[told[0]].is_flag else 2 :]
+    while told and told[0] in getattr(command, "commands", {}):
+        command = command.commands[told.pop(0)]
+    assert not hasattr(command, "commands"), f"no command: {words}"
+    known |= {option for one in command.get_params(Context(command)) for option in (*one.opts, *one.secondary_opts)}
+    return {word.partition("=")[0] for word in told if re.match(r"--[a-z]|-[a-z]$", word)} - known
