@@ -34,6 +34,7 @@ from marey_server.store.database.connections import Database
 from marey_server.store.jobs.failure import end_for_lost_author
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.reaper import StartGrace
+from marey_server.store.monitoring.workers import WorkerMemory
 
 log = logging.getLogger(__name__)
 
@@ -102,6 +103,7 @@ class Services:
         self._seal_key = database.read(SYSTEM, read_seal_key)
         self.queue_policy = QueuePolicy(settings.lease_ttl_s, settings.heartbeat_s, settings.cancel_grace_s)
         self.start_grace = StartGrace(self.queue_policy)
+        self.worker_memory = WorkerMemory()
         self._watch()
 
     def _watch(self) -> None:
