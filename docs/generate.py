@@ -118,6 +118,13 @@ if a clip has a newer revision, every condition on the facet is false, until a j
     return NOTE + text + _table(("facet", "meaning"), facets).rstrip() + "\n"
 
 
+def declared_metrics() -> list[MetricWrapperBase]:
+    """Return all metrics of a server in the order of their declarations."""
+    metrics = Metrics()
+    declared = (*vars(metrics).values(), *vars(metrics.operator).values())
+    return [one for one in declared if isinstance(one, MetricWrapperBase)]
+
+
 def metrics_page() -> str:
     """Return the page of the metrics of a server."""
     rows = [
@@ -127,8 +134,7 @@ def metrics_page() -> str:
             ", ".join(f"`{label}`" for label in one._labelnames),
             one._documentation,
         )
-        for one in vars(Metrics()).values()
-        if isinstance(one, MetricWrapperBase)
+        for one in declared_metrics()
     ]
     text = """# Metrics
 

@@ -382,3 +382,13 @@ def test_an_administrator_lists_waiting_and_working_workers(
     assert (idle["name"], idle["running"], idle["alive"], idle["version"]) == ("idle", 0, True, "9.9")
     assert (idle["labels"], idle["kinds"]) == ({"site": "lyon"}, ["errand"])
     assert owner.get("/workers").status_code == 403
+
+
+def test_metrics_show_the_queue_and_do_not_read_it_again_at_once(server: Server, owner: httpx.Client) -> None:
+    submit(owner, labels={"gpu": "secret-name"})
+    text = httpx.get(f"{server.address}/metrics").text
+    assert 'marey_jobs_queued{kind="errand",labels="some"} 1.0' in text
+    assert 'marey_workers{version="other"} 0.0' in text
+    assert "secret-name" not in text
+    submit(owner, labels={"gpu": "secret-name"})
+    assert 'marey_jobs_queued{kind="errand",labels="some"} 1.0' in httpx.get(f"{server.address}/metrics").text

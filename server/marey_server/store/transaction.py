@@ -57,6 +57,26 @@ class Quotas:
     project_proposal_bytes: int = 64 * 2**20
 
 
+class Observer:
+    """Receiver of numbers about committed transactions, for metrics; this base class ignores them."""
+
+    def count_ended(self, state: str, reason: str | None) -> None:
+        """Count a job that has ended; `reason` is that of a failure."""
+
+    def count_requeued(self, outcome: str) -> None:
+        """Count a job that is queued again after an attempt with this outcome."""
+
+    def count_lost_lease(self) -> None:
+        """Count an attempt whose lease has expired."""
+
+    def observe_claims(self, delays_s: Sequence[float]) -> None:
+        """Record for how many seconds each job of a claim could have run before."""
+
+
+IGNORED = Observer()
+"""Observer that ignores everything."""
+
+
 class Transaction:
     """Transaction with the principal on whose behalf it runs."""
 
@@ -67,6 +87,7 @@ class Transaction:
         clock: Clock,
         blobs: BlobBacking,
         quotas: Quotas = Quotas(),
+        observer: Observer = IGNORED,
     ) -> None:
         self.connection = connection
         self.principal = principal
@@ -74,6 +95,7 @@ class Transaction:
         """Role and scope that the request's operation declares; `projects.require` enforces them."""
         self.blobs = blobs
         self.quotas = quotas
+        self.observer = observer
         self.folder_rights: dict[tuple[str, str | None], FolderRights] = {}
         """Rights that this transaction has read, by project and user; see `store.folder_roles.rights`."""
         self.shared_outputs = 0
@@ -95,7 +117,7 @@ class Transaction:
 
     def beside(self, principal: Principal) -> Transaction:
         """Return a transaction for another `principal` on the same connection; the two are committed together."""
-        return Transaction(self.connection, principal, self._clock, self.blobs, self.quotas)
+        return Transaction(self.connection, principal, self._clock, self.blobs, self.quotas, self.observer)
 
     @property
     def is_postgres(self) -> bool:
