@@ -58,6 +58,8 @@ def command_line_page() -> str:
 def _commands(group: Any, prefix: str) -> Iterator[tuple[str, Any]]:
     for name, command in sorted(group.commands.items()):
         if hasattr(command, "commands"):
+            if command.invoke_without_command:
+                yield f"{prefix} {name}", command
             yield from _commands(command, f"{prefix} {name}")
         else:
             yield f"{prefix} {name}", command
@@ -116,6 +118,13 @@ if a clip has a newer revision, every condition on the facet is false, until a j
     return NOTE + text + _table(("facet", "meaning"), facets).rstrip() + "\n"
 
 
+def declared_metrics() -> list[MetricWrapperBase]:
+    """Return all metrics of a server in the order of their declarations."""
+    metrics = Metrics()
+    declared = (*vars(metrics).values(), *vars(metrics.operator).values())
+    return [one for one in declared if isinstance(one, MetricWrapperBase)]
+
+
 def metrics_page() -> str:
     """Return the page of the metrics of a server."""
     rows = [
@@ -125,8 +134,7 @@ def metrics_page() -> str:
             ", ".join(f"`{label}`" for label in one._labelnames),
             one._documentation,
         )
-        for one in vars(Metrics()).values()
-        if isinstance(one, MetricWrapperBase)
+        for one in declared_metrics()
     ]
     text = """# Metrics
 

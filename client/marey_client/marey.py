@@ -22,6 +22,7 @@ from marey_client.transport import Transport
 from marey_schemas.access import Login, Me, NewToken, Project, ProjectCreate
 from marey_schemas.audit import AuditEntry
 from marey_schemas.invitations import AcceptedInvitation, InvitationAcceptance, SignedUp, SignUp
+from marey_schemas.queue.workers import Worker
 
 
 class Marey:
@@ -109,6 +110,14 @@ class Marey:
         read it. `AuditConditions` describes the conditions.
         """
         return read_audit(self.transport, "/audit", **conditions)
+
+    def workers(self) -> Iterator[Worker]:
+        """List the workers that the server knows, by name. Only administrators may list them.
+
+        A server knows the workers that run jobs, and the workers that claimed jobs from it in the last 24 hours. If
+        several servers share a database, workers that wait for jobs of another server are missing.
+        """
+        return pages(self.transport, Worker, "/workers")
 
     @cached_property
     def jobs(self) -> Jobs:

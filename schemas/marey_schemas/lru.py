@@ -80,6 +80,11 @@ class LruCache(Generic[Key, Value]):
         self.put(key, value)
         return value
 
+    def items(self) -> list[tuple[Key, Value]]:
+        """Return all keys with their values, the least recently used first."""
+        with self._lock:
+            return [(key, value) for key, (value, _) in self._entries.items()]
+
     def pop(self, key: Key) -> Value | None:
         """Remove the value of `key` and return it, or None."""
         with self._lock:

@@ -118,6 +118,7 @@ def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
         "PATCH /users/{user}/quotas": "administrator",
         "PATCH /projects/{project}/quotas": "administrator",
         "GET /audit": "administrator",
+        "GET /workers": "administrator",
         "GET /projects/{project}/audit": "owner",
         "PATCH /projects/{project}": "owner",
         "DELETE /projects/{project}": "owner",

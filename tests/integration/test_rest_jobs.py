@@ -367,3 +367,28 @@ def test_the_server_takes_back_jobs_of_lost_workers_by_itself(
         (first,) = claim(worker)
         (second,) = claim(worker, wait_s=30)
         assert (second["job"], second["fence"] > first["fence"]) == (job["id"], True)
+
+
+def test_an_administrator_lists_waiting_and_working_workers(
+    server: Server, owner: httpx.Client, worker: httpx.Client
+) -> None:
+    chief = server.client(server.make_user("chief", administrator=True, scopes=("read", "admin")))
+    waiting = {"worker": "idle", "kinds": ["errand"], "labels": {"site": "lyon"}, "version": "9.9"}
+    assert ok(worker.post("/leases", json=waiting))["leases"] == []
+    submit(owner)
+    assert len(claim(worker)) == 1
+    idle, busy = ok(chief.get("/workers"))["items"]
+    assert (busy["name"], busy["running"], busy["alive"]) == ("w", 1, True)
+    assert (idle["name"], idle["running"], idle["alive"], idle["version"]) == ("idle", 0, True, "9.9")
+    assert (idle["labels"], idle["kinds"]) == ({"site": "lyon"}, ["errand"])
+    assert owner.get("/workers").status_code == 403
+
+
+def test_metrics_show_the_queue_and_do_not_read_it_again_at_once(server: Server, owner: httpx.Client) -> None:
+    submit(owner, labels={"gpu": "secret-name"})
+    text = httpx.get(f"{server.address}/metrics").text
+    assert 'marey_jobs_queued{kind="errand",labels="some"} 1.0' in text
+    assert 'marey_workers{version="other"} 0.0' in text
+    assert "secret-name" not in text
+    submit(owner, labels={"gpu": "secret-name"})
+    assert 'marey_jobs_queued{kind="errand",labels="some"} 1.0' in httpx.get(f"{server.address}/metrics").text

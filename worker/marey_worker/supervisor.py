@@ -11,6 +11,7 @@ import uuid
 from collections.abc import Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from typing import Self
 
@@ -163,6 +164,7 @@ class Supervisor:
             max=1,
             wait_s=CLAIM_WAIT_S,
             claim_id=opened.id,
+            version=version("marey"),
         )
         return claim(opened.transport, wanted)
 

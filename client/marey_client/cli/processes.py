@@ -1,4 +1,4 @@
-"""Commands `serve`, `worker`, `demo` and `db`, which do their work on this machine."""
+"""Commands `serve`, `worker`, `demo` and `db`, which do their work on this machine, and `worker ls`."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from typing import Annotated, Any
 
 import typer
 
-from marey_client.cli.terminal.invocation import AsJson
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_table
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
 from marey_schemas.queue.log_lines import LogForm
 
 db = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage the database of a server on this machine.")
+
+workers = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
 
 DataFolder = Annotated[
     Path | None,
@@ -32,7 +35,7 @@ READY_TIMEOUT_S = 10.0
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
     app.command()(serve)
-    app.command()(worker)
+    app.add_typer(workers, name="worker")
     app.command()(ready)
     app.command()(demo)
     app.add_typer(db, name="db")
@@ -59,6 +62,7 @@ def serve(
     embedded.serve(data=data, host=host, port=port, local_workers=workers, database_url=database_url, log_form=log_form)
 
 
+@workers.callback()
 def worker(
     context: typer.Context,
     slots: Annotated[
@@ -83,6 +87,8 @@ def worker(
     ] = None,
 ) -> None:
     """Run a worker, which runs the jobs of a server until you stop the worker. The token must have the scope `work`."""
+    if context.invoked_subcommand is not None:
+        return
     from marey_client import embedded
     from marey_client.cli.terminal.invocation import credential_of
     from marey_client.cli.terminal.typed_values import assignment
@@ -110,6 +116,35 @@ def ready(context: typer.Context) -> None:
     with Marey(url, retries=ONCE, timeout_s=READY_TIMEOUT_S) as marey:
         marey.transport.send("GET", f"{marey.transport.url}/readyz")
     print_message(f"{url} is ready")
+
+
+@workers.command("ls")
+def list_workers(context: typer.Context, as_json: AsJson = False) -> None:
+    """List the workers that the server knows, and whether they are alive. Only administrators may list them.
+
+    A server knows the workers that run jobs, and the workers that claimed jobs from it in the last 24 hours. If several
+    servers share a database, workers that wait for jobs of another server are missing. Times are in UTC.
+    """
+    with connect(context) as marey:
+        found = list(marey.workers())
+    if as_json:
+        return print_json(found)
+    return print_table(
+        ("worker", "state", "running", "last seen", "version", "labels", "kinds"),
+        [
+            (
+                one.name,
+                "alive" if one.alive else "away",
+                one.running,
+                one.seen_at,
+                one.version,
+                " ".join(f"{name}={value}" for name, value in sorted((one.labels or {}).items())),
+                " ".join(one.kinds or ()),
+            )
+            for one in found
+        ],
+        right=("running",),
+    )
 
 
 def demo(

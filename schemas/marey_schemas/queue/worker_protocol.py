@@ -34,6 +34,9 @@ class ClaimRequest(Request):
     max: int = Field(1, ge=1, le=256)
     wait_s: float = Field(0, ge=0, le=30)
     protocol: int = PROTOCOL_VERSION
+    version: str | None = Field(
+        None, min_length=1, max_length=64, description="Version of Marey that the worker runs, shown to administrators."
+    )
     job: str | None = Field(None, description="Claim only this job.")
     claim_id: str | None = Field(
         None,

@@ -74,6 +74,7 @@ class MetricsPage(Resource):
     @reads(access=Access.ANYONE, scope=None, answer=Bytes, answer_types=("text/plain",))
     async def get(self) -> Reply:
         """Return metrics in the text format of Prometheus."""
+        await self.services.refresh_figures()
         text, media_type = await self.services.metrics.exposition()
         return Reply(text, media_type=media_type, headers={"Cache-Control": NOT_STORED})
 

@@ -89,6 +89,7 @@ class _FeedPosition:
             news = await self._read(events.read_news, self._last)
             wakeups.announce({*news.topics, NUMBERED_EVENTS} if news.last > self._last else news.topics)
             self._last, complete = news.last, news.complete
+        self._services.metrics.operator.note_feed()
         await self._announce_due()
 
     async def _announce_due(self) -> None:

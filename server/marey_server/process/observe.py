@@ -26,6 +26,7 @@ from prometheus_client import (
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 from marey_schemas.queue.log_lines import LogForm, log_to_standard_error
+from marey_server.process.operator_metrics import OperatorMetrics
 
 _SANE_ID = re.compile(r"[A-Za-z0-9._:-]{8,128}")
 _BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30)
@@ -129,6 +130,7 @@ class Metrics:
         self.imports = Counter("marey_imported_files", "Files imported.", ("status",), registry=self.registry)
         self.draining = Gauge("marey_draining", "1 while the server is stopping.", registry=self.registry)
         self._add_webhooks()
+        self.operator = OperatorMetrics(self.registry)
         self._rendering = asyncio.Lock()
         self._renderings = 0
         self._rendered = b""

@@ -9,13 +9,15 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import version
 from typing import Any
 
 from marey_schemas.lru import LruCache
 from marey_server.access import scopes
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.access.secret_tokens import is_sealed, token_hash
-from marey_server.errors import AuthorLostProblem, UnavailableProblem
+from marey_server.errors import ApiProblem, AuthorLostProblem, UnavailableProblem
 from marey_server.motions.searching import SearchableKey
 from marey_server.process.children import Children
 from marey_server.process.computing import ComputeThreads
@@ -31,9 +33,12 @@ from marey_server.store import events
 from marey_server.store.credentials import tokens
 from marey_server.store.credentials.server_key import read_seal_key
 from marey_server.store.database.connections import Database
+from marey_server.store.database.lanes import SERVER
 from marey_server.store.jobs.failure import end_for_lost_author
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.reaper import StartGrace
+from marey_server.store.monitoring.figures import read_figures
+from marey_server.store.monitoring.workers import WorkerMemory
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +48,8 @@ ANSWER_ENTRY_BYTES = 512
 """Memory in bytes of an entry in the cache of answers, in addition to its body."""
 MODEL_CACHE_BYTES = 64 << 20
 """Greatest size of the cache of models' documents, in bytes."""
+FIGURES_WAIT_S = 0.5
+"""Greatest number of seconds that a request for metrics waits for numbers from the database."""
 TOKENS_REMEMBERED = 10_000
 ADMISSIONS_REMEMBERED = 10_000
 
@@ -102,12 +109,16 @@ class Services:
         self._seal_key = database.read(SYSTEM, read_seal_key)
         self.queue_policy = QueuePolicy(settings.lease_ttl_s, settings.heartbeat_s, settings.cancel_grace_s)
         self.start_grace = StartGrace(self.queue_policy)
+        self.worker_memory = WorkerMemory()
+        self._reading_figures: asyncio.Task[None] | None = None
         self._watch()
 
     def _watch(self) -> None:
         """Show the sizes of queues and pools in the metrics."""
         passwords = {"passwords": self.password_lane, "passwords-unknown": self.unknown_lane}
         self.metrics.watch({**self.database.lanes, **self.compute_threads.lanes, **passwords})
+        self.database.observer = self.metrics.operator
+        self.metrics.operator.watch_disk(self.settings.data, self.settings.min_free_bytes)
         self.metrics.children.set_function(lambda: self.children.sizes[0])
         self.metrics.waiting.labels("children").set_function(lambda: self.children.sizes[1])
         self.metrics.in_flight.set_function(lambda: len(self.in_flight))
@@ -155,6 +166,26 @@ class Services:
         self._tokens_noted.put(token_id, now)
         with suppress(UnavailableProblem):  # too many writes wait: a later use is recorded
             self.database.submit_write(SYSTEM, tokens.note_use, token_id)
+
+    async def refresh_figures(self) -> None:
+        """Read the numbers about the queue and stored data for the metrics, unless they were read a short time ago.
+
+        This method returns after `FIGURES_WAIT_S` even if the database is busy; the metrics show the result later.
+        """
+        if self._reading_figures is None or self._reading_figures.done():
+            if not self.metrics.operator.is_due:
+                return
+            self._reading_figures = asyncio.create_task(self._read_figures())
+        await asyncio.wait({self._reading_figures}, timeout=FIGURES_WAIT_S)
+
+    async def _read_figures(self) -> None:
+        shown, begun_s = self.metrics.operator, time.monotonic()
+        run = partial(read_figures, heard=self.worker_memory.heard(), version=version("marey"))
+        try:
+            shown.show(await asyncio.wrap_future(self.database.queue_read(SERVER, SYSTEM, run)), self.settings.blobs)
+        except ApiProblem as error:
+            log.warning("the numbers for metrics cannot be read: %s", error.detail)
+        shown.rest(time.monotonic() - begun_s)
 
     async def number_events(self) -> None:
         """Number all committed events, so that they can be read; on SQLite, events are numbered already."""

@@ -57,6 +57,26 @@ class Quotas:
     project_proposal_bytes: int = 64 * 2**20
 
 
+class Observer:
+    """Receiver of numbers about committed transactions, for metrics; this base class ignores them."""
+
+    def count_ended(self, state: str, reason: str | None) -> None:
+        """Count a job that has ended; `reason` is that of a failure."""
+
+    def count_requeued(self, outcome: str) -> None:
+        """Count a job that is queued again after an attempt with this outcome."""
+
+    def count_lost_lease(self) -> None:
+        """Count an attempt whose lease has expired."""
+
+    def observe_claims(self, delays_s: Sequence[float]) -> None:
+        """Record for how many seconds each job of a claim could have run before."""
+
+
+IGNORED = Observer()
+"""Observer that ignores everything."""
+
+
 class Transaction:
     """Transaction with the principal on whose behalf it runs."""
 
@@ -67,6 +87,7 @@ class Transaction:
         clock: Clock,
         blobs: BlobBacking,
         quotas: Quotas = Quotas(),
+        observer: Observer = IGNORED,
     ) -> None:
         self.connection = connection
         self.principal = principal
@@ -74,6 +95,7 @@ class Transaction:
         """Role and scope that the request's operation declares; `projects.require` enforces them."""
         self.blobs = blobs
         self.quotas = quotas
+        self.observer = observer
         self.before_statement: Callable[[], object] = bool
         """Called before each statement of `execute`; an error that it raises stops the transaction."""
         self.folder_rights: dict[tuple[str, str | None], FolderRights] = {}
@@ -97,7 +119,7 @@ class Transaction:
 
     def beside(self, principal: Principal) -> Transaction:
         """Return a transaction for another `principal` on the same connection; the two are committed together."""
-        other = Transaction(self.connection, principal, self._clock, self.blobs, self.quotas)
+        other = Transaction(self.connection, principal, self._clock, self.blobs, self.quotas, self.observer)
         other.before_statement = self.before_statement
         return other
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from functools import partial
 
+from marey_schemas.items import Page
 from marey_schemas.queue.worker_protocol import (
     BatchCompleteAnswer,
     BatchCompleteRequest,
@@ -20,13 +21,15 @@ from marey_schemas.queue.worker_protocol import (
     StageAnswer,
     StageRequest,
 )
+from marey_schemas.queue.workers import Worker
 from marey_schemas.sizes import KIB, MIB
 from marey_server.errors import BadRequestProblem
-from marey_server.http.declarations import Access, Bytes, RequestBody, writes
+from marey_server.http.declarations import Access, Bytes, RequestBody, reads, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store.jobs import completion, logs, queue, reaper, staging
 from marey_server.store.jobs.staging import PreparedOutput
+from marey_server.store.monitoring.workers import list_workers
 from marey_server.store.wakeups import wakeups, work_topic
 
 LOOK_FOR_WORK_S = 15.0
@@ -52,6 +55,7 @@ class Leases(Resource):
                 leases = await self.change(
                     reaper.claim_after_reaping, body, self.services.start_grace, self.services.queue_policy
                 )
+                self._remember(body)
                 left_s = deadline - loop.time()
                 self.uneventful = not leases
                 if leases or left_s <= 0:
@@ -59,6 +63,28 @@ class Leases(Resource):
                 await listener.wait(min(left_s, LOOK_FOR_WORK_S))
                 if not self.is_awaited():  # claim nothing for a caller that has gone
                     return Reply(LeaseList())
+
+    def _remember(self, claim: ClaimRequest) -> None:
+        """Remember, in memory only, that the worker has claimed jobs."""
+        if self.principal is not None:
+            self.services.worker_memory.hear(self.principal.token_id, claim)
+
+
+class Workers(Resource):
+    """Workers that this server knows."""
+
+    path = "/workers"
+    tag = "Work"
+
+    @reads(access=Access.ADMINISTRATOR, scope="admin", answer=Worker, paged=True)
+    async def get(self) -> Rendered:
+        """List the workers, in one page.
+
+        The list contains workers that claimed jobs from this server process in the last 24 hours, until the process is
+        restarted, and all workers that run jobs. Workers that wait for jobs of another process are missing.
+        """
+        heard, policy = self.services.worker_memory.heard(), self.services.queue_policy
+        return await self.answer_with(lambda workers: Reply(Page(items=workers)), list_workers, heard, policy)
 
 
 class Completions(Resource):
@@ -189,6 +215,7 @@ class AttemptFailure(Resource):
 
 RESOURCES: tuple[type[Resource], ...] = (
     Leases,
+    Workers,
     Completions,
     AttemptHeartbeat,
     AttemptLog,

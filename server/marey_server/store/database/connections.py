@@ -34,7 +34,7 @@ from marey_server.store.database.lanes import SERVER, Client, Lane
 from marey_server.store.database.opening import sqlite_file
 from marey_server.store.database.write_ahead_log import PAGE_BYTES, SHORT_BYTES, WriteAheadLog
 from marey_server.store.database.write_lane import WriteLane
-from marey_server.store.transaction import Quotas, Transaction
+from marey_server.store.transaction import IGNORED, Observer, Quotas, Transaction
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -87,6 +87,8 @@ class Database:
         self._high_water_us = 0
         self.blobs: BlobBacking = blobs or DatabaseBlobs()
         self.quotas = quotas or Quotas()
+        self.observer: Observer = IGNORED
+        """Receiver of numbers about the transactions of this process; the server replaces it."""
         self._lane: AbstractContextManager[Any] = threading.Lock() if self.is_sqlite else nullcontext()
         file = sqlite_file(self.url)
         self._log = WriteAheadLog(file) if file else None
@@ -164,7 +166,7 @@ class Database:
         raise AssertionError("unreachable")
 
     def _transaction(self, connection: Connection, principal: Principal) -> Transaction:
-        return Transaction(connection, principal, self.clock, self.blobs, self.quotas)
+        return Transaction(connection, principal, self.clock, self.blobs, self.quotas, self.observer)
 
     def _run_and_commit(
         self,

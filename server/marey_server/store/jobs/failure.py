@@ -143,6 +143,8 @@ def apply_outcome(
         moved = _queue_again(tx, row, condition, outcome, values)
     if not moved:
         raise lease_lost(end.job_id, end.fence)
+    if outcome.rest_us is not None:
+        tx.after_commit(lambda: tx.observer.count_requeued(outcome.attempt_outcome))
     end_attempts(tx, [end])
     staging.drop_staged(tx, [(end.job_id, end.fence)])
     propagate_ends(tx, ended)

@@ -64,6 +64,11 @@ _ENDINGS: dict[str, OrdinaryEventKind] = {
 """Kinds of events by the state in which jobs ended."""
 
 
+def _count(tx: Transaction, ended: Sequence[Ended]) -> None:
+    for one in ended:
+        tx.observer.count_ended(one.state, None if one.failure is None else one.failure["reason"])
+
+
 def _announce(tx: Transaction, ended: Sequence[Ended]) -> None:
     for state in sorted({end.state for end in ended}):
         emit_job_events(
@@ -72,6 +77,7 @@ def _announce(tx: Transaction, ended: Sequence[Ended]) -> None:
             [(end.project_id, end.id, _facts_of(end)) for end in ended if end.state == state],
         )
     wake_watchers(tx, [end.id for end in ended])
+    tx.after_commit(lambda: _count(tx, ended))
 
 
 def _facts_of(end: Ended) -> dict[str, Any]:

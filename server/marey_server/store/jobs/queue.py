@@ -97,6 +97,8 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
         ],
     )
     emit_job_events(tx, "job.started", [(row.project_id, row.id, {"fence": row.fence}) for row in rows])
+    delays_s = [max(0, tx.now_us - row.run_at_us) / SECOND_US for row in rows]
+    tx.after_commit(lambda: tx.observer.observe_claims(delays_s))
     tx.after_commit(lambda: faults.point("claim.after_commit"))
     return _leases(tx, rows, tokens, policy)
 

@@ -100,6 +100,7 @@ def _take_back(tx: Transaction, row: Row[Any], policy: QueuePolicy) -> bool:
             condition = and_(held(row.id, row.fence), job.c.lease_expires_us <= tx.now_us)
             end = AttemptEnd(row.id, row.fence, outcome.attempt_outcome, "The lease ran out.")
             apply_outcome(tx, row, condition, outcome, end, fence=job.c.fence + 1)
+        tx.after_commit(tx.observer.count_lost_lease)
     except OperationalError:  # concerns the database, not this job: the whole page is tried again
         raise
     except Exception:

@@ -1,0 +1,140 @@
+"""Metrics about the queue, workers and stored data, for operators.
+
+Counters count what this process did. Numbers from the database are the same in every process that shares it; they are
+read for a request to /metrics, but not again until at least `REFRESH_S` have passed, and 20 times the duration of the
+last read.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+
+from marey_server.store.monitoring.figures import Figures
+from marey_server.store.transaction import Observer
+
+REFRESH_S = 10.0
+REST = 20
+"""Least time between two reads of the database, in seconds and as a multiple of the duration of the last read."""
+_CLAIM_DELAYS_S = (0.01, 0.05, 0.1, 0.5, 1, 5, 30, 120, 600, 3600, 6 * 3600, 86400)
+
+
+class OperatorMetrics(Observer):
+    """Metrics about the queue, workers and stored data; it observes the transactions of this process."""
+
+    def __init__(self, registry: CollectorRegistry) -> None:
+        self._add_jobs(registry)
+        self._add_stored(registry)
+        self.feed_age = Gauge(
+            "marey_events_lag_seconds", "Time since this process last read the feed of events to its end; normally "
+            "less than 3 seconds.", registry=registry,
+        )  # fmt: skip
+        self.figures_age = Gauge(
+            "marey_figures_age_seconds", "Time since the numbers of jobs, workers, uploads and stored bytes were read "
+            "from the database.", registry=registry,
+        )  # fmt: skip
+        self._feed_read_s = self._figures_read_s = time.monotonic()
+        self._next_read_s = 0.0
+        self.feed_age.set_function(lambda: time.monotonic() - self._feed_read_s)
+        self.figures_age.set_function(lambda: time.monotonic() - self._figures_read_s)
+
+    def _add_jobs(self, registry: CollectorRegistry) -> None:
+        self.jobs_queued = Gauge(
+            "marey_jobs_queued", "Jobs in the queue by kind, including those that wait for a retry. `labels` is `some` "
+            "if the jobs require labels of their worker, otherwise `none`.", ("kind", "labels"), registry=registry,
+        )  # fmt: skip
+        self.oldest_age = Gauge(
+            "marey_oldest_queued_job_age_seconds", "Longest time for which a queued job could have run, by kind and "
+            "`labels` as for `marey_jobs_queued`.", ("kind", "labels"), registry=registry,
+        )  # fmt: skip
+        self.jobs_running = Gauge("marey_jobs_running", "Jobs that workers run, by kind.", ("kind",), registry=registry)
+        self.workers = Gauge(
+            "marey_workers", "Workers that run jobs, or that claimed jobs from this server in the last minute. "
+            "`version` is the version of the server, `other`, or `unknown` (the worker claims jobs from another "
+            "server).", ("version",), registry=registry,
+        )  # fmt: skip
+        self.jobs_ended = Counter(
+            "marey_jobs_ended", "Jobs that ended, by state (succeeded, failed or cancelled) and by the reason of a "
+            "failure; `none` if the job did not fail.", ("state", "reason"), registry=registry,
+        )  # fmt: skip
+        self.attempts_lost = Counter(
+            "marey_leases_lost", "Attempts that ended because their lease expired.", registry=registry
+        )
+        self.jobs_requeued = Counter(
+            "marey_jobs_requeued", "Retries of jobs, by outcome of the attempt before: failed, interrupted or lost.",
+            ("outcome",), registry=registry,
+        )  # fmt: skip
+        self.claim_delay = Histogram(
+            "marey_claim_delay_seconds", "Time from when a job could run to its claim by a worker.",
+            buckets=_CLAIM_DELAYS_S, registry=registry,
+        )  # fmt: skip
+
+    def _add_stored(self, registry: CollectorRegistry) -> None:
+        self.uploads = Gauge("marey_upload_sessions", "Unfinished uploads.", registry=registry)
+        self.stored_bytes = Gauge(
+            "marey_stored_bytes", "Bytes of the revisions of all projects, by backing of blobs (database or "
+            "directory). Bytes that several revisions share count for each of them.", ("backing",), registry=registry,
+        )  # fmt: skip
+        self.disk_free = Gauge("marey_disk_free_bytes", "Free bytes on the disk of the data folder.", registry=registry)
+        self.disk_floor = Gauge(
+            "marey_disk_min_free_bytes", "Free bytes below which nothing is stored: the setting min_free_bytes.",
+            registry=registry,
+        )  # fmt: skip
+
+    def watch_disk(self, folder: Path, floor_bytes: int) -> None:
+        """Show the free space of the disk that holds `folder`, and the least free space."""
+        self.disk_floor.set(floor_bytes)
+        self.disk_free.set_function(lambda: shutil.disk_usage(folder).free if folder.exists() else 0)
+
+    def note_feed(self) -> None:
+        """Note that this process has read the feed of events to its end."""
+        self._feed_read_s = time.monotonic()
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the numbers are so old that they may be read again."""
+        return time.monotonic() >= self._next_read_s
+
+    def rest(self, duration_s: float) -> None:
+        """Put off the next read of the numbers, after a read that took `duration_s`."""
+        self._next_read_s = time.monotonic() + max(REFRESH_S, REST * duration_s)
+
+    def show(self, figures: Figures, backing: str) -> None:
+        """Show numbers that were read from the database."""
+        self._figures_read_s = time.monotonic()
+        _replace(self.jobs_queued, {key: one.count for key, one in figures.queued.items()})
+        _replace(self.oldest_age, {key: one.oldest_age_s for key, one in figures.queued.items()})
+        _replace(self.jobs_running, {(kind,): count for kind, count in figures.running.items()})
+        _replace(self.workers, {(version,): count for version, count in figures.workers.items()})
+        self.uploads.set(figures.uploads)
+        self.stored_bytes.labels(backing).set(figures.stored_bytes)
+
+    def count_ended(self, state: str, reason: str | None) -> None:
+        """Count a job that has ended."""
+        self.jobs_ended.labels(state, reason or "none").inc()
+
+    def count_requeued(self, outcome: str) -> None:
+        """Count a job that is queued again after an attempt with this outcome."""
+        self.jobs_requeued.labels(outcome).inc()
+
+    def count_lost_lease(self) -> None:
+        """Count an attempt whose lease has expired."""
+        self.attempts_lost.inc()
+
+    def observe_claims(self, delays_s: Sequence[float]) -> None:
+        """Record for how many seconds each job of a claim could have run before."""
+        for delay_s in delays_s:
+            self.claim_delay.observe(delay_s)
+
+
+def _replace(gauge: Gauge, values: Mapping[tuple[str, ...], float]) -> None:
+    """Set the values of a gauge; combinations of labels that are not given become 0."""
+    for shown in gauge.collect():
+        for sample in shown.samples:
+            gauge.labels(**sample.labels).set(0)
+    for labels, value in values.items():
+        gauge.labels(*labels).set(value)

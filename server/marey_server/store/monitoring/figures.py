@@ -1,0 +1,101 @@
+"""Numbers about the queue and stored data for metrics.
+
+The queries read queued and running jobs, uploads of the last days, and one row for each project. They never
+read ended jobs or blobs, so their cost does not grow with the age of a server.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from sqlalchemy import case, func, select
+
+from marey_schemas.queue import job_kinds
+from marey_schemas.queue.workers import Worker
+from marey_server.store.jobs.fencing import QUEUED, RUNNING
+from marey_server.store.monitoring.workers import HeardWorker, list_workers
+from marey_server.store.tables import holding, job, project, upload
+from marey_server.store.transaction import Transaction
+
+OTHER = "other"
+"""Value of a label that stands for all values which the server does not define."""
+
+
+UNKNOWN = "unknown"
+"""Label of workers that claim jobs from another server, so that their versions are unknown."""
+
+
+@dataclass(frozen=True)
+class QueuedJobs:
+    """Number of queued jobs, and the longest time in seconds for which one of them could have run."""
+
+    count: int
+    oldest_age_s: float
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Numbers about the queue and stored data at one moment."""
+
+    queued: dict[tuple[str, str], QueuedJobs] = field(default_factory=dict)
+    """Queued jobs by kind, and by whether they require labels of their worker (`some` or `none`)."""
+    running: dict[str, int] = field(default_factory=dict)
+    """Number of running attempts by kind."""
+    workers: dict[str, int] = field(default_factory=dict)
+    """Number of workers that are alive: of the version of the server, `other`, or `unknown`."""
+    uploads: int = 0
+    stored_bytes: int = 0
+
+
+def read_figures(tx: Transaction, heard: Sequence[HeardWorker], version: str) -> Figures:
+    """Return the numbers; `heard` are the workers that this process has heard, `version` is that of this server."""
+    alive = [worker for worker in list_workers(tx, heard) if worker.alive]
+    unfinished = select(func.count()).where(upload.c.finished_digest.is_(None), upload.c.dropped.is_(False))
+    stored = select(func.coalesce(func.sum(holding.c.stored_bytes), 0)).join(
+        project, project.c.id == holding.c.owner_id
+    )
+    return Figures(
+        queued=_queued(tx),
+        running=_running(tx),
+        workers={version: 0, OTHER: 0, UNKNOWN: 0, **Counter(_shown_version(worker, version) for worker in alive)},
+        uploads=int(tx.execute(unfinished).scalar_one()),
+        stored_bytes=int(tx.execute(stored).scalar_one()),
+    )
+
+
+def _shown_version(worker: Worker, version: str) -> str:
+    """Return the version of the server if the worker has the same, `other` or, for a worker never heard, `unknown`."""
+    if worker.kinds is None:
+        return UNKNOWN
+    return version if worker.version == version else OTHER
+
+
+def _queued(tx: Transaction) -> dict[tuple[str, str], QueuedJobs]:
+    labels = case((job.c.labels_key == "", "none"), else_="some")
+    rows = tx.execute(
+        select(job.c.kind, labels.label("labels"), func.count().label("jobs"), func.min(job.c.run_at_us).label("since"))
+        .where(job.c.state == QUEUED)
+        .group_by(job.c.kind, labels)
+    )
+    found: dict[tuple[str, str], QueuedJobs] = {}
+    for row in rows:
+        key = (_known(row.kind), row.labels)
+        before = found.get(key, QueuedJobs(0, 0.0))
+        age_s = max(before.oldest_age_s, (tx.now_us - row.since) / 1e6)
+        found[key] = QueuedJobs(before.count + row.jobs, age_s)
+    return found
+
+
+def _running(tx: Transaction) -> dict[str, int]:
+    found: Counter[str] = Counter()
+    leased = (job.c.state == RUNNING, job.c.lease_expires_us.is_not(None))
+    for row in tx.execute(select(job.c.kind, func.count().label("jobs")).where(*leased).group_by(job.c.kind)):
+        found[_known(row.kind)] += row.jobs
+    return dict(found)
+
+
+def _known(kind: str) -> str:
+    """Return the kind, or `other` if it belongs to a package that is no longer installed."""
+    return kind if kind in job_kinds.job_kinds() else OTHER

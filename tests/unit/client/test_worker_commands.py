@@ -1,0 +1,26 @@
+"""Commands `worker` and `worker ls`."""
+
+from contextlib import nullcontext
+from datetime import UTC, datetime
+from types import SimpleNamespace
+
+import pytest
+from typer.testing import CliRunner
+
+from marey_client import embedded
+from marey_client.cli import processes
+from marey_client.cli.app import app
+from marey_schemas.queue.workers import Worker
+
+
+def test_a_worker_starts_without_a_subcommand_and_workers_are_listed_with_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[dict[str, object]] = []
+    monkeypatch.setattr(embedded, "work", lambda _, **options: started.append(options))
+    assert CliRunner().invoke(app, ["worker", "--slots", "2"]).exit_code == 0
+    assert [one["slots"] for one in started] == [2]
+    known = Worker(name="host:1", alive=False, seen_at=datetime(2026, 11, 27, tzinfo=UTC), running=0)
+    monkeypatch.setattr(processes, "connect", lambda _: nullcontext(SimpleNamespace(workers=lambda: [known])))
+    told = CliRunner().invoke(app, ["worker", "ls"]).stdout
+    assert "host:1" in told
+    assert "away" in told
+    assert len(started) == 1

@@ -1,0 +1,79 @@
+"""Files in `deploy/monitoring`: they use only metrics and labels that exist, and the runbook describes each alert."""
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+from docs.generate import declared_metrics
+
+ROOT = Path(__file__).parents[3]
+FILES = ROOT / "deploy" / "monitoring"
+ALERTS = [rule for group in yaml.safe_load((FILES / "alerts.yml").read_text())["groups"] for rule in group["rules"]]
+PANELS = json.loads((FILES / "dashboard.json").read_text())["panels"]
+OF_PROMETHEUS = {"instance", "job", "le"}
+"""Labels that Prometheus adds, and the label of the buckets of histograms."""
+UNITS = ("_total", "_seconds", "_bytes")
+UNITLESS = {
+    "marey_http_in_flight", "marey_connections", "marey_waiting", "marey_database_connections", "marey_children",
+    "marey_draining", "marey_jobs_queued", "marey_jobs_running", "marey_workers", "marey_upload_sessions",
+}  # fmt: skip
+"""Gauges that count things, so that their names have no unit."""
+
+
+def known() -> dict[str, set[str]]:
+    """Return the labels of each metric by the names that a query may use."""
+    found: dict[str, set[str]] = {}
+    for metric in declared_metrics():
+        labels = set(metric._labelnames) | OF_PROMETHEUS
+        endings = {"counter": ["_total"], "histogram": ["_bucket", "_count", "_sum"]}.get(metric._type, [""])
+        found |= {metric._name + ending: labels for ending in endings}
+    return found
+
+
+def queries() -> Iterator[str]:
+    yield from (alert["expr"] for alert in ALERTS)
+    yield from (target["expr"] for panel in PANELS for target in panel["targets"])
+
+
+def labels_in(query: str) -> set[str]:
+    """Return the labels that a query selects or groups by."""
+    selected = {name for inner in re.findall(r"\{([^}]*)\}", query) for name in re.findall(r"(\w+)\s*[=!]", inner)}
+    grouped = {name.strip() for inner in re.findall(r"\bby \(([^)]*)\)", query) for name in inner.split(",")}
+    return selected | grouped
+
+
+@pytest.mark.parametrize("query", list(queries()))
+def test_a_query_uses_only_metrics_and_labels_that_exist(query: str) -> None:
+    metrics = known()
+    used = set(re.findall(r"\bmarey_\w+", query))
+    assert used <= metrics.keys()
+    for name in used:
+        assert labels_in(query) <= metrics[name], name
+    assert used or "up{" in query
+
+
+def test_texts_of_alerts_and_legends_use_labels_of_their_queries() -> None:
+    texts = [(alert["annotations"]["summary"], alert["expr"]) for alert in ALERTS]
+    texts += [(target["legendFormat"], target["expr"]) for panel in PANELS for target in panel["targets"]]
+    metrics = known()
+    for text, query in texts:
+        used = re.findall(r"\{\{ ?(?:\$labels\.)?(\w+) ?\}\}", text)
+        names = re.findall(r"\bmarey_\w+", query)
+        allowed = set.union(OF_PROMETHEUS, *(metrics[name] for name in names))
+        assert set(used) <= allowed, text
+
+
+def test_the_runbook_describes_each_alert_once_and_no_other() -> None:
+    runbook = (ROOT / "docs" / "how-to" / "answer-an-alert.md").read_text()
+    sections = re.findall(r"^## (\w+)\n\n(.*?)(?=^## |\Z)", runbook, re.MULTILINE | re.DOTALL)
+    assert [name for name, _ in sections] == [alert["alert"] for alert in ALERTS]
+    for name, text in sections:
+        assert all(part in text for part in ("**Meaning.**", "```sh", "**Expect**")), name
+
+
+def test_names_of_metrics_end_in_their_unit() -> None:
+    names = {f"{one._name}{'_total' if one._type == 'counter' else ''}" for one in declared_metrics()}
+    assert {name for name in names if not name.endswith(UNITS)} == UNITLESS

@@ -1,0 +1,74 @@
+"""List of workers: what claims and attempts show about them, and who may see it."""
+
+import pytest
+from tests.support.queue_desk import Desk
+
+from marey_schemas.queue.worker_protocol import ClaimRequest
+from marey_schemas.queue.workers import Worker
+from marey_server.access.principal import SYSTEM, Principal
+from marey_server.errors import ForbiddenProblem
+from marey_server.store.monitoring.workers import (
+    ALIVE_S,
+    FORGOTTEN_AFTER_S,
+    LARGEST_CLAIM_BYTES,
+    MOST_REMEMBERED,
+    WorkerMemory,
+    list_workers,
+)
+
+
+class Seconds:
+    """Clock that tests set."""
+
+    now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def claim_of(name: str, **fields: object) -> ClaimRequest:
+    return ClaimRequest.model_validate({"worker": name, "kinds": ["errand"], **fields})
+
+
+def workers(desk: Desk, memory: WorkerMemory) -> dict[str, Worker]:
+    return {one.name: one for one in desk.database.read(SYSTEM, list_workers, memory.heard())}
+
+
+def test_a_waiting_worker_is_alive_until_it_is_silent_and_forgotten_after_a_day(desk: Desk) -> None:
+    clock = Seconds()
+    memory = WorkerMemory(clock)
+    memory.hear("tok_1", claim_of("host:1", labels={"gpu": "a100"}, version="0.1.0"))
+    shown = workers(desk, memory)["host:1"]
+    assert (shown.alive, shown.running, shown.version) == (True, 0, "0.1.0")
+    assert (shown.kinds, shown.labels) == (("errand",), {"gpu": "a100"})
+    clock.now += ALIVE_S + 1
+    assert not workers(desk, memory)["host:1"].alive
+    clock.now += FORGOTTEN_AFTER_S
+    assert workers(desk, memory) == {}
+
+
+def test_a_worker_of_another_server_is_shown_while_it_runs_jobs(desk: Desk) -> None:
+    desk.submit()
+    desk.submit()
+    desk.claim_many(2)
+    (shown,) = workers(desk, WorkerMemory()).values()
+    assert (shown.alive, shown.running) == (True, 2)
+    assert (shown.version, shown.kinds, shown.labels) == (None, None, None)
+    desk.clock.advance(61)
+    assert workers(desk, WorkerMemory()) == {}
+
+
+def test_only_administrators_see_workers(desk: Desk) -> None:
+    owner = Principal("user", "usr_1", "ada", scopes=("read", "write", "jobs", "work", "admin"))
+    with pytest.raises(ForbiddenProblem):
+        desk.database.read(owner, list_workers, [])
+
+
+def test_the_memory_of_workers_is_limited() -> None:
+    memory = WorkerMemory()
+    for number in range(MOST_REMEMBERED + 10):
+        memory.hear("tok_1", claim_of(f"host:{number}"))
+    memory.hear("tok_1", claim_of("long", kinds=["x" * LARGEST_CLAIM_BYTES]))
+    names = {one.key.name for one in memory.heard()}
+    assert len(names) == MOST_REMEMBERED
+    assert not names & {"host:0", "long"}
