@@ -68,7 +68,7 @@ def check_server(marey: Marey) -> Iterator[Finding]:
 
     transport = marey.transport
     try:
-        found = transport.send("GET", "").json()
+        found = transport.send("GET", f"{transport.url}/").json()
         transport.send("GET", f"{transport.url}/readyz")
     except Unreachable as error:
         yield "server", "fault", f"{error}; start it with `marey serve`, or name it with --server"

@@ -75,7 +75,7 @@ def answers(ready: int, workers: httpx.Response) -> httpx.MockTransport:
     def answer(request: httpx.Request) -> httpx.Response:
         if request.url.path == "/readyz":
             return httpx.Response(ready, json={"status": "ready"})
-        return workers if request.url.path.endswith("/workers") else httpx.Response(200, json={"version": "9.9"})
+        return workers if request.url.path == "/api/v1/workers" else httpx.Response(200, json={"version": "9.9"})
 
     return httpx.MockTransport(answer)
 
