@@ -1,4 +1,4 @@
-"""Access to the server, worker and motion packages for the commands `serve`, `worker`, `demo` and `db`.
+"""Access to the server, worker and motion packages for the commands `serve`, `worker`, `demo`, `db` and `doctor`.
 
 Only this module imports these packages, and only when such a command runs, so that the client can be installed alone.
 """
@@ -37,6 +37,13 @@ def database(action: str, *, data: Path | None, database_url: str | None, **opti
     commands = room("marey_server.commands", "server")
     with _refusals_of(commands):
         getattr(commands, action)(**_given({"data": data, "database_url": database_url}), **options)
+
+
+def examine(*, data: Path | None, database_url: str | None) -> list[tuple[str, str, str]]:
+    """Check a server's machine; return for each check its name, its state (ok, warning or fault) and a detail."""
+    commands = room("marey_server.commands", "server")
+    found: list[tuple[str, str, str]] = commands.examine(**_given({"data": data, "database_url": database_url}))
+    return found
 
 
 def work(credential: Credential, **options: Any) -> None:

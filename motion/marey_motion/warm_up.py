@@ -96,8 +96,13 @@ def _recorded_origin() -> str:
     return STAMP.read_text("utf-8").partition(" ")[0] if STAMP.is_file() else ""
 
 
-def _is_done() -> bool:
-    """Return whether everything is compiled, from the installed sources and by the installed compiler."""
+def kernels_are_compiled() -> bool:
+    """Check whether everything is compiled, from the installed sources and by the installed compiler.
+
+    Returns
+    -------
+    bool    True if no kernel is left to compile
+    """
     return STAMP.is_file() and STAMP.read_text("utf-8") == f"{_origin()} {_DONE}"
 
 
@@ -299,7 +304,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if unknown := set(arguments.stages) - set(STAGES):
         parser.error(f"no stage {', '.join(sorted(unknown))}; there are {', '.join(STAGES)}")
-    if not arguments.stages and _is_done():
+    if not arguments.stages and kernels_are_compiled():
         return
     discard_outdated_kernels()
     compile_kernels(arguments.stages or tuple(STAGES), arguments.processes)

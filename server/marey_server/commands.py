@@ -147,6 +147,19 @@ def fsck(*, repair: bool = False, as_json: bool = False, **settings: Any) -> Non
         raise CommandFailed(f"the database has faults ({len(findings)}), which are listed above")
 
 
+def examine(**settings: Any) -> list[tuple[str, str, str]]:
+    """Check this machine; return for each check its name, its state (ok, warning or fault) and a detail."""
+    from marey_server.app import connect_database
+    from marey_server.process.doctor import examine as examine_machine
+
+    try:
+        chosen = read_settings(**settings)
+    except CommandFailed as error:
+        return [("settings", "fault", str(error))]
+    findings = examine_machine(chosen, os.environ, connect_database)
+    return [(one.check, one.state, one.detail) for one in findings]
+
+
 def clock(*, set_now: bool = False, **settings: Any) -> None:
     """Print the clock stored in an SQLite database and the clock of this machine.
 

@@ -18,6 +18,8 @@ import httpx
 import pytest
 from tests.support.rest_server import PATIENCE_S, Server, running
 
+from marey_client.cli.doctor import check_server
+from marey_client.marey import Marey
 from marey_schemas.access import UserCreate
 from marey_server.access.passwords import hash_password
 from marey_server.access.principal import SYSTEM
@@ -303,3 +305,13 @@ def test_the_roots_tell_programs_where_to_go_and_lead_browsers_to_the_page(serve
         assert (led.status_code, led.headers["Location"]) == (303, told["documentation"])
         page = client.get(led.headers["Location"], headers=browser)
         assert (page.status_code, page.headers["Content-Type"]) == (200, "text/html; charset=utf-8")
+
+
+def test_the_doctor_finds_a_running_server_ready_and_lists_workers_for_administrators_only(server: Server) -> None:
+    administrator = server.make_user("chief", administrator=True, scopes=("read", "admin"))
+    for token, told in ((administrator, "no worker is alive"), (server.make_project(), "not checked")):
+        with Marey(server.address, token) as marey:
+            ready, version, workers = check_server(marey)
+        assert ready == ("server", "ok", f"{server.address} is ready")
+        assert version[1] == "ok"
+        assert told in workers[2]

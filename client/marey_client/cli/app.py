@@ -12,6 +12,7 @@ from marey_client.cli import (
     annotating,
     audit,
     clip_jobs,
+    doctor,
     edits,
     evaluations,
     improvements,
@@ -73,6 +74,7 @@ def marey(
 
 for register in (
     processes,
+    doctor,
     accounts,
     tokens,
     projects,

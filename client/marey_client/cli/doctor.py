@@ -1,0 +1,96 @@
+"""Command `doctor`, which checks this machine and the server, and says what to do."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from marey_client.cli.processes import DatabaseUrl, DataFolder
+from marey_client.cli.terminal.invocation import AsJson, credential_of
+from marey_client.cli.terminal.output import print_json
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from marey_client.marey import Marey
+
+Finding = tuple[str, str, str]
+"""Check, state (ok, warning or fault), and detail, which says what to do."""
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the command of this module."""
+    app.command()(doctor)
+
+
+def doctor(
+    context: typer.Context,
+    data: DataFolder = None,
+    database_url: DatabaseUrl = None,
+    local: Annotated[
+        bool, typer.Option("--local/--no-local", help="Check the data folder and the database on this machine.")
+    ] = True,
+    remote: Annotated[bool, typer.Option("--remote/--no-remote", help="Check the running server.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Check settings, clock, disk, data folder, database, kernels, the running server, and its workers.
+
+    Prints one line for each check: ok, warning or fault, and what to do. The exit status is 1 if there are faults. On a
+    machine without a server's data folder, use --no-local; while the server is stopped, use --no-remote. Only the token
+    of an administrator shows workers and the reason why a server is not ready.
+    """
+    findings: list[Finding] = []
+    if local:
+        from marey_client import embedded
+
+        findings += embedded.examine(data=data, database_url=database_url)
+    if remote:
+        from marey_client.marey import Marey
+        from marey_client.retries import ONCE
+
+        credential = credential_of(context)
+        with Marey(credential.url, credential.bearer, retries=ONCE, timeout_s=10.0) as marey:
+            findings += check_server(marey)
+    if as_json:
+        print_json([{"check": check, "state": state, "detail": detail} for check, state, detail in findings])
+    else:
+        for check, state, detail in findings:
+            typer.echo(f"{state:<7}  {check}: {detail}")
+    if any(state == "fault" for _, state, _ in findings):
+        raise typer.Exit(1)
+
+
+def check_server(marey: Marey) -> Iterator[Finding]:
+    """Yield the findings about the running server: ready, version, and workers."""
+    from marey_client.errors import MareyError, RequestFailed, Unreachable
+
+    transport = marey.transport
+    try:
+        found = transport.send("GET", f"{transport.url}/").json()
+        transport.send("GET", f"{transport.url}/readyz")
+    except Unreachable as error:
+        yield "server", "fault", f"{error}; start it with `marey serve`, or name it with --server"
+        return
+    except MareyError as error:
+        yield "server", "fault", str(error)
+        return
+    yield "server", "ok", f"{transport.url} is ready"
+    own, its = version("marey"), found["version"]
+    advice = "the same as here" if own == its else f"here it is {own}; install the same version"
+    yield "version of the server", "ok" if own == its else "warning", f"{its}, {advice}"
+    try:
+        yield _check_workers(marey, its)
+    except RequestFailed as error:
+        yield "workers", "ok", f"not checked, because the token may not list workers ({error})"
+
+
+def _check_workers(marey: Marey, its: str) -> Finding:
+    alive = [worker for worker in marey.workers() if worker.alive]
+    other = sorted(worker.name for worker in alive if worker.kinds is not None and worker.version != its)
+    if not alive:
+        return "workers", "warning", "no worker is alive, so jobs wait; start one with `marey worker`"
+    if other:
+        return "workers", "warning", f"{', '.join(other)}: not of version {its}; install it there and restart them"
+    return "workers", "ok", f"{len(alive)} alive"

@@ -1,0 +1,86 @@
+"""Checks of a server's machine, which also work while no server runs: settings, clock, disk, rights, database, kernels.
+
+The checks do not change stored data, and do not create a database that does not exist.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from typing import Literal, NamedTuple
+
+from marey_motion.warm_up import kernels_are_compiled
+from marey_server.access.principal import SYSTEM
+from marey_server.errors import ApiProblem
+from marey_server.process.disk_space import DiskSpace
+from marey_server.process.settings import Settings, misspelt_variables
+from marey_server.store.clock_setting import read_clock
+from marey_server.store.database.connections import Database
+from marey_server.store.database.opening import DatabaseUnusable, opening, sqlite_file
+from marey_server.store.fsck import find_faults
+
+CLOCK_AHEAD_S = 60
+"""Number of seconds by which the stored clock may be ahead of the clock of this machine."""
+
+
+class Finding(NamedTuple):
+    """Result of one check; the detail of a warning or fault says what to do."""
+
+    check: str
+    state: Literal["ok", "warning", "fault"]
+    detail: str
+
+
+def examine(
+    settings: Settings, environment: Mapping[str, str], connect: Callable[[Settings], Database]
+) -> Iterator[Finding]:
+    """Yield one finding for each check of this machine; `connect` opens the database of the settings."""
+    yield _check_variables(environment)
+    yield _check_disk(settings)
+    yield _check_rights(settings)
+    yield from _check_database(settings, connect)
+    compiled = kernels_are_compiled()
+    missing = "not all kernels are compiled, so first uses wait; run `python -m marey_motion.warm_up`"
+    yield Finding("kernels", "ok" if compiled else "warning", "compiled" if compiled else missing)
+
+
+def _check_variables(environment: Mapping[str, str]) -> Finding:
+    wrong = [f"{name} has no effect; did you mean {meant}?" for name, meant in misspelt_variables(environment).items()]
+    return Finding("settings", "warning" if wrong else "ok", " ".join(wrong) or "valid")
+
+
+def _check_disk(settings: Settings) -> Finding:
+    fault = DiskSpace(settings.data, settings.min_free_bytes).fault()
+    return Finding("disk", "fault" if fault else "ok", fault or "enough space is free")
+
+
+def _check_rights(settings: Settings) -> Finding:
+    folder = settings.data
+    if not folder.is_dir():
+        return Finding("data folder", "fault", f"there is no folder {folder}; name it with --data, or start the server")
+    if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
+        return Finding("data folder", "fault", f"{folder} cannot be written by this user; run as the server's user")
+    if stat.S_IMODE(folder.stat().st_mode) & 0o077:
+        return Finding("data folder", "warning", f"other users can open {folder}; run `chmod 700 {folder}`")
+    return Finding("data folder", "ok", f"only its owner can open {folder}")
+
+
+def _check_database(settings: Settings, connect: Callable[[Settings], Database]) -> Iterator[Finding]:
+    file = sqlite_file(settings.resolved_database_url)
+    if file is not None and not file.is_file():
+        yield Finding("database", "fault", f"there is no database {file}; name its folder with --data")
+        return
+    try:
+        with opening(settings.resolved_database_url), closing(connect(settings)) as database:
+            faults = database.read(SYSTEM, find_faults)
+            clock = database.read(SYSTEM, lambda tx: read_clock(tx.connection)) if database.is_sqlite else None
+    except (DatabaseUnusable, ApiProblem) as error:
+        yield Finding("database", "fault", str(error))
+        return
+    yield Finding("database", "fault" if faults else "ok", "; ".join(faults) or "reachable, with the current tables")
+    if clock is not None:
+        ahead = clock.stored_us - clock.wall_us > CLOCK_AHEAD_S * 1_000_000
+        advice = "; correct the clock of this machine, or stop the server and run `marey db clock --set`"
+        yield Finding("clock", "warning" if ahead else "ok", f"{clock}{advice if ahead else ''}")
