@@ -90,3 +90,9 @@ def test_services_have_time_to_end_their_requests() -> None:
     containers = [int(one["stop_grace_period"].rstrip("s")) for one in services().values() if "build" in one]
     assert len(units) == len(UNITS)
     assert min(units + containers) > drain_s
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda file: file.name)
+def test_units_leave_what_workers_and_servers_need(unit: Path) -> None:
+    assert directives(unit, "MemoryDenyWriteExecute") == [], "numba could not load"
+    assert directives(unit, "ProcSubset") == [], "psutil could not read /proc/stat, and every job would fail"
