@@ -24,6 +24,8 @@ def unknown_options(words: list[str]) -> set[str]:
         told = told[1 if of_all[told[0]].is_flag else 2 :]
     while told and told[0] in getattr(command, "commands", {}):
         command = command.commands[told.pop(0)]
-    assert getattr(command, "invoke_without_command", True), f"no command: {words}"  # of a group that does nothing itself
+    assert getattr(command, "invoke_without_command", True), (
+        f"no command: {words}"
+    )  # of a group that does nothing itself
     known |= {option for one in command.get_params(Context(command)) for option in (*one.opts, *one.secondary_opts)}
     return {word.partition("=")[0] for word in told if re.match(r"--[a-z]|-[a-z]$", word)} - known

@@ -461,16 +461,16 @@ def test_at_a_terminal_many_items_are_removed_after_a_yes(
 def test_a_disabled_user_is_let_in_again_and_an_administrator_made(
     run: Command, marey: Marey, lab: ProjectHandle
 ) -> None:
-    run("user", "create", "ada", "--without-password")
-    assert "marey user enable ada" in run("user", "disable", "ada").stderr
-    assert marey.users.get("ada").disabled
-    run("user", "enable", "ada")
-    assert not marey.users.get("ada").disabled
-    run("user", "change", "ada", "--administrator", "--display-name", "Ada L.")
-    assert (marey.users.get("ada").administrator, marey.users.get("ada").display_name) == (True, "Ada L.")
-    run("user", "change", "ada", "--no-administrator")
-    assert not marey.users.get("ada").administrator
-    assert "give --display-name, --administrator or both" in run("user", "change", "ada", status=2).stderr
+    run("user", "create", "una", "--without-password")
+    assert "marey user enable una" in run("user", "disable", "una").stderr
+    assert marey.users.get("una").disabled
+    run("user", "enable", "una")
+    assert not marey.users.get("una").disabled
+    run("user", "change", "una", "--administrator", "--display-name", "Una L.")
+    assert (marey.users.get("una").administrator, marey.users.get("una").display_name) == (True, "Una L.")
+    run("user", "change", "una", "--no-administrator")
+    assert not marey.users.get("una").administrator
+    assert "give --display-name, --administrator or both" in run("user", "change", "una", status=2).stderr
 
 
 def test_quotas_are_shown_and_changed(run: Command, marey: Marey, lab: ProjectHandle) -> None:

@@ -57,7 +57,7 @@ def test_the_commands_of_the_page_work_in_their_order(
     assert "Describe the walk" in ls
     assert "there are 0" in show
     assert "info changed" in diff
-    assert "recorded request-changes" in rest[-1]
+    assert "recorded the verdict request-changes" in rest[-1]
     change_walk("the left foot slides")
     follow([commit])
     follow(next(blocks).splitlines(), MAREY_TOKEN=token)

@@ -94,11 +94,11 @@ class OnItem(Operation):
         return self.project(model).items[self.item]
 
     def absent(self, model: Model, outcome: Outcome) -> bool:
-        """Return whether the item is deleted or purged in the model; if so, check that the outcome says so."""
-        status = self.found(model).status
-        if status != "present":
-            refuse(outcome, 404 if status == "deleted" else 410)
-        return status != "present"
+        """Return whether the item is deleted or purged in the model; if so, check that reading it was refused."""
+        absent = self.found(model).status != "present"
+        if absent:
+            refuse(outcome, 404)
+        return absent
 
 
 @dataclass(frozen=True)
