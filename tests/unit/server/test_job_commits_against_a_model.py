@@ -23,7 +23,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.queue.worker_protocol import CompleteAnswer, Lease
 from marey_server.errors import ApiProblem, ConflictProblem, LeaseLostProblem
 from marey_server.store import datasets
-from marey_server.store.datasets import outputs
+from marey_server.store.datasets import output_plans, outputs
 from marey_server.store.items.drafts import Draft
 from marey_server.store.tables import dataset_ref
 from marey_server.store.transaction import Transaction
@@ -238,11 +238,11 @@ def test_jobs_that_commit_behave_as_their_model(desk: Desk) -> None:
 
 
 def overwrite_what_others_changed(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(outputs, "merge_entries", lambda _others, own, take, _merge: merge_entries([], own, take))
+    patch.setattr(output_plans, "merge_entries", lambda _others, own, take, _merge: merge_entries([], own, take))
 
 
 def forget_what_the_job_made(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(outputs, "merge_entries", lambda others, _own, take, _merge: merge_entries(others, [], take))
+    patch.setattr(output_plans, "merge_entries", lambda others, _own, take, _merge: merge_entries(others, [], take))
 
 
 def ignore_the_rule(patch: pytest.MonkeyPatch) -> None:
