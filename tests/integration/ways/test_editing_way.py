@@ -243,7 +243,7 @@ def test_an_animator_edits_from_the_command_line(lab: ProjectHandle, run: Comman
     assert "0 refused" in told
     assert {clip.item.tags for clip in lab.clips.list(collection="longer")} == {("long",)}
     piped = run("edit", "apply", walk, "--file", "-", "--suffix", "-short", stdin='[{"command": "trim", "stop": 9}]')
-    assert "1 clips" in piped.stdout
+    assert "1 clip," in piped.stdout
     assert clips_of(lab, "walks")["walk 0-short"].item.summary["frames"] == 9
 
 
