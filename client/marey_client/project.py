@@ -17,6 +17,7 @@ from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.handles.invitations import Invitations
 from marey_client.handles.models import ModelHandle
 from marey_client.handles.pipelines import PipelineRun, submit_pipeline
+from marey_client.handles.schedules import Schedules
 from marey_client.handles.webhooks import Webhooks
 from marey_client.jobs import Jobs, OnProgress
 from marey_client.project_items import ProjectItems
@@ -117,6 +118,11 @@ class ProjectHandle(ProjectItems):
     def invitations(self) -> Invitations:
         """The invitations to the project."""
         return Invitations(self.transport, f"{self.url}/invitations")
+
+    @cached_property
+    def schedules(self) -> Schedules:
+        """The schedules of the project, which submit jobs at certain times."""
+        return Schedules(self.transport, self.name)
 
     @cached_property
     def webhooks(self) -> Webhooks:

@@ -39,6 +39,9 @@ ProjectAuditKind = Literal[
     "webhook.changed",
     "webhook.rotated",
     "webhook.deleted",
+    "schedule.created",
+    "schedule.changed",
+    "schedule.deleted",
 ]
 """Kinds of audit entries in a project."""
 
@@ -80,6 +83,8 @@ OrdinaryEventKind = Literal[
     "job.succeeded",
     "job.failed",
     "job.cancelled",
+    "schedule.submitted",
+    "schedule.refused",
     "webhook.requested",
 ]
 """Kinds of events in a project that are not in the audit log."""

@@ -199,6 +199,16 @@ def change_webhooks(story: Story) -> None:
     story.send(owner, "DELETE", path, None, ("webhook.deleted", *hook))
 
 
+def change_schedules(story: Story) -> None:
+    owner, nightly = story.owner, ("olga", "nightly", "lab")
+    job = {"kind": "import", "params": {"files": [{"name": "walk.bvh", "blob": f"sha256:{'0' * 64}"}]}}
+    body = {"name": "nightly", "cron": "0 3 * * *", "job": job}
+    story.send(owner, "POST", f"{LAB}/schedules", body, ("schedule.created", *nightly))
+    path = f"{LAB}/schedules/nightly"
+    story.send(owner, "PATCH", path, {"paused": True}, ("schedule.changed", *nightly))
+    story.send(owner, "DELETE", path, None, ("schedule.deleted", *nightly))
+
+
 def _stored_secrets(story: Story) -> list[str]:
     """Return all secrets and hashes of secrets that the tables contain."""
 
@@ -214,7 +224,7 @@ def _stored_secrets(story: Story) -> list[str]:
 
 CHAPTERS = (
     change_users_and_tokens, change_projects_and_members, delete_and_restore, purge, invite, change_folder_roles,
-    change_datasets, change_webhooks,
+    change_datasets, change_webhooks, change_schedules,
 )  # fmt: skip
 
 

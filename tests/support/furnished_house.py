@@ -99,6 +99,8 @@ BODIES = {
     "Document": {"schema": "marey/clip-info@1", "comment": CANARY},
     "JobCreate": {"kind": "no-such-kind"},
     "JobBatch": {"jobs": [{"kind": "no-such-kind"}]},
+    "ScheduleCreate": {"name": "s", "cron": "0 3 * * *", "job": {"kind": "no-such-kind"}},
+    "ScheduleChange": {"description": CANARY},
     "PipelineCreate": {"steps": {"only": {"kind": "no-such-kind"}}},
     "ClaimRequest": {"worker": "w", "kinds": ["no-such-kind"]},
     "BatchCompleteRequest": {"completions": [{"job": "job_x", "fence": 1, "write_id": "12345678"}]},
@@ -270,9 +272,12 @@ def _furnish(owner: Any) -> dict[str, str]:
     hook = owner.post(webhooks, json={"url": f"https://hooks.invalid/{CANARY}", "description": CANARY}).json()["id"]
     delivery = owner.post(f"{webhooks}/{hook}/test").json()["id"]
     assert owner.patch(f"{webhooks}/{hook}", json={"paused": True}).is_success
+    job_of_schedule = {"kind": "evaluate", "inputs": {"clips": {"item": made.json()["id"]}}, "message": CANARY}
+    schedule = {"name": "nightly", "cron": "0 0 29 2 *", "job": job_of_schedule, "description": CANARY}
+    assert owner.post("/projects/lab/schedules", json=schedule).status_code == 201
     invitation = owner.post("/projects/lab/invitations", json=BODIES["InvitationCreate"]).json()["id"]
     return {
-        "invitation": invitation, "webhook": hook, "delivery": delivery,
+        "invitation": invitation, "webhook": hook, "delivery": delivery, "schedule": "nightly",
         "collection": collection, "item": made.json()["id"], "annotation": annotation.json()["id"], "dataset": CANARY,
         "ref": "spare", "version": "spare", "proposal": "1",
     }  # fmt: skip

@@ -25,7 +25,7 @@ from marey_server.handlers import (
     uploads,
     webhooks,
 )
-from marey_server.handlers.queue import jobs, leases, pipelines
+from marey_server.handlers.queue import jobs, leases, pipelines, schedules
 from marey_server.handlers.versions import contents, datasets, differences, proposals
 from marey_server.http.resource import Resource
 
@@ -53,6 +53,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     *jobs.RESOURCES,
     *pipelines.RESOURCES,
     *leases.RESOURCES,
+    *schedules.RESOURCES,
     *blobs.RESOURCES,
     *uploads.RESOURCES,
     *events.RESOURCES,

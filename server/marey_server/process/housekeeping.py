@@ -1,9 +1,9 @@
 """Periodic work of the server.
 
 It reclaims expired leases, and shares cached results with waiting jobs. It commits the outputs of jobs that have many
-outputs, and merges waiting proposals. It deletes old or unreferenced data. Only the leading process does this work, but
-concurrent housekeeping would be safe, because every statement checks its conditions again. Each kind of work runs in a
-separate task, so that a failure does not affect other kinds of work.
+outputs, merges waiting proposals, and submits the jobs of due schedules. It deletes old or unreferenced data. Only the
+leading process does this work, but concurrent housekeeping would be safe, because every statement checks its conditions
+again. Each kind of work runs in a separate task, so that a failure does not affect other kinds of work.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from marey_server.store.jobs import reaper
 from marey_server.store.jobs.finishing import commit_deferred
 from marey_server.store.jobs.reaper import StartGrace
 from marey_server.store.retention import retire
+from marey_server.store.schedules.firing import DUE_AT_ONCE, submit_due
 from marey_server.store.transaction import Transaction
 from marey_server.store.wakeups import OUTPUTS_TO_COMMIT, Listener, wakeups
 
@@ -56,6 +57,7 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
             (tick_s, tick_s, _reap),
             (tick_s, tick_s, _share_results),
             (tick_s, tick_s, partial(_merge_waiting, merges=merges)),
+            (tick_s, tick_s, _submit_scheduled),
             (0.0, 0.0, partial(_commit_outputs, listener=listener, longest_wait_s=tick_s)),
             (FORGET_TRIES_EVERY_S, FORGET_TRIES_EVERY_S, _forget_tries),
             (FIRST_GARBAGE_S, GARBAGE_EVERY_S, _collect_garbage),
@@ -139,6 +141,13 @@ async def _merge_waiting(services: Services, holder: str, merges: WaitingMerges)
     """Merge the waiting proposals that now meet all requirements."""
     if await _write(services, _leads, holder):
         await _in_thread(services, merges.attempt)
+
+
+async def _submit_scheduled(services: Services, holder: str) -> None:
+    """Submit the jobs of due schedules."""
+    if await _write(services, _leads, holder):
+        while await _in_thread(services, submit_due, services.database) == DUE_AT_ONCE:
+            pass
 
 
 async def _commit_outputs(services: Services, holder: str, *, listener: Listener, longest_wait_s: float) -> None:

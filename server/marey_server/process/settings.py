@@ -234,6 +234,9 @@ class Settings(BaseSettings):
     project_webhooks: int = Field(
         Quotas.project_webhooks, ge=0, description="Greatest number of webhooks of a project; 0: no webhooks."
     )
+    project_schedules: int = Field(
+        Quotas.project_schedules, ge=0, description="Greatest number of schedules of a project; 0: no schedules."
+    )
     project_invitations: int = Field(
         Quotas.project_invitations, ge=0, description="Greatest number of open invitations to a project."
     )

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, update
 
 from marey_server.store.database.clock import datetime_of, set_high_water, stored_high_water_us, wall_clock_us
-from marey_server.store.tables import invitation, job, metadata, token
+from marey_server.store.tables import invitation, job, metadata, schedule, token
 
 PAST = frozenset(
     {
         "at_us", "cancel_requested_us", "created_us", "deleted_us", "delivered_us", "ended_us", "failing_since_us",
-        "finished_us", "last_used_us", "purged_us", "since_us", "started_us", "updated_us",
+        "finished_us", "fired_us", "last_used_us", "purged_us", "since_us", "started_us", "updated_us",
     }
 )  # fmt: skip
 """Columns of times in the past; no value may lie in the future."""
@@ -35,6 +35,9 @@ MOVED = {
 
 A start time in the future is set to now, and the end time moves back by the same amount.
 """
+
+RECOMPUTED = schedule.c.due_us
+"""Column of the times of schedules. Times in the future are set to 0: the server then computes the next time."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,7 @@ def set_clock(connection: Connection) -> int:
     for column, origin in MOVED.items():
         later = update(column.table).where(origin > now_us, column.is_not(None))
         moved += connection.execute(later.values({column: column - origin + now_us})).rowcount
+    moved += connection.execute(update(schedule).where(now_us < RECOMPUTED).values({RECOMPUTED: 0})).rowcount
     for table in metadata.sorted_tables:
         for column in table.columns:
             if column.name in PAST | WAITING and column not in MOVED:

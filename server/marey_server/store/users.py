@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, func, insert, select
+from sqlalchemy import ColumnElement, Row, func, insert, select, update
 
 from marey_schemas.access import EndTokens, QuotaChange, QuotasInUse, Scope, User, UserChange, UserCreate
 from marey_schemas.items import Page
@@ -26,7 +26,7 @@ from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
 from marey_server.store.invitations.validity import withdraw_unauthorised
 from marey_server.store.revs import ExpectedRev, change_row
-from marey_server.store.tables import invitation, user
+from marey_server.store.tables import invitation, schedule, user
 from marey_server.store.transaction import Transaction
 
 FIRST_ADMINISTRATOR = "admin"
@@ -144,8 +144,17 @@ def change_user(
     default = EndTokens.SESSIONS if password_hash is not None else EndTokens.NONE
     ended = request.end_tokens or default
     tokens.end_tokens(tx, row.id, ended)
+    if ended is EndTokens.ALL:
+        _pause_schedules(tx, row.id)
     _audit_change(tx, row, values, ended)
     return _shown(row)
+
+
+def _pause_schedules(tx: Transaction, user_id: str) -> None:
+    """Pause the schedules of a user, because somebody else may have created them with a token of the user."""
+    reason = "Paused, because all tokens of the author were revoked."
+    which = (schedule.c.author_id == user_id, schedule.c.due_us.is_not(None))
+    tx.execute(update(schedule).where(*which).values(due_us=None, problem=reason, rev=schedule.c.rev + 1))
 
 
 def _audit_change(tx: Transaction, row: Row[Any], values: Mapping[str, Any], ended: EndTokens) -> None:

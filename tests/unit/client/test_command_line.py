@@ -30,8 +30,8 @@ from marey_client.cli.datasets.combining import resolutions_of
 from marey_client.cli.files import uploading
 from marey_client.cli.files.listing import _items_in
 from marey_client.cli.files.uploading import _print_entries
-from marey_client.cli.jobs import _done
-from marey_client.cli.pipelines import _print_shortfalls
+from marey_client.cli.queue.jobs import _done
+from marey_client.cli.queue.pipelines import _print_shortfalls
 from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
 from marey_client.cli.terminal.following import clips_at, follow, print_ended
 from marey_client.cli.terminal.invocation import connect

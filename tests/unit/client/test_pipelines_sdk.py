@@ -9,7 +9,7 @@ import pytest
 from tests.support.scripted_server import ScriptedServer, problem
 
 from marey_client import errors
-from marey_client.cli.pipelines import follow_run
+from marey_client.cli.queue.pipelines import follow_run
 from marey_client.explanations import explain
 from marey_client.handles.pipelines import PipelineRun
 from marey_schemas.queue.jobs import Job

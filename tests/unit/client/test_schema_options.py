@@ -10,11 +10,11 @@ import typer
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from marey_client.cli import jobs
 from marey_client.cli.app import app
 from marey_client.cli.clip_jobs import ALIGN, CUT
 from marey_client.cli.evaluations import EVALUATE
 from marey_client.cli.files.uploading import UPLOAD
+from marey_client.cli.queue import jobs
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.options.imports import ImportOptions

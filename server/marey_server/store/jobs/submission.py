@@ -24,6 +24,7 @@ from marey_schemas.queue.pipelines import (
     order_steps,
 )
 from marey_server import faults
+from marey_server.access.folder_rights import FolderRights
 from marey_server.access.labels import labels_key
 from marey_server.errors import InvalidProblem
 from marey_server.field_errors import field_errors, json_pointer
@@ -90,6 +91,21 @@ def submit_at(
     return submit_checked(tx, project, checked, {one: found.state for one, found in upstream.items()})
 
 
+def check_request(tx: Transaction, project: ProjectRow, request: JobCreate, at: str) -> None:
+    """Check that a job could be submitted now, without submitting it; `at` is the place of the job in the request.
+
+    Raises `InvalidProblem` with a pointer to the fault, and `ForbiddenProblem` if the caller may not write to the
+    folder of the results.
+    """
+    checked = _check(tx, project, request, find_items(tx, project, (request,)), at)
+    _require_folders(rights_of_caller(tx, project), checked)
+
+
+def _require_folders(rights: FolderRights, submitted: Submission) -> None:
+    for folder in result_folders(submitted.kind, submitted.params, submitted.pins, submitted.request.into):
+        rights.require(folder, Role.CONTRIBUTOR)
+
+
 def submit_checked(
     tx: Transaction, project: ProjectRow, submissions: Sequence[Submission], upstream: Mapping[str, JobState]
 ) -> list[Job]:
@@ -102,8 +118,7 @@ def submit_checked(
     """
     rights = rights_of_caller(tx, project)
     for submitted in submissions:
-        for folder in result_folders(submitted.kind, submitted.params, submitted.pins, submitted.request.into):
-            rights.require(folder, Role.CONTRIBUTOR)
+        _require_folders(rights, submitted)
         record_permission(tx, project, submitted.id, submitted.kind, submitted.params, submitted.pins)
     heads = [_head(project, one, upstream) for one in submissions]
     tasks, sources = lay_out(tx, [one for one in heads if not one.unbound])

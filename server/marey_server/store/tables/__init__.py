@@ -47,6 +47,7 @@ from marey_server.store.tables.queue import (
     job_dependency,
     job_item,
     job_log,
+    schedule,
     staged_output,
 )
 from marey_server.store.tables.serving import (
@@ -105,6 +106,7 @@ __all__ = [
     "proposal_review",
     "revision",
     "revision_part",
+    "schedule",
     "server_state",
     "sign_in_limit",
     "staged_output",

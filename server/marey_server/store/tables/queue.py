@@ -16,7 +16,8 @@ from sqlalchemy import (
     text,
 )
 
-from marey_server.store.tables.columns import DIGEST, ID, Document, Micros, metadata
+from marey_schemas.queue.schedules import MAX_CRON_LENGTH, MAX_TIMEZONE_LENGTH
+from marey_server.store.tables.columns import DIGEST, ID, Document, Micros, Name, metadata
 
 UNFINISHED = text("state IN ('waiting', 'queued', 'running')")
 """Condition of `ix_job_unfinished`, written in the form in which SQLite uses this index."""
@@ -196,4 +197,27 @@ staged_output = Table(
         "draft", Document, nullable=False
     ),  # a store draft: documents by digest, or bodies that refer to other outputs
     ForeignKeyConstraint(["job_id", "fence"], ["attempt.job_id", "attempt.fence"]),
+)
+
+schedule = Table(
+    "schedule",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("project_id", ID, ForeignKey("project.id"), nullable=False),
+    Column("name", Name, nullable=False),
+    Column("cron", String(MAX_CRON_LENGTH), nullable=False),
+    Column("timezone", String(MAX_TIMEZONE_LENGTH), nullable=False),
+    Column("job", Document, nullable=False),  # request to submit a job
+    Column("overlapping", Boolean, nullable=False),
+    Column("description", Text, nullable=False),
+    Column("author_id", ID, ForeignKey("user.id"), nullable=False),  # as whom jobs are submitted
+    Column("scopes", Document, nullable=False),  # of the token with which the author set the job
+    Column("due_us", Micros, index=True),  # null: paused; 0: the next time must be computed
+    Column("fired_us", Micros),
+    Column("last_job_id", ID),  # the job may be deleted
+    Column("problem", Text),  # why the last job was not submitted
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False),
+    Column("rev", Integer, nullable=False),
+    Index("uq_schedule_project_id_name", "project_id", "name", unique=True),
 )

@@ -1,0 +1,1 @@
+"""Commands of jobs, pipelines and schedules."""

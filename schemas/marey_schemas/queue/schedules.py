@@ -1,0 +1,102 @@
+"""Schedules: jobs that the server submits at the times of a cron expression."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any
+
+from pydantic import Field, StringConstraints
+
+from marey_schemas.base import Answer, Request
+from marey_schemas.names import Message
+from marey_schemas.queue.jobs import JobCreate
+
+MAX_CRON_LENGTH = 100
+MAX_TIMEZONE_LENGTH = 64
+
+ScheduleName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?$")]
+"""Name of a schedule: lower-case letters, digits, `-` and `_`; the name is part of URLs."""
+
+Cron = Annotated[
+    str,
+    Field(
+        min_length=9,
+        max_length=MAX_CRON_LENGTH,
+        description="Times as five fields: minute, hour, day of the month, month, day of the week. `0 3 * * 1-5` means "
+        "3:00 from Monday to Friday.",
+    ),
+]
+
+TimeZoneName = Annotated[
+    str,
+    Field(
+        min_length=1,
+        max_length=MAX_TIMEZONE_LENGTH,
+        description="Time zone of the times, such as `Europe/Berlin`. A time that is skipped when clocks are put "
+        "forward is replaced by the time after the gap.",
+    ),
+]
+
+Overlapping = Annotated[
+    bool,
+    Field(
+        description="Whether a job is submitted even if the previous job of the schedule has not ended. If false, such "
+        "times are skipped."
+    ),
+]
+
+
+class ScheduleCreate(Request):
+    """Request to create a schedule.
+
+    The server submits its jobs as the user who created it, with the scopes of the token that was used.
+    """
+
+    name: ScheduleName
+    cron: Cron
+    timezone: TimeZoneName = "UTC"
+    job: JobCreate = Field(
+        description="The job to submit. Its inputs are pinned to their newest revisions at each submission."
+    )
+    overlapping: Overlapping = False
+    paused: bool = False
+    description: Message = ""
+
+
+class ScheduleChange(Request):
+    """Request to change a schedule; absent fields stay as they are.
+
+    If `job` is given or `paused` is false, the server submits later jobs as the user who makes this change.
+    """
+
+    cron: Cron | None = None
+    timezone: TimeZoneName | None = None
+    job: JobCreate | None = None
+    overlapping: Overlapping | None = None
+    paused: bool | None = None
+    description: Message | None = None
+
+
+class Schedule(Answer):
+    """Schedule of a project."""
+
+    name: str
+    project: str
+    cron: str
+    timezone: str
+    job: dict[str, Any] = Field(description="The job that is submitted, as in the request.")
+    overlapping: bool
+    paused: bool
+    description: str
+    author: str | None = Field(description="Name of the user as whom the server submits the jobs.")
+    created_at: datetime
+    updated_at: datetime
+    next_at: datetime | None = Field(
+        description="Time of the next submission; null: the schedule is paused, or the time is being computed."
+    )
+    last_at: datetime | None = Field(None, description="Time at which the schedule last submitted or skipped a job.")
+    last_job: str | None = Field(None, description="Id of the job that was submitted last; it may be deleted already.")
+    problem: str | None = Field(
+        None, description="Reason why the last job was not submitted; null if it was submitted or not due yet."
+    )
+    rev: int

@@ -1,0 +1,1 @@
+"""Schedules: their times, their management by members of a project, and the submission of their jobs."""
