@@ -9,7 +9,7 @@ integers (see `tiles`), so that the sum is exact.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -137,6 +137,20 @@ class ArrayDifference:
                 "bad-array", f"the member `difference` must be an array {expected.str} of {len(numbers)} frames"
             )
         return numbers.astype(np.intp), difference
+
+
+def detach_differences(tree: Any, keep: Callable[[ArrayDifference], None]) -> Any:
+    """Return a document with each array difference replaced by the reference to the array, as `detach_arrays` does.
+
+    `keep` is called with each array difference. Raises `ArrayError` if one is malformed.
+    """
+    if isinstance(tree, Mapping):
+        found = ArrayDifference.of(tree)
+        if found is None:
+            return {key: detach_differences(member, keep) for key, member in tree.items()}
+        keep(found)
+        return {"dtype": found.dtype, "shape": list(found.shape), "content": found.digest}
+    return [detach_differences(member, keep) for member in tree] if isinstance(tree, list) else tree
 
 
 def _decoded(array: Any, most_bytes: int) -> NDArray[Any]:

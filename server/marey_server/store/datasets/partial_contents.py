@@ -186,8 +186,10 @@ class Comparison:
 
 def _require_size(size_bytes: int) -> None:
     if size_bytes > MAX_ARRAY_BYTES:
-        most = MAX_ARRAY_BYTES // MIB
-        raise _bad_array(f"the partial arrays and array differences of a request, and their bases, may have at most {most} MiB each in total")
+        raise _bad_array(
+            "the arrays that a request describes by a base, and their bases, may have at most "
+            f"{MAX_ARRAY_BYTES // MIB} MiB each in total"
+        )
 
 
 def _bad_array(detail: str) -> InvalidProblem:
