@@ -148,10 +148,10 @@ def _described(value: Any, part: str) -> _Described | None:
 
 
 @dataclass
-class Comparison:
-    """Comparison of the documents of one answer with documents that the reader has."""
+class DocumentComparison:
+    """DocumentComparison of the documents of one answer with documents that the reader has."""
 
-    left_bytes: int = MAX_ARRAY_BYTES
+    left_bytes: int
     """Size of the arrays that may still be compared, which bounds the time; further arrays are sent whole."""
 
     def compared(self, value: Any, before: Any, references: Mapping[str, Mapping[str, Any]], content: str) -> Any:

@@ -13,17 +13,16 @@ from marey_schemas.datasets.contents import (
     ContentsRequest,
     ExportCheck,
     ExportPermission,
-    PartOfContent,
     RequestedDocument,
 )
 from marey_schemas.documents.blob_references import members_of, references_of
-from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.encoding.arrays import MAX_ARRAY_BYTES, EncodedArray
 from marey_schemas.encoding.partial_arrays import tile_digests
 from marey_server.store import documents, projects
 from marey_server.store.datasets.contents import Contents, find_contents_of
 from marey_server.store.datasets.history import revisions_with
 from marey_server.store.datasets.naming import find_dataset
-from marey_server.store.datasets.partial_contents import Comparison
+from marey_server.store.datasets.partial_contents import DocumentComparison
 from marey_server.store.items.consents import find_ended_with, record_override, require_consent
 from marey_server.store.items.facets import facets_of_contents
 from marey_server.store.items.reading import MOST_BYTES_AT_ONCE
@@ -32,6 +31,9 @@ from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import document, item
 from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.records import RevisionKey, portable_document, references_in
+
+MOST_BYTES_COMPARED = MAX_ARRAY_BYTES
+"""Total size of the arrays of one answer that are compared with arrays of bases; the other arrays are sent whole."""
 
 
 def check_export(tx: Transaction, project: str, name: str, request: ExportCheck) -> ExportPermission:
@@ -80,7 +82,7 @@ class LoadedContents:
 
 def contents_document(loaded: LoadedContents) -> dict[str, Any]:
     """Return the answer to a request for contents. It takes long for large arrays, so no transaction should be open."""
-    comparison = Comparison()
+    comparison = DocumentComparison(MOST_BYTES_COMPARED)
     found = [
         one.tree if one.base is None else comparison.compared(one.tree, one.base, one.arrays, one.base_content)
         for one in loaded.documents
@@ -131,9 +133,14 @@ def _loaded(
     tx: Transaction, held: Mapping[str, RevisionKey], places: Sequence[RequestedDocument]
 ) -> list[_LoadedDocument]:
     """Load the documents at `places`, each with its base, as many as fit into an answer."""
-    named = {content for one in places for content in (one.content, one.base) if content in held}
-    parts = read_part_digests(tx, {held[content] for content in named})
-    digests = [(_digest(parts, held, one.content, one), _digest(parts, held, one.base, one)) for one in places]
+    named = {content for one in places for content in (one.content, one.base)}
+    keys = {content: held[content] for content in named if content is not None and content in held}
+    parts = read_part_digests(tx, set(keys.values()))
+    of_content = {content: parts[key] for content, key in keys.items()}
+    digests = [
+        (of_content.get(one.content, {}).get(one.part), of_content.get(one.base or "", {}).get(one.part))
+        for one in places
+    ]
     present = sorted({digest for pair in digests for digest in pair if digest is not None})
     statement = select(document.c.digest, document.c.size_bytes)
     sizes = {
@@ -153,16 +160,6 @@ def _loaded(
         )
         for place, (digest, base) in zip(places, chosen, strict=False)
     ]
-
-
-def _digest(
-    parts: Mapping[RevisionKey, Mapping[str, str]],
-    held: Mapping[str, RevisionKey],
-    content: str | None,
-    place: PartOfContent,
-) -> str | None:
-    """Return the digest of the document of a part in the revision with a content digest; None if there is none."""
-    return parts[held[content]].get(place.part) if content in held else None
 
 
 def _portable(tx: Transaction, project_id: str, loaded: Sequence[_LoadedDocument]) -> list[_LoadedDocument]:
