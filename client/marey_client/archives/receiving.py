@@ -35,7 +35,7 @@ from marey_versions.records import CommitRecord, contents_in, path_and_kind, rev
 MOST_BYTES_SENT = 16 * MIB
 """Total size of documents, in bytes, above which no further revision is added to a request."""
 MOST_BYTES_RESTORED = 64 * MIB
-"""Total size of arrays that are sent as differences above which no further revision is added to a request.
+"""Greatest total size of the arrays that are sent as differences in one request; one revision may have more.
 
 The server keeps the whole arrays in memory.
 """
@@ -239,12 +239,15 @@ class _Import:
         batch: list[str] = []
         size_bytes = restored_bytes = 0
         for content in contents:
-            batch.append(content)
             documents = self._revision(content).parts.values()
+            adds_bytes = sum(one.nbytes for document in documents for one in self._differences(document).values())
+            if batch and restored_bytes + adds_bytes > MOST_BYTES_RESTORED:
+                yield batch
+                batch, size_bytes, restored_bytes = [], 0, 0
+            batch.append(content)
+            restored_bytes += adds_bytes
             size_bytes += sum(map(self._size_bytes, documents))
-            restored_bytes += sum(one.nbytes for document in documents for one in self._differences(document).values())
-            full = size_bytes > MOST_BYTES_SENT or restored_bytes > MOST_BYTES_RESTORED
-            if full or len(batch) == MOST_CONTENTS:
+            if size_bytes > MOST_BYTES_SENT or len(batch) == MOST_CONTENTS:
                 yield batch
                 batch, size_bytes, restored_bytes = [], 0, 0
         if batch:
