@@ -62,6 +62,10 @@ class EarlierVersionsMissing(MareyError):
     """The archive builds on a version that the dataset does not have."""
 
 
+class DifferencesRefused(MareyError):
+    """A server refused revisions whose arrays were sent as differences; perhaps it accepts whole arrays."""
+
+
 class LargeCommit(MareyError):
     """A commit changes more entries than a server accepts in a commit from an archive or another server."""
 

@@ -7,14 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from random import Random
+from types import SimpleNamespace
 from typing import Any
 
+import httpx
+import numpy as np
 import pytest
 from tests.support.rest_server import Server
 from tests.support.store_fixtures import motion_tree, skeleton_tree
+from tests.support.tiers import examples
 
 from marey_client import Marey
-from marey_client.archives import writing
+from marey_client.archives import documents
 from marey_client.blobs import Blobs
 from marey_client.errors import RequestFailed
 from marey_client.handles.versions import DatasetHandle
@@ -23,11 +28,15 @@ from marey_client.project import ProjectHandle
 from marey_client.transport import Transport
 from marey_schemas.access import ProjectCreate, Role
 from marey_schemas.datasets.commits import Commit, MoveEntry, PutEntry, RemoveEntry
+from marey_schemas.encoding.array_differences import ArrayDifference
+from marey_schemas.encoding.canonical import array_digest
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM
 from marey_server.store import projects
+from marey_server.store.datasets import partial_contents
 from marey_server.store.items.facets import publish_facets
 from marey_server.store.transaction import Transaction
+from marey_versions.archive.checking import check_archive
 from marey_versions.archive.members import MemberKind
 from marey_versions.archive.reading import Archive
 
@@ -56,8 +65,8 @@ def gaits(lab: ProjectHandle) -> DatasetHandle:
     return lab.datasets.create("gaits")
 
 
-def make_rig(lab: ProjectHandle, joints: int = 2) -> ItemHandle:
-    return lab.skeletons.create("rig", {"hierarchy": skeleton_tree(joints)})
+def make_rig(lab: ProjectHandle, joints: int = 2, name: str = "rig") -> ItemHandle:
+    return lab.skeletons.create(name, {"hierarchy": skeleton_tree(joints)})
 
 
 def make_clip(lab: ProjectHandle, rig: ItemHandle) -> ItemHandle:
@@ -169,7 +178,7 @@ def test_no_member_of_an_archive_has_the_facets_of_all_revisions(
     clip.put_part("info", {"schema": "marey/clip-info@1", "comment": "second"})
     measure(server, clip, usage=0.75)
     commit(gaits, walk=clip)
-    monkeypatch.setattr(writing, "MOST_CONTENTS", 1)
+    monkeypatch.setattr(documents, "MOST_CONTENTS", 1)
     gaits.archive(tmp_path / "gaits.tar")
     with (tmp_path / "gaits.tar").open("rb") as file:
         archive = Archive(file)
@@ -274,3 +283,206 @@ def test_only_the_changed_blocks_of_a_clip_are_sent(
     assert made is not None
     (copy,) = partner.clips.list(collection="gaits")
     assert (copy.part("motion")["poses"] == motion["poses"]).all()
+
+
+@pytest.fixture
+def sent(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+    """The requests that the client sends: path, and size with headers of request and answer together, in bytes."""
+    noted: list[tuple[str, int]] = []
+    once = Transport.send
+
+    def send(self: Transport, method: str, path: str, **options: Any) -> httpx.Response:
+        response = once(self, method, path, **options)
+        heads = [*response.request.headers.raw, *response.headers.raw]
+        size = sum(len(name) + len(value) + 4 for name, value in heads)
+        noted.append((path, size + len(response.request.content) + len(response.content)))
+        return response
+
+    monkeypatch.setattr(Transport, "send", send)
+    return noted
+
+
+def make_walk(lab: ProjectHandle, name: str = "walk", frames: int = 900) -> ItemHandle:
+    """Create a clip with the poses of random smooth motion."""
+    motion = motion_tree(make_rig(lab, 20, f"rig of {name}").item, joints=20, frames=frames)
+    rng = np.random.default_rng(len(name))
+    motion["poses"][:, :3] = np.cumsum(rng.normal(size=(frames, 3)), axis=0) / 100
+    info = {"schema": "marey/clip-info@1", "comment": "first"}
+    return lab.clips.create(name, {"motion": motion, "info": info})
+
+
+def edit(clip: ItemHandle, frames: slice, by: float) -> None:
+    motion = clip.part("motion")
+    motion["poses"][frames, :3] += np.float32(by)
+    clip.put_part("motion", motion)
+
+
+def poses_in(partner: ProjectHandle, name: str = "walk") -> Any:
+    """Return the poses of a clip of the copied version, after a checkout."""
+    partner.datasets.at("gaits").check_out("main", discard=True)
+    (found,) = (one for one in partner.clips.list(collection="gaits") if one.name == name)
+    return found.part("motion")["poses"]
+
+
+def test_a_few_edited_frames_of_a_short_clip_are_sent_alone_on_both_ways(
+    lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle, sent: list[tuple[str, int]]
+) -> None:
+    """All frames of the clip are in one block, so that a partial array would be the whole array."""
+    clip = make_walk(lab)
+    assert_copied(partner, gaits, commit(gaits, walk=clip))
+    first = sum(size for path, size in sent if path.endswith("/contents"))
+    edit(clip, slice(500, 509), 0.25)
+    made = commit(gaits, walk=clip)
+    sent.clear()
+    assert_copied(partner, gaits, made)
+    assert sum(size for path, size in sent if path.endswith("/contents")) < first / 4
+    assert max(size for path, size in sent if path.endswith("/gaits/contents")) < 4_000
+    assert (poses_in(partner) == clip.part("motion")["poses"]).all()
+
+
+@pytest.mark.parametrize("seed", range(examples(4)))
+def test_random_edits_of_random_clips_arrive_equal_whatever_the_receiver_holds(
+    lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle, seed: int
+) -> None:
+    """Edits, insertions, and returns to earlier content, in one or several versions between two copies."""
+    random = Random(seed)
+    clips = {name: make_walk(lab, name, random.choice([3, 300, 900])) for name in ("a", "walk", "third")}
+    made = commit(gaits, **clips)
+    for step in range(8):
+        if random.random() < 0.5:
+            assert_copied(partner, gaits, made)
+        for name in random.sample(sorted(clips), random.randint(1, 3)):
+            clip, motion = clips[name], clips[name].part("motion")
+            poses = motion["poses"]
+            start = random.randrange(len(poses))
+            what = random.choice(["edit", "insert", "info", "first"])
+            if what == "insert":
+                motion["poses"] = np.concatenate([poses[:start], poses[: random.randint(1, 5)], poses[start:]])
+            elif what == "first":
+                motion = clip.part("motion", revision=1)
+            else:
+                poses[start : start + random.randint(1, 40), : random.randint(1, 3)] += np.float32(random.random())
+            clip.put_part("motion", motion)
+            if what == "info":
+                clip.put_part("info", {"schema": "marey/clip-info@1", "comment": f"{step}"})
+        made = commit(gaits, **clips)
+    assert_copied(partner, gaits, made)
+    for name, clip in clips.items():
+        assert array_digest(poses_in(partner, name)) == array_digest(clip.part("motion")["poses"])
+
+
+def test_a_copy_from_a_server_of_an_earlier_version_reads_whole_arrays(
+    lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clip = make_walk(lab)
+    assert_copied(partner, gaits, commit(gaits, walk=clip))
+    edit(clip, slice(500, 509), 0.25)
+    made = commit(gaits, walk=clip)
+    once = Transport.send
+    refusals: list[bytes] = []
+
+    def send(self: Transport, method: str, path: str, *, content: Any = None, **options: Any) -> httpx.Response:
+        if path.endswith("/lab/contents") and b'"base"' in content:
+            refusals.append(content)
+            content = content.replace(b'"base"', b'"unknown"')
+        return once(self, method, path, content=content, **options)
+
+    monkeypatch.setattr(Transport, "send", send)
+    assert_copied(partner, gaits, made)
+    assert len(refusals) == 1
+    assert (poses_in(partner) == clip.part("motion")["poses"]).all()
+
+
+def test_a_copy_to_a_server_of_an_earlier_version_sends_whole_arrays(
+    lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A server of an earlier version takes an array difference for a malformed array."""
+    between = ArrayDifference.between
+    clip = make_walk(lab)
+    assert_copied(partner, gaits, commit(gaits, walk=clip))
+    edit(clip, slice(500, 509), 0.25)
+    made = commit(gaits, walk=clip)
+    monkeypatch.setattr(partial_contents, "ArrayDifference", SimpleNamespace(of=lambda _: None, between=between))
+    assert_copied(partner, gaits, made)
+    assert (poses_in(partner) == clip.part("motion")["poses"]).all()
+    assert list((tmp_path / "cache").rglob("*.tar*")) == []
+
+
+def test_a_copy_with_differences_continues_after_an_interruption(
+    lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Ctrl-C while documents are read, and again while they are sent."""
+    clips = {name: make_walk(lab, name) for name in ("a", "walk")}
+    assert_copied(partner, gaits, commit(gaits, **clips))
+    for clip in clips.values():
+        edit(clip, slice(500, 509), 0.25)
+    made = commit(gaits, **clips)
+    once = Transport.send
+    for ending in ("/lab/contents", "/gaits/received-commits"):
+
+        def send(self: Transport, method: str, path: str, *, ending: str = ending, **options: Any) -> httpx.Response:
+            if path.endswith(ending):
+                raise KeyboardInterrupt
+            return once(self, method, path, **options)
+
+        with monkeypatch.context() as interrupted:
+            interrupted.setattr(Transport, "send", send)
+            with pytest.raises(KeyboardInterrupt):
+                partner.datasets.pull(gaits, "gaits")
+    (kept,) = (tmp_path / "cache").rglob("*.tar")
+    with kept.open("rb") as file:
+        archive = Archive(file)
+        check_archive(archive)
+        assert sum(member.kind is MemberKind.DIFFERENCES for member in archive.members) == 2
+        assert not any(member.kind is MemberKind.ARRAY for member in archive.members)
+    assert_copied(partner, gaits, made)
+    assert (poses_in(partner) == clips["walk"].part("motion")["poses"]).all()
+    assert list((tmp_path / "cache").rglob("*.tar*")) == []
+
+
+def test_an_archive_of_later_versions_contains_whole_arrays(
+    lab: ProjectHandle, gaits: DatasetHandle, tmp_path: Path
+) -> None:
+    clip = make_walk(lab)
+    first = commit(gaits, walk=clip)
+    edit(clip, slice(500, 509), 0.25)
+    commit(gaits, walk=clip)
+    gaits.archive(tmp_path / "later.tar", since=first.digest)
+    with (tmp_path / "later.tar").open("rb") as file:
+        archive = Archive(file)
+        kinds = {member.kind for member in archive.members}
+        assert (MemberKind.ARRAY in kinds, MemberKind.DIFFERENCES in kinds) == (True, False)
+
+
+def test_tiles_that_do_not_fit_into_one_answer_are_asked_for_again(
+    lab: ProjectHandle,
+    partner: ProjectHandle,
+    gaits: DatasetHandle,
+    sent: list[tuple[str, int]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two versions of long clips are copied at once: the receiver has the first when it gets the second."""
+    clips = {name: make_walk(lab, name, 12 * 256) for name in ("a", "walk", "third")}
+    commit(gaits, **clips)
+    for clip in clips.values():
+        edit(clip, slice(600, 610), 0.25)
+    made = commit(gaits, **clips)
+    monkeypatch.setattr("marey_server.store.datasets.portable.MOST_BYTES_AT_ONCE", 1)
+    monkeypatch.setattr("marey_client.archives.receiving.LEAST_BYTES_SHARED", 1)
+    assert_copied(partner, gaits, made)
+    sizes = [size for path, size in sent if path.endswith("/gaits/contents")]
+    assert sizes[-1] < sizes[-2] / 2
+    assert (poses_in(partner) == clips["walk"].part("motion")["poses"]).all()
+
+
+def test_a_push_of_one_relabelled_clip_sends_less_than_twenty_kilobytes_in_all(
+    lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle, sent: list[tuple[str, int]]
+) -> None:
+    clips = {f"clip {number}": make_walk(lab, f"clip {number}", 3) for number in range(20)}
+    assert_copied(partner, gaits, commit(gaits, **clips))
+    clips["clip 7"].put_part("info", {"schema": "marey/clip-info@1", "comment": "second"})
+    made = commit(gaits, **clips)
+    sent.clear()
+    assert partner.datasets.pull(gaits, "gaits").commit == made
+    assert len(sent) <= 12
+    assert sum(size for _, size in sent) < 20_000

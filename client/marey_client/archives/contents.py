@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from marey_client.errors import UnexpectedAnswer
 from marey_client.transport import BLOCKS, MAX_ANSWER_BYTES, as_json
-from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent
+from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent, RequestedDocument
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree
 from marey_schemas.encoding.partial_arrays import partial_array
-from marey_schemas.sizes import batched
 
 if TYPE_CHECKING:
     from marey_client.transport import Transport
@@ -42,7 +41,7 @@ def read_facets(transport: Transport, project_url: str, contents: Sequence[str])
 
 
 def first_documents(
-    transport: Transport, project_url: str, places: Sequence[PartOfContent], *, keep_blocks: bool = False
+    transport: Transport, project_url: str, places: Sequence[RequestedDocument], *, keep_blocks: bool = False
 ) -> list[Any]:
     """Request documents by address; return the first of them, as many as fit into one answer, but at least one.
 
@@ -60,7 +59,9 @@ def first_documents(
     return found
 
 
-def read_documents(transport: Transport, project_url: str, places: Sequence[PartOfContent]) -> Iterator[dict[str, Any]]:
+def read_documents(
+    transport: Transport, project_url: str, places: Sequence[RequestedDocument]
+) -> Iterator[dict[str, Any]]:
     """Yield the documents at the given addresses, in order, with numpy arrays; memory holds one answer at a time."""
     waiting = list(places)
     while waiting:
@@ -86,13 +87,21 @@ class ArrayBases:
 def bases_of_arrays(transport: Transport, project_url: str, places: Mapping[K, PartOfContent]) -> dict[K, ArrayBases]:
     """Ask a project for the tiles of documents; documents that the project does not have are left out.
 
-    `places` are the addresses of the documents. The server may leave out documents if all together are too large.
+    `places` are the addresses of the documents. An answer has as many documents as fit into it, at least one; the next
+    request asks for the others.
+
+    Raises `UnexpectedAnswer` if an answer has no documents.
     """
     found: dict[K, ArrayBases] = {}
-    for some in batched(places.items(), MOST_CONTENTS):
+    waiting = list(places.items())
+    while waiting:
+        some = waiting[:MOST_CONTENTS]
         request = ContentsRequest(tiles=tuple(place for _, place in some))
         tiles = request_contents(transport, project_url, request)["tiles"]
         for (key, place), of_document in zip(some, tiles, strict=False):
             if of_document:
                 found[key] = ArrayBases(place.content, of_document)
+        if not tiles:
+            raise UnexpectedAnswer("the server's answer has no tiles")
+        waiting = waiting[len(tiles) :]
     return found

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 
 from marey_client.archives.contents import ArrayBases, bases_of_arrays, request_contents
 from marey_client.blobs import Blobs
-from marey_client.errors import EarlierVersionsMissing, LargeCommit
+from marey_client.errors import Conflict, DifferencesRefused, EarlierVersionsMissing, Invalid, LargeCommit
 from marey_client.progress import OnProgress
 from marey_client.transport import Transport, as_json, read_model
 from marey_schemas.datasets.commits import Commit
@@ -23,6 +23,8 @@ from marey_schemas.datasets.contents import (
     ReceivedCommit,
 )
 from marey_schemas.documents.blob_references import references_of
+from marey_schemas.encoding.array_differences import ArrayDifference
+from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import attach_arrays
 from marey_schemas.kinds import Kind
 from marey_schemas.sizes import KIB, MIB, batched
@@ -32,6 +34,11 @@ from marey_versions.records import CommitRecord, contents_in, path_and_kind, rev
 
 MOST_BYTES_SENT = 16 * MIB
 """Total size of documents, in bytes, above which no further revision is added to a request."""
+MOST_BYTES_RESTORED = 64 * MIB
+"""Greatest total size of the arrays that are sent as differences in one request; one revision may have more.
+
+The server keeps the whole arrays in memory.
+"""
 LEAST_BYTES_SHARED = 16 * KIB
 """Size of a document in bytes above which the server is asked for tiles of its arrays; for less, that would not pay."""
 
@@ -54,20 +61,25 @@ class ReceivingDataset(Protocol):
     def at(self, version: str) -> Commit:
         """Return the commit that a version names."""
 
-    def has(self, commit: str) -> bool:
-        """Return whether the dataset has a commit."""
-
 
 def send_versions(
-    dataset: ReceivingDataset, archive: Archive, on_progress: OnProgress, *, begins: str | None = None
+    dataset: ReceivingDataset,
+    archive: Archive,
+    on_progress: OnProgress,
+    has: Callable[[str], bool],
+    *,
+    begins: str | None = None,
 ) -> Commit:
     """Record the versions of an archive in a dataset, with their digests; return the newest version.
 
-    If `begins` names a branch without commits, this branch moves to the newest version; no other branch moves. After an
-    interrupted import, the next import sends only the data that the server lacks. Raises `LargeCommit`, before anything
-    is sent, if the server would refuse one of the versions.
+    `has` returns whether the dataset has a commit. If `begins` names a branch without commits, this branch moves to the
+    newest version; no other branch moves. After an interrupted import, the next import sends only the data that the
+    server lacks.
+
+    Raises `LargeCommit`, before anything is sent, if the server would refuse one of the versions. Raises
+    `DifferencesRefused` if the server refuses revisions whose arrays the archive has only as differences.
     """
-    return _Import(dataset, archive, on_progress).run(begins)
+    return _Import(dataset, archive, on_progress, has).run(begins)
 
 
 def require_base(archive: Archive, has: Callable[[str], bool]) -> None:
@@ -104,6 +116,8 @@ class _Import:
     dataset: ReceivingDataset
     archive: Archive
     on_progress: OnProgress
+    has: Callable[[str], bool]
+    """Function that returns whether the dataset has the commit with a digest."""
     revisions: dict[str, _Revision] = field(default_factory=dict)
     """Revisions of entries, by content digest."""
     held: set[str] = field(default_factory=set)
@@ -120,7 +134,7 @@ class _Import:
     """For the key of each entry: the revision in the last commit that was noted."""
 
     def run(self, begins: str | None) -> Commit:
-        require_base(self.archive, self.dataset.has)
+        require_base(self.archive, self.has)
         self.facets = self.archive.facets()
         history = self.archive.history()
         changes = {digest: self.archive.changes(digest) for digest, _ in history}
@@ -131,7 +145,7 @@ class _Import:
             require_receivable(digest, len(changes[digest]))
         for digest in known & changes.keys():
             self._note(put[digest])
-        head = self.archive.manifest.commit
+        head, made = self.archive.manifest.commit, None
         for done, (digest, record) in enumerate(history):
             self.on_progress("sending versions", done, len(history))
             if digest not in known:
@@ -140,14 +154,14 @@ class _Import:
                 self._add_facets()
             begun = begins if digest == head else None
             if digest not in known or begun is not None:
-                self._send_commit(record, changes[digest], begun)
-        return self.dataset.at(head)
+                made = self._send_commit(record, changes[digest], begun)
+        return made or self.dataset.at(head)
 
     def _known(self, history: list[tuple[str, CommitRecord]]) -> set[str]:
         """Return the digests of commits that the dataset has; a dataset with a commit also has all its ancestors."""
         known: set[str] = set()
         for digest, record in reversed(history):
-            if digest not in known and not self.dataset.has(digest):
+            if digest not in known and not self.has(digest):
                 continue
             known.update((digest, *record.parents))
         return known
@@ -223,21 +237,33 @@ class _Import:
     def _batches(self, contents: list[str]) -> Iterator[list[str]]:
         """Divide revisions into batches, one for each request; the number and the total size of a batch are limited."""
         batch: list[str] = []
-        size_bytes = 0
+        size_bytes = restored_bytes = 0
         for content in contents:
+            documents = self._revision(content).parts.values()
+            adds_bytes = sum(one.nbytes for document in documents for one in self._differences(document).values())
+            if batch and restored_bytes + adds_bytes > MOST_BYTES_RESTORED:
+                yield batch
+                batch, size_bytes, restored_bytes = [], 0, 0
             batch.append(content)
-            size_bytes += sum(map(self._size_bytes, self._revision(content).parts.values()))
+            restored_bytes += adds_bytes
+            size_bytes += sum(map(self._size_bytes, documents))
             if size_bytes > MOST_BYTES_SENT or len(batch) == MOST_CONTENTS:
                 yield batch
-                batch, size_bytes = [], 0
+                batch, size_bytes, restored_bytes = [], 0, 0
         if batch:
             yield batch
 
+    def _differences(self, document: str) -> dict[str, ArrayDifference]:
+        """Return the differences with which arrays of a document are sent, by the digest of the array."""
+        return {} if self._is_stored(document) else self.archive.differences(document)
+
     def _size_bytes(self, document: str) -> int:
+        """Return the size of a document without the arrays that are sent as differences."""
         if self._is_stored(document):
             return 0
         arrays, _ = references_of("", self._document(document))
-        members = [ArchiveMember(MemberKind.ARRAY, leaf["content"]) for leaf in arrays.values()]
+        digests = {leaf["content"] for leaf in arrays.values()} - self._differences(document).keys()
+        members = [ArchiveMember(MemberKind.ARRAY, digest) for digest in digests]
         members.append(ArchiveMember(MemberKind.DOCUMENT, document))
         return sum(self.archive.members[member][1] for member in members)
 
@@ -252,7 +278,13 @@ class _Import:
                 {"content": content, "kind": one.kind, "path": one.path, "parts": parts}
                 | ({"facets": facets} if facets else {})  # which servers of earlier versions do not know
             )
-        self.dataset.transport.send_tree("POST", f"{self.dataset.url}/contents", {"revisions": sent})
+        try:
+            self.dataset.transport.send_tree("POST", f"{self.dataset.url}/contents", {"revisions": sent})
+        except (Conflict, Invalid) as error:
+            documents = [document for content in contents for document in self._revision(content).parts.values()]
+            if not any(map(self._differences, documents)):
+                raise
+            raise DifferencesRefused(str(error)) from error
         self._note(contents)
         self.sent.update(contents)
 
@@ -278,17 +310,24 @@ class _Import:
     def _part(self, digest: str, bases: ArrayBases | None) -> Any:
         """Return a part of a revision for a request: the document, or a reference to a revision that contains it.
 
-        The result is a reference if the project already has the document. Tiles of `bases` are left out of the arrays.
+        The result is a reference if the project already has the document. Arrays that the archive has as differences
+        are sent as differences. Tiles of `bases` are left out of all other arrays.
         """
         if self._is_stored(digest):
             return {"content": self.homes[digest]}
         tree = self._document(digest)
-        self._send_files(set(references_of(str(tree.get("schema")), tree)[1].values()))
-        if bases is None:
-            return attach_arrays(tree, self.archive.array)
-        arrays, _ = references_of(str(tree.get("schema")), tree)
+        arrays, files = references_of(str(tree.get("schema")), tree)
+        self._send_files(set(files.values()))
+        differences = self._differences(digest)
         pointers = {leaf["content"]: pointer for pointer, leaf in arrays.items()}
-        return attach_arrays(tree, lambda content: bases.without_shared(pointers[content], self.archive.array(content)))
+
+        def sent(content: str) -> EncodedArray | dict[str, Any]:
+            if content in differences:
+                return differences[content].document
+            array = self.archive.array(content)
+            return array if bases is None else bases.without_shared(pointers[content], array)
+
+        return attach_arrays(tree, sent)
 
     def _send_files(self, digests: set[str]) -> None:
         blobs = Blobs(self.dataset.transport)
@@ -301,7 +340,7 @@ class _Import:
 
     # -- commits -------------------------------------------------------------------------------------------------------
 
-    def _send_commit(self, record: CommitRecord, changes: Mapping[str, EntryChange], begins: str | None) -> None:
+    def _send_commit(self, record: CommitRecord, changes: Mapping[str, EntryChange], begins: str | None) -> Commit:
         request = ReceivedCommit(
             tree=record.tree,
             parents=record.parents,
@@ -312,7 +351,7 @@ class _Import:
             begins=begins,
         )
         url = f"{self.dataset.url}/received-commits"
-        read_model(Commit, self.dataset.transport.send("POST", url, content=as_json(request)))
+        return read_model(Commit, self.dataset.transport.send("POST", url, content=as_json(request)))
 
 
 def _received(key: str, change: EntryChange) -> ReceivedChange:

@@ -6,15 +6,18 @@ import os
 import shutil
 import stat
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
-from marey_client.archives.writing import DatasetReader, short_name, write_archive
+from marey_client.archives.writing import DatasetReader, short_name, write_transfer
+from marey_client.errors import DifferencesRefused
 from marey_client.progress import OnProgress
 from marey_schemas.datasets.commits import Commit
 from marey_versions.archive.reading import Archive
+
+T = TypeVar("T")
 
 MOST_DAYS_KEPT = 7
 """Number of days after which files of interrupted copies are deleted."""
@@ -23,7 +26,8 @@ MOST_DAYS_KEPT = 7
 class MissingCommits(NamedTuple):
     """Commits that another dataset lacks; `bases` are the newest of their ancestors that the other dataset has."""
 
-    commits: tuple[str, ...]
+    commits: tuple[Commit, ...]
+    """The newest commit and its ancestors; the newest is the first."""
     bases: tuple[str, ...]
 
 
@@ -33,42 +37,67 @@ def find_missing(source: DatasetReader, head: Commit, has: Callable[[str], bool]
     `has` returns whether the other dataset has the commit with a digest. A dataset that has a commit also has the
     ancestors of the commit, so `has` is not called for these.
     """
-    missing: dict[str, None] = {}
+    if has(head.digest):
+        return MissingCommits((), (head.digest,))
+    missing = {head.digest: head}
     bases: dict[str, None] = {}
-    waiting = [head.digest]
+    waiting = list(head.parents)
     while waiting:
-        for commit in source.log(waiting.pop()):
+        start = waiting.pop()
+        if start in missing or start in bases:
+            continue
+        if has(start):  # asked before the log is read: most copies have one new commit
+            bases[start] = None
+            continue
+        for commit in source.log(start):
             if commit.digest in missing:
                 break
             if has(commit.digest):
                 bases[commit.digest] = None
                 break
-            missing[commit.digest] = None
+            missing[commit.digest] = commit
             waiting += commit.parents[1:]
-    return MissingCommits(tuple(missing), tuple(bases))
+    return MissingCommits(tuple(missing.values()), tuple(bases))
+
+
+def copy_missing(
+    source: DatasetReader, missing: MissingCommits, receive: Callable[[Archive], T], on_progress: OnProgress
+) -> T:
+    """Write an archive of missing commits, and return the result of `receive`, which sends it to the other dataset.
+
+    Arrays are sent as differences from those of the commits that the other dataset has. If its server refuses this,
+    which servers of earlier versions do, the archive is written and sent again with whole arrays.
+
+    Consents are not checked here: take records are copied with their clips, so that the other server checks the
+    consents. Raises `LargeCommit` if the other server would refuse one of the commits.
+    """
+    if missing.bases:
+        with suppress(DifferencesRefused), _fetched(source, missing, on_progress, differences=True) as archive:
+            return receive(archive)
+    with _fetched(source, missing, on_progress, differences=False) as archive:
+        return receive(archive)
 
 
 @contextmanager
-def fetched_versions(
-    source: DatasetReader, head: Commit, bases: Sequence[str], on_progress: OnProgress
+def _fetched(
+    source: DatasetReader, missing: MissingCommits, on_progress: OnProgress, *, differences: bool
 ) -> Iterator[Archive]:
-    """Write an archive of `head` and its ancestors, without `bases` and their ancestors; yield the opened archive.
+    """Write an archive of missing commits, and yield the opened archive.
 
-    The archive's file is deleted after the `with` block, but kept if the block ends with an error. If the program is
-    interrupted while it writes the file, the next call continues writing. Consents are not checked here: take records
-    are copied with their clips, so that the other server checks the consents. Raises `LargeCommit` if the other server
-    would refuse one of the commits.
+    The archive's file is deleted after the `with` block, but kept if the block ends with an error of another kind than
+    `DifferencesRefused`. If the program is interrupted while it writes the file, the next call continues writing.
     """
-    path = transfers_folder() / f"{short_name(head.digest, bases)}.tar"
+    name = short_name(missing.commits[0].digest, missing.bases)
+    path = transfers_folder() / (f"{name}.differences.tar" if differences else f"{name}.tar")
     if not path.exists():
-        write_archive(source, head.digest, path, on_progress, since=bases, check=_accept, to_send=True)
-    with path.open("rb") as file:
-        yield Archive(file)
+        write_transfer(source, missing.commits, path, on_progress, differences=differences)
+    try:
+        with path.open("rb") as file:
+            yield Archive(file)
+    except DifferencesRefused:
+        path.unlink(missing_ok=True)
+        raise
     path.unlink(missing_ok=True)
-
-
-def _accept(_contents: Sequence[str]) -> None:
-    """Accept all revisions, without a check of consents."""
 
 
 def transfers_folder() -> Path:

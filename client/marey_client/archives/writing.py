@@ -4,49 +4,38 @@ from __future__ import annotations
 
 import fcntl
 import os
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
 
-from marey_client.archives.contents import first_documents, read_facets, request_contents
+from marey_client.archives.documents import CheckContents, DocumentWriter, EarlierDocument
 from marey_client.archives.receiving import require_receivable
-from marey_client.blobs import Blobs
 from marey_client.errors import ArchiveInUse, BadRequest, NothingToArchive, UnexpectedAnswer
 from marey_client.progress import OnProgress
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
 from marey_schemas.datasets.contents import (
     MOST_CHECKED,
-    MOST_CONTENTS,
-    ContentsRequest,
     ExportCheck,
     ExportPermission,
     PartOfContent,
 )
-from marey_schemas.documents.blob_references import references_of
-from marey_schemas.encoding.arrays import EncodedArray
-from marey_schemas.encoding.canonical import canonical_json, detach_arrays
+from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.sizes import batched
 from marey_versions.archive.checking import check_archive
 from marey_versions.archive.members import ArchiveMember, BadArchive, MemberKind
 from marey_versions.archive.reading import Archive
 from marey_versions.archive.writing import ArchiveWriter
-from marey_versions.records import CommitRecord, contents_in, revision_content
+from marey_versions.records import CommitRecord, revision_content
 from marey_versions.tree.chunks import digest_of
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from marey_client.transport import Transport
     from marey_schemas.datasets.differences import DatasetDifference
 
 MOST_LISTED = 10_000
 """Number of differences that are requested at once; versions that differ in more entries are listed whole."""
-
-CheckContents = Callable[[Sequence[str]], object]
-"""Function called with content digests of revisions before their documents are read."""
 
 
 class DatasetReader(Protocol):
@@ -85,22 +74,70 @@ def write_archive(
     *,
     since: Sequence[str] = (),
     check: CheckContents,
-    to_send: bool = False,
 ) -> Commit:
     """Write an archive of a version and check it; the versions `since` and all versions before them are left out.
 
     Before the documents of revisions are read, `check` is called with the content digests of these revisions, and may
     raise an error. An interrupted call leaves a file whose name ends in `.part`; the next call with the same arguments
     continues it. Raises `ArchiveInUse` if another process is writing the file, and `NothingToArchive` if no version is
-    left. With `to_send`, also raises `LargeCommit`, before documents are read, if one of the commits has more changes
-    than servers accept.
+    left.
     """
     head = dataset.at(version)
     bases = [dataset.at(one) for one in since]
     part = path.with_name(f"{path.name}.{short_name(head.digest, [one.digest for one in bases])}.part")
+
+    def fill(writer: ArchiveWriter) -> None:
+        before: dict[str, Commit] = {}
+        for base in bases:
+            before = _history(dataset, base, before)
+        commits = [one for one in _history(dataset, head, before).values() if one.digest not in before]
+        if not commits:
+            raise NothingToArchive(f"there is nothing to archive: the versions to leave out include {head.digest}")
+        documents = _documents(dataset, writer, part.parent, on_progress, check, differences=False)
+        _Making(dataset, documents, to_send=False).run(head, commits)
+
+    _write(part, path, fill, on_progress)
+    return head
+
+
+def write_transfer(
+    dataset: DatasetReader, commits: Sequence[Commit], path: Path, on_progress: OnProgress, *, differences: bool
+) -> None:
+    """Write and check an archive of commits for a server that has all other ancestors of the first of these commits.
+
+    With `differences`, arrays may be replaced by their differences from arrays of these ancestors, so that only this
+    server can read them. Continues after an interruption as `write_archive` does. Raises `LargeCommit`, before
+    documents are read, if a commit has more changes than servers accept. Consents are not checked.
+    """
+
+    def fill(writer: ArchiveWriter) -> None:
+        documents = _documents(dataset, writer, path.parent, on_progress, _accept, differences=differences)
+        _Making(dataset, documents, to_send=True).run(commits[0], commits)
+
+    _write(path.with_name(f"{path.name}.part"), path, fill, on_progress)
+
+
+def _accept(_contents: Sequence[str]) -> None:
+    """Accept all revisions, without a check of consents."""
+
+
+def _documents(
+    dataset: DatasetReader,
+    writer: ArchiveWriter,
+    folder: Path,
+    on_progress: OnProgress,
+    check: CheckContents,
+    *,
+    differences: bool,
+) -> DocumentWriter:
+    return DocumentWriter(dataset.transport, dataset.project_url, writer, folder, on_progress, check, differences)
+
+
+def _write(part: Path, path: Path, fill: Callable[[ArchiveWriter], None], on_progress: OnProgress) -> None:
+    """Write and check the archive `path`, which has the name `part` until it is complete; `fill` adds its members."""
     part.parent.mkdir(parents=True, exist_ok=True)
     with _opened(part) as file:
-        _Making(dataset, ArchiveWriter(file), part.parent, on_progress, check, to_send).run(head, bases)
+        fill(ArchiveWriter(file))
         try:
             check_archive(Archive(file), lambda done, of: on_progress("checking", done, of))
         except BadArchive as error:
@@ -111,7 +148,6 @@ def write_archive(
         file.flush()
         os.fsync(file.fileno())
         part.replace(path)  # before the file is unlocked, so that no other process changes the finished archive
-    return head
 
 
 def check_consents(dataset: DatasetReader, reason: str | None, contents: Sequence[str]) -> frozenset[str]:
@@ -159,57 +195,39 @@ def _is_at(path: Path, file: BinaryIO) -> bool:
         return False
 
 
+def _history(dataset: DatasetReader, head: Commit, known: Mapping[str, Commit]) -> dict[str, Commit]:
+    """Read the commit `head` and its ancestors, back to the commits `known`; return all of them by digest."""
+    found = dict(known)
+    waiting = [head.digest]
+    while waiting:
+        start = waiting.pop()
+        if start in found:
+            continue
+        for commit in dataset.log(start):
+            if commit.digest in found:
+                break
+            found[commit.digest] = commit
+            waiting += commit.parents[1:]
+    return found
+
+
 @dataclass
 class _Making:
     """Archive that is being written."""
 
     dataset: DatasetReader
-    writer: ArchiveWriter
-    folder: Path
-    """Folder in whose file system files are kept, without a name, until they are in the archive."""
-    on_progress: OnProgress
-    check: CheckContents
+    documents: DocumentWriter
     to_send: bool
     """Whether the archive must be importable; then a commit with more changes than servers accept is an error."""
-    known: set[str] = field(default_factory=set)
-    """Content digests of the revisions that the archive has, or will have."""
-    documents: dict[str, PartOfContent] = field(default_factory=dict)
-    """Address on the server of each document of an entry, by the digest of the document."""
-    earlier: dict[str, PartOfContent] = field(default_factory=dict)
-    """Address of the earlier document, by the digest of the document that replaced it."""
 
-    def run(self, head: Commit, bases: Sequence[Commit]) -> None:
-        before: dict[str, Commit] = {}
-        for base in bases:
-            before = self._history(base, before)
-        commits = [one for one in self._history(head, before).values() if one.digest not in before]
-        if not commits:
-            raise NothingToArchive(f"there is nothing to archive: the versions to leave out include {head.digest}")
+    def run(self, head: Commit, commits: Sequence[Commit]) -> None:
+        """Write the given commits, of which `head` is the newest; the parents that are left out are the base."""
+        base = {parent for one in commits for parent in one.parents} - {one.digest for one in commits}
         for done, commit in enumerate(commits):
-            self.on_progress("reading versions", done, len(commits))
-            self._add_commit(commit, unchanged=bool(bases))
-        self.check(sorted(self.known))
-        self._add_documents(self.documents)
-        self._add_facets()
-        parents = {parent for commit in commits for parent in commit.parents}
-        self.writer.finish(self.dataset.name, head.digest, sorted(parents & before.keys()))
-
-    # -- versions ------------------------------------------------------------------------------------------------------
-
-    def _history(self, head: Commit, known: Mapping[str, Commit]) -> dict[str, Commit]:
-        """Read the commit `head` and its ancestors, back to the commits `known`; return all of them by digest."""
-        found = dict(known)
-        waiting = [head.digest]
-        while waiting:
-            start = waiting.pop()
-            if start in found:
-                continue
-            for commit in self.dataset.log(start):
-                if commit.digest in found:
-                    break
-                found[commit.digest] = commit
-                waiting += commit.parents[1:]
-        return found
+            self.documents.on_progress("reading versions", done, len(commits))
+            self._add_commit(commit, unchanged=bool(base))
+        self.documents.run()
+        self.documents.writer.finish(self.dataset.name, head.digest, sorted(base))
 
     def _add_commit(self, commit: Commit, *, unchanged: bool) -> None:
         """Add a commit and its changes to the archive, and note the revisions of the changed entries.
@@ -231,8 +249,9 @@ class _Making:
             lines.append(canonical_json(line) + b"\n")
             if change.after is not None:
                 self._note(change.after, earlier)
-        self.writer.add(ArchiveMember(MemberKind.CHANGES, commit.digest), b"".join(lines))
-        self.writer.add(ArchiveMember(MemberKind.COMMIT, commit.digest), canonical_json(record.document))
+        writer = self.documents.writer
+        writer.add(ArchiveMember(MemberKind.CHANGES, commit.digest), b"".join(lines))
+        writer.add(ArchiveMember(MemberKind.COMMIT, commit.digest), canonical_json(record.document))
 
     def _note(self, entry: Entry, earlier: Entry | None) -> None:
         """Record the revision of an entry, and the addresses of its documents.
@@ -240,13 +259,14 @@ class _Making:
         Documents that are also in `earlier`, the entry before the commit, are left out.
         """
         content = _content(entry)
-        self.known.add(content)
+        self.documents.known.add(content)
         for part, digest in entry.parts.items():
             before = None if earlier is None else earlier.parts.get(part)
             if digest != before:
-                self.documents.setdefault(digest, PartOfContent(content=content, part=part))
-            if earlier is not None and before not in (None, digest):
-                self.earlier[digest] = PartOfContent(content=_content(earlier), part=part)
+                self.documents.documents.setdefault(digest, PartOfContent(content=content, part=part))
+            if earlier is not None and before is not None and before != digest:
+                place = PartOfContent(content=_content(earlier), part=part)
+                self.documents.earlier[digest] = EarlierDocument(before, place)
 
     def _changes(self, commit: Commit) -> dict[tuple[str, str], _EntryPair]:
         """Return the entries that differ between a commit and its first parent, by path and kind."""
@@ -276,89 +296,6 @@ class _Making:
             return None
         return found if found.complete else None
 
-    # -- content -------------------------------------------------------------------------------------------------------
-
-    def _add_documents(self, wanted: Mapping[str, PartOfContent]) -> None:
-        """Add documents, given by digest, to the archive.
-
-        New revisions, arrays and files to which a document refers are added before the document.
-        """
-        digests = [one for one in wanted if ArchiveMember(MemberKind.DOCUMENT, one) not in self.writer]
-        total = len(digests)
-        while digests:
-            trees = self._fetch([wanted[digest] for digest in digests[:MOST_CONTENTS]])
-            together = dict(zip(digests, trees, strict=False))
-            self._add_together(together)
-            digests = digests[len(together) :]
-            self.on_progress("reading documents", total - len(digests), total)
-
-    def _add_together(self, trees: Mapping[str, Any]) -> None:
-        arrays: dict[str, EncodedArray] = {}
-
-        def keep(name: str, array: NDArray[Any] | EncodedArray) -> None:
-            arrays[name] = array if isinstance(array, EncodedArray) else EncodedArray.of(array)
-
-        bodies = {digest: detach_arrays(tree, keep) for digest, tree in trees.items()}
-        self._add_revisions({one for body in bodies.values() for one in contents_in(body)} - self.known)
-        for name, array in arrays.items():
-            self.writer.add(ArchiveMember(MemberKind.ARRAY, name), array.data)
-        for digest, body in bodies.items():
-            data = canonical_json(body)
-            if digest_of(data) != digest:
-                raise UnexpectedAnswer(f"the server's document {digest} does not match its digest")
-            for file in self._files(digest, body):
-                self._add_file(ArchiveMember(MemberKind.FILE, file))
-            self.writer.add(ArchiveMember(MemberKind.DOCUMENT, digest), data)
-
-    def _files(self, digest: str, body: Any) -> set[str]:
-        """Return the digests of the files that a document names, without the files that its earlier version named."""
-        named = _files_in(body)
-        if named and digest in self.earlier:
-            (before,) = self._fetch([self.earlier[digest]])
-            named -= _files_in(before)
-        return named
-
-    def _add_revisions(self, contents: Iterable[str]) -> None:
-        """Add revisions, given by content digest, and their documents; other documents refer to these revisions."""
-        waiting = sorted(contents)
-        self.known.update(waiting)
-        self.check(waiting)
-        for some in batched(waiting, MOST_CONTENTS):
-            found = self._ask(ContentsRequest(revisions=tuple(some)))["revisions"]
-            for content, one in zip(some, found, strict=True):
-                if one is None:
-                    raise UnexpectedAnswer(f"a document refers to the content {content}, which the project lacks")
-                self._add_documents(
-                    {digest: PartOfContent(content=content, part=part) for part, digest in one["parts"].items()}
-                )
-                self.writer.add(ArchiveMember(MemberKind.REVISION, content), canonical_json(one))
-
-    def _add_facets(self) -> None:
-        """Add the facets of all revisions, which jobs may have published after the revisions were committed.
-
-        Each member has those of a few revisions, because readers refuse members of more than `MOST_BYTES`.
-        """
-        for some in batched(sorted(self.known), MOST_CONTENTS):
-            if facets := read_facets(self.dataset.transport, self.dataset.project_url, some):
-                data = canonical_json(facets)
-                self.writer.add(ArchiveMember(MemberKind.FACETS, digest_of(data)), data)
-
-    def _add_file(self, member: ArchiveMember) -> None:
-        if member in self.writer:
-            return
-        with tempfile.TemporaryFile(dir=self.folder) as file:  # without a name, so that a killed process leaves none
-            Blobs(self.dataset.transport).fetch_into(member.digest, file)
-            size_bytes = file.tell()
-            file.seek(0)
-            self.writer.add_stream(member, file, size_bytes)
-
-    def _fetch(self, places: Sequence[PartOfContent]) -> list[Any]:
-        """Request the documents at `places` in order; return as many as fit into one answer, at least one."""
-        return first_documents(self.dataset.transport, self.dataset.project_url, places, keep_blocks=True)
-
-    def _ask(self, request: ContentsRequest) -> dict[str, Any]:
-        return request_contents(self.dataset.transport, self.dataset.project_url, request, keep_blocks=True)
-
 
 class _EntryPair(NamedTuple):
     """State of an entry after and before a commit; None where the entry does not exist."""
@@ -373,10 +310,6 @@ class _EntryPair(NamedTuple):
             return {}
         parts = self.after.parts.items() & self.before.parts.items()
         return {part: _content(self.before) for part, _ in parts}
-
-
-def _files_in(document: Mapping[str, Any]) -> set[str]:
-    return set(references_of(str(document.get("schema")), document)[1].values())
 
 
 def _content(entry: Entry) -> str:

@@ -12,7 +12,7 @@ from marey_client.archives.contents import read_documents, request_contents
 from marey_client.archives.writing import DatasetReader, check_consents
 from marey_client.errors import CannotExport
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
-from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent
+from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, RequestedDocument
 from marey_schemas.datasets.exports import (
     ExportedClip,
     ExportedIdentity,
@@ -114,7 +114,7 @@ class VersionToExport:
 
     def documents(self, entries: Sequence[Entry], part: str) -> Iterator[dict[str, Any]]:
         """Yield the document of the given part of each entry; the documents refer to revisions by content digest."""
-        places = [PartOfContent(content=_located(one).content, part=part) for one in entries]
+        places = [RequestedDocument(content=_located(one).content, part=part) for one in entries]
         return read_documents(self.dataset.transport, self.dataset.project_url, places)
 
     def parts_of(self, content: str) -> Mapping[str, str]:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from marey_client.errors import NotFound, RequestFailed
+from marey_client.errors import Conflict, NotFound, RequestFailed
 from marey_client.handles.versions import DatasetHandle
 from marey_client.paging import pages
 from marey_client.progress import OnProgress, ignore_progress
 from marey_client.transport import Transport
 from marey_schemas.datasets.commits import Commit
-from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, RefKind
+from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefKind
 
 if TYPE_CHECKING:
     from marey_versions.archive.reading import Archive
@@ -79,7 +81,7 @@ class Datasets:
             except NotFound:
                 require_base(archive, lambda _commit: False)
                 handle = self.create(name, collection=name)
-            return _receive(handle, archive, into, on_progress)
+            return _receive(handle, archive, into, handle.find_ref(into), handle.has, on_progress)
 
     def pull(
         self,
@@ -97,15 +99,21 @@ class Datasets:
         `import_archive`; by default, it is the branch that `version` names, or `main` if `version` is not a branch. If
         `version` is a tag, the tag is created too, unless a branch or tag of this name exists.
         """
-        from marey_client.archives.transfers import fetched_versions, find_missing
+        from marey_client.archives.transfers import copy_missing, find_missing
 
         head, named = source.at(version), source.find_ref(version)
-        target = self._opened_or_created(name)
         branch = into or (version if named is not None and named.kind is RefKind.BRANCH else MAIN)
-        missing = find_missing(source, head, target.has)
+        target = self.at(name)
+        ref = target.find_ref(branch)
+        if ref is None:
+            self._create_unless_exists(name)
+            ref = target.find_ref(branch)
+        has = _known_commits(target, ref)
+        missing = find_missing(source, head, has)
         if missing.commits:
-            with fetched_versions(source, head, missing.bases, on_progress) as archive:
-                made = _receive(target, archive, branch, on_progress)
+            made = copy_missing(
+                source, missing, lambda archive: _receive(target, archive, branch, ref, has, on_progress), on_progress
+            )
         else:
             made = _forward(target, branch, target.at(head.digest))
         if named is None or named.kind is not RefKind.TAG:
@@ -113,29 +121,48 @@ class Datasets:
         tag = target.find_ref(named.name) or target.create_tag(named.name, head.digest)
         return made._replace(tag=tag.name if tag.kind is RefKind.TAG and tag.commit == head.digest else None)
 
-    def _opened_or_created(self, name: str) -> DatasetHandle:
-        handle = self.at(name)
+    def _create_unless_exists(self, name: str) -> None:
         try:
-            handle.read()
+            self.at(name).read()
         except NotFound:
-            return self.create(name, collection=name)
-        return handle
+            self.create(name, collection=name)
 
     def at(self, name: str) -> DatasetHandle:
         """Return a handle of the dataset with this name; no request is sent."""
         return DatasetHandle(self.transport, f"{self.url}/{name}")
 
 
-def _receive(dataset: DatasetHandle, archive: Archive, into: str, on_progress: OnProgress) -> ImportedVersion:
+def _known_commits(dataset: DatasetHandle, ref: Ref | None) -> Callable[[str], bool]:
+    """Return a function that asks the server only once whether the dataset has a commit.
+
+    `ref` is a branch of the dataset, whose newest commit is known.
+    """
+    ask = cache(dataset.has)
+    return lambda digest: (ref is not None and ref.commit == digest) or ask(digest)
+
+
+def _receive(
+    dataset: DatasetHandle,
+    archive: Archive,
+    into: str,
+    ref: Ref | None,
+    has: Callable[[str], bool],
+    on_progress: OnProgress,
+) -> ImportedVersion:
     """Record the versions of an archive without checking the archive; move the branch `into` to the newest version.
 
-    The branch does not move if its newest commit is not an ancestor of the newest version.
+    `ref` is the branch `into`, or None if there is no such branch or tag. The branch does not move if its newest commit
+    is not an ancestor of the newest version.
     """
     from marey_client.archives.receiving import send_versions
 
-    ref = dataset.find_ref(into)
     empty = ref is not None and ref.commit is None
-    made = send_versions(dataset, archive, on_progress, begins=into if empty else None)
+    made = send_versions(dataset, archive, on_progress, has, begins=into if empty else None)
+    if ref is not None and ref.commit in archive.manifest.base:
+        with suppress(Conflict):  # the branch has moved, or is protected
+            merged = dataset.merge(made.digest, into=into, expected=ref.commit)
+            if merged.commit is not None and merged.commit.digest == made.digest:
+                return ImportedVersion(made, into, True)
     return _forward(dataset, into, made)
 
 
@@ -149,7 +176,7 @@ def _forward(dataset: DatasetHandle, branch: str, commit: Commit) -> ImportedVer
         dataset.create_branch(branch, commit.digest)
     elif ref.commit is None:
         dataset.move_branch(branch, commit.digest, expected_rev=ref.rev)
-    else:
+    elif ref.commit != commit.digest:
         return ImportedVersion(commit, branch, _fast_forward(dataset, branch, commit.digest))
     return ImportedVersion(commit, branch, True)
 
@@ -157,10 +184,8 @@ def _forward(dataset: DatasetHandle, branch: str, commit: Commit) -> ImportedVer
 def _fast_forward(dataset: DatasetHandle, branch: str, commit: str) -> bool:
     """Move a branch to the given commit if this commit is a descendant of the branch's newest commit.
 
-    The branch must have a commit already. Returns whether the branch is at the given commit now.
+    The branch must have another commit already. Returns whether the branch is at the given commit now.
     """
-    if dataset.at(branch).digest == commit:
-        return True
     try:
         preview = dataset.merge(commit, into=branch, preview=True)
     except RequestFailed:  # nothing to merge, or no single common version: a person must decide

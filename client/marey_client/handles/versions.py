@@ -311,8 +311,11 @@ class DatasetHandle:
         return pages(self.transport, Ref, f"{self.url}/refs")
 
     def find_ref(self, name: str) -> Ref | None:
-        """Return the branch or tag with a name, or None."""
-        return next((one for one in self.refs() if one.name == name), None)
+        """Return the branch or tag with a name; None if there is none, or if there is no such dataset."""
+        try:
+            return self.ref(name)
+        except NotFound:
+            return None
 
     def create_branch(self, name: str, at: str = MAIN) -> Ref:
         """Create a branch at a version."""

@@ -39,11 +39,22 @@ class PartOfContent(Request):
     part: PartName
 
 
+class RequestedDocument(PartOfContent):
+    """Address of a document, and the revision with an earlier version of it that the reader has."""
+
+    base: Digest | None = Field(
+        None,
+        description="Content digest of a revision of the project. Arrays of the document that differ in a few frames "
+        "from those in the same part of this revision are returned as array differences. Null: all arrays are "
+        "returned whole.",
+    )
+
+
 class ContentsRequest(Request):
     """Request for revisions of a project by their content digests, and for documents of such revisions."""
 
     revisions: tuple[Digest, ...] = Field((), max_length=MOST_CONTENTS)
-    documents: tuple[PartOfContent, ...] = Field((), max_length=MOST_CONTENTS)
+    documents: tuple[RequestedDocument, ...] = Field((), max_length=MOST_CONTENTS)
     tiles: tuple[PartOfContent, ...] = Field(
         (), max_length=MOST_CONTENTS, description="Documents whose arrays are requested as digests of their tiles."
     )

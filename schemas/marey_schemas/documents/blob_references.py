@@ -20,6 +20,11 @@ def is_array_reference(value: Any) -> bool:
     return type(value) not in _LEAVES and isinstance(value, Mapping) and value.keys() == _REFERENCE_KEYS
 
 
+def pointer_to(pointer: str, key: object) -> str:
+    """Return the JSON Pointer of the member `key` of the object at `pointer`."""
+    return f"{pointer}/{str(key).replace('~', '~0').replace('/', '~1')}"
+
+
 def members_of(tree: Any) -> list[tuple[str, Any]]:
     """List JSON Pointers and values of the nodes of a document; objects and lists precede the values in them.
 
@@ -32,7 +37,7 @@ def members_of(tree: Any) -> list[tuple[str, Any]]:
         found.append((pointer, value))
         if type(value) is dict or isinstance(value, Mapping):  # nearly all are; asking for mappings takes far longer
             for key, member in value.items():
-                at = f"{pointer}/{str(key).replace('~', '~0').replace('/', '~1')}"
+                at = pointer_to(pointer, key)
                 if type(member) in _LEAVES:
                     found.append((at, member))
                 else:

@@ -6,7 +6,7 @@ The first axis counts frames; all others together are columns. docs/reference/bl
 import math
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -139,6 +139,46 @@ def count_tiles(spec: ArraySpec) -> int:
 def join(spec: ArraySpec, packed: list[bytes]) -> bytes:
     """Return an encoded array that has the given tiles, in the layout that `encode` uses."""
     return _assembled(_layout_of(spec), packed)
+
+
+def changed_blocks(data: bytes, former: bytes) -> Iterator[slice]:
+    """Yield the frames of each block whose tiles differ between two encoded arrays; equal tiles are not decoded.
+
+    Raises `BlockError` if the arrays do not have the same dtype, shape and layout.
+    """
+    (layout, starts), (other, others) = _read_head(data), _read_head(former)
+    if layout != other:
+        raise BlockError("arrays with different layouts cannot be compared block by block")
+    for block in range(layout.blocks):
+        first, end = block * layout.groups, (block + 1) * layout.groups
+        if data[starts[first] : starts[end]] != former[others[first] : others[end]]:
+            yield layout.block(block)
+
+
+Edit = Callable[[NDArray[Any], NDArray[np.intp], slice], None]
+"""Function that changes some frames of a block in place.
+
+It is called with the (frames, columns) array of the block, the indices of the frames in the block, and the place of
+these frames in the list of all frames to change.
+"""
+
+
+def with_edited_frames(data: bytes, frames: NDArray[np.intp], edit: Edit) -> bytes:
+    """Return an encoded array in which `edit` has changed some frames; tiles of other blocks are copied unchanged.
+
+    `frames` are indices in ascending order. Raises `BlockError`.
+    """
+    layout, starts = _read_head(data)
+    packed = [data[here:there] for here, there in pairwise(starts)]
+    for block in np.unique(frames // layout.block_frames).tolist():
+        within = layout.block(block)
+        start, stop = np.searchsorted(frames, [within.start, within.stop]).tolist()
+        table = decode(data, frames=within).reshape(within.stop - within.start, layout.columns)
+        edit(table, frames[start:stop] - within.start, slice(start, stop))
+        packed[block * layout.groups : (block + 1) * layout.groups] = _packed(
+            layout.of_frames(len(table)), table, predict=True
+        )
+    return _assembled(layout, packed)
 
 
 def _packed(layout: _Layout, array: NDArray[Any], *, predict: bool) -> list[bytes]:

@@ -83,7 +83,7 @@ def _compress(sections: list[Bytes], level: int = 1) -> bytes:
 
 def _predict(tile: NDArray[Any], lead: int | None) -> list[Bytes]:
     """Return the sections of the form `QUATERNIONS` if the tile contains unit quaternions, else of `DIFFERENCES`."""
-    channels = _to_integers(np.ascontiguousarray(tile.T))
+    channels = to_integers(np.ascontiguousarray(tile.T))
     if lead is not None and _holds_rotations(tile, lead):
         return [np.array([QUATERNIONS, lead], np.uint8), *_predict_quaternions(channels, lead)]
     return [np.array([DIFFERENCES], np.uint8), *_difference(channels)]
@@ -94,9 +94,9 @@ def _restore(content: Bytes, dtype: np.dtype[Any], frames: int, columns: int) ->
     if form == RAW:
         tile = body.take(frames * columns * dtype.itemsize).view(dtype).reshape(frames, columns)
     elif form == DIFFERENCES:
-        tile = _from_integers(_undo_difference(body, dtype.itemsize, columns, frames), dtype).T
+        tile = from_integers(_undo_difference(body, dtype.itemsize, columns, frames), dtype).T
     elif form == QUATERNIONS and dtype == np.dtype("<f4"):
-        tile = _from_integers(_undo_prediction(body, columns, frames), dtype).T
+        tile = from_integers(_undo_prediction(body, columns, frames), dtype).T
     else:
         raise TileError(f"the tile has the form {form}, which does not exist for the dtype {dtype.str}")
     body.require_end()
@@ -125,13 +125,14 @@ class _Sections:
 # Floats as integers
 
 
-def _to_integers(channels: NDArray[Any]) -> Integers:
+def to_integers(channels: NDArray[Any]) -> Integers:
     """Return the values as unsigned integers; the integers of floats, read as signed integers, sort like the floats."""
     bits = channels.view(f"<u{channels.dtype.itemsize}")
     return _order(bits) if channels.dtype.kind == "f" else bits
 
 
-def _from_integers(integers: Integers, dtype: np.dtype[Any]) -> NDArray[Any]:
+def from_integers(integers: Integers, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return the values whose integers `to_integers` returned; `dtype` is the dtype of the values."""
     return (_order(integers) if dtype.kind == "f" else integers).view(dtype)
 
 
@@ -231,7 +232,7 @@ def _predict_quaternions(channels: Integers, lead: int) -> list[Bytes]:
     errors.
     """
     count = (len(channels) - lead) // 4
-    values = _from_integers(channels, np.dtype("<f4"))
+    values = from_integers(channels, np.dtype("<f4"))
     quaternions = values[lead : lead + 4 * count].reshape(count, 4, -1)
     chosen = np.abs(quaternions).min(axis=2).argmax(axis=1)
     predicted_rows, other_rows = _rows(chosen, len(channels), lead)
@@ -272,9 +273,9 @@ def _prediction(others: Integers, lead: int, count: int, negative: NDArray[np.bo
     Products of two float32 are exact in double precision, so a fused multiply-add changes nothing: every machine with
     IEEE 754 arithmetic computes the same bits.
     """
-    three = _from_integers(others[lead : lead + 3 * count], np.dtype("<f4")).reshape(count, 3, -1)
+    three = from_integers(others[lead : lead + 3 * count], np.dtype("<f4")).reshape(count, 3, -1)
     with np.errstate(all="ignore"):  # corrupt bytes may hold anything
         squared = np.square(three.astype(np.float64))
         rest = 1.0 - squared[:, 0] - squared[:, 1] - squared[:, 2]
         length = np.sqrt(np.maximum(rest, 0.0)).astype(np.float32)
-    return _to_integers(np.where(negative[:, None], -length, length))
+    return to_integers(np.where(negative[:, None], -length, length))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from tests.support.command_line import CommandLine
 
-from marey_client.archives import contents, receiving, writing
+from marey_client.archives import contents, documents, receiving, writing
 from marey_client.errors import RequestFailed
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.versions import DatasetHandle
@@ -195,7 +195,7 @@ def test_an_archive_is_continued_where_an_attempt_ended(
         return once(*request, **options)
 
     monkeypatch.setattr(contents, "request_contents", ask)
-    monkeypatch.setattr(writing, "MOST_CONTENTS", 2)
+    monkeypatch.setattr(documents, "MOST_CONTENTS", 2)
     with pytest.raises(ConnectionError):
         gaits.archive(again)
     assert not again.exists()

@@ -131,7 +131,7 @@ def test_a_push_that_was_interrupted_continues_and_leaves_no_file(
     assert [path.suffix for path in kept.iterdir()] == [".tar"]
     assert partner.datasets.at("gaits").ref("main").commit is None
     with monkeypatch.context() as counted:
-        counted.setattr(transfers, "write_archive", fail)  # the archive is there already
+        counted.setattr(transfers, "write_transfer", fail)  # the archive is there already
         told(push)
     assert list(kept.iterdir()) == []
     assert partner.datasets.at("gaits").at() == studio.datasets.at("gaits").at()

@@ -21,7 +21,7 @@ from tests.support.teams.transfers import LISTED
 
 from marey_client.archives.contents import read_documents
 from marey_client.handles.versions import DatasetHandle
-from marey_schemas.datasets.contents import PartOfContent
+from marey_schemas.datasets.contents import RequestedDocument
 from marey_schemas.datasets.naming import RefKind
 from marey_server.access.principal import SYSTEM
 from marey_server.store.database.connections import Database
@@ -98,7 +98,7 @@ class Comparison:
     def documents(self, contents: Iterable[Content]) -> None:
         """Compare documents and files of versions, in the form that servers exchange."""
         wanted = [(content, part, value) for content in contents for part, value in content.parts]
-        places = [PartOfContent(content=content_digest(content), part=part) for content, part, _ in wanted]
+        places = [RequestedDocument(content=content_digest(content), part=part) for content, part, _ in wanted]
         project = self._clients.project(self._lab)
         found = read_documents(project.transport, project.url, places)
         for (content, part, value), tree in zip(wanted, found, strict=True):

@@ -17,7 +17,7 @@ import pytest
 
 from marey_client.archives import receiving
 from marey_client.archives.receiving import ReceivingDataset, send_versions
-from marey_client.archives.transfers import MOST_DAYS_KEPT, fetched_versions, transfers_folder
+from marey_client.archives.transfers import MOST_DAYS_KEPT, MissingCommits, copy_missing, transfers_folder
 from marey_client.archives.writing import short_name, write_archive
 from marey_client.errors import ArchiveInUse, BadRequest, LargeCommit
 from marey_client.progress import ignore_progress
@@ -211,12 +211,12 @@ def test_a_commit_that_no_server_receives_is_archived_but_not_imported(tmp_path:
     dataset = ListedDataset([entry("a"), entry("b")], [])
     base, large = dataset.commits
     written(dataset, tmp_path / "gaits.tar")
-    receiver = cast(ReceivingDataset, SimpleNamespace(has=lambda commit: commit == base.digest))
+    receiver = cast(ReceivingDataset, SimpleNamespace())
     with (
         (tmp_path / "gaits.tar").open("rb") as file,
         pytest.raises(LargeCommit, match=f"{large.digest} changes 2 .* 1"),
     ):
-        send_versions(receiver, Archive(file), ignore_progress)
+        send_versions(receiver, Archive(file), ignore_progress, lambda commit: commit == base.digest)
 
 
 @pytest.mark.parametrize("branch", [None, "main"])
@@ -232,14 +232,14 @@ def test_each_commit_is_sent_once_and_the_newest_with_the_branch_that_begins_wit
         sent.append(json.loads(content))
         return httpx.Response(201, content=dataset.commits[-1].model_dump_json())
 
+    has = [one.digest for one in dataset.commits[:known]].__contains__
     receiver = SimpleNamespace(
-        has=[one.digest for one in dataset.commits[:known]].__contains__,
         at=dataset.at,
         url="/gaits",
         transport=SimpleNamespace(send=send),
     )
     with (tmp_path / "gaits.tar").open("rb") as file:
-        send_versions(cast(ReceivingDataset, receiver), Archive(file), ignore_progress, begins=branch)
+        send_versions(cast(ReceivingDataset, receiver), Archive(file), ignore_progress, has, begins=branch)
     expected = [] if known == 2 and branch is None else [branch]
     assert [one.get("begins") for one in sent] == expected
     assert all(len(one["changes"]) == 1 for one in sent)
@@ -249,5 +249,6 @@ def test_each_commit_is_sent_once_and_the_newest_with_the_branch_that_begins_wit
 def test_a_copy_with_a_commit_that_no_server_receives_ends_before_documents_are_read() -> None:
     # The dataset has no transport, so a request for documents would be another error.
     dataset = ListedDataset([entry("a"), entry("b")])
-    with pytest.raises(LargeCommit), fetched_versions(dataset, dataset.commits[0], (), ignore_progress):
-        pass
+    missing = MissingCommits(tuple(dataset.commits), ())
+    with pytest.raises(LargeCommit):
+        copy_missing(dataset, missing, lambda _archive: None, ignore_progress)

@@ -6,7 +6,7 @@ import hashlib
 import io
 import tarfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,10 +14,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from marey_schemas.encoding.array_differences import ArrayDifference
 from marey_schemas.encoding.arrays import ArrayError, EncodedArray
 from marey_schemas.encoding.canonical import array_digest, canonical_json
 from marey_versions.archive.checking import check_archive
-from marey_versions.archive.members import MANIFEST, ArchiveMember, BadArchive, MemberKind
+from marey_versions.archive.members import MANIFEST, ArchiveMember, BadArchive, MemberKind, differences_member
 from marey_versions.archive.reading import Archive
 from marey_versions.archive.writing import ArchiveWriter
 from marey_versions.records import CommitRecord, key_of, revision_content
@@ -415,3 +416,62 @@ def test_only_archives_with_facets_have_the_newer_schema() -> None:
     made.members[ArchiveMember(MemberKind.FACETS, digest_of(data))] = data
     for written, schema in ((example(), b"marey/archive@1"), (made, b"marey/archive@2")):
         assert schema in written.write().getvalue()
+
+
+def first_commit() -> tuple[str, ...]:
+    """Return the commit on which the archive of `later_part` builds."""
+    return (Archive(example().write()).history()[0][0],)
+
+
+def with_difference(**changed: Any) -> tuple[Example, str]:
+    """Return an archive of a later version whose clip has its poses as a difference; and the digest of the document.
+
+    `changed` are members of the difference that are replaced.
+    """
+    made, line = later_part()
+    edited = POSES.copy()
+    edited[1] += 1
+    digest = array_digest(edited)
+    leaf = {"dtype": "<f4", "shape": [4, 3], "content": digest}
+    motion = made.document({"schema": "marey/motion@1", "poses": leaf})
+    found = ArrayDifference(
+        base=digest_of(b"revision before"), pointer="/poses", dtype="<f4", shape=(4, 3), digest=digest,
+        frames=np.array([1], "<u4"), difference=np.ones((1, 3), "<u4"),
+    )  # fmt: skip
+    made.members[ArchiveMember(MemberKind.DIFFERENCES, motion)] = differences_member([replace(found, **changed)])
+    del line["unchanged"]
+    line["parts"]["motion"] = motion
+    made.members[ArchiveMember(MemberKind.CHANGES, made.head)] = canonical_json(line) + b"\n"
+    return made, motion
+
+
+def test_an_archive_of_later_versions_may_have_arrays_as_differences() -> None:
+    """Programs that do not know differences refuse its schema."""
+    made, motion = with_difference()
+    archive = checked(made.write(base=first_commit()))
+    (found,) = archive.differences(motion).values()
+    assert isinstance(found.difference, np.ndarray)
+    assert np.array_equal(found.difference, np.ones((1, 3)))
+    assert archive.differences(digest_of(b"other")) == {}
+    assert b'"marey/archive@3"' in made.write(base=first_commit()).getvalue()
+
+
+def test_an_archive_with_the_whole_history_or_a_damaged_difference_is_refused() -> None:
+    base = first_commit()
+    made, motion = with_difference()
+    name = ArchiveMember(MemberKind.DIFFERENCES, motion)
+    with pytest.raises(BadArchive, match=r"differences/.*must contain whole arrays"):
+        Archive(made.write()).differences(motion)
+    with pytest.raises(BadArchive, match=r"dtype or shape given here differs from that of the array differences/"):
+        checked(with_difference(shape=(5, 3))[0].write(base=base))
+    with pytest.raises(BadArchive, match=r"arrays/.*no such member"):
+        checked(with_difference(digest=digest_of(b"other"))[0].write(base=base))
+    data = made.members[name]
+    for damaged in (data[:-1], b"", b"\x00", b"\x91\x01", data[:-9] + bytes(9)):
+        made.members[name] = damaged
+        with pytest.raises(BadArchive, match="differences/"):
+            checked(made.write(base=base))
+    made.members[name] = data
+    made.members[ArchiveMember(MemberKind.DIFFERENCES, digest_of(b"other"))] = data
+    with pytest.raises(BadArchive, match="no version in the archive contains this member"):
+        checked(made.write(base=base))

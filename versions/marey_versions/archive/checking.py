@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from marey_schemas.documents.blob_references import references_of
+from marey_schemas.encoding.array_differences import ArrayDifference
+from marey_schemas.encoding.arrays import EncodedArray
 from marey_versions.archive.members import ArchiveMember, BadArchive, MemberKind
 from marey_versions.archive.reading import Archive
 from marey_versions.records import contents_in, path_and_kind, revision_content
@@ -59,8 +61,9 @@ class _Check:
         tree = self.archive.tree(MemberKind.DOCUMENT, digest)
         self._mark(ArchiveMember(MemberKind.DOCUMENT, digest))
         arrays, files = references_of(str(tree.get("schema")) if isinstance(tree, dict) else "", tree)
+        differences = self._differences(digest)
         for leaf in arrays.values():
-            self._array(leaf, digest)
+            self._array(leaf, digest, differences.get(str(leaf["content"])))
         for one in set(files.values()):
             self._file(one)
         for content in set(contents_in(tree)) - self.known:
@@ -74,14 +77,29 @@ class _Check:
             raise BadArchive(f"{member.name}: the content of the member does not describe a revision")
         self._revision(content, found["parts"].values())
 
-    def _array(self, leaf: Mapping[str, Any], document: str) -> None:
+    def _array(self, leaf: Mapping[str, Any], document: str, difference: ArrayDifference | None) -> None:
         member = ArchiveMember(MemberKind.ARRAY, str(leaf["content"]))
+        if difference is not None:
+            self._require_size(leaf, document, difference, ArchiveMember(MemberKind.DIFFERENCES, document))
+            if member not in self.archive.members:
+                return
         if member not in self.checked:
-            array = self.archive.array(member.digest)
-            if leaf != {"dtype": array.dtype, "shape": list(array.shape), "content": member.digest}:
-                name = ArchiveMember(MemberKind.DOCUMENT, document).name
-                raise BadArchive(f"{name}: the dtype or shape given here differs from that of the array {member.name}")
+            self._require_size(leaf, document, self.archive.array(member.digest), member)
             self._mark(member)
+
+    def _differences(self, document: str) -> dict[str, ArrayDifference]:
+        found = self.archive.differences(document)
+        if found:
+            self._mark(ArchiveMember(MemberKind.DIFFERENCES, document))
+        return found
+
+    def _require_size(
+        self, leaf: Mapping[str, Any], document: str, array: EncodedArray | ArrayDifference, member: ArchiveMember
+    ) -> None:
+        """Raise `BadArchive` if a document states another dtype or shape than the member with the array."""
+        if leaf["dtype"] != array.dtype or leaf["shape"] != list(array.shape):
+            name = ArchiveMember(MemberKind.DOCUMENT, document).name
+            raise BadArchive(f"{name}: the dtype or shape given here differs from that of the array {member.name}")
 
     def _file(self, digest: str) -> None:
         member = ArchiveMember(MemberKind.FILE, digest)

@@ -6,19 +6,23 @@ import io
 import json
 import re
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from enum import StrEnum
 from typing import Any, BinaryIO, NamedTuple
 
+from marey_schemas.encoding.array_differences import ArrayDifference
 from marey_schemas.encoding.arrays import MAX_ARRAY_BYTES, ArrayError, EncodedArray
 from marey_schemas.encoding.blocks import BlockError, read_spec
 from marey_schemas.encoding.canonical import array_digest, canonical_json
+from marey_schemas.encoding.codecs import MSGPACK, CodecError, decode_tree, encode_tree
 from marey_schemas.sizes import MIB
 from marey_versions.tree.chunks import digest_of
 
 SCHEMA = "marey/archive@1"
 SCHEMA_WITH_FACETS = "marey/archive@2"
 """Schema of archives that have facets; programs that know only the other schema refuse these archives."""
+SCHEMA_WITH_DIFFERENCES = "marey/archive@3"
+"""Schema of archives in which arrays are described by their differences from arrays of earlier versions."""
 MANIFEST = "archive.json"
 """Name of the last member. An archive without this member is incomplete."""
 MOST_BYTES = 256 * MIB
@@ -39,6 +43,11 @@ class MemberKind(StrEnum):
     """Revision that documents refer to: its kind, and the content digests of its parts."""
     FACETS = "facets"
     """Facets of revisions: values by the name of the facet, by the content digest of the revision."""
+    DIFFERENCES = "differences"
+    """Arrays of a document that the archive has only as differences; the digest in the name is that of the document.
+
+    Only the temporary archives of pushes and pulls have such members.
+    """
     DOCUMENT = "documents"
     ARRAY = "arrays"
     FILE = "files"
@@ -49,7 +58,12 @@ class MemberKind(StrEnum):
         return _ENDINGS.get(self, ".json")
 
 
-_ENDINGS = {MemberKind.CHANGES: ".jsonl", MemberKind.ARRAY: ".blocks", MemberKind.FILE: ""}
+_ENDINGS = {
+    MemberKind.CHANGES: ".jsonl",
+    MemberKind.DIFFERENCES: ".msgpack",
+    MemberKind.ARRAY: ".blocks",
+    MemberKind.FILE: "",
+}
 _NAME = re.compile(r"([a-z]+)/([0-9a-f]{64})([.a-z]*)")
 
 
@@ -133,6 +147,23 @@ def stored_array(member: ArchiveMember, data: bytes) -> EncodedArray:
         raise BadArchive(f"{member.name}: {error}") from error
     require_digest(member, array_digest(decoded))
     return EncodedArray(spec.dtype, spec.shape, data, decoded)
+
+
+def differences_member(differences: Iterable[ArrayDifference]) -> bytes:
+    """Return the content of a member with the differences of the arrays of a document."""
+    return encode_tree([one.document for one in differences], MSGPACK, arrays="blocks")
+
+
+def stored_differences(member: ArchiveMember, data: bytes) -> list[ArrayDifference]:
+    """Return the differences in a member. Raises `BadArchive` if the member is not a list of array differences."""
+    try:
+        found = [ArrayDifference.of(one) for one in decode_tree(data, MSGPACK, keep_blocks=True)]
+    except (ArrayError, CodecError, TypeError) as error:
+        raise BadArchive(f"{member.name}: {error}") from error
+    differences = [one for one in found if one is not None]
+    if len(differences) < len(found):
+        raise BadArchive(f"{member.name}: the content of the member is not a list of array differences")
+    return differences
 
 
 def require_digest(member: ArchiveMember, digest: str) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, BinaryIO, NamedTuple
 
+from marey_schemas.encoding.array_differences import ArrayDifference
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.names import is_digest
 from marey_schemas.queue.facets import is_facet_name
@@ -16,6 +17,7 @@ from marey_versions.archive.members import (
     MANIFEST,
     MOST_BYTES,
     SCHEMA,
+    SCHEMA_WITH_DIFFERENCES,
     SCHEMA_WITH_FACETS,
     ArchiveMember,
     BadArchive,
@@ -24,6 +26,7 @@ from marey_versions.archive.members import (
     read_headers,
     require_digest,
     stored_array,
+    stored_differences,
 )
 from marey_versions.records import CommitRecord, DatasetEntry, entry_of, key_of
 from marey_versions.tree.building import build
@@ -96,6 +99,19 @@ class Archive:
         """Return an array after a check that it can be decoded and has the given digest."""
         member = ArchiveMember(MemberKind.ARRAY, digest)
         return stored_array(member, self._read(member))
+
+    def differences(self, document: str) -> dict[str, ArrayDifference]:
+        """Return the arrays of a document that the archive has only as differences, by the digest of the array.
+
+        The archive must build on earlier versions. An array is compared with its digest only by a server that has the
+        base of the difference.
+        """
+        member = ArchiveMember(MemberKind.DIFFERENCES, document)
+        if member not in self.members:
+            return {}
+        if not self.manifest.base:
+            raise BadArchive(f"{member.name}: an archive with the whole history must contain whole arrays")
+        return {one.digest: one for one in stored_differences(member, self._read(member))}
 
     def file(self, digest: str) -> Iterator[bytes]:
         """Yield the bytes of a file in pieces. Raises `BadArchive` after the last piece if the digest differs."""
@@ -220,9 +236,9 @@ def _manifest(data: bytes) -> Manifest:
         schema, manifest = tree["schema"], Manifest(str(tree["dataset"]), str(tree["commit"]), base)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise BadArchive(f"{MANIFEST}: the content of the member is not the manifest of an archive") from error
-    if schema not in (SCHEMA, SCHEMA_WITH_FACETS):
+    if schema not in (SCHEMA, SCHEMA_WITH_FACETS, SCHEMA_WITH_DIFFERENCES):
         raise BadArchive(
-            f"{MANIFEST}: this version of Marey reads {SCHEMA_WITH_FACETS}, not {str(schema)[:80]!r}; update Marey"
+            f"{MANIFEST}: this version of Marey reads {SCHEMA_WITH_DIFFERENCES}, not {str(schema)[:80]!r}; update Marey"
         )
     for digest in (manifest.commit, *base):
         if not is_digest(digest):

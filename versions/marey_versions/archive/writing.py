@@ -12,6 +12,7 @@ from marey_schemas.encoding.canonical import canonical_json
 from marey_versions.archive.members import (
     MANIFEST,
     SCHEMA,
+    SCHEMA_WITH_DIFFERENCES,
     SCHEMA_WITH_FACETS,
     ArchiveMember,
     BadArchive,
@@ -51,8 +52,9 @@ class ArchiveWriter:
         `base` lists the commits that precede those of the archive and that the archive does not contain.
         """
         counts = Counter(name.partition("/")[0] for name in self._held)
+        with_facets = SCHEMA_WITH_FACETS if counts[MemberKind.FACETS] else SCHEMA
         manifest = {
-            "schema": SCHEMA_WITH_FACETS if counts[MemberKind.FACETS] else SCHEMA,
+            "schema": SCHEMA_WITH_DIFFERENCES if counts[MemberKind.DIFFERENCES] else with_facets,
             "dataset": dataset, "commit": commit, "base": sorted(base),
             "members": dict(sorted(counts.items())),
         }  # fmt: skip

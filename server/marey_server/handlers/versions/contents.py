@@ -34,10 +34,11 @@ class ProjectContents(Resource):
         The answer is `{"revisions": [...], "documents": [...], "facets": [...], "tiles": [...]}` in the order of the
         request. A revision has its `kind` and the content digests of its `parts`. Its facets are the numbers that jobs
         have published about it, by name. In documents, references to revisions are replaced by `{"content": digest}`,
-        so that a document has the same digest on every server. For each document in the list `tiles` of the request,
-        the answer has the digests of the tiles of each array, by JSON Pointer. A revision or document that the project
-        does not have is null. If the documents together are too large, the last ones are missing from the list: request
-        them again.
+        so that a document has the same digest on every server. If the request names a `base` for a document, arrays
+        that hardly differ from those of the base are replaced by array differences (see the page about the block
+        format). For each document in the list `tiles` of the request, the answer has the digests of the tiles of each
+        array, by JSON Pointer. A revision or document that the project does not have is null. If the documents together
+        are too large, the last ones are missing from the list: request them again.
         """
         found = await self.look_up(datasets.load_contents, project, body)
         return await self.render_document(Reply(await self.compute(datasets.contents_document, found)))

@@ -1,15 +1,22 @@
-"""Partial arrays in received documents: their bases are read from the project, and the whole arrays are restored."""
+"""Arrays that documents describe by means of another array of the project, their base.
+
+In received documents, these are partial arrays and array differences, from which the whole arrays are restored. In
+documents that are read, arrays are replaced by array differences if the reader has the bases.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 from sqlalchemy import func, select
 
 from marey_schemas.datasets.contents import ReceivedRevision
-from marey_schemas.documents.blob_references import members_of
+from marey_schemas.documents.blob_references import members_of, pointer_to
 from marey_schemas.encoding import blocks
+from marey_schemas.encoding.array_differences import ArrayDifference
 from marey_schemas.encoding.arrays import MAX_ARRAY_BYTES, EncodedArray
 from marey_schemas.encoding.arrayspec import ArrayError, ArraySpec
 from marey_schemas.encoding.partial_arrays import completed, is_partial
@@ -28,26 +35,35 @@ class BasePlace(NamedTuple):
     pointer: str
 
 
-Bases = Mapping[BasePlace, Sequence[bytes]]
-"""Tiles of the bases of partial arrays."""
+@dataclass(frozen=True)
+class Base:
+    """Array of the project from which other arrays are restored."""
+
+    array: EncodedArray
+
+    @cached_property
+    def tiles(self) -> list[bytes]:
+        """The tiles of the array; many partial arrays can have one base."""
+        return blocks.split(self.array.data)
+
+
+Bases = Mapping[BasePlace, Base]
 
 
 def bases_named_in(received: Sequence[ReceivedRevision], take_bytes: Callable[[int], None]) -> set[BasePlace]:
-    """Return the places of the bases of all partial arrays in received documents.
+    """Return the places of the bases of all partial arrays and array differences in received documents.
 
-    `take_bytes` is called with the size of the whole arrays, before they take memory. Raises `InvalidProblem` if a
-    partial array is malformed, or if the arrays together are too large.
+    `take_bytes` is called with the size of the whole arrays, before they take memory. Raises `InvalidProblem` if one of
+    these objects is malformed, or if the arrays together are too large.
     """
     found: set[BasePlace] = set()
     size_bytes = 0
-    for place, partial in _partial_arrays(received):
-        if not all(isinstance(one, str) for one in place):
-            raise _bad_array("the members `base` and `pointer` of a partial array must be texts")
-        try:
-            size_bytes += ArraySpec.parse(partial["dtype"], partial["shape"]).nbytes
-        except ArrayError as error:
-            raise _bad_array(str(error)) from error
-        found.add(place)
+    for one in received:
+        for part, tree in one.parts.items():
+            for _, value in members_of(tree):
+                if (described := _described(value, part)) is not None:
+                    found.add(described.place)
+                    size_bytes += described.size_bytes
     _require_size(size_bytes)
     take_bytes(size_bytes)
     return found
@@ -58,8 +74,8 @@ def load_bases(
     places: set[BasePlace],
     stored: Mapping[str, Mapping[str, str]],
     take_bytes: Callable[[int], None],
-) -> dict[BasePlace, list[bytes]]:
-    """Load the tiles of the bases of partial arrays.
+) -> dict[BasePlace, Base]:
+    """Load the bases of partial arrays and array differences.
 
     `stored` maps content digests and parts to the digests of documents. `take_bytes` is called with the size of these
     documents before they are loaded.
@@ -74,15 +90,15 @@ def load_bases(
     take_bytes(size_bytes)
     trees = documents.load_documents(tx, wanted)
     named = {(digest, place.pointer) for place, digest in digests.items()}
-    tiles = {
-        (digest, pointer): blocks.split(value.data)
+    arrays = {
+        (digest, pointer): Base(value)
         for digest, tree in trees.items()
         for pointer, value in members_of(tree)
         if isinstance(value, EncodedArray) and (digest, pointer) in named
     }
-    found: dict[BasePlace, list[bytes]] = {}
+    found: dict[BasePlace, Base] = {}
     for place, digest in digests.items():
-        base = None if digest is None else tiles.get((digest, place.pointer))
+        base = None if digest is None else arrays.get((digest, place.pointer))
         if base is None:
             raise _bad_array(f"the revision {place.content} has no array at {place.pointer!r} of {place.part!r}")
         found[place] = base
@@ -90,12 +106,15 @@ def load_bases(
 
 
 def restored(value: Any, part: str, bases: Bases) -> Any:
-    """Return the document of a part with a whole array in place of each partial array."""
+    """Return the document of a part with a whole array in place of each partial array and each array difference."""
     if not bases:
         return value
-    if is_partial(value):
+    if (described := _described(value, part)) is not None:
+        base = bases[described.place]
         try:
-            return completed(value, bases[_place(value, part)])
+            if described.difference is not None:
+                return described.difference.applied_to(base.array)
+            return completed(value, base.tiles)
         except ArrayError as error:
             raise _bad_array(str(error)) from error
     if isinstance(value, dict):
@@ -103,22 +122,74 @@ def restored(value: Any, part: str, bases: Bases) -> Any:
     return [restored(member, part, bases) for member in value] if isinstance(value, list) else value
 
 
-def _partial_arrays(received: Sequence[ReceivedRevision]) -> Iterator[tuple[BasePlace, Mapping[str, Any]]]:
-    for one in received:
-        for part, tree in one.parts.items():
-            for _, value in members_of(tree):
-                if is_partial(value):
-                    yield _place(value, part), value
+class _Described(NamedTuple):
+    """Array of a received document that is described by means of a base."""
+
+    place: BasePlace
+    size_bytes: int
+    """Size of the whole array."""
+    difference: ArrayDifference | None
+    """None if the array is a partial array."""
 
 
-def _place(partial: Mapping[str, Any], part: str) -> BasePlace:
-    return BasePlace(partial["base"], part, partial["pointer"])
+def _described(value: Any, part: str) -> _Described | None:
+    """Return what a partial array or an array difference describes; None for any other value of a document."""
+    try:
+        difference = ArrayDifference.of(value)
+        if difference is None and not is_partial(value):
+            return None
+        place = BasePlace(value["base"], part, value["pointer"])
+        size_bytes = ArraySpec.parse(value["dtype"], value["shape"]).nbytes
+    except ArrayError as error:
+        raise _bad_array(str(error)) from error
+    if not all(isinstance(one, str) for one in place):
+        raise _bad_array("the members `base` and `pointer` of a partial array must be texts")
+    return _Described(place, size_bytes, difference)
+
+
+@dataclass
+class DocumentComparison:
+    """DocumentComparison of the documents of one answer with documents that the reader has."""
+
+    left_bytes: int
+    """Size of the arrays that may still be compared, which bounds the time; further arrays are sent whole."""
+
+    def compared(self, value: Any, before: Any, references: Mapping[str, Mapping[str, Any]], content: str) -> Any:
+        """Return a document with array differences in place of the arrays that are similar in the document `before`.
+
+        `references` are the references to the arrays of the document, by JSON Pointer, and `content` is the content
+        digest of the revision with the document `before`.
+        """
+        bases = {at: one for at, one in members_of(before) if isinstance(one, EncodedArray)}
+
+        def visit(pointer: str, one: Any) -> Any:
+            if isinstance(one, EncodedArray):
+                base = bases.get(pointer)
+                if base is None:
+                    return one
+                return self._difference(one, base, content, pointer, references[pointer]["content"])
+            if isinstance(one, dict):
+                return {key: visit(pointer_to(pointer, key), member) for key, member in one.items()}
+            if isinstance(one, list):
+                return [visit(f"{pointer}/{index}", member) for index, member in enumerate(one)]
+            return one
+
+        return visit("", value)
+
+    def _difference(self, array: EncodedArray, base: EncodedArray, content: str, pointer: str, digest: str) -> Any:
+        self.left_bytes -= ArraySpec(array.dtype, array.shape).nbytes
+        found = None
+        if self.left_bytes >= 0:
+            found = ArrayDifference.between(array, base, content, pointer, digest)
+        return array if found is None else found.document
 
 
 def _require_size(size_bytes: int) -> None:
     if size_bytes > MAX_ARRAY_BYTES:
-        most = MAX_ARRAY_BYTES // MIB
-        raise _bad_array(f"the partial arrays of a request, and their bases, may have at most {most} MiB each in total")
+        raise _bad_array(
+            "the arrays that a request describes by a base, and their bases, may have at most "
+            f"{MAX_ARRAY_BYTES // MIB} MiB each in total"
+        )
 
 
 def _bad_array(detail: str) -> InvalidProblem:

@@ -3,28 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sqlalchemy import select
 
 from marey_schemas.access import Role
-from marey_schemas.datasets.contents import ContentsRequest, ExportCheck, ExportPermission, PartOfContent
-from marey_schemas.documents.blob_references import members_of
-from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.datasets.contents import (
+    ContentsRequest,
+    ExportCheck,
+    ExportPermission,
+    RequestedDocument,
+)
+from marey_schemas.documents.blob_references import members_of, references_of
+from marey_schemas.encoding.arrays import MAX_ARRAY_BYTES, EncodedArray
 from marey_schemas.encoding.partial_arrays import tile_digests
 from marey_server.store import documents, projects
 from marey_server.store.datasets.contents import Contents, find_contents_of
 from marey_server.store.datasets.history import revisions_with
 from marey_server.store.datasets.naming import find_dataset
+from marey_server.store.datasets.partial_contents import DocumentComparison
 from marey_server.store.items.consents import find_ended_with, record_override, require_consent
 from marey_server.store.items.facets import facets_of_contents
 from marey_server.store.items.reading import MOST_BYTES_AT_ONCE
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.tables import document, item
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.records import RevisionKey, portable_document, references_in
+
+MOST_BYTES_COMPARED = MAX_ARRAY_BYTES
+"""Total size of the arrays of one answer that are compared with arrays of bases; the other arrays are sent whole."""
 
 
 def check_export(tx: Transaction, project: str, name: str, request: ExportCheck) -> ExportPermission:
@@ -49,16 +58,36 @@ def check_export(tx: Transaction, project: str, name: str, request: ExportCheck)
 
 
 @dataclass(frozen=True)
+class _LoadedDocument:
+    """Document that was loaded for an answer, and the document of which the reader has the arrays."""
+
+    tree: documents.Tree | None
+    """None if the project does not have the document."""
+    base: documents.Tree | None = None
+    base_content: str = ""
+    """Content digest of the revision with the document `base`."""
+    arrays: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """References to the arrays of `tree`, by JSON Pointer, if there is a `base`."""
+
+
+@dataclass(frozen=True)
 class LoadedContents:
-    """Members of the answer to a request for contents, and the documents for whose arrays it lists the tiles."""
+    """Members of the answer to a request for contents, and the documents whose arrays must still be compared."""
 
     members: Mapping[str, Any]
-    tiled: Sequence[documents.Tree | None]
+    documents: Sequence[_LoadedDocument]
+    tiled: Sequence[_LoadedDocument]
+    """Documents for whose arrays the answer lists the tiles."""
 
 
 def contents_document(loaded: LoadedContents) -> dict[str, Any]:
     """Return the answer to a request for contents. It takes long for large arrays, so no transaction should be open."""
-    return {**loaded.members, "tiles": [_tiles_of(tree) for tree in loaded.tiled]}
+    comparison = DocumentComparison(MOST_BYTES_COMPARED)
+    found = [
+        one.tree if one.base is None else comparison.compared(one.tree, one.base, one.arrays, one.base_content)
+        for one in loaded.documents
+    ]
+    return {**loaded.members, "documents": found, "tiles": [_tiles_of(one.tree) for one in loaded.tiled]}
 
 
 def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> LoadedContents:
@@ -69,14 +98,16 @@ def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> Lo
     """
     project_row = projects.require(tx, project)
     wanted = {*request.revisions, *(one.content for one in (*request.documents, *request.tiles))}
+    wanted |= {one.base for one in request.documents if one.base is not None}
     held = {one: RevisionKey(*key) for one, key in revisions_with(tx, project_row.id, wanted).items()}
     contents = find_contents_of(tx, project_row.id, held.values())
     members = {
         "revisions": _described(tx, held, contents, request),
-        "documents": _portable(tx, project_row.id, _loaded(tx, held, request.documents)),
         "facets": _facets(tx, project_row.id, request),
     }
-    return LoadedContents(members, tiled=_loaded(tx, held, request.tiles))
+    loaded = _portable(tx, project_row.id, _loaded(tx, held, request.documents))
+    places = [RequestedDocument(content=one.content, part=one.part) for one in request.tiles]
+    return LoadedContents(members, loaded, tiled=_loaded(tx, held, places))
 
 
 def _facets(tx: Transaction, project_id: str, request: ContentsRequest) -> list[dict[str, float]]:
@@ -99,26 +130,46 @@ def _described(
 
 
 def _loaded(
-    tx: Transaction, held: Mapping[str, RevisionKey], places: Sequence[PartOfContent]
-) -> list[documents.Tree | None]:
-    """Load the documents at `places`, as many as fit into an answer; None stands for one that does not exist."""
-    parts = read_part_digests(tx, {held[one.content] for one in places if one.content in held})
-    digests = [parts[held[one.content]].get(one.part) if one.content in held else None for one in places]
-    present = sorted({digest for digest in digests if digest is not None})
+    tx: Transaction, held: Mapping[str, RevisionKey], places: Sequence[RequestedDocument]
+) -> list[_LoadedDocument]:
+    """Load the documents at `places`, each with its base, as many as fit into an answer."""
+    named = {content for one in places for content in (one.content, one.base)}
+    keys = {content: held[content] for content in named if content is not None and content in held}
+    parts = read_part_digests(tx, set(keys.values()))
+    of_content = {content: parts[key] for content, key in keys.items()}
+    digests = [
+        (of_content.get(one.content, {}).get(one.part), of_content.get(one.base or "", {}).get(one.part))
+        for one in places
+    ]
+    present = sorted({digest for pair in digests for digest in pair if digest is not None})
+    statement = select(document.c.digest, document.c.size_bytes)
     sizes = {
         row.digest: row.size_bytes
-        for row in tx.execute(select(document.c.digest, document.c.size_bytes).where(document.c.digest.in_(present)))
+        for some in in_lists(present)
+        for row in tx.execute(statement.where(document.c.digest.in_(some)))
     }
     chosen = _that_fit(digests, sizes)
-    loaded = documents.load_documents(tx, {digest for digest in chosen if digest is not None})
-    return [None if digest is None else loaded[digest] for digest in chosen]
+    trees = documents.load_documents(tx, {digest for pair in chosen for digest in pair if digest is not None})
+    bodies = documents.load_bodies(tx, {digest for digest, base in chosen if digest is not None and base is not None})
+    return [
+        _LoadedDocument(
+            None if digest is None else trees[digest],
+            None if base is None or digest is None else trees[base],
+            place.base or "",
+            references_of("", bodies[digest])[0] if digest in bodies else {},
+        )
+        for place, (digest, base) in zip(places, chosen, strict=False)
+    ]
 
 
-def _portable(tx: Transaction, project_id: str, trees: Sequence[documents.Tree | None]) -> list[dict[str, Any] | None]:
+def _portable(tx: Transaction, project_id: str, loaded: Sequence[_LoadedDocument]) -> list[_LoadedDocument]:
     """Return the documents with content digests in place of references to revisions."""
-    referred = {one for tree in trees if tree is not None for one in references_in(tree)}
+    referred = {reference for one in loaded if one.tree is not None for reference in references_in(one.tree)}
     contents = find_contents_of(tx, project_id, referred)
-    return [None if tree is None else portable_document(tree, contents.revisions.get) for tree in trees]
+    return [
+        one if one.tree is None else replace(one, tree=portable_document(one.tree, contents.revisions.get))
+        for one in loaded
+    ]
 
 
 def _tiles_of(tree: documents.Tree | None) -> dict[str, list[str]] | None:
@@ -128,14 +179,16 @@ def _tiles_of(tree: documents.Tree | None) -> dict[str, list[str]] | None:
     return {pointer: tile_digests(one) for pointer, one in members_of(tree) if isinstance(one, EncodedArray)}
 
 
-def _that_fit(digests: list[str | None], sizes: Mapping[str, int]) -> list[str | None]:
-    """Cut the list of digests so that the documents have at most `MOST_BYTES_AT_ONCE` bytes in total.
+def _that_fit(
+    digests: list[tuple[str | None, str | None]], sizes: Mapping[str, int]
+) -> list[tuple[str | None, str | None]]:
+    """Cut a list of documents and their bases, so that they have at most `MOST_BYTES_AT_ONCE` bytes in total.
 
-    The first digest is always kept, even if its document alone is larger than this limit.
+    The first document and its base are always kept, even if they alone are larger than this limit.
     """
     size_bytes = 0
-    for place, digest in enumerate(digests):
-        size_bytes += 0 if digest is None else sizes[digest]
+    for place, pair in enumerate(digests):
+        size_bytes += sum(sizes[digest] for digest in pair if digest is not None)
         if place and size_bytes > MOST_BYTES_AT_ONCE:
             return digests[:place]
     return digests

@@ -1,0 +1,181 @@
+"""Documents, arrays and files of an archive that is being written, read from the server by content digest."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from marey_client.archives.contents import first_documents, read_facets, request_contents
+from marey_client.blobs import Blobs
+from marey_client.errors import Invalid, UnexpectedAnswer
+from marey_client.progress import OnProgress
+from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent, RequestedDocument
+from marey_schemas.documents.blob_references import references_of
+from marey_schemas.encoding.array_differences import ArrayDifference, detach_differences
+from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.encoding.canonical import canonical_json, detach_arrays
+from marey_schemas.sizes import batched
+from marey_versions.archive.members import ArchiveMember, MemberKind, differences_member
+from marey_versions.archive.writing import ArchiveWriter
+from marey_versions.records import contents_in
+from marey_versions.tree.chunks import digest_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from marey_client.transport import Transport
+
+OF_UNKNOWN_FIELDS = "invalid-body"
+"""Code of the error with which servers of earlier versions refuse a request that names bases."""
+CheckContents = Callable[[Sequence[str]], object]
+"""Function called with content digests of revisions before their documents are read."""
+
+
+class EarlierDocument(NamedTuple):
+    """Document that another one has replaced: its digest, and its address on the server."""
+
+    digest: str
+    place: PartOfContent
+
+
+@dataclass
+class DocumentWriter:
+    """Writer of the documents of an archive, with everything to which they refer."""
+
+    transport: Transport
+    project_url: str
+    writer: ArchiveWriter
+    folder: Path
+    """Folder in whose file system files are kept, without a name, until they are in the archive."""
+    on_progress: OnProgress
+    check: CheckContents
+    differences: bool
+    """Whether arrays may be replaced by their differences from arrays that the reader of the archive has."""
+    known: set[str] = field(default_factory=set)
+    """Content digests of the revisions that the archive has, or will have."""
+    documents: dict[str, PartOfContent] = field(default_factory=dict)
+    """Address on the server of each document of an entry, by the digest of the document."""
+    earlier: dict[str, EarlierDocument] = field(default_factory=dict)
+    """The earlier document, by the digest of the document that replaced it."""
+
+    def run(self) -> None:
+        """Add all documents, and the facets of all revisions."""
+        self.check(sorted(self.known))
+        self._add_documents(self.documents)
+        self._add_facets()
+
+    def _add_documents(self, wanted: Mapping[str, PartOfContent]) -> None:
+        """Add documents, given by digest, to the archive.
+
+        New revisions, arrays and files to which a document refers are added before the document.
+        """
+        digests = [one for one in wanted if ArchiveMember(MemberKind.DOCUMENT, one) not in self.writer]
+        total = len(digests)
+        while digests:
+            trees = self._fetch([self._requested(digest, wanted[digest]) for digest in digests[:MOST_CONTENTS]])
+            together = dict(zip(digests, trees, strict=False))
+            self._add_together(together)
+            digests = digests[len(together) :]
+            self.on_progress("reading documents", total - len(digests), total)
+
+    def _add_together(self, trees: Mapping[str, Any]) -> None:
+        arrays: dict[str, EncodedArray] = {}
+
+        def keep(name: str, array: NDArray[Any] | EncodedArray) -> None:
+            arrays[name] = array if isinstance(array, EncodedArray) else EncodedArray.of(array)
+
+        differences: dict[str, list[ArrayDifference]] = {digest: [] for digest in trees}
+        bodies = {
+            digest: detach_arrays(detach_differences(tree, differences[digest].append), keep)
+            for digest, tree in trees.items()
+        }
+        self._add_revisions({one for body in bodies.values() for one in contents_in(body)} - self.known)
+        for name, array in arrays.items():
+            self.writer.add(ArchiveMember(MemberKind.ARRAY, name), array.data)
+        for digest, body in bodies.items():
+            data = canonical_json(body)
+            if digest_of(data) != digest:
+                raise UnexpectedAnswer(f"the server's document {digest} does not match its digest")
+            if found := differences[digest]:
+                self.writer.add(ArchiveMember(MemberKind.DIFFERENCES, digest), differences_member(found))
+            for file in self._files(digest, body):
+                self._add_file(ArchiveMember(MemberKind.FILE, file))
+            self.writer.add(ArchiveMember(MemberKind.DOCUMENT, digest), data)
+
+    def _files(self, digest: str, body: Any) -> set[str]:
+        """Return the digests of the files that a document names, without the files that its earlier version named."""
+        named = _files_in(body)
+        if named and digest in self.earlier:
+            place = self.earlier[digest].place
+            (before,) = self._fetch([RequestedDocument(content=place.content, part=place.part)])
+            named -= _files_in(before)
+        return named
+
+    def _add_revisions(self, contents: Iterable[str]) -> None:
+        """Add revisions, given by content digest, and their documents; other documents refer to these revisions."""
+        waiting = sorted(contents)
+        self.known.update(waiting)
+        self.check(waiting)
+        for some in batched(waiting, MOST_CONTENTS):
+            found = self._ask(ContentsRequest(revisions=tuple(some)))["revisions"]
+            for content, one in zip(some, found, strict=True):
+                if one is None:
+                    raise UnexpectedAnswer(f"a document refers to the content {content}, which the project lacks")
+                self._add_documents(
+                    {digest: PartOfContent(content=content, part=part) for part, digest in one["parts"].items()}
+                )
+                self.writer.add(ArchiveMember(MemberKind.REVISION, content), canonical_json(one))
+
+    def _add_facets(self) -> None:
+        """Add the facets of all revisions, which jobs may have published after the revisions were committed.
+
+        Each member has those of a few revisions, because readers refuse members of more than `MOST_BYTES`.
+        """
+        for some in batched(sorted(self.known), MOST_CONTENTS):
+            if facets := read_facets(self.transport, self.project_url, some):
+                data = canonical_json(facets)
+                self.writer.add(ArchiveMember(MemberKind.FACETS, digest_of(data)), data)
+
+    def _add_file(self, member: ArchiveMember) -> None:
+        if member in self.writer:
+            return
+        with tempfile.TemporaryFile(dir=self.folder) as file:  # without a name, so that a killed process leaves none
+            Blobs(self.transport).fetch_into(member.digest, file)
+            size_bytes = file.tell()
+            file.seek(0)
+            self.writer.add_stream(member, file, size_bytes)
+
+    def _requested(self, digest: str, place: PartOfContent) -> RequestedDocument:
+        """Return the request for a document, with the revision whose arrays the reader of the archive has.
+
+        The reader has a revision that an entry had before the commits of the archive.
+        """
+        one: EarlierDocument | None = EarlierDocument(digest, place)
+        passed: set[str] = set()
+        while self.differences and one is not None and one.digest not in passed:
+            passed.add(one.digest)
+            one = self.earlier.get(one.digest)
+            if one is not None and one.place.content not in self.known:
+                return RequestedDocument(content=place.content, part=place.part, base=one.place.content)
+        return RequestedDocument(content=place.content, part=place.part)
+
+    def _fetch(self, places: Sequence[RequestedDocument]) -> list[Any]:
+        """Request the documents at `places` in order; return as many as fit into one answer, at least one."""
+        try:
+            return first_documents(self.transport, self.project_url, places, keep_blocks=True)
+        except Invalid as error:
+            if error.code != OF_UNKNOWN_FIELDS or all(one.base is None for one in places):
+                raise
+            self.differences = False
+            whole = [RequestedDocument(content=one.content, part=one.part) for one in places]
+            return first_documents(self.transport, self.project_url, whole, keep_blocks=True)
+
+    def _ask(self, request: ContentsRequest) -> dict[str, Any]:
+        return request_contents(self.transport, self.project_url, request, keep_blocks=True)
+
+
+def _files_in(document: Mapping[str, Any]) -> set[str]:
+    return set(references_of(str(document.get("schema")), document)[1].values())

@@ -1,0 +1,173 @@
+"""Differences between arrays: an array is sent as the frames in which it differs from one that the receiver has.
+
+In a document, such an *array difference* is an object in place of the array. It names the other array, its *base*, by
+the content digest of a revision and a JSON Pointer into the same part of this revision. The other members are `dtype`
+and `shape`; `digest`, the content digest of the whole array; `frames`, the indices of the frames that differ; and
+`difference`, the new values of these frames minus the values of the base. The values are subtracted as unsigned
+integers (see `tiles`), so that the sum is exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_schemas.encoding import blocks
+from marey_schemas.encoding.arrays import EncodedArray, array_from_leaf, with_blocks
+from marey_schemas.encoding.arrayspec import ArrayError, ArraySpec
+from marey_schemas.encoding.canonical import array_digest
+from marey_schemas.encoding.tiles import from_integers, to_integers
+
+MOST_CHANGED = 1 / 2
+"""Share of the frames above which an array is sent whole, because its difference would hardly be smaller."""
+_MEMBERS = frozenset({"base", "pointer", "dtype", "shape", "digest", "frames", "difference"})
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayDifference:
+    """Array as a document describes it: by a base, and by the frames in which it differs from the base."""
+
+    base: str
+    """Content digest of the revision that has the base."""
+    pointer: str
+    dtype: str
+    shape: tuple[int, ...]
+    digest: str
+    """Content digest of the whole array."""
+    frames: NDArray[Any] | EncodedArray
+    """Indices of the frames that differ, in ascending order."""
+    difference: NDArray[Any] | EncodedArray
+    """Differences (len(frames), columns), as unsigned integers of the size of the array's elements."""
+
+    @classmethod
+    def of(cls, value: Any) -> ArrayDifference | None:
+        """Return the array difference that a value of a document describes; None if it describes none.
+
+        Raises `ArrayError` if dtype or shape are malformed.
+        """
+        if not isinstance(value, Mapping) or value.keys() != _MEMBERS:
+            return None
+        spec = ArraySpec.parse(value["dtype"], value["shape"])
+        return cls(**{**value, "dtype": spec.dtype, "shape": spec.shape})
+
+    @classmethod
+    def between(
+        cls, array: EncodedArray, base: EncodedArray, content: str, pointer: str, digest: str
+    ) -> ArrayDifference | None:
+        """Return an array as its difference from a base; None if this would not be smaller.
+
+        `content` and `pointer` name the base; `digest` is the content digest of the array. At most half of the array is
+        held in memory, decoded.
+        """
+        spec = ArraySpec(array.dtype, array.shape)
+        if spec != ArraySpec(base.dtype, base.shape) or not spec.shape:
+            return None
+        most = MOST_CHANGED * spec.shape[0]
+        numbers: list[NDArray[np.intp]] = [np.empty(0, np.intp)]
+        rows: list[NDArray[Any]] = [np.empty((0, _columns(spec)), _unsigned(spec))]
+        try:
+            for within in blocks.changed_blocks(array.data, base.data):
+                new, old = (_integers(blocks.decode(one.data, frames=within), spec) for one in (array, base))
+                changed = np.flatnonzero((new != old).any(axis=1))
+                numbers.append(changed + within.start)
+                rows.append(new[changed] - old[changed])
+                if (most := most - len(changed)) < 0:
+                    return None
+        except blocks.BlockError:  # an array that was stored with another layout
+            return None
+        frames = np.concatenate(numbers).astype("<u4")
+        difference = EncodedArray.of(np.concatenate(rows))
+        if len(difference.data) >= len(array.data):
+            return None
+        return cls(content, pointer, spec.dtype, spec.shape, digest, frames, difference)
+
+    @property
+    def nbytes(self) -> int:
+        """The size of the whole array in bytes."""
+        return ArraySpec(self.dtype, self.shape).nbytes
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The object that stands for the array in a document."""
+        return {
+            "base": self.base, "pointer": self.pointer, "dtype": self.dtype, "shape": list(self.shape),
+            "digest": self.digest, "frames": self.frames, "difference": self.difference,
+        }  # fmt: skip
+
+    def applied_to(self, base: EncodedArray) -> NDArray[Any] | EncodedArray:
+        """Return the whole array, checked as if it had been sent whole; tiles without changes are those of the base.
+
+        Raises `ArrayError` if the difference does not match the base, or if the result has another digest.
+        """
+        spec = ArraySpec(self.dtype, self.shape)
+        if spec != ArraySpec(base.dtype, base.shape) or not spec.shape:
+            raise ArrayError("bad-array", f"the difference is of an array {spec}, but its base has another size")
+        frames, difference = self._checked(spec)
+        dtype = np.dtype(spec.dtype)
+
+        def add(table: NDArray[Any], rows: NDArray[np.intp], places: slice) -> None:
+            table[rows] = from_integers(to_integers(table[rows]) + difference[places], dtype)
+
+        try:
+            data = blocks.with_edited_frames(base.data, frames, add)
+        except blocks.BlockError as error:
+            raise ArrayError("bad-array", str(error)) from error
+        leaf = {"dtype": spec.dtype, "shape": spec.shape, "encoding": "blocks", "data": data}
+        array = array_from_leaf(leaf)
+        if array_digest(array) != self.digest:
+            raise ArrayError("bad-array", "with this base and difference, the array does not have its digest")
+        return with_blocks(leaf, array)
+
+    def _checked(self, spec: ArraySpec) -> tuple[NDArray[np.intp], NDArray[Any]]:
+        """Return `frames` and `difference` as arrays; sizes are checked before memory is allocated."""
+        expected = _unsigned(spec)
+        frames, difference = (_decoded(one, spec.nbytes) for one in (self.frames, self.difference))
+        if frames.ndim != 1 or frames.dtype.kind not in "iu":
+            raise ArrayError("bad-array", "the member `frames` of an array difference must be a list of integers")
+        numbers = frames.astype(np.int64)
+        outside = len(numbers) and (numbers[0] < 0 or numbers[-1] >= spec.shape[0])
+        if outside or (np.diff(numbers) <= 0).any():
+            raise ArrayError("bad-array", "the frames of an array difference must be ascending indices of the array")
+        if difference.dtype != expected or difference.shape != (len(numbers), _columns(spec)):
+            raise ArrayError(
+                "bad-array", f"the member `difference` must be an array {expected.str} of {len(numbers)} frames"
+            )
+        return numbers.astype(np.intp), difference
+
+
+def detach_differences(tree: Any, keep: Callable[[ArrayDifference], None]) -> Any:
+    """Return a document with each array difference replaced by the reference to the array, as `detach_arrays` does.
+
+    `keep` is called with each array difference. Raises `ArrayError` if one is malformed.
+    """
+    if isinstance(tree, Mapping):
+        found = ArrayDifference.of(tree)
+        if found is None:
+            return {key: detach_differences(member, keep) for key, member in tree.items()}
+        keep(found)
+        return {"dtype": found.dtype, "shape": list(found.shape), "content": found.digest}
+    return [detach_differences(member, keep) for member in tree] if isinstance(tree, list) else tree
+
+
+def _decoded(array: Any, most_bytes: int) -> NDArray[Any]:
+    found = array.decode(max_bytes=most_bytes) if isinstance(array, EncodedArray) else array
+    if not isinstance(found, np.ndarray):
+        raise ArrayError("bad-array", "the members `frames` and `difference` of an array difference must be arrays")
+    return found
+
+
+def _columns(spec: ArraySpec) -> int:
+    return int(np.prod(spec.shape[1:], dtype=np.int64))
+
+
+def _unsigned(spec: ArraySpec) -> np.dtype[Any]:
+    return np.dtype(f"<u{np.dtype(spec.dtype).itemsize}")
+
+
+def _integers(frames: NDArray[Any], spec: ArraySpec) -> NDArray[Any]:
+    """Return the (frames, columns) integers of decoded frames."""
+    return to_integers(frames.reshape(len(frames), _columns(spec)))
