@@ -110,7 +110,7 @@ def run_texts(connection: Connection, texts: Sequence[str]) -> list[Any]:
     """Run statements without parameters on Postgres, in one round trip; return the rows of the last one."""
     try:
         with closing(connection.connection.cursor()) as cursor:
-            cursor.execute("; ".join(texts), prepare=False)
+            cursor.execute("; ".join(texts))
             while cursor.nextset():
                 pass
             return list(cursor.fetchall())
