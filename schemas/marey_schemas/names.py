@@ -32,6 +32,9 @@ DIGEST_PATTERN = r"^sha256:[0-9a-f]{64}$"
 Digest = Annotated[str, StringConstraints(pattern=DIGEST_PATTERN)]
 """Digest of bytes: `sha256:` and 64 hexadecimal digits."""
 
+ShownText = Annotated[str, StringConstraints(min_length=1, pattern=r"^[^\x00-\x1f\x7f-\x9f]+$")]
+"""Text of a program that is shown to people: without control characters, with which it could change a terminal."""
+
 PartName = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 
 Message = Annotated[str, StringConstraints(max_length=2000)]

@@ -23,9 +23,12 @@ from marey_client.marey import Marey
 from marey_schemas.access import UserCreate
 from marey_server.access.passwords import hash_password
 from marey_server.access.principal import SYSTEM
+from marey_server.process import services
+from marey_server.process.operator_metrics import OperatorMetrics
 from marey_server.store import users
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import SERVER
+from marey_server.store.monitoring.figures import Figures
 
 SERVE = "import asyncio; from marey_server.app import serve; from marey_server.process.settings import Settings; "
 
@@ -224,6 +227,32 @@ def test_metrics_tell_the_sizes_of_queues_and_pools(server: Server) -> None:
     assert float(sizes["marey_connections"]) >= 1
     assert float(sizes["marey_children"]) == float(sizes['marey_waiting{lane="children"}']) == 0
     assert float(sizes["marey_request_memory_bytes"]) >= 0
+
+
+def test_metrics_never_wait_for_the_database_except_for_the_first_numbers(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert 'marey_workers{version="unknown"}' in metrics(server)  # the first request already shows numbers
+    begun, going_on = threading.Event(), threading.Event()
+
+    def read_slowly(*_given: Any, **_options: Any) -> Figures:
+        begun.set()
+        going_on.wait(PATIENCE_S)
+        return Figures(uploads=7)
+
+    monkeypatch.setattr(services, "read_figures", read_slowly)
+    monkeypatch.setattr(services, "FIGURES_WAIT_S", PATIENCE_S)
+    monkeypatch.setattr(OperatorMetrics, "is_due", True)
+    try:
+        assert "marey_upload_sessions 0.0" in metrics(server)  # and does not hang
+        assert begun.wait(PATIENCE_S)
+        assert "marey_upload_sessions 0.0" in metrics(server)
+    finally:
+        going_on.set()
+    deadline = time.monotonic() + PATIENCE_S
+    while "marey_upload_sessions 7.0" not in metrics(server):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 def test_metrics_tell_how_many_requests_are_under_way(server: Server) -> None:

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from marey_schemas.base import Answer, Request
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.kinds import Kind
-from marey_schemas.names import MOST_TAGS, CollectionPath, ItemName, Tag
+from marey_schemas.names import MOST_TAGS, CollectionPath, ItemName, ShownText, Tag
 from marey_schemas.queue.facets import MOST_MEASURED, ItemFacets
 from marey_schemas.queue.jobs import ItemInput, JobOutput, JobState, Progress, Resources
 
@@ -28,14 +28,14 @@ PROTOCOL_VERSION = 1
 class ClaimRequest(Request):
     """Request of a worker for jobs."""
 
-    worker: str = Field(min_length=1, max_length=255, description="Name of the worker, shown to people.")
-    kinds: tuple[str, ...] = Field(min_length=1, max_length=256)
+    worker: ShownText = Field(max_length=255, description="Name of the worker, shown to people.")
+    kinds: tuple[ShownText, ...] = Field(min_length=1, max_length=256)
     labels: dict[str, str] = Field(default_factory=dict)
     max: int = Field(1, ge=1, le=256)
     wait_s: float = Field(0, ge=0, le=30)
     protocol: int = PROTOCOL_VERSION
-    version: str | None = Field(
-        None, min_length=1, max_length=64, description="Version of Marey that the worker runs, shown to administrators."
+    version: ShownText | None = Field(
+        None, max_length=64, description="Version of Marey that the worker runs, shown to administrators."
     )
     job: str | None = Field(None, description="Claim only this job.")
     claim_id: str | None = Field(

@@ -1,8 +1,8 @@
 """Metrics about the queue, workers and stored data, for operators.
 
-Counters count what this process did. Numbers from the database are the same in every process that shares it; they are
-read for a request to /metrics, but not again until at least `REFRESH_S` have passed, and 20 times the duration of the
-last read.
+Counters count what this process did. Numbers from the database are the same in every process that shares it. A request
+to /metrics starts a read of these numbers, but not before at least `REFRESH_S` have passed, and 20 times the duration
+of the last read. The request does not wait for this read: it shows the numbers of the last one, with their age.
 """
 
 from __future__ import annotations
@@ -34,9 +34,11 @@ class OperatorMetrics(Observer):
             "less than 3 seconds.", registry=registry,
         )  # fmt: skip
         self.figures_age = Gauge(
-            "marey_figures_age_seconds", "Time since the numbers of jobs, workers, uploads and stored bytes were read "
-            "from the database.", registry=registry,
+            "marey_figures_age_seconds", "Age of the numbers of jobs, workers, uploads, stored bytes and the database. "
+            "A request for metrics shows the numbers that were read for an earlier request.", registry=registry,
         )  # fmt: skip
+        self.has_figures = False
+        """Whether numbers were read from the database since the start."""
         self._feed_read_s = self._figures_read_s = time.monotonic()
         self._next_read_s = 0.0
         self.feed_age.set_function(lambda: time.monotonic() - self._feed_read_s)
@@ -76,8 +78,15 @@ class OperatorMetrics(Observer):
     def _add_stored(self, registry: CollectorRegistry) -> None:
         self.uploads = Gauge("marey_upload_sessions", "Unfinished uploads.", registry=registry)
         self.stored_bytes = Gauge(
-            "marey_stored_bytes", "Bytes of the revisions of all projects, by backing of blobs (database or "
-            "directory). Bytes that several revisions share count for each of them.", ("backing",), registry=registry,
+            "marey_stored_bytes", "Bytes that the quotas of all projects count, by backing of blobs (database or "
+            "directory): a part of an item counts in each revision that changed it. Bytes that several items or "
+            "projects share are stored once, but count for each of them. Deleted items take space until they are "
+            "purged, but do not count. `marey_database_bytes` shows the space that is taken.", ("backing",),
+            registry=registry,
+        )  # fmt: skip
+        self.database_bytes = Gauge(
+            "marey_database_bytes", "Space that the database takes on its disk, with the free space inside it. Blobs "
+            "in the folder `blobs` are not part of it.", registry=registry,
         )  # fmt: skip
         self.disk_free = Gauge("marey_disk_free_bytes", "Free bytes on the disk of the data folder.", registry=registry)
         self.disk_floor = Gauge(
@@ -105,13 +114,14 @@ class OperatorMetrics(Observer):
 
     def show(self, figures: Figures, backing: str) -> None:
         """Show numbers that were read from the database."""
-        self._figures_read_s = time.monotonic()
+        self.has_figures, self._figures_read_s = True, time.monotonic()
         _replace(self.jobs_queued, {key: one.count for key, one in figures.queued.items()})
         _replace(self.oldest_age, {key: one.oldest_age_s for key, one in figures.queued.items()})
         _replace(self.jobs_running, {(kind,): count for kind, count in figures.running.items()})
         _replace(self.workers, {(version,): count for version, count in figures.workers.items()})
         self.uploads.set(figures.uploads)
         self.stored_bytes.labels(backing).set(figures.stored_bytes)
+        self.database_bytes.set(figures.database_bytes)
 
     def count_ended(self, state: str, reason: str | None) -> None:
         """Count a job that has ended."""

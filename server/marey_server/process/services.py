@@ -49,7 +49,7 @@ ANSWER_ENTRY_BYTES = 512
 MODEL_CACHE_BYTES = 64 << 20
 """Greatest size of the cache of models' documents, in bytes."""
 FIGURES_WAIT_S = 0.5
-"""Greatest number of seconds that a request for metrics waits for numbers from the database."""
+"""Greatest number of seconds that a request for metrics waits for the first numbers from the database."""
 TOKENS_REMEMBERED = 10_000
 ADMISSIONS_REMEMBERED = 10_000
 
@@ -168,15 +168,15 @@ class Services:
             self.database.submit_write(SYSTEM, tokens.note_use, token_id)
 
     async def refresh_figures(self) -> None:
-        """Read the numbers about the queue and stored data for the metrics, unless they were read a short time ago.
+        """Begin to read the numbers about the queue and stored data for the metrics, unless they were read recently.
 
-        This method returns after `FIGURES_WAIT_S` even if the database is busy; the metrics show the result later.
+        Does not wait for the result, which later requests for metrics show. Only while nothing was read yet, this
+        method waits, at most `FIGURES_WAIT_S`.
         """
-        if self._reading_figures is None or self._reading_figures.done():
-            if not self.metrics.operator.is_due:
-                return
+        if (self._reading_figures is None or self._reading_figures.done()) and self.metrics.operator.is_due:
             self._reading_figures = asyncio.create_task(self._read_figures())
-        await asyncio.wait({self._reading_figures}, timeout=FIGURES_WAIT_S)
+        if self._reading_figures is not None and not self.metrics.operator.has_figures:
+            await asyncio.wait({self._reading_figures}, timeout=FIGURES_WAIT_S)
 
     async def _read_figures(self) -> None:
         shown, begun_s = self.metrics.operator, time.monotonic()

@@ -18,7 +18,7 @@ from marey_server.access.roles import STRICTEST
 from marey_server.store import tables
 from marey_server.store.blob_backings import BlobBacking
 from marey_server.store.database.clock import Clock
-from marey_server.store.database.prepared import Prepared
+from marey_server.store.database.prepared import Prepared, run_together
 from marey_server.store.wakeups import COMMITTED_EVENTS, wakeups
 
 _MOST_IN_LIST = 1000
@@ -89,6 +89,8 @@ class Transaction:
         blobs: BlobBacking,
         quotas: Quotas = Quotas(),
         observer: Observer = IGNORED,
+        *,
+        now_us: int | None = None,
     ) -> None:
         self.connection = connection
         self.principal = principal
@@ -106,7 +108,7 @@ class Transaction:
         self.new_document_bytes = 0
         """Number of bytes of new documents and arrays that this transaction has stored."""
         self._clock = clock
-        self._now_us: int | None = None
+        self._now_us = now_us
         self._after_commit: list[Callable[[], None]] = []
         self._has_emitted = False
         self._locks: set[tuple[str, bool]] = set()
@@ -142,6 +144,13 @@ class Transaction:
         """Return the first row of a prepared statement, or None."""
         rows = statement.run(self.connection, parameters)
         return rows[0] if rows else None
+
+    def run_together(self, *runs: tuple[Prepared, Mapping[str, Any]]) -> list[list[Any]]:
+        """Run prepared statements that do not depend on each other, and return the rows of each.
+
+        On Postgres, all of them take a single round trip.
+        """
+        return run_together(self.connection, runs)
 
     def run_each(self, statement: Prepared, many: Sequence[Mapping[str, Any]]) -> None:
         """Run a prepared statement once for each mapping in `many`."""

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from marey_client import embedded
 from marey_client.cli import processes
 from marey_client.cli.app import app
+from marey_client.cli.terminal.output import print_table
 from marey_schemas.queue.workers import Worker
 
 
@@ -24,3 +25,8 @@ def test_a_worker_starts_without_a_subcommand_and_workers_are_listed_with_one(mo
     assert "host:1" in told
     assert "away" in told
     assert len(started) == 1
+
+
+def test_a_table_shows_control_characters_as_escapes(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table(("worker",), [("Ångström\x1b]0;title\x07\x9b31m",)])
+    assert r"Ångström\x1b]0;title\x07\x9b31m" in capsys.readouterr().out

@@ -8,6 +8,7 @@ from marey_server.access.principal import SYSTEM
 from marey_server.process.observe import Metrics
 from marey_server.store.monitoring.figures import Figures, read_figures
 from marey_server.store.monitoring.workers import WorkerMemory
+from marey_server.store.tables import server_state
 
 
 def figures(desk: Desk) -> Figures:
@@ -32,6 +33,13 @@ def test_figures_count_queued_and_running_jobs_and_workers_and_never_name_what_a
     assert shown.running == {"errand": 1}
     assert shown.workers == {"1.0": 2, "other": 1, "unknown": 1}  # the desk's own worker runs a job
     assert (shown.uploads, shown.stored_bytes) == (0, 0)
+
+
+def test_the_size_of_the_database_grows_with_its_content(desk: Desk) -> None:
+    before = figures(desk).database_bytes
+    added = {"key": "large", "value": "".join(map(str, range(500_000)))}  # Postgres compresses what repeats itself
+    desk.database.write(SYSTEM, lambda tx: tx.execute(tx.insert_or_ignore(server_state, added)).rowcount)
+    assert figures(desk).database_bytes > before > 0
 
 
 def test_counters_count_ends_retries_lost_leases_and_delays_of_claims(desk: Desk) -> None:

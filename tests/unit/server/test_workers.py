@@ -1,6 +1,7 @@
 """List of workers: what claims and attempts show about them, and who may see it."""
 
 import pytest
+from pydantic import ValidationError
 from tests.support.queue_desk import Desk
 
 from marey_schemas.queue.worker_protocol import ClaimRequest
@@ -27,7 +28,7 @@ class Seconds:
 
 
 def claim_of(name: str, **fields: object) -> ClaimRequest:
-    return ClaimRequest.model_validate({"worker": name, "kinds": ["errand"], **fields})
+    return ClaimRequest.model_validate({"worker": name, "kinds": ["errand"]} | fields)
 
 
 def workers(desk: Desk, memory: WorkerMemory) -> dict[str, Worker]:
@@ -45,6 +46,17 @@ def test_a_waiting_worker_is_alive_until_it_is_silent_and_forgotten_after_a_day(
     assert not workers(desk, memory)["host:1"].alive
     clock.now += FORGOTTEN_AFTER_S
     assert workers(desk, memory) == {}
+
+
+@pytest.mark.parametrize("field", ["worker", "version", "kinds"])
+@pytest.mark.parametrize("character", ["\x1b", "\n", "\x9b", "\x7f"])
+def test_a_worker_cannot_announce_what_would_control_the_terminal_of_an_administrator(
+    field: str, character: str
+) -> None:
+    text = f"host{character}]0;title"
+    with pytest.raises(ValidationError, match="pattern"):
+        claim_of("host", **{field: [text] if field == "kinds" else text})
+    assert claim_of("Ångström-🦾:7").worker == "Ångström-🦾:7"
 
 
 def test_a_worker_of_another_server_is_shown_while_it_runs_jobs(desk: Desk) -> None:

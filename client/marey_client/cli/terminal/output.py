@@ -42,12 +42,16 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
 
 
 def _shown(cell: object) -> str:
-    """Return a cell as text; times are in UTC, to the second."""
+    """Return a cell as text; times are in UTC, to the second.
+
+    Control characters are escaped, because other users wrote some texts, and must not control the terminal.
+    """
     from datetime import datetime
 
     if isinstance(cell, datetime):
         return cell.strftime("%Y-%m-%d %H:%M:%SZ")
-    return "" if cell is None else str(cell)
+    text = "" if cell is None else str(cell)
+    return "".join(one if one.isprintable() or one == "\n" else ascii(one)[1:-1] for one in text)
 
 
 def print_rows(rows: Iterable[tuple[str, str, str]]) -> None:

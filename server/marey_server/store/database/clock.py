@@ -16,6 +16,8 @@ FAR_AHEAD_DAYS = 366
 """Days that a clock may be ahead of the stored time; a clock that is further ahead must be confirmed by an operator."""
 NOTABLY_AHEAD_S = 60
 """Number of seconds by which the stored time may be ahead of the machine's clock without a message in the log."""
+POSTGRES_NOW = "SELECT (extract(epoch FROM clock_timestamp()) * 1000000)::bigint"
+"""Query for the time of a Postgres server in microseconds since the epoch."""
 DAY_US = 86400 * 1_000_000
 _HIGH_WATER = "clock_high_water_us"
 _SAVE_EVERY_US = 1_000_000
@@ -57,8 +59,7 @@ class DatabaseClock:
         Raises `ClockFarAhead` if the wall clock is implausibly far ahead when the process first asks for the time.
         """
         if connection.dialect.name == "postgresql":
-            now = text("SELECT (extract(epoch FROM clock_timestamp()) * 1000000)::bigint")
-            return int(connection.execute(now).scalar_one())
+            return int(connection.execute(text(POSTGRES_NOW)).scalar_one())
         with self._lock:
             if self._start_us is None:
                 stored_us, wall_us = stored_high_water_us(connection), wall_clock_us()

@@ -12,7 +12,6 @@ Each write starts with `BEGIN IMMEDIATE`, and reads run at the same time as writ
 from __future__ import annotations
 
 import errno
-import json
 import sqlite3
 import threading
 import time
@@ -22,25 +21,24 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import sqlalchemy
-from sqlalchemy import URL, Connection, Engine, event, exc, make_url
+from sqlalchemy import Connection, exc, make_url
 
 from marey_schemas.backoff import Backoff
 from marey_server.access.principal import Principal
-from marey_server.errors import InvalidProblem, StorageFullProblem, UnavailableProblem
+from marey_server.errors import ApiProblem, InvalidProblem, StorageFullProblem, UnavailableProblem
 from marey_server.store import tables
 from marey_server.store.blob_backings import BlobBacking, DatabaseBlobs
 from marey_server.store.database.clock import Clock, DatabaseClock, save_high_water
+from marey_server.store.database.engines import begin_snapshot, postgres_engine, roll_back, sqlite_engine
 from marey_server.store.database.lanes import SERVER, Client, Lane
 from marey_server.store.database.opening import sqlite_file
-from marey_server.store.database.write_ahead_log import PAGE_BYTES, SHORT_BYTES, WriteAheadLog
+from marey_server.store.database.write_ahead_log import WriteAheadLog
 from marey_server.store.database.write_lane import WriteLane
 from marey_server.store.transaction import IGNORED, Observer, Quotas, Transaction
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-BUSY_TIMEOUT_MS = 30_000
-CACHE_KIB = 4096
 WRITE_TRIES = 5
 WRITE_BACKOFF = Backoff(first_s=0.02, longest_s=0.16, jitter=1.0)
 READ_TRIES = 3
@@ -48,12 +46,6 @@ RESERVED_THREADS = 3
 """Number of threads, and of connections, for short transactions that must not wait for other transactions."""
 SHARED_BY_ALL = 2
 """Greatest number of ordinary threads of which one client may use all; half of two would make a lone client slow."""
-
-_POSTGRES_SETTINGS = {
-    "statement_timeout": "120s",
-    "lock_timeout": "30s",
-    "idle_in_transaction_session_timeout": "300s",  # a server that was stopped must not hold its locks for ever
-}
 
 
 class Database:
@@ -74,16 +66,15 @@ class Database:
             self.url = self.url.set(drivername="postgresql+psycopg")
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         if self.is_sqlite:
-            self.engine = _sqlite_engine(self.url, 2, echo, begin="BEGIN IMMEDIATE")
-            self._read_engine = _sqlite_engine(
+            self.engine = sqlite_engine(self.url, 2, echo, begin="BEGIN IMMEDIATE")
+            self._read_engine = sqlite_engine(
                 self.url, readers + RESERVED_THREADS, echo, begin="BEGIN", query_only=True
             )
         else:
-            self.engine = _postgres_engine(self.url, readers + RESERVED_THREADS, echo)
-            self._read_engine = self.engine.execution_options(
-                isolation_level="REPEATABLE READ", postgresql_readonly=True
-            )
+            self.engine = postgres_engine(self.url, readers + RESERVED_THREADS, echo)
+            self._read_engine = self.engine.execution_options(isolation_level="AUTOCOMMIT")  # see `begin_snapshot`
         self.clock: Clock = clock or DatabaseClock()
+        self._has_own_clock = clock is None
         self._high_water_us = 0
         self.blobs: BlobBacking = blobs or DatabaseBlobs()
         self.quotas = quotas or Quotas()
@@ -132,8 +123,14 @@ class Database:
         """Run `function(tx, ...)` in a read-only transaction in the calling thread; retry if the connection breaks."""
         for attempt in range(READ_TRIES):
             try:
-                with self._read_engine.connect() as connection, connection.begin():
-                    return function(self._transaction(connection, principal), *args, **kwargs)
+                with self._read_engine.connect() as connection, connection.begin() as transaction:
+                    begun_us = None if self.is_sqlite else begin_snapshot(connection)
+                    tx = self._transaction(connection, principal, begun_us if self._has_own_clock else None)
+                    try:
+                        return function(tx, *args, **kwargs)
+                    except ApiProblem:
+                        transaction.commit()  # there is nothing to roll back, and see `roll_back`
+                        raise
             except _FAILURES as error:
                 if attempt == READ_TRIES - 1 or not _worth_retrying(error):
                     raise _translated(error) from error
@@ -165,8 +162,8 @@ class Database:
                 return answer
         raise AssertionError("unreachable")
 
-    def _transaction(self, connection: Connection, principal: Principal) -> Transaction:
-        return Transaction(connection, principal, self.clock, self.blobs, self.quotas, self.observer)
+    def _transaction(self, connection: Connection, principal: Principal, now_us: int | None = None) -> Transaction:
+        return Transaction(connection, principal, self.clock, self.blobs, self.quotas, self.observer, now_us=now_us)
 
     def _run_and_commit(
         self,
@@ -176,7 +173,12 @@ class Database:
         **kwargs: P.kwargs,
     ) -> T:
         with tx.connection.begin() as transaction:
-            answer = function(tx, *args, **kwargs)
+            try:
+                answer = function(tx, *args, **kwargs)
+            except ApiProblem:
+                if not self.is_sqlite:
+                    roll_back(tx.connection)
+                raise
             high_water_us = self._high_water_us
             if self.is_sqlite and tx.now_us >= high_water_us:
                 high_water_us = save_high_water(tx.connection, tx.now_us)
@@ -264,62 +266,6 @@ class Database:
             self._log.close()
         self._read_engine.dispose()
         self.engine.dispose()
-
-
-# -- engines ----------------------------------------------------------------------------------------------------------
-
-
-def _dumps(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-
-
-def _sqlite_engine(url: URL, connections: int, echo: bool, *, begin: str, query_only: bool = False) -> Engine:
-    engine = sqlalchemy.create_engine(
-        url,
-        pool_size=connections,
-        max_overflow=4,
-        echo=echo,
-        hide_parameters=True,  # they hold hashes of secrets, and what fails is logged
-        json_serializer=_dumps,
-        connect_args={"timeout": BUSY_TIMEOUT_MS / 1000, "check_same_thread": False, "isolation_level": None},
-        poolclass=sqlalchemy.QueuePool,
-    )
-    # No memory map: it saves 15 us of a read of 150 KB, and counts once per connection as memory of the process.
-    pragmas = [
-        f"page_size = {PAGE_BYTES}",
-        "journal_mode = WAL",
-        f"journal_size_limit = {SHORT_BYTES}",
-        "wal_autocheckpoint = 0",  # see `WriteAheadLog`
-        "synchronous = FULL",
-        "foreign_keys = ON",
-        f"cache_size = -{CACHE_KIB}",
-        f"query_only = {'ON' if query_only else 'OFF'}",
-    ]
-
-    def configure(connection: sqlite3.Connection, _record: object) -> None:
-        for pragma in pragmas:
-            connection.execute(f"PRAGMA {pragma}")
-
-    event.listen(engine, "connect", configure)
-    event.listen(engine, "begin", lambda connection: connection.exec_driver_sql(begin))
-    return engine
-
-
-def _postgres_engine(url: URL, connections: int, echo: bool) -> Engine:
-    connect_args: dict[str, Any] = {"application_name": "marey", "connect_timeout": 10}
-    if "options" not in url.query:
-        connect_args["options"] = " ".join(f"-c {name}={value}" for name, value in _POSTGRES_SETTINGS.items())
-    return sqlalchemy.create_engine(
-        url,
-        pool_size=connections,
-        max_overflow=4,
-        pool_timeout=30,
-        echo=echo,
-        hide_parameters=True,  # they hold hashes of secrets, and what fails is logged
-        isolation_level="READ COMMITTED",
-        json_serializer=_dumps,
-        connect_args=connect_args,
-    )
 
 
 # -- failures ---------------------------------------------------------------------------------------------------------

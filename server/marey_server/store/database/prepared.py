@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import namedtuple
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any, TypeVar
@@ -40,19 +40,20 @@ class Prepared:
 
     def run(self, connection: Connection, parameters: Parameters) -> list[Any]:
         """Run the statement and return its rows as named tuples."""
-        form = self._form(connection.dialect, parameters)
+        form = self.form(connection.dialect, parameters)
         rows = _run(connection, form.text, form.values(parameters), gives_rows=form.to_row is not None)
-        return rows if form.to_row is None else list(map(form.to_row, rows))
+        return form.rows(rows)
 
     def run_each(self, connection: Connection, many: Sequence[Parameters]) -> None:
         """Run the statement once for each mapping in `many`, all with the same keys; return no rows."""
         if len(many) == 1:
             self.run(connection, many[0])
         elif many:
-            form = self._form(connection.dialect, many[0])
+            form = self.form(connection.dialect, many[0])
             _run(connection, form.text, [form.values(one) for one in many], many=True)
 
-    def _form(self, dialect: Dialect, parameters: Parameters) -> _Form:
+    def form(self, dialect: Dialect, parameters: Parameters) -> _Form:
+        """Return the statement compiled for the names of the parameters and the lengths of the lists among them."""
         if self._lists is not None:
             form = self._forms.get(self._key(dialect, self._lists, parameters))
             if form is not None:
@@ -69,6 +70,28 @@ class Prepared:
         return (dialect.name, *parameters, *[len(parameters[name]) for name in lists])
 
 
+def run_together(connection: Connection, runs: Sequence[tuple[Prepared, Parameters]]) -> list[list[Any]]:
+    """Run statements that do not depend on each other, and return the rows of each.
+
+    On Postgres, the driver sends all of them at once, and then waits once.
+    """
+    if connection.dialect.name != "postgresql":
+        return [statement.run(connection, parameters) for statement, parameters in runs]
+    forms = [(statement.form(connection.dialect, parameters), parameters) for statement, parameters in runs]
+    driver: Any = connection.connection.driver_connection
+    text = ""
+    try:
+        with ExitStack() as cursors:
+            with driver.pipeline():
+                filled = []
+                for form, parameters in forms:
+                    text = form.text
+                    filled.append(cursors.enter_context(driver.cursor()).execute(text, form.values(parameters)))
+            return [form.rows(cursor.fetchall()) for (form, _), cursor in zip(forms, filled, strict=True)]
+    except connection.dialect.loaded_dbapi.Error as error:
+        raise _failure(connection, text, error) from error
+
+
 def padded(values: Iterable[T]) -> list[T]:
     """Extend a list for `IN` to a length that is a power of two, by repeating its last value.
 
@@ -81,6 +104,18 @@ def padded(values: Iterable[T]) -> list[T]:
 def run_text(connection: Connection, text: str) -> None:
     """Run a statement that has no parameters and returns no rows."""
     _run(connection, text, ())
+
+
+def run_texts(connection: Connection, texts: Sequence[str]) -> list[Any]:
+    """Run statements without parameters on Postgres, in one round trip; return the rows of the last one."""
+    try:
+        with closing(connection.connection.cursor()) as cursor:
+            cursor.execute("; ".join(texts))
+            while cursor.nextset():
+                pass
+            return list(cursor.fetchall())
+    except connection.dialect.loaded_dbapi.Error as error:
+        raise _failure(connection, texts[0], error) from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +140,10 @@ class _Form:
         for name, convert in self.converts.items():
             named[name] = convert(named[name])
         return named if self.order is None else tuple([named[name] for name in self.order])
+
+    def rows(self, found: list[Any]) -> list[Any]:
+        """Return rows of the driver as named tuples."""
+        return found if self.to_row is None else list(map(self.to_row, found))
 
 
 def _members(names: Sequence[str], given: Sequence[Any]) -> Iterable[tuple[str, Any]]:

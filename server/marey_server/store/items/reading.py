@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -141,9 +141,17 @@ def shown_items(
     tx: Transaction, rows: Sequence[Row[Any]], *, tags: bool = True, parts: bool = True, facets: bool = True
 ) -> list[Item]:
     """Return items as documents; one query each reads the tags, the parts and the facets of all items."""
-    tags_of = read_tags(tx, [row.id for row in rows]) if tags and rows else {}
-    parts_of = read_parts(tx, [(row.id, row.head) for row in rows]) if parts and rows else {}
-    facets_of = _read_facets(tx, rows) if facets and rows else {}
+    ids = {"items": [row.id for row in rows]}
+    runs = {
+        "tags": (_TAGS, ids),
+        "parts": (_PARTS, _keys_of([(row.id, row.head) for row in rows])),
+        "facets": (_FACETS, ids),
+    }
+    asked = [name for name, wanted in (("tags", tags), ("parts", parts), ("facets", facets)) if wanted and rows]
+    found = dict(zip(asked, tx.run_together(*(runs[name] for name in asked)), strict=True))
+    tags_of, parts_of, facets_of = (
+        _tags(found.get("tags", ())), _parts(found.get("parts", ())), _facets(found.get("facets", ()))
+    )  # fmt: skip
     return [
         Item(
             id=row.id, kind=Kind(row.kind), name=row.name, collection=row.path, tags=tags_of.get(row.id, ()),
@@ -156,18 +164,18 @@ def shown_items(
     ]  # fmt: skip
 
 
-def read_tags(tx: Transaction, item_ids: Collection[str]) -> dict[str, tuple[str, ...]]:
+def _tags(rows: Iterable[Any]) -> dict[str, tuple[str, ...]]:
     """Return the sorted tags of each item."""
     found: dict[str, list[str]] = {}
-    for row in tx.run(_TAGS, {"items": list(item_ids)}):
+    for row in rows:
         found.setdefault(row.item_id, []).append(row.tag)
     return {item_id: tuple(sorted(tags)) for item_id, tags in found.items()}
 
 
-def _read_facets(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, dict[str, float]]:
-    """Return, by item id, the facets of the newest revision of each item, sorted by name."""
+def _facets(rows: Iterable[Any]) -> dict[str, dict[str, float]]:
+    """Return the facets of each item, sorted by name."""
     found: dict[str, dict[str, float]] = {}
-    for row in tx.run(_FACETS, {"items": [row.id for row in rows]}):
+    for row in rows:
         found.setdefault(row.item_id, {})[row.name] = row.value
     return found
 
@@ -176,9 +184,16 @@ def read_parts(
     tx: Transaction, revisions: Collection[tuple[str, int]]
 ) -> dict[tuple[str, int], dict[str, PartSummary]]:
     """Return the parts of the given revisions, by item id and revision number."""
-    keys = {"items": list({item_id for item_id, _ in revisions}), "numbers": list({number for _, number in revisions})}
+    return _parts(tx.run(_PARTS, _keys_of(revisions)))
+
+
+def _keys_of(revisions: Collection[tuple[str, int]]) -> dict[str, list[Any]]:
+    return {"items": list({item_id for item_id, _ in revisions}), "numbers": list({number for _, number in revisions})}
+
+
+def _parts(rows: Iterable[Any]) -> dict[tuple[str, int], dict[str, PartSummary]]:
     found: dict[tuple[str, int], dict[str, PartSummary]] = {}
-    for row in tx.run(_PARTS, keys):
+    for row in rows:
         summary = PartSummary(document=row.digest, schema_=row.schema, size_bytes=row.size_bytes)
         found.setdefault((row.item_id, row.number), {})[row.part] = summary
     return found

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from sqlalchemy import case, func, select
+from sqlalchemy import case, func, select, text
 
 from marey_schemas.queue import job_kinds
 from marey_schemas.queue.workers import Worker
@@ -25,6 +25,10 @@ OTHER = "other"
 
 UNKNOWN = "unknown"
 """Label of workers that claim jobs from another server, so that their versions are unknown."""
+
+
+_SQLITE_BYTES = text("SELECT page_count * page_size FROM pragma_page_count, pragma_page_size")
+_POSTGRES_BYTES = text("SELECT pg_database_size(current_database())")
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,9 @@ class Figures:
     """Number of workers that are alive: of the version of the server, `other`, or `unknown`."""
     uploads: int = 0
     stored_bytes: int = 0
+    """Bytes that the quotas of all projects count."""
+    database_bytes: int = 0
+    """Space that the database takes."""
 
 
 def read_figures(tx: Transaction, heard: Sequence[HeardWorker], version: str) -> Figures:
@@ -62,6 +69,7 @@ def read_figures(tx: Transaction, heard: Sequence[HeardWorker], version: str) ->
         workers={version: 0, OTHER: 0, UNKNOWN: 0, **Counter(_shown_version(worker, version) for worker in alive)},
         uploads=int(tx.execute(unfinished).scalar_one()),
         stored_bytes=int(tx.execute(stored).scalar_one()),
+        database_bytes=int(tx.execute(_POSTGRES_BYTES if tx.is_postgres else _SQLITE_BYTES).scalar_one()),
     )
 
 
