@@ -41,7 +41,7 @@ from marey_server.store.purge_lock import hold_off_purges, last_purge, require_n
 from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, fast_forward, item, user
 from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.merging import CombinedEntry
-from marey_versions.records import CommitRecord, DatasetEntry, RevisionKey, key_of, path_and_kind
+from marey_versions.records import CommitRecord, DatasetEntry, RevisionKey, entry_of, key_of, path_and_kind
 from marey_versions.tree.building import build
 from marey_versions.tree.chunks import Value
 from marey_versions.tree.editing import change
@@ -379,4 +379,4 @@ def _take_away(state: dict[str, Value | None], one: RemoveEntry | MoveEntry) -> 
         target = key_of(one.to, one.kind)
         if state.get(target) is not None:
             raise ConflictProblem(f"The version has a {one.kind.value} at {one.to!r} already.", code="path-taken")
-        state[target] = value
+        state[target] = entry_of(key, value).value  # a damaged entry is not copied
