@@ -267,6 +267,8 @@ def _require_checked_out(found: Row[Any], manifest: FolderManifest | None, paren
                 "folder_commit": there, "commit": parent,
                 "checked_out": None if manifest is None else manifest.shown,
             },
+            unnamed="The version that is checked out in the folder is not the newest one of this branch. Check out the "
+            "branch, or commit to the branch that is checked out.",
         )  # fmt: skip
 
 
@@ -301,6 +303,8 @@ def _require_selected(found: Row[Any], changes: Mapping[str, Value | None], sele
             "one is there. Rename it, or check out a selection that includes this entry.",
             code="not-checked-out",
             context={"count": len(hidden), "path": path, "kind": kind},
+            unnamed="The folder has an item in the place of an entry that is not checked out. Rename the item, or "
+            "check out a selection that includes this entry.",
         )
 
 

@@ -250,6 +250,7 @@ def branch_moved(branch: str, head: str | None) -> ConflictProblem:
         f"The branch {branch!r} has moved. Read it again, then repeat the commit.",
         code=BRANCH_MOVED,
         context={"commit": head},
+        unnamed="The branch has moved. Read it again, then repeat the commit.",
     )
 
 
@@ -373,7 +374,9 @@ def _require_no_commit(tx: Transaction, dataset_id: str, name: str) -> None:
     """
     if found := _commits_by_digits(tx, dataset_id, name):
         raise ConflictProblem(
-            f"The commit {found[0]} is named by its first digits {name!r}; choose another name.", code="name-taken"
+            f"The commit {found[0]} is named by its first digits {name!r}; choose another name.",
+            code="name-taken",
+            unnamed=f"A commit is named by its first digits {name!r}; choose another name.",
         )
 
 

@@ -55,6 +55,7 @@ def lock_open(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
             f"The proposal {number} is {row.state} already, by {row.ending_name}.",
             code=f"proposal-{row.state}",
             context={"state": row.state, "merged": row.merged},
+            unnamed=f"The proposal {number} is {row.state} already.",
         )
     return row
 
@@ -62,11 +63,8 @@ def lock_open(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
 def require_newest(tx: Transaction, row: Row[Any], version: str | None) -> None:
     """Raise `ConflictProblem` if `version` is given and is not the newest commit of the proposal."""
     if version is not None and resolve(tx, row.dataset_id, version) != row.head_now:
-        raise ConflictProblem(
-            "The proposal has a newer commit than the one in the request; review the newest commit first.",
-            code="proposal-moved",
-            context={"commit": row.head_now},
-        )
+        text = "The proposal has a newer commit than the one in the request; review the newest commit first."
+        raise ConflictProblem(text, code="proposal-moved", context={"commit": row.head_now}, unnamed=text)
 
 
 def is_proposal(dataset_id: str, number: int) -> tuple[ColumnElement[bool], ...]:
