@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import orjson
+
 from marey_schemas.documents.blob_references import is_array_reference
 from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.kinds import Kind
@@ -87,7 +89,8 @@ def path_and_kind(key: str) -> tuple[str, str]:
 
 def revision_content(kind: str, parts: Mapping[str, str]) -> str:
     """Return the content digest of a revision from its kind and the content digests of its parts."""
-    return digest_of(_canonical({"kind": kind, "parts": dict(parts)}))
+    # orjson writes objects of texts like `_canonical`, which also writes numbers as they are in documents.
+    return digest_of(orjson.dumps({"kind": kind, "parts": dict(parts)}, option=orjson.OPT_SORT_KEYS))
 
 
 def references_in(body: Any) -> Iterator[RevisionKey]:

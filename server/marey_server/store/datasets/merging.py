@@ -235,9 +235,12 @@ def record_merge(
         projects.require(tx, project)
         return merge.answer
     if merge.answer.conflict_count:
-        text = f"{counted(merge.answer.conflict_count, 'entry')} changed on both sides; send a resolution for each."
-        context = merge.answer.model_dump(mode="json")
-        raise ConflictProblem(text, code="merge-conflicts", context=context, unnamed=text)
+        raise ConflictProblem(
+            f"{counted(merge.answer.conflict_count, 'entry')} changed on both sides; send a resolution for each.",
+            code="merge-conflicts",
+            context=merge.answer.model_dump(mode="json"),
+            unnamed=True,
+        )
     commit = record_commit(tx, project, name, merge.commit, mover)
     return merge.answer.model_copy(update={"commit": commit})
 
@@ -293,9 +296,11 @@ def _common(tx: Transaction, dataset_id: str, ours: str, theirs: str) -> str | N
     """
     nearest = nearest_common(CommitReader(tx, dataset_id).read, ours, theirs)
     if len(nearest) > 1:
-        text = (
+        raise ConflictProblem(
             "The two versions have several nearest common commits, because earlier merges crossed. Cherry-pick the "
-            "commits that the branch lacks instead."
+            "commits that the branch lacks instead.",
+            code="several-bases",
+            context={"commits": nearest},
+            unnamed=True,
         )
-        raise ConflictProblem(text, code="several-bases", context={"commits": nearest}, unnamed=text)
     return nearest[0] if nearest else None

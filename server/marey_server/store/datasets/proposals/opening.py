@@ -63,8 +63,12 @@ def lock_open(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
 def require_newest(tx: Transaction, row: Row[Any], version: str | None) -> None:
     """Raise `ConflictProblem` if `version` is given and is not the newest commit of the proposal."""
     if version is not None and resolve(tx, row.dataset_id, version) != row.head_now:
-        text = "The proposal has a newer commit than the one in the request; review the newest commit first."
-        raise ConflictProblem(text, code="proposal-moved", context={"commit": row.head_now}, unnamed=text)
+        raise ConflictProblem(
+            "The proposal has a newer commit than the one in the request; review the newest commit first.",
+            code="proposal-moved",
+            context={"commit": row.head_now},
+            unnamed=True,
+        )
 
 
 def is_proposal(dataset_id: str, number: int) -> tuple[ColumnElement[bool], ...]:

@@ -104,8 +104,12 @@ def _require_job(tx: Transaction, project_id: str, job_id: str, state: CheckStat
         )
     read = commits_of(found.inputs)
     if read and head not in read:
-        text = f"The job {job_id} read versions of the dataset, but not the newest commit of the proposal."
-        raise ConflictProblem(text, code="job-of-another-commit", context={"commits": sorted(read)}, unnamed=text)
+        raise ConflictProblem(
+            f"The job {job_id} read versions of the dataset, but not the newest commit of the proposal.",
+            code="job-of-another-commit",
+            context={"commits": sorted(read)},
+            unnamed=True,
+        )
 
 
 def _store_check(tx: Transaction, project_row: ProjectRow, row: Row[Any], request: CheckReport) -> None:
