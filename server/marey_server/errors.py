@@ -6,13 +6,18 @@ Raise them anywhere; the handlers turn them into problem documents. `code` is st
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from marey_schemas.problems import FieldError
 
 
 class ApiProblem(Exception):
-    """The request could not be carried out."""
+    """The request could not be carried out.
+
+    If the error names something that the request does not name, such as the path of another item, `unnamed` is the text
+    for callers who may change the project but not read it. They get it in place of `detail`, also in `errors`, and they
+    get no `context`. If only the context names something, `unnamed` is True.
+    """
 
     status: ClassVar[int] = 500
     code: ClassVar[str] = "internal"
@@ -25,6 +30,7 @@ class ApiProblem(Exception):
         errors: Sequence[FieldError] = (),
         context: Mapping[str, Any] | None = None,
         headers: Mapping[str, str] | None = None,
+        unnamed: str | Literal[True] | None = None,
     ) -> None:
         super().__init__(detail)
         self.detail = detail
@@ -32,6 +38,7 @@ class ApiProblem(Exception):
         self.errors = tuple(errors)
         self.context = dict(context or {})
         self.headers = dict(headers or {})
+        self.unnamed = detail if unnamed is True else unnamed
 
     @property
     def title(self) -> str:

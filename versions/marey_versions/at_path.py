@@ -9,7 +9,7 @@ from itertools import chain, islice
 
 from marey_schemas.datasets.differences import ChangeKind
 from marey_versions.compared import ComparedEntry, compare_entries
-from marey_versions.records import DatasetEntry, key_of
+from marey_versions.records import DatasetEntry, entry_of, key_of
 from marey_versions.tree.difference import Changed, difference
 from marey_versions.tree.reading import ChunkReader, Tree
 
@@ -98,7 +98,7 @@ class PathComparer:
 def _stays(one: Changed) -> bool:
     """Return whether an entry was not moved: it is in both versions, and at least one of its parts is unchanged."""
     sides = [one.before, one.after]
-    before, after = ({} if side is None else side["parts"] for side in sides)
+    before, after = ({} if side is None else entry_of(one.key, side).parts for side in sides)
     return bool(before.items() & after.items())
 
 

@@ -12,15 +12,22 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import orjson
+
 from marey_schemas.documents.blob_references import is_array_reference
 from marey_schemas.encoding.canonical import canonical_json
+from marey_schemas.kinds import Kind
 from marey_schemas.names import is_digest
-from marey_versions.tree.chunks import Value, digest_of
+from marey_versions.tree.chunks import DamagedChunk, Value, digest_of
 
 COMMIT_SCHEMA = "marey/commit@1"
 
 _SEPARATOR = "\t"
 """Character between path and kind in a key. It sorts before every character that a path can contain."""
+
+
+_KINDS = frozenset(kind.value for kind in Kind)
+_ONLY_TEXT = frozenset({str})
 
 
 class RevisionKey(NamedTuple):
@@ -61,8 +68,17 @@ def key_of(path: str, kind: str) -> str:
 
 
 def entry_of(key: str, value: Value) -> DatasetEntry:
-    """Return the entry that a key and its value in the tree describe."""
-    return DatasetEntry(*path_and_kind(key), value["parts"], tuple(value["tags"]))
+    """Return the entry that a key and its value in the tree describe.
+
+    Raises `DamagedChunk` if the kind is unknown, or if the value is not that of an entry.
+    """
+    path, kind = path_and_kind(key)
+    parts, tags = value.get("parts"), value.get("tags")
+    if kind not in _KINDS or type(parts) is not dict or type(tags) is not list:
+        raise DamagedChunk(f"the entry {key!r} has an unknown kind, or lacks parts or tags")
+    if not {*map(type, parts.values()), *map(type, tags)} <= _ONLY_TEXT:
+        raise DamagedChunk(f"a part or tag of the entry {key!r} is not a text")
+    return DatasetEntry(path, kind, parts, tuple(tags))
 
 
 def path_and_kind(key: str) -> tuple[str, str]:
@@ -73,7 +89,8 @@ def path_and_kind(key: str) -> tuple[str, str]:
 
 def revision_content(kind: str, parts: Mapping[str, str]) -> str:
     """Return the content digest of a revision from its kind and the content digests of its parts."""
-    return digest_of(_canonical({"kind": kind, "parts": dict(parts)}))
+    # orjson writes objects of texts like `_canonical`, which also writes numbers as they are in documents.
+    return digest_of(orjson.dumps({"kind": kind, "parts": dict(parts)}, option=orjson.OPT_SORT_KEYS))
 
 
 def references_in(body: Any) -> Iterator[RevisionKey]:

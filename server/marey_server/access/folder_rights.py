@@ -90,12 +90,15 @@ class FolderRights:
             return FolderRoleProblem(
                 f"You need at least the role {needed.value} in the project {self.project!r} for this.",
                 context=context,
+                unnamed=f"You need at least the role {needed.value} in the project {self.project!r} for this.",
             )
         place = f"the folder {path!r}" if path else "the top folder"
         return FolderRoleProblem(
             f"You need at least the role {needed.value} in {place} of the project {self.project!r} for this; your role "
             f"there is {held.value}. An owner of the project can change it.",
             context=context,
+            unnamed=f"You need at least the role {needed.value} in a folder of the project {self.project!r} for this; "
+            f"your role there is {held.value}. An owner of the project can change it.",
         )
 
 

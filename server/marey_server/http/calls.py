@@ -56,8 +56,24 @@ class Caller:
 
         If a change answers with content of the project, the caller needs the scope `read` in the project, too.
         """
+        return not self.operation.shows_project or self._reads(project)
+
+    def sees_names(self, project: str | None) -> bool:
+        """Return whether a refusal may name what the caller has not named: only if the caller may read the project."""
+        changes_project = self.operation.access.role is not None and self.operation.scope != "read"
+        return not changes_project or self._reads(project)
+
+    def _reads(self, project: str | None) -> bool:
+        """Return whether the caller has the scope `read` in a project.
+
+        Without a project in the address, the caller needs it in every project in which the operation is possible.
+        """
         held = self.principal.scopes if self.principal is not None else ()
-        return not self.operation.shows_project or scopes.allows(held, "read", project)
+        if project is not None:
+            return scopes.allows(held, "read", project)
+        return all(
+            scopes.allows(held, "read", one or None) for one in scopes.projects_of(held, self.operation.scope or "")
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -109,6 +109,8 @@ class Operation:
     """Whether an attempt of a job may repeat the request after the attempt has ended."""
     in_folders: bool = False
     """Whether members who have the declared role only in some folders may use the operation in these folders."""
+    names: bool = False
+    """Whether a change answers with names of the project's content, such as those of conflicts of a merge."""
 
     @property
     def required_role(self) -> RequiredRole:
@@ -130,7 +132,8 @@ class Operation:
     @property
     def shows_project(self) -> bool:
         """Whether the operation changes a project and shows its content, so that callers need the scope `read`, too."""
-        return self.scope == "write" and self.access.role is not None and self.etag and self.answer is not None
+        shows = self.etag or self.names
+        return self.scope == "write" and self.access.role is not None and shows and self.answer is not None
 
     @property
     def may_create(self) -> bool:
@@ -194,6 +197,7 @@ def writes(
     attempts: bool = False,
     replays: bool = False,
     in_folders: bool = False,
+    names: bool = False,
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes something.
 
@@ -206,6 +210,7 @@ def writes(
     replays : whether an ended attempt may repeat the request
     in_folders : whether members who have the role only in some folders may use the method in these folders; the
         function that the method calls must check the role in the folder
+    names : whether the answer, which has no ETag, names content of the project; then callers need the scope `read`, too
     """
     if access is Access.READER:
         raise TypeError("A method that changes a project requires at least the role contributor.")
@@ -213,7 +218,7 @@ def writes(
         access=access, scope=scope, query=query, body=body, answer=answer,
         status=status or (200 if answer else 204), precondition=precondition, idempotency=idempotency,
         etag=etag, also=also, headers=headers, reserved=reserved, attempts=attempts,
-        replays=replays, in_folders=in_folders,
+        replays=replays, in_folders=in_folders, names=names,
     )  # fmt: skip
 
 
@@ -238,6 +243,7 @@ def _declare(
     attempts: bool = False,
     replays: bool = False,
     in_folders: bool = False,
+    names: bool = False,
 ) -> Callable[[Method], Declared]:
     def attach(method: Method) -> Declared:
         @wraps(method)
@@ -249,7 +255,7 @@ def _declare(
         perform.operation = Operation(  # type: ignore[attr-defined]
             method.__name__.upper(), summary.rstrip("."), description.strip(), access, scope, query, taken, answer,
             status, paged, etag, precondition, idempotency, answer_types, also, public, headers, stream, reserved,
-            attempts, replays, in_folders,
+            attempts, replays, in_folders, names,
         )  # fmt: skip
         return perform
 

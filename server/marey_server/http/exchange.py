@@ -224,7 +224,12 @@ class Exchange(RequestHandler):
 
     def _write_problem(self, error: BaseException) -> None:
         self.problem_code = problem_code(error)
-        self.send(render_problem(error, self.request_id))
+        self.send(render_problem(error, self.request_id, names=self.sees_names))
+
+    @property
+    def sees_names(self) -> bool:
+        """Whether the answer may name what the caller has not named; see `ApiProblem`."""
+        return True
 
     def log_exception(self, _type: Any, value: Any, _traceback: Any) -> None:
         """Log internal errors with their traceback; refusals are not logged as errors."""
@@ -263,10 +268,13 @@ def problem_code(error: BaseException) -> str:
     return ApiProblem.code
 
 
-def render_problem(error: BaseException, request_id: str) -> Rendered:
-    """Return the problem document of an error; for internal errors, it contains only the request id."""
+def render_problem(error: BaseException, request_id: str, *, names: bool = True) -> Rendered:
+    """Return the problem document of an error; for internal errors, it contains only the request id.
+
+    Without `names`, it names nothing that the request does not name.
+    """
     if isinstance(error, ApiProblem):
-        problem = _of_refusal(error, request_id)
+        problem = _of_refusal(error, request_id, names=names)
         headers = dict(error.headers)
     elif isinstance(error, HTTPError):
         title = responses.get(error.status_code, "Error")
@@ -284,9 +292,13 @@ def render_problem(error: BaseException, request_id: str) -> Rendered:
     return Rendered(problem.status, headers, problem.model_dump_json(by_alias=True).encode())
 
 
-def _of_refusal(error: ApiProblem, request_id: str) -> Problem:
-    problem = _problem(error.status, error.error_code, error.title, error.detail, request_id)
-    return problem.model_copy(update={"errors": error.errors, "context": error.context})
+def _of_refusal(error: ApiProblem, request_id: str, *, names: bool) -> Problem:
+    if names or error.unnamed is None:
+        problem = _problem(error.status, error.error_code, error.title, error.detail, request_id)
+        return problem.model_copy(update={"errors": error.errors, "context": error.context})
+    problem = _problem(error.status, error.error_code, error.title, error.unnamed, request_id)
+    errors = tuple(one.model_copy(update={"detail": error.unnamed}) for one in error.errors)
+    return problem.model_copy(update={"errors": errors})
 
 
 def _problem(status: int, code: str, title: str, detail: str, request_id: str) -> Problem:

@@ -146,6 +146,11 @@ class Resource(CallingExchange):
         self.holding.shrink(loaded_bytes)
         return rendered
 
+    @property
+    def sees_names(self) -> bool:
+        """Whether the answer may name what the caller has not named; see `ApiProblem`."""
+        return not hasattr(self, "caller") or self.caller.sees_names(self.path_kwargs.get("project"))
+
     def _write_problem(self, error: BaseException) -> None:
         super()._write_problem(error)
         if isinstance(error, AuthorLostProblem):

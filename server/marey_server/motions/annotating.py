@@ -63,7 +63,8 @@ def _changed(found: FoundAnnotation, change: AnnotationChange) -> PreparedDocume
         except MotionError as error:
             wrong = FieldError(pointer=f"/commands/{index}", code=error.code, detail=str(error))
             detail = f"Command {index} ({command.command}) cannot be carried out, so nothing was changed: {error}"
-            raise InvalidProblem(detail, code="command-refused", errors=[wrong]) from error
+            unnamed = f"Command {index} ({command.command}) cannot be carried out, so nothing was changed."
+            raise InvalidProblem(detail, code="command-refused", errors=[wrong], unnamed=unnamed) from error
     changed = documents.layer_to_document(layer, annotation.clip, annotation.layer, annotation.made_by)
     return prepare_part(Kind.ANNOTATION, "annotation", changed.model_dump(mode="json", by_alias=True))
 

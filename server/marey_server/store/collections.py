@@ -163,7 +163,11 @@ def create_collection(tx: Transaction, project: str, request: CollectionCreate) 
 
 
 def _path_taken(path: str) -> ConflictProblem:
-    return ConflictProblem(f"There is already a collection {path!r}.", code="path-taken")
+    return ConflictProblem(
+        f"There is already a collection {path!r}.",
+        code="path-taken",
+        unnamed="There is already a collection with this path.",
+    )
 
 
 def move_collection(
@@ -182,7 +186,11 @@ def move_collection(
     rights.require_entry(old, Role.CONTRIBUTOR)
     rights.require(new.rpartition("/")[0], Role.CONTRIBUTOR)
     if new.startswith(f"{old}/"):
-        raise InvalidProblem(f"The collection {old!r} cannot be moved into itself.", code="into-itself")
+        raise InvalidProblem(
+            f"The collection {old!r} cannot be moved into itself.",
+            code="into-itself",
+            unnamed="The collection cannot be moved into itself.",
+        )
     if new != old:
         ensure(tx, project_row, new.rpartition("/")[0])
     with taken(_path_taken(new)):

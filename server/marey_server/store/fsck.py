@@ -61,7 +61,7 @@ from marey_server.store.tables import (
 )
 from marey_server.store.transaction import Transaction
 from marey_versions.records import CommitRecord, entry_of
-from marey_versions.tree.chunks import Branch, DamagedChunk, decode
+from marey_versions.tree.chunks import Branch, DamagedChunk, Leaf, decode
 from marey_versions.tree.reading import Tree
 
 PAGE = 100
@@ -332,11 +332,12 @@ def _check_folder(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return a fault for each entry of a version if no revision of the project has the content of the entry."""
+    """Return a fault for each entry that is damaged, or whose content is not that of any revision of the project."""
     trees = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id == row.id)
     waiting = set(tx.execute(trees).scalars())
     seen: set[str] = set()
     lacking: dict[str, str] = {}
+    findings: list[StoreDefect] = []
     while waiting:
         batch = {waiting.pop() for _ in range(min(len(waiting), PAGE))}
         seen |= batch
@@ -347,13 +348,26 @@ def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
                 if isinstance(chunk, Branch):
                     waiting |= {child.digest for child in chunk.children} - seen
                 else:
-                    entries |= {(one := entry_of(*entry)).content: one.path for entry in chunk.entries}
+                    entries |= _contents_in(row, digest, chunk, findings)
         found = revisions_with(tx, row.project_id, entries)
         lacking |= {content: path for content, path in entries.items() if content not in found}
-    return [
+    return findings + [
         StoreDefect("entry-lost", row.id, f"no revision has the content {content} of {path!r}")
         for content, path in sorted(lacking.items())
     ]
+
+
+def _contents_in(row: Row[Any], digest: str, leaf: Leaf, findings: list[StoreDefect]) -> dict[str, str]:
+    """Return the paths of the entries in a chunk by their content; add a fault to `findings` for each damaged entry."""
+    found: dict[str, str] = {}
+    for key, value in leaf.entries:
+        try:
+            entry = entry_of(key, value)
+        except DamagedChunk as error:
+            findings.append(StoreDefect("entry-corrupt", row.id, f"in the chunk {digest}, {error}"))
+        else:
+            found[entry.content] = entry.path
+    return found
 
 
 def _check_proposals(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:

@@ -52,11 +52,18 @@ def selected_tree(lab: QueriedLab, text: str) -> str | None:
 def test_the_contents_that_are_selected_first_leave_out_no_entry(versioned: QueriedLab, text: str) -> None:
     found = selected_tree(versioned, text)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(selecting, "_possible_contents", lambda *_: None)
+        patch.setattr(selecting, "MOST_IN_MEMORY", 0)
+        patch.setattr(selecting, "SEARCHED_AT_ONCE", 3)
+        assert selected_tree(versioned, text) == found
+        patch.setattr(selecting, "_with_possible_content", lambda _tx, _project, _queries, entries: entries)
         assert selected_tree(versioned, text) == found
 
 
-def test_only_possible_contents_are_compared(versioned: QueriedLab, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("in_memory", [0, 1000])
+def test_only_possible_contents_are_compared(
+    versioned: QueriedLab, monkeypatch: pytest.MonkeyPatch, in_memory: int
+) -> None:
+    monkeypatch.setattr(selecting, "MOST_IN_MEMORY", in_memory)
     revised = len(versioned.clips[1::4]) + 2  # of these and of two more clips, the database does not have all facts
     monkeypatch.setattr(selecting, "MOST_SEARCHED", revised)
     assert selected_tree(versioned, "frames = 1000 and not tag = nothing") is None

@@ -49,16 +49,21 @@ def log(file: Path) -> Iterator[WriteAheadLog]:
 
 
 @pytest.fixture
-def writing(file: Path) -> Iterator[sqlite3.Connection]:
-    with closing(connect(file)) as connection:
+def page_bytes() -> int:
+    return write_ahead_log.PAGE_BYTES
+
+
+@pytest.fixture
+def writing(file: Path, page_bytes: int) -> Iterator[sqlite3.Connection]:
+    with closing(connect(file, page_bytes)) as connection:
         connection.execute("CREATE TABLE some (data BLOB)")
         yield connection
 
 
-def connect(file: Path) -> sqlite3.Connection:
+def connect(file: Path, page_bytes: int = write_ahead_log.PAGE_BYTES) -> sqlite3.Connection:
     connection = sqlite3.connect(file, isolation_level=None)
     limit = f"journal_size_limit = {SHORT_BYTES}"
-    for pragma in (f"page_size = {write_ahead_log.PAGE_BYTES}", "journal_mode = WAL", limit, "wal_autocheckpoint = 0"):
+    for pragma in (f"page_size = {page_bytes}", "journal_mode = WAL", limit, "wal_autocheckpoint = 0"):
         connection.execute(f"PRAGMA {pragma}")
     return connection
 
@@ -77,6 +82,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.001)
 
 
+@pytest.mark.parametrize("page_bytes", [write_ahead_log.PAGE_BYTES, 16_384], ids=["new", "earlier"])
 def test_a_log_that_was_copied_is_restarted_by_a_later_write(log: WriteAheadLog, writing: sqlite3.Connection) -> None:
     while write(log, writing) <= 4 * SHORT_BYTES:
         pass

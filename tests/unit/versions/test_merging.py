@@ -11,13 +11,14 @@ from tests.support.tiers import examples
 
 from marey_schemas.datasets.differences import ChangeKind
 from marey_schemas.datasets.merges import Side
+from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.names import MOST_TAGS
 from marey_versions.annotations import ADDED_TWICE, AnnotationClash
 from marey_versions.choices import Choice
 from marey_versions.compared import ComparedEntry, compare_entries
 from marey_versions.merging import ChangedPart, MergedEntries, merge_entries
-from marey_versions.records import DatasetEntry, key_of
-from marey_versions.tree.chunks import Value
+from marey_versions.records import DatasetEntry, key_of, revision_content
+from marey_versions.tree.chunks import Value, digest_of
 from marey_versions.tree.difference import Changed
 
 State = dict[str, Value]
@@ -31,6 +32,11 @@ values = st.builds(
     st.sets(st.sampled_from(["x", "y"])),
 )
 states = st.dictionaries(paths.map(lambda path: key_of(path, "clip")), values, max_size=5)
+
+
+@given(st.text(), st.dictionaries(st.text(), st.text(), max_size=4))
+def test_the_digest_of_a_content_is_that_of_its_canonical_json(kind: str, parts: dict[str, str]) -> None:
+    assert revision_content(kind, parts) == digest_of(canonical_json({"kind": kind, "parts": parts}))
 
 
 def entry(motion: str, info: str | None = None, *tags: str) -> Value:

@@ -104,19 +104,30 @@ def test_a_tree_without_its_entries_is_the_empty_tree() -> None:
 
 
 class Counting(ChunksInMemory):
-    """Store of chunks that counts how many chunks are loaded and how many bytes are stored."""
+    """Store of chunks that counts requests for chunks, loaded chunks, and stored bytes."""
 
-    loaded = 0
+    loaded = requests = 0
     stored_bytes = 0
 
     def load(self, digests: Iterable[str]) -> Mapping[str, bytes]:
         found = super().load(digests)
         self.loaded += len(found)
+        self.requests += 1
         return found
 
     def save(self, chunks: Mapping[str, bytes]) -> None:
         self.stored_bytes += sum(map(len, chunks.values()))
         super().save(chunks)
+
+
+def test_a_difference_loads_the_chunks_of_each_level_of_both_trees_at_once() -> None:
+    entries = numbered(5_000)
+    store = Counting(stored(entries)[0])
+    root = build(ChunksInMemory(), sorted(entries.items()))
+    other = change(store, root, {f"take-{number:05d}": {"number": -1} for number in range(0, 5_000, 500)})
+    store.requests = 0
+    assert len(list(difference(store, root, other))) == 10
+    assert store.requests == decode(root, store[root]).level + 1
 
 
 @pytest.mark.slow

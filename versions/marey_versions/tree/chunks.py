@@ -15,6 +15,8 @@ Entry = tuple[str, Value]
 SCHEMA = "marey/tree-chunk@1"
 MOST_CHUNK_BYTES = 8 * 2**20
 """Greatest size of a chunk in bytes; a chunk usually has about 4,000."""
+MOST_ENTRIES = 1 << 40
+"""Greatest number of entries in a tree that a chunk can state, so that sums of these numbers remain lengths."""
 
 
 class DamagedChunk(Exception):
@@ -121,12 +123,41 @@ def decode(digest: str, data: bytes) -> Chunk:
 
 
 def decode_trusted(digest: str, data: bytes) -> Chunk:
-    """Return the chunk with these bytes, read from a store that checked the digest when it stored them."""
+    """Return the chunk with these bytes, read from a store that checked the digest when it stored them.
+
+    Raises `DamagedChunk` if the bytes are not those of a chunk, for example if a member has another type.
+    """
     try:
         content = orjson.loads(data)
+        if content["schema"] != SCHEMA:
+            raise ValueError(f"it does not have the schema {SCHEMA}")
         level = content["level"]
-        if level == 0:
-            return Leaf(tuple((key, value) for key, value in content["entries"]))
-        return Branch(level, tuple(Child(*child) for child in content["children"]))
+        if type(level) is not int or level < 0:
+            raise ValueError("its level is not a number of levels")
+        return _branch(level, content["children"]) if level else _leaf(content["entries"])
     except (orjson.JSONDecodeError, KeyError, TypeError, ValueError) as error:
         raise DamagedChunk(f"the chunk {digest} cannot be read: {error}") from error
+
+
+def _leaf(members: Any) -> Leaf:
+    entries = []
+    before = ""
+    for key, value in members:
+        if key <= before or type(value) is not dict:  # a key that is no text cannot be compared: a TypeError
+            raise ValueError(f"its entry {key!r} has no object as value, or is not in order")
+        before = key
+        entries.append((key, value))
+    return Leaf(tuple(entries))
+
+
+def _branch(level: int, members: Any) -> Branch:
+    children = []
+    before = ""
+    for key, digest, entries in members:
+        if key <= before or type(digest) is not str or type(entries) is not int or not 0 < entries <= MOST_ENTRIES:
+            raise ValueError(f"its reference to the chunk that ends with {key!r} is not valid, or is not in order")
+        before = key
+        children.append(Child(key, digest, entries))
+    if not children:
+        raise ValueError("it refers to no chunk below it")
+    return Branch(level, tuple(children))

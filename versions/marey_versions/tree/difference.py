@@ -44,7 +44,7 @@ def _before_all_with(prefix: str) -> str | None:
 def _difference(reader: ChunkReader, before: str, after: str, within: KeyRange) -> Iterator[Changed]:
     if before == after:
         return iter(())
-    pair = [reader.one(before), reader.one(after)]
+    pair = reader.several([before, after])
     sides = [[Child(chunk.last_key, root, chunk.count)] for chunk, root in zip(pair, (before, after), strict=True)]
     levels = [chunk.level for chunk in pair]
     while max(levels) != min(levels):
@@ -80,7 +80,8 @@ def _compare(
         yield from _compare_leaves(reader, before, after, within)
         return
     for part in _parts(before, after, within):
-        old, new = (_inside(_expanded(reader, _inside(side, part), level), part) for side in (before, after))
+        sides = _loaded(reader, before, after, part)
+        old, new = (_inside(_expanded(reader, side, level), part) for side in sides)
         yield from _compare(reader, level - 1, old, new, part)
 
 
@@ -92,6 +93,15 @@ def _parts(before: Sequence[Child], after: Sequence[Child], within: KeyRange) ->
         yield KeyRange(start, longer[place].last_key)
         start = longer[place].last_key
     yield KeyRange(start, within.last)
+
+
+def _loaded(
+    reader: ChunkReader, before: Sequence[Child], after: Sequence[Child], within: KeyRange
+) -> tuple[list[Child], list[Child]]:
+    """Return the chunks of both trees that can have keys in a range; they were loaded with one request to the store."""
+    sides = _inside(before, within), _inside(after, within)
+    reader.several([child.digest for side in sides for child in side])
+    return sides
 
 
 def _inside(children: Sequence[Child], within: KeyRange) -> list[Child]:
@@ -113,7 +123,7 @@ def _compare_leaves(
     reader: ChunkReader, before: Sequence[Child], after: Sequence[Child], within: KeyRange
 ) -> Iterator[Changed]:
     for part in _parts(before, after, within):
-        old, new = (_entries(reader, _inside(side, part), part) for side in (before, after))
+        old, new = (_entries(reader, side, part) for side in _loaded(reader, before, after, part))
         for key in sorted(old.keys() | new.keys()):
             if old.get(key) != new.get(key):
                 yield Changed(key, old.get(key), new.get(key))

@@ -182,6 +182,7 @@ class DatasetMerges(Resource):
         body=RequestBody(MergeRequest, max_bytes=MAX_COMMIT_BYTES),
         answer=MergeAnswer,
         idempotency="key",
+        names=True,
     )
     async def post(self, project: str, dataset: str, body: MergeRequest) -> Rendered:
         """Merge a version into a branch, entry by entry and part by part, or preview the result.
@@ -204,6 +205,7 @@ class CherryPicks(Resource):
         body=RequestBody(PickRequest, max_bytes=MAX_COMMIT_BYTES),
         answer=MergeAnswer,
         idempotency="key",
+        names=True,
     )
     async def post(self, project: str, dataset: str, body: PickRequest) -> Rendered:
         """Repeat the changes of one commit on a branch, or preview the result.
@@ -225,6 +227,7 @@ class DatasetReverts(Resource):
         body=RequestBody(PickRequest, max_bytes=MAX_COMMIT_BYTES),
         answer=MergeAnswer,
         idempotency="key",
+        names=True,
     )
     async def post(self, project: str, dataset: str, body: PickRequest) -> Rendered:
         """Undo the changes of one commit on a branch, but not later changes, or preview the result.

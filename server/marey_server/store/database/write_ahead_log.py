@@ -22,9 +22,10 @@ from marey_server import faults
 
 log = logging.getLogger(__name__)
 
-PAGE_BYTES = 16_384
-FRAME_BYTES = PAGE_BYTES + 24
-"""Size in bytes of a page in the log, with its header."""
+PAGE_BYTES = 8192
+"""Size of the pages of new databases; others keep theirs (docs/decisions/0053)."""
+HEADER_BYTES = 24
+"""Size of the header of a page in the log."""
 SHORT_BYTES = 4 * 2**20
 """Length of the log up to which nothing is copied. SQLite shortens the file to this length after restarting the log."""
 LITTLE_BYTES = 3 * 2**20
@@ -102,12 +103,13 @@ class WriteAheadLog:
                 self._connection = sqlite3.connect(self._file, isolation_level=None, check_same_thread=False)
             faults.point("log.before_copy")
             pages: int = self._connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()[2]
+            (page_bytes,) = self._connection.execute("PRAGMA page_size").fetchone()
             faults.point("log.after_copy")
         except sqlite3.Error as error:
             self._note_failure(error)
             return 0
         self._failing = False
-        return max(pages, 0) * FRAME_BYTES
+        return max(pages, 0) * (int(page_bytes) + HEADER_BYTES)
 
     def _restart(self, connection: sqlite3.Connection, patience_ms: int) -> None:
         """Copy the rest of the log into the database, then restart the log.

@@ -116,6 +116,7 @@ def _require_recorded(tx: Transaction, found: Row[Any], state: FolderState, stor
             f"The folder {found.path!r} has changes that no commit has recorded; commit or discard them.",
             code="uncommitted-changes",
             context={"count": len(changed)},
+            unnamed="The folder has changes that no commit has recorded; commit or discard them.",
         )
 
 
@@ -128,6 +129,8 @@ def _require_possible(found: Row[Any], compared: Sequence[ComparedEntry]) -> Non
                 f"The entry at {entry.path!r} has {len(entry.tags)} tags; an item has at most {MOST_TAGS}. Commit the "
                 "entry with fewer tags, or check out another version.",
                 code="too-many-tags",
+                unnamed=f"An entry has {len(entry.tags)} tags; an item has at most {MOST_TAGS}. Commit the entry with "
+                "fewer tags, or check out another version.",
             )
 
 
@@ -179,6 +182,8 @@ class _Checkout:
                 f"The project has no item with the content of {counted(len(lacking), 'entry')} of the version; the "
                 f"first is at {lacking[0]!r}. Commit an existing item to this path, or check out another version.",
                 code="no-content",
+                unnamed=f"The project has no item with the content of {counted(len(lacking), 'entry')} of the version. "
+                "Check out another version.",
             )
         parts = read_part_digests(self.tx, set(held.values()))
         return {content: (key[0], parts[key]) for content, key in held.items()}

@@ -41,7 +41,7 @@ from marey_server.store.purge_lock import hold_off_purges, last_purge, require_n
 from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, fast_forward, item, user
 from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.merging import CombinedEntry
-from marey_versions.records import CommitRecord, DatasetEntry, RevisionKey, key_of, path_and_kind
+from marey_versions.records import CommitRecord, DatasetEntry, RevisionKey, entry_of, key_of, path_and_kind
 from marey_versions.tree.building import build
 from marey_versions.tree.chunks import Value
 from marey_versions.tree.editing import change
@@ -267,6 +267,8 @@ def _require_checked_out(found: Row[Any], manifest: FolderManifest | None, paren
                 "folder_commit": there, "commit": parent,
                 "checked_out": None if manifest is None else manifest.shown,
             },
+            unnamed="The version that is checked out in the folder is not the newest one of this branch. Check out the "
+            "branch, or commit to the branch that is checked out.",
         )  # fmt: skip
 
 
@@ -301,6 +303,8 @@ def _require_selected(found: Row[Any], changes: Mapping[str, Value | None], sele
             "one is there. Rename it, or check out a selection that includes this entry.",
             code="not-checked-out",
             context={"count": len(hidden), "path": path, "kind": kind},
+            unnamed="The folder has an item in the place of an entry that is not checked out. Rename the item, or "
+            "check out a selection that includes this entry.",
         )
 
 
@@ -379,4 +383,4 @@ def _take_away(state: dict[str, Value | None], one: RemoveEntry | MoveEntry) -> 
         target = key_of(one.to, one.kind)
         if state.get(target) is not None:
             raise ConflictProblem(f"The version has a {one.kind.value} at {one.to!r} already.", code="path-taken")
-        state[target] = value
+        state[target] = entry_of(key, value).value  # a damaged entry is not copied

@@ -51,7 +51,9 @@ def read_folder(tx: Transaction, project_row: ProjectRow, found: Row[Any]) -> Fo
         )
     if found.folder_deleted_us is not None:
         raise InvalidProblem(
-            f"The folder {found.path!r} of the dataset is deleted; restore it first.", code="folder-deleted"
+            f"The folder {found.path!r} of the dataset is deleted; restore it first.",
+            code="folder-deleted",
+            unnamed="The folder of the dataset is deleted; restore it first.",
         )
     rows = tx.execute(_items_in(project_row, found.path)).all()
     contents = find_contents_of(tx, project_row.id, [RevisionKey(row.id, row.head) for row in rows])

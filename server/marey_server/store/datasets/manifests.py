@@ -16,7 +16,7 @@ from sqlalchemy import ColumnElement, Row, and_, select
 from marey_server.store.datasets.chunks import StoredChunks, store_chunks
 from marey_server.store.tables import dataset, dataset_commit
 from marey_server.store.transaction import Transaction, in_lists
-from marey_versions.tree.chunks import Leaf, encode
+from marey_versions.tree.chunks import Chunk, DamagedChunk, Leaf, encode
 from marey_versions.tree.reading import ChunkReader
 
 _KEY = "manifest"
@@ -60,9 +60,19 @@ def read_manifests(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, Folde
     reader = ChunkReader(StoredChunks(tx))
     partial = sorted(named.keys() - found.keys())
     for of, chunk in zip(partial, reader.several([named[one] for one in partial]), strict=True):
-        assert isinstance(chunk, Leaf)
-        found[of] = FolderManifest(**dict(chunk.entries)[_KEY])
+        found[of] = _manifest_in(chunk)
     return found
+
+
+def _manifest_in(chunk: Chunk) -> FolderManifest:
+    """Return the manifest in a chunk. Raises `DamagedChunk` if the chunk does not contain one."""
+    value = dict(chunk.entries).get(_KEY) if isinstance(chunk, Leaf) else None
+    if value is None or value.keys() != {"commit", "query", "paths", "tree"}:
+        raise DamagedChunk("the chunk does not contain the manifest of a folder")
+    texts = [value["commit"], value["tree"], *(value["paths"] if type(value["paths"]) is list else [None])]
+    if not all(isinstance(one, str) for one in texts) or not isinstance(value["query"], str | None):
+        raise DamagedChunk("a member of the manifest of a folder has another type")
+    return FolderManifest(**value)
 
 
 def store_manifest(tx: Transaction, manifest: FolderManifest) -> str:

@@ -239,6 +239,7 @@ def record_merge(
             f"{counted(merge.answer.conflict_count, 'entry')} changed on both sides; send a resolution for each.",
             code="merge-conflicts",
             context=merge.answer.model_dump(mode="json"),
+            unnamed=True,
         )
     commit = record_commit(tx, project, name, merge.commit, mover)
     return merge.answer.model_copy(update={"commit": commit})
@@ -300,5 +301,6 @@ def _common(tx: Transaction, dataset_id: str, ours: str, theirs: str) -> str | N
             "commits that the branch lacks instead.",
             code="several-bases",
             context={"commits": nearest},
+            unnamed=True,
         )
     return nearest[0] if nearest else None

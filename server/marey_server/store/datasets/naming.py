@@ -203,11 +203,10 @@ def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> 
     held = tx.execute(select(func.count()).where(dataset_ref.c.dataset_id == row.id)).scalar_one()
     _require_room(held, MOST_REFS, "branches and tags in a dataset", "too-many-refs")
     with taken(ConflictProblem(f"There is a branch or tag {request.name!r} already.", code="name-taken")):
-        tx.execute(insert(dataset_ref).values(**new_ref(tx, row.id, request.name, request.kind, digest)))
+        row_of_ref = new_ref(tx, row.id, request.name, request.kind, digest)
+        made = tx.execute(insert(dataset_ref).values(**row_of_ref).returning(*dataset_ref.c)).one()
     created: OrdinaryEventKind = "branch.created" if request.kind is RefKind.BRANCH else "tag.created"
     tx.emit(created, row.id, project_id=project_row.id, name=request.name, commit=digest)
-    made = find_ref(tx, row.id, request.name)
-    assert made is not None
     return _shown_ref(made)
 
 
@@ -250,6 +249,7 @@ def branch_moved(branch: str, head: str | None) -> ConflictProblem:
         f"The branch {branch!r} has moved. Read it again, then repeat the commit.",
         code=BRANCH_MOVED,
         context={"commit": head},
+        unnamed="The branch has moved. Read it again, then repeat the commit.",
     )
 
 
@@ -326,6 +326,8 @@ def resolve(tx: Transaction, dataset_id: str, version: str) -> str:
     if ref is not None and ref.digest is None:
         raise NotFoundProblem(f"The branch {name!r} has no commits yet.", code="no-commits")
     digest = _by_digits(tx, dataset_id, name) if ref is None else str(ref.digest)
+    if back == 0:
+        return digest
     chain = first_parents(dataset_id, digest, back)
     found = tx.execute(select(chain.c.digest).where(chain.c.place == back)).scalar()
     if found is None:
@@ -373,7 +375,9 @@ def _require_no_commit(tx: Transaction, dataset_id: str, name: str) -> None:
     """
     if found := _commits_by_digits(tx, dataset_id, name):
         raise ConflictProblem(
-            f"The commit {found[0]} is named by its first digits {name!r}; choose another name.", code="name-taken"
+            f"The commit {found[0]} is named by its first digits {name!r}; choose another name.",
+            code="name-taken",
+            unnamed=f"A commit is named by its first digits {name!r}; choose another name.",
         )
 
 

@@ -46,12 +46,15 @@ def require_move(ref: Row[Any], mover: Mover) -> None:
         return
     if not roles.includes(mover.role, rule.role):
         raise ForbiddenProblem(
-            f"The branch {ref.name!r} is protected; moving it requires at least the role {rule.role.value}.", code=CODE
+            f"The branch {ref.name!r} is protected; moving it requires at least the role {rule.role.value}.",
+            code=CODE,
+            unnamed=f"The branch is protected; moving it requires at least the role {rule.role.value}.",
         )
     if not rule.direct_commits and not mover.by_proposal:
         raise ConflictProblem(
             f"The branch {ref.name!r} is protected. Commit to another branch, then open a proposal to merge it.",
             code=CODE,
+            unnamed="The branch is protected. Commit to another branch, then open a proposal to merge it.",
         )
 
 
@@ -94,5 +97,7 @@ def require_no_protected_branch(tx: Transaction, dataset_id: str) -> None:
     name = tx.execute(protected.limit(1)).scalar()
     if name is not None:
         raise ConflictProblem(
-            f"The branch {name!r} is protected; remove the protection before you delete the dataset.", code=CODE
+            f"The branch {name!r} is protected; remove the protection before you delete the dataset.",
+            code=CODE,
+            unnamed="A branch is protected; remove the protection before you delete the dataset.",
         )

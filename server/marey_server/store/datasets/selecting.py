@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
-from sqlalchemy import Row, and_, select
+from sqlalchemy import Row, Select, and_, select
 
 from marey_schemas.datasets.checkouts import CheckoutRequest
 from marey_schemas.kinds import Kind
@@ -39,6 +39,8 @@ from marey_versions.tree.reading import ChunkReader, Tree
 MOST_SEARCHED = 200_000
 """Greatest number of entries whose content one query is compared with."""
 SEARCHED_AT_ONCE = 1000
+MOST_IN_MEMORY = 200_000
+"""Greatest number of content digests that are in memory at the same time; they take about 30 MB."""
 OF_ENTRIES = frozenset({"name", "path", "folder", "tag"})
 """Fields of queries that an entry has apart from its content."""
 
@@ -117,9 +119,9 @@ def _matching(
     if len(early) == len(operands):
         yield from ((entry.key, entry.value) for entry in found)
         return
-    possible = _possible_contents(tx, project_id, [one for one in operands if _is_of_content(one)])
-    if possible is not None:
-        found = (entry for entry in found if entry.content in possible)
+    of_content = [one for one in operands if _is_of_content(one)]
+    if of_content:
+        found = _with_possible_content(tx, project_id, of_content, found)
     for some in batched(_limited(found), SEARCHED_AT_ONCE):
         for entry, facts in _facts(tx, project_id, folder, some):
             if matches(query, facts):
@@ -132,22 +134,39 @@ def _is_of_content(query: Query) -> bool:
     return fields.isdisjoint(OF_ENTRIES) and not any(field.startswith(FACET_PREFIX) for field in fields)
 
 
-def _possible_contents(tx: Transaction, project_id: str, queries: Sequence[Query]) -> set[str] | None:
-    """Return the content digests of the revisions of a project that may meet all `queries`; None without `queries`.
+def _with_possible_content(
+    tx: Transaction, project_id: str, queries: Sequence[Query], entries: Iterable[DatasetEntry]
+) -> Iterator[DatasetEntry]:
+    """Yield the entries whose content is that of a revision of the project which may meet all `queries`.
 
-    The newest revisions are selected by the database, which has their facts. Older revisions are all returned.
+    The database evaluates the queries for the newest revisions, because it has their facts. Older revisions may all
+    meet them. If the contents of these revisions are too many for the memory, the database is asked for each group of
+    entries.
     """
-    if not queries:
-        return None
+    newest, older = _possible_contents(project_id, queries)
+    possible = set(tx.execute(newest.limit(MOST_IN_MEMORY + 1)).scalars())
+    possible.update(tx.execute(older.limit(MOST_IN_MEMORY + 1)).scalars())
+    if len(possible) <= MOST_IN_MEMORY:
+        yield from (entry for entry in entries if entry.content in possible)
+        return
+    del possible
+    for some in batched(entries, SEARCHED_AT_ONCE):
+        among = revision.c.content.in_({entry.content for entry in some})
+        found = {*tx.execute(newest.where(among)).scalars(), *tx.execute(older.where(among)).scalars()}
+        yield from (entry for entry in some if entry.content in found)
+
+
+def _possible_contents(project_id: str, queries: Sequence[Query]) -> tuple[Select[Any], Select[Any]]:
+    """Return SQL statements for the contents of newest revisions that meet all `queries`, and of all older ones."""
     of_project = (
         select(revision.c.content)
         .join(item, item.c.id == revision.c.item_id)
-        .where(item.c.project_id == project_id, item.c.purged_us.is_(None))
+        .where(item.c.project_id == project_id, item.c.purged_us.is_(None), revision.c.content.is_not(None))
     )
     selected = and_(*(sql_of(one, project_id) for one in queries))
-    newest = tx.execute(of_project.where(revision.c.number == item.c.head, selected)).scalars()
-    older = tx.execute(of_project.where(revision.c.number != item.c.head)).scalars()
-    return {*newest, *older}
+    return of_project.where(revision.c.number == item.c.head, selected), of_project.where(
+        revision.c.number != item.c.head
+    )
 
 
 def _early(entries: Iterable[tuple[str, Value]], early: Sequence[Query], folder: str) -> Iterator[DatasetEntry]:

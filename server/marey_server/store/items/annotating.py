@@ -82,5 +82,9 @@ def _frame_count(tx: Transaction, project: str, annotated: dict[str, Any]) -> in
     try:
         motion = read_part(tx, project, Kind.CLIP, clip.item, "motion", revision=clip.revision, arrays="none").tree
     except NotFoundProblem as error:
-        raise InvalidProblem(f"The clip of the annotation no longer exists: {error.detail}", code="no-clip") from error
+        raise InvalidProblem(
+            f"The clip of the annotation no longer exists: {error.detail}",
+            code="no-clip",
+            unnamed="The clip of the annotation no longer exists.",
+        ) from error
     return int(motion["poses"]["shape"][0])

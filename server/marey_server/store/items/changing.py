@@ -213,7 +213,12 @@ def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, exp
     collection_id = collections.ensure(tx, project_row, gone.path)
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_not(None), item.c.purged_us.is_(None))
     values = {"deleted_us": None, "updated_us": tx.now_us, "collection_id": collection_id}
-    with taken(ConflictProblem(f"The collection now contains another {kind} named {gone.name!r}.", code="name-taken")):
+    name_taken = ConflictProblem(
+        f"The collection now contains another {kind} named {gone.name!r}.",
+        code="name-taken",
+        unnamed=f"The collection now contains another {kind} with the same name.",
+    )
+    with taken(name_taken):
         row = change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))
     quotas.hold(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
     shown = _shown(tx, project_row, kind, item_id)

@@ -98,6 +98,7 @@ def require_consent(ended: Collection[EndedConsent]) -> None:
         f"{what}. {CONSENT_REMEDY}",
         code=CONSENT_EXPIRED,
         context=_named(ended),
+        unnamed=f"The consent for {counted(len(ended), 'clip')} ended. {CONSENT_REMEDY}",
     )
 
 

@@ -353,6 +353,8 @@ class _Publication:
                 raise ConflictProblem(
                     f"There is already a {kind} {place!r}; choose another name, or change the existing item.",
                     code="name-taken",
+                    unnamed=f"There is already a {kind} with this folder and name; choose another name, or change the "
+                    "existing item.",
                 )
 
     def _row(self, one: _Ready, item_id: str) -> dict[str, Any]:

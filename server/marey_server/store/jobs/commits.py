@@ -93,7 +93,7 @@ def check_target(
         require_move(ref, Mover(author_of(tx), project.role))
     except ApiProblem as error:
         fault = FieldError(pointer=f"{at}/branch", code=error.error_code, detail=error.detail)
-        raise type(error)(error.detail, code=error.error_code, errors=[fault]) from None
+        raise type(error)(error.detail, code=error.error_code, errors=[fault], unnamed=error.unnamed) from None
     target = {
         **request.model_dump(), "dataset_id": found.id, "base": ref.digest, "within": found.path or "", "kinds": kinds,
     }  # fmt: skip

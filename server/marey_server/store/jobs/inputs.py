@@ -104,7 +104,11 @@ def pin_inputs(
         )
     if errors:
         first = f"{errors[0].pointer}: {errors[0].detail}"
-        raise InvalidProblem(f"The inputs of the job are not valid: {first}", errors=errors[:100])
+        raise InvalidProblem(
+            f"The inputs of the job are not valid: {first}",
+            errors=errors[:100],
+            unnamed="The inputs of the job are not valid: they are missing, of another kind, or cannot be read.",
+        )
     return pins
 
 

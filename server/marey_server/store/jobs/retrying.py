@@ -48,6 +48,7 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
         raise ConflictProblem(
             f"This job is a task of the job {row.parent_id} and cannot be retried alone; retry the other job.",
             code="is-task",
+            unnamed="This job is a task of another job and cannot be retried alone; retry the other job.",
         )
     family = _Family(tx, project)
     family.add_with_needed([job_id])
@@ -155,7 +156,8 @@ def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_
     pins = _late_pins(row, stand_ins) if row.unbound else _pins_of(tx, row, kind.fan_out)
     if purged := [pin["item"] for many in pins.values() for pin in many if "purged" in pin]:
         detail = f"The job cannot run again: its input {purged[0]} was purged, and the content of this input is gone."
-        raise ConflictProblem(detail, code="input-purged")
+        unnamed = "The job cannot run again: one of its inputs was purged, and the content of this input is gone."
+        raise ConflictProblem(detail, code="input-purged", unnamed=unnamed)
     return Submission(
         kind,
         request_of(row).model_copy(update={"concurrency_key": _concurrency_key(tx, row)}),

@@ -163,7 +163,8 @@ def _check(
         raise InvalidProblem(detail, errors=found) from error
     pins = pin_inputs(tx, project, kind, request, known, at)
     if (clash := find_clash(kind, params, pins, request.into)) is not None:
-        raise _invalid(f"{at}{clash.place}", clash.code, clash.detail)
+        unnamed = "Two results of the job, or a result and an input, would have the same place, or a path is too long."
+        raise _invalid(f"{at}{clash.place}", clash.code, clash.detail, unnamed)
     tasks, plain = _count_tasks(kind, params, at), params.model_dump(mode="json")
     late = [maker for _, _, maker in late_inputs(request, at)]
     return Submission(
@@ -196,8 +197,9 @@ def _count_tasks(kind: KindDeclaration, params: Any, at: str) -> int:
     return count
 
 
-def _invalid(pointer: str, code: str, detail: str) -> InvalidProblem:
-    return InvalidProblem(detail, errors=[FieldError(pointer=pointer, code=code, detail=detail)])
+def _invalid(pointer: str, code: str, detail: str, unnamed: str | None = None) -> InvalidProblem:
+    errors = [FieldError(pointer=pointer, code=code, detail=detail)]
+    return InvalidProblem(detail, errors=errors, unnamed=unnamed)
 
 
 def _lock_upstream(

@@ -57,6 +57,8 @@ def delete_uncited_ref(
         "version first.",
         code="tag-cited",
         context={"holders": [one.model_dump(mode="json") for one in held.holders], "others": held.others},
+        unnamed=f"The tag {ref!r} cannot be deleted, because its version is cited. Purge what cites it, or create "
+        "another tag of the same version first.",
     )
 
 

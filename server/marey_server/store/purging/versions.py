@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from sqlalchemy import and_, func, select
 
@@ -14,7 +14,7 @@ from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.tables import dataset, dataset_commit, dataset_ref, proposal
 from marey_server.store.transaction import Transaction
 from marey_versions.records import entry_of
-from marey_versions.tree.chunks import Branch, DamagedChunk, decode_trusted
+from marey_versions.tree.chunks import Branch, DamagedChunk, Entry, decode_trusted
 
 _AT_ONCE = 200
 _NOTHING: frozenset[str] = frozenset()
@@ -78,8 +78,11 @@ class VersionSearch:
             self._below[digest] = _NOTHING.union(*found) if any(found) else _NOTHING
         return self._below[digest]
 
-    def _found_in(self, entries: Iterable[Any]) -> frozenset[str]:
-        near = [entry for entry in entries if not self._parts.isdisjoint(entry[1]["parts"].values())]
+    def _found_in(self, entries: Iterable[Entry]) -> frozenset[str]:
+        try:  # `entry_of` would check each entry, but few of them have a wanted part
+            near = [entry for entry in entries if not self._parts.isdisjoint(entry[1]["parts"].values())]
+        except (KeyError, AttributeError, TypeError) as error:
+            raise DamagedChunk(f"an entry of a version has no parts that are texts: {error!r}") from error
         return frozenset(entry_of(*one).content for one in near) & self.wanted.keys() if near else _NOTHING
 
     def holders(self, tx: Transaction, contents: Mapping[str, Collection[str]]) -> dict[str, list[DatasetHolder]]:

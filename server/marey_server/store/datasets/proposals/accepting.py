@@ -229,6 +229,7 @@ def _require_green(prepared: PreparedAcceptance, missing: tuple[Missing, ...]) -
             f"The proposal cannot be merged yet. {' '.join(one.detail for one in missing)}",
             code="proposal-not-green",
             context={"missing": [one.model_dump(mode="json") for one in missing]},
+            unnamed="The proposal cannot be merged yet: approvals or checks are missing, or it has conflicts.",
         )
 
 

@@ -55,6 +55,7 @@ def lock_open(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
             f"The proposal {number} is {row.state} already, by {row.ending_name}.",
             code=f"proposal-{row.state}",
             context={"state": row.state, "merged": row.merged},
+            unnamed=f"The proposal {number} is {row.state} already.",
         )
     return row
 
@@ -66,6 +67,7 @@ def require_newest(tx: Transaction, row: Row[Any], version: str | None) -> None:
             "The proposal has a newer commit than the one in the request; review the newest commit first.",
             code="proposal-moved",
             context={"commit": row.head_now},
+            unnamed=True,
         )
 
 

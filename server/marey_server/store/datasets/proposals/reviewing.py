@@ -108,6 +108,7 @@ def _require_job(tx: Transaction, project_id: str, job_id: str, state: CheckStat
             f"The job {job_id} read versions of the dataset, but not the newest commit of the proposal.",
             code="job-of-another-commit",
             context={"commits": sorted(read)},
+            unnamed=True,
         )
 
 
