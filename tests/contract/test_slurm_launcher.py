@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -10,9 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from tests.support.attached_worker import python_path
 from tests.support.launcher_contract import REQUEST, Engine, LauncherContract, processes_of
+from tests.support.server_process import ServerProcess
 from tests.support.slurm_cluster import CPUS, SlurmCluster, missing_programs, running_cluster
 
+from marey_schemas.access import ProjectCreate
+from marey_schemas.queue.jobs import JobCreate
 from marey_server.launchers import slurm
 from marey_server.launchers.launcher import EngineError, LaunchContext, Launcher, LauncherUnusable
 from marey_server.launchers.slurm import SlurmLauncher
@@ -112,6 +117,44 @@ class TestSlurmLauncher(LauncherContract):
         os.environ[slurm.CONFIGURATION] = str(cluster.configuration)
         cluster.start_controller()
         assert engine.states()[name] == "running"
+
+    def test_the_workers_of_a_pool_outlive_their_server_and_work_for_the_next(
+        self, cluster: SlurmCluster, tmp_path: Path
+    ) -> None:
+        pool = {
+            "name": "night",
+            "least": 1,
+            "most": 2,
+            "kinds": ["add"],
+            "memory_mb": 512,
+            "options": {"qos": "normal"},
+        }
+        environment = {"MAREY_POOLS": json.dumps([pool]), "MAREY_LAUNCHER": "slurm", "PYTHONPATH": python_path()}
+        server = ServerProcess(tmp_path, SLURM_CONF=str(cluster.configuration), **environment).start()
+
+        def work() -> str:
+            with server.client() as marey:
+                job = marey.jobs.submit("lab", JobCreate(kind="add", params={"a": 1, "b": 2}, cache="off"))
+                assert marey.jobs.wait(job.id).result["sum"] == 3
+                (attempt,) = marey.jobs.attempts(job.id)
+                return attempt.worker
+
+        try:
+            with server.client() as marey:
+                marey.create_project(ProjectCreate(name="lab"))
+            name = work()
+            (worker,) = processes_of(name)
+            server.kill()
+            assert worker.is_running()
+            server.start()
+            assert work() == name
+            assert processes_of(name) == [worker]
+            assert server.stop() == 0
+            assert worker.is_running()
+            assert server.log.read_text().count("pool night: started 1 workers") == 1
+        finally:
+            server.kill()
+            cluster.ask("scancel", "--me")
 
 
 def test_an_option_that_slurm_does_not_have_is_refused(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ class SlurmCluster:
             "SlurmctldPort": str(reserved_port()),
             "SlurmdPort": str(reserved_port()),
             "AuthType": "auth/munge",
-            "AuthInfo": f"socket={folder}/munge.socket",
+            "AuthInfo": f"socket={folder}/munge.socket,cred_expire=15",  # also the pause before a task is run again
             "StateSaveLocation": f"{folder}/state",
             "SlurmdSpoolDir": f"{folder}/spool",
             "SlurmctldPidFile": f"{folder}/slurmctld.pid",

@@ -22,6 +22,9 @@ from marey_server.process.data_folder import WORKER_TOKENS
 ENTRY_POINTS = "marey.launchers"
 """Group of entry points in which packages register their launchers."""
 
+HEALTHY_AFTER_S = 30.0
+"""Run time in seconds after which a worker counts as healthy, so that its end is no reason for a long pause."""
+
 WorkerState = Literal["starting", "running", "ended"]
 
 EndReason = Literal[
@@ -45,7 +48,7 @@ class LauncherUnusable(Exception):
 
 @dataclass(frozen=True)
 class LaunchContext:
-    """What the workers of a pool need to reach the server, and the settings of the launcher.
+    """Facts that the workers of a pool need to reach the server, and the options of the launcher.
 
     Parameters
     ----------

@@ -18,6 +18,7 @@ from datetime import UTC, datetime
 from marey_schemas.backoff import Backoff
 from marey_schemas.processes.environment import clean_environment
 from marey_server.launchers.launcher import (
+    HEALTHY_AFTER_S,
     LaunchContext,
     LaunchedWorker,
     LauncherUnusable,
@@ -31,9 +32,6 @@ from marey_server.process.data_folder import WORKER_CACHE
 log = logging.getLogger(__name__)
 
 PAUSES = Backoff(first_s=0.5, longest_s=30.0, jitter=0.25)
-HEALTHY_AFTER_S = 30.0
-"""Run time in seconds after which a worker counts as healthy, so that it is restarted after a short pause."""
-
 STOP_S = 20.0
 
 

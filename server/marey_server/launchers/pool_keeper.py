@@ -16,7 +16,7 @@ from typing import TypeVar
 from marey_schemas.backoff import Backoff
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ApiProblem
-from marey_server.launchers.launcher import EngineError, LaunchedWorker, Launcher, WorkerRequest
+from marey_server.launchers.launcher import HEALTHY_AFTER_S, EngineError, LaunchedWorker, Launcher, WorkerRequest
 from marey_server.launchers.pool_size import PoolLimits, PoolSize
 from marey_server.process.worker_pools import WorkerPool
 from marey_server.store import leader
@@ -35,8 +35,6 @@ ENGINE_S = 60.0
 LEAD_TTL_US = 60_000_000
 VISIBLE_AFTER_S = 60.0
 """Seconds after a start for which a worker counts although the engine does not list it yet."""
-HEALTHY_AFTER_S = 30.0
-"""Run time in seconds after which the end of a worker is no reason to pause the next start."""
 FAULT_PAUSES = Backoff(first_s=10.0, longest_s=300.0, jitter=0.25)
 START_PAUSES = Backoff(first_s=5.0, longest_s=600.0, jitter=0.25)
 QUIET_ENDS = ("finished", "stopped", "deadline", "preempted")

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-MOST_SAMPLES = 1000
+SAMPLES_REMEMBERED = 1000
 """Greatest number of remembered samples; the oldest are forgotten first."""
 
 
@@ -37,7 +37,7 @@ class PoolSize:
 
     def __init__(self, limits: PoolLimits) -> None:
         self._limits = limits
-        self._samples: deque[tuple[float, int]] = deque(maxlen=MOST_SAMPLES)
+        self._samples: deque[tuple[float, int]] = deque(maxlen=SAMPLES_REMEMBERED)
         """Times, and the number of workers that the queue needed at each time."""
         self._since_s: float | None = None
 

@@ -11,6 +11,7 @@ import asyncio
 import logging
 import os
 import re
+import signal
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -56,6 +57,8 @@ FIELDS = ("ArrayJobID", "ArrayTaskID", "Name", "State", "exit_code", "Reason", "
 
 STARTING = frozenset({"PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_FED", "REQUEUE_HOLD", "SPECIAL_EXIT"})
 RUNNING = frozenset({"RUNNING", "COMPLETING", "SIGNALING", "STAGE_OUT", "STOPPED", "SUSPENDED", "RESIZING"})
+STOPPED_STATUS = (INTERRUPTED_STATUS, -signal.SIGTERM)
+"""Exit statuses of a worker that was asked to stop while it ran a job, or before it could handle the signal."""
 END_REASONS: Mapping[str, EndReason] = {
     "COMPLETED": "finished",
     "CANCELLED": "stopped",
@@ -76,19 +79,23 @@ class SlurmOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    partition: str | None = None
-    account: str | None = None
-    qos: str | None = None
-    constraint: str | None = None
-    reservation: str | None = None
-    gres: str | None = None
-    """Generic resources such as `gpu:a100:1`; without it, `gpus` of the pool become `gpu:N`."""
-    python: str = sys.executable
-    """Python interpreter on the nodes, in whose environment Marey is installed."""
-    cache: Path | None = None
-    """Folder on the nodes in which workers keep downloaded inputs."""
-    arguments: tuple[str, ...] = Field((), max_length=50)
-    """Further options of `sbatch`, such as `--nice=100`."""
+    partition: str | None = Field(None, description="Partition that runs the workers.")
+    account: str | None = Field(None, description="Account that is charged.")
+    qos: str | None = Field(None, description="Quality of service.")
+    constraint: str | None = Field(None, description="Features that nodes must have, such as `fast&ib`.")
+    reservation: str | None = Field(None, description="Reservation in which the workers run.")
+    gres: str | None = Field(
+        None, description="Generic resources such as `gpu:a100:1`. Absent: `gpu:N` if the pool sets `gpus` to N."
+    )
+    python: str | None = Field(
+        None, description="Python interpreter on the nodes, with Marey installed. Absent: that of the server."
+    )
+    cache: Path | None = Field(
+        None, description="Folder on the nodes for downloaded inputs. Absent: marey/inputs below ~/.cache."
+    )
+    arguments: tuple[str, ...] = Field(
+        (), max_length=50, description="Further options of `sbatch`, such as `--nice=100`."
+    )
 
 
 class _Task(NamedTuple):
@@ -193,7 +200,7 @@ class SlurmLauncher:
         yield from options.arguments
 
     def _command(self, request: WorkerRequest) -> Iterator[str]:
-        yield from (self._options.python, *worker_arguments(request, self._context.url))
+        yield from (self._options.python or sys.executable, *worker_arguments(request, self._context.url))
         yield from ("--token-file", str(self._context.token_file))
         if self._options.cache is not None:
             yield from ("--cache", str(self._options.cache))
@@ -274,22 +281,22 @@ def _time_of(text: str) -> datetime | None:
 def _end_of(task: _Task) -> WorkerEnd:
     reason = END_REASONS.get(task.state, "unknown")
     number = _status_of(task.exit_code)
-    if reason == "failed" and task.state == "FAILED" and number is not None and number < 0:
-        reason = "killed"
-    elif reason == "failed" and number == INTERRUPTED_STATUS:
+    if task.state == "FAILED" and number in STOPPED_STATUS:
         reason = "stopped"
+    elif task.state == "FAILED" and number is not None and number < 0:
+        reason = "killed"
     detail = task.state if task.reason in ("", "None") else f"{task.state}, {task.reason}"
     return WorkerEnd(reason, number, detail)
 
 
 def _status_of(exit_code: str) -> int | None:
     """Return the exit status, or a negative signal: `squeue` shows the status of `wait`, `sacct` status and signal."""
-    status, _, signal = exit_code.partition(":")
-    if not status.isdecimal() or not (signal or "0").isdecimal():
+    status, _, number = exit_code.partition(":")
+    if not status.isdecimal() or not (number or "0").isdecimal():
         return None
-    if not signal:
+    if not number:
         return os.waitstatus_to_exitcode(int(status))
-    return -int(signal) if int(signal) else int(status)
+    return -int(number) if int(number) else int(status)
 
 
 def _last_line(complaint: bytes) -> str:
