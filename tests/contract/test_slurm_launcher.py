@@ -14,7 +14,7 @@ import pytest
 from tests.support.attached_worker import python_path
 from tests.support.launcher_contract import REQUEST, Engine, LauncherContract, processes_of
 from tests.support.server_process import ServerProcess
-from tests.support.slurm_cluster import CPUS, SlurmCluster, missing_programs, running_cluster
+from tests.support.slurm_cluster import CPUS, SlurmCluster, running_cluster
 
 from marey_schemas.access import ProjectCreate
 from marey_schemas.queue.jobs import JobCreate
@@ -22,18 +22,12 @@ from marey_server.launchers import slurm
 from marey_server.launchers.launcher import EngineError, LaunchContext, Launcher, LauncherUnusable
 from marey_server.launchers.slurm import SlurmLauncher
 
-MISSING = missing_programs()
-needs_slurm = pytest.mark.skipif(
-    bool(MISSING),
-    reason=f"Slurm is not installed (tests/support/install_slurm.sh installs it): no {', '.join(MISSING)}",
-)
-
 
 def context_of(folder: Path, **options: object) -> LaunchContext:
     return LaunchContext("crew", "http://127.0.0.1:1", "secret", folder, "text", "info", options)
 
 
-@needs_slurm
+@pytest.mark.slurm
 class TestSlurmLauncher(LauncherContract):
     @pytest.fixture(scope="class")
     @classmethod

@@ -109,6 +109,7 @@ def processes_of(name: str) -> list[psutil.Process]:
     return found
 
 
+@pytest.mark.slow
 class LauncherContract:
     """Tests that every launcher must pass; each subclass defines the fixture `make_launcher`."""
 

@@ -16,18 +16,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tests.support.server_process import reserved_port
+from tests.support.tiers import SYSTEM_PATH
 
-PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "scontrol", "sinfo", "squeue")
 CPUS = 4
 MEMORY_MB = 8000
 PATIENCE_S = 60.0
-
-_SEARCH_PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
-
-
-def missing_programs() -> list[str]:
-    """Return the programs that are not installed."""
-    return [name for name in PROGRAMS if shutil.which(name, path=_SEARCH_PATH) is None]
 
 
 class SlurmCluster:
@@ -80,7 +73,7 @@ class SlurmCluster:
         yield from (f"--{option}={self.folder}/munge.{ending}" for option, ending in files.items())
 
     def _spawn(self, program: str, *arguments: str) -> subprocess.Popen[bytes]:
-        path = shutil.which(program, path=_SEARCH_PATH)
+        path = shutil.which(program, path=SYSTEM_PATH)
         assert path is not None
         with (self.folder / f"{program}.out").open("ab") as output:
             daemon = subprocess.Popen([path, *arguments], stdin=subprocess.DEVNULL, stdout=output, stderr=output)
