@@ -25,7 +25,8 @@ class FakeLauncher:
         self.requests.append(request)
         self.keys.append(key)
         names = tuple(f"gpu-{key}-{number}" for number in range(count))
-        self.states = dict.fromkeys(names, "starting") | self.states
+        for name in names:
+            self.states.setdefault(name, "starting")
         if self.lose_answers:
             raise EngineError("the answer was lost")
         return names

@@ -32,6 +32,8 @@ ROUND_S = 10.0
 """Seconds between two rounds."""
 ENGINE_S = 60.0
 """Greatest number of seconds that a call of an engine may take."""
+MOST_EXPLAINED = 10
+"""Greatest number of ends in a round for which the engine is asked for the reason."""
 LEAD_TTL_US = 60_000_000
 VISIBLE_AFTER_S = 60.0
 """Seconds after a start for which a worker counts although the engine does not list it yet."""
@@ -56,7 +58,7 @@ class PoolKeeper:
         self._launcher = launcher
         self._database = database
         self._clock_s = clock_s
-        self._lead = f"worker-pool {pool.name}"
+        self._lead = f"pool {pool.name}"
         self._holder = secrets.token_hex(8)
         self._size = PoolSize(PoolLimits(pool.least, pool.most, pool.slots, shrink_after_s=pool.idle_s))
         self._unanswered: tuple[str, int] | None = None
@@ -101,8 +103,6 @@ class PoolKeeper:
             self._size.forget()
             self._ended = None
             return
-        if self._unanswered is not None:
-            await self._start(*self._unanswered)
         listed = await self._ask(self._launcher.list())
         await self._note_ends(listed)
         present = self._present(listed)
@@ -111,7 +111,9 @@ class PoolKeeper:
         now_s = self._clock_s()
         size = self._size.decide(now_s, queued=demand.queued, running=running, present=len(present))
         if size > len(present) and now_s >= self._start_after_s:
-            await self._start(secrets.token_hex(4), size - len(present))
+            await self._start(*(self._unanswered or (secrets.token_hex(4), size - len(present))))
+        else:
+            self._unanswered = None  # the workers are there, or are no longer needed
         idle = [name for name in present if name not in demand.running]
         superfluous = idle[: max(0, len(present) - size)]
         if superfluous:
@@ -123,7 +125,7 @@ class PoolKeeper:
     # -- workers --
 
     async def _start(self, key: str, count: int) -> None:
-        """Start workers; if the answer is lost, the next round repeats the start with the same key."""
+        """Start workers; if the answer is lost and the engine lists no new workers, the start is repeated."""
         pool = self._pool
         request = WorkerRequest(
             labels=pool.labels, kinds=pool.kinds, slots=pool.slots, cpus=pool.cpus, memory_bytes=pool.memory_bytes,
@@ -155,7 +157,7 @@ class PoolKeeper:
         """Log why workers ended since the last round; after quick failures, pause before the next start."""
         ended = {worker.name for worker in listed if worker.state == "ended"}
         news = set() if self._ended is None else ended - self._ended
-        for name in sorted(news):
+        for name in sorted(news)[:MOST_EXPLAINED]:
             end = await self._ask(self._launcher.why_ended(name))
             if end is None:
                 continue
@@ -166,6 +168,8 @@ class PoolKeeper:
             if not quiet and ran_s < HEALTHY_AFTER_S:
                 self._quick_failures += 1
                 self._start_after_s = self._clock_s() + START_PAUSES.delay_s(self._quick_failures)
+        if len(news) > MOST_EXPLAINED:
+            log.info("pool %s: %d other workers ended", self._pool.name, len(news) - MOST_EXPLAINED)
         if any(self._clock_s() - since_s >= HEALTHY_AFTER_S for since_s in self._running_since.values()):
             self._quick_failures = 0
         self._ended = ended

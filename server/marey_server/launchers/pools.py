@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import EntryPoint, entry_points
@@ -22,6 +23,8 @@ from marey_server.launchers.worker_tokens import keep_pool_token, make_worker_to
 from marey_server.process.data_folder import WORKER_TOKENS
 from marey_server.process.services import Services
 from marey_server.process.worker_pools import WorkerPool
+
+log = logging.getLogger(__name__)
 
 BUILT_IN = {
     "local": "marey_server.launchers.local:LocalLauncher",
@@ -47,6 +50,8 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
         data = settings.data.absolute()
         fixed = LocalLauncher(LaunchContext(FIXED_POOL, address, token, data, settings.log_form, settings.log_level))
         await fixed.start(WorkerRequest(), settings.local_workers, key=FIXED_KEY)
+    if settings.pools and settings.worker_url is None and settings.launcher != "local":
+        log.info("workers in pools reach this server at %s; the setting worker_url names another address", address)
     tasks = [asyncio.create_task(keeper.keep()) for keeper in keepers]
     try:
         yield

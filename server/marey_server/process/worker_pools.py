@@ -7,8 +7,13 @@ from typing import Annotated, Any, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from marey_schemas.sizes import MIB
+from marey_server.access.labels import MOST_LABELS
 
 SHORTEST_DEADLINE_S = 600
+
+LabelName = Annotated[str, Field(pattern=r"^[^=\x00-\x20]{1,100}$")]
+LabelValue = Annotated[str, Field(pattern=r"^[^\x00-\x1f]{0,100}$")]
+"""Parts of labels, which are given to workers as arguments of the form name=value."""
 
 
 class WorkerPool(BaseModel):
@@ -20,7 +25,9 @@ class WorkerPool(BaseModel):
         pattern=r"^[a-z]([a-z0-9-]{0,18}[a-z0-9])?$",
         description="Name of the pool; the names of its workers begin with it.",
     )
-    labels: dict[str, str] = Field(default_factory=dict, max_length=6, description="Labels of the workers.")
+    labels: dict[LabelName, LabelValue] = Field(
+        default_factory=dict, max_length=MOST_LABELS, description="Labels of the workers."
+    )
     kinds: tuple[str, ...] = Field(
         (), max_length=256, description="Kinds of jobs that the workers run; empty: all kinds."
     )

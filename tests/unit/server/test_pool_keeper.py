@@ -11,6 +11,7 @@ import pytest
 from tests.support.fake_launcher import FakeLauncher
 from tests.support.queue_desk import Desk
 
+from marey_schemas.backoff import Backoff
 from marey_server.errors import UnavailableProblem
 from marey_server.launchers import pool_keeper
 from marey_server.launchers.launcher import EngineError, WorkerEnd, WorkerRequest
@@ -92,15 +93,43 @@ def test_workers_that_run_nothing_are_stopped_after_the_idle_time_and_busy_ones_
     assert names[1] not in pool.launcher.stopped, "workers that are being stopped do not count"
 
 
-def test_a_start_whose_answer_was_lost_is_repeated_with_its_key_and_starts_nothing_twice(pool: Pool) -> None:
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_start_whose_answer_was_lost_starts_nothing_twice(pool: Pool, listed: bool) -> None:
     pool.launcher.lose_answers = True
     with pytest.raises(EngineError):
         pool.grow(2)
     pool.launcher.lose_answers = False
+    if not listed:
+        pool.launcher.states = {}
     pool.adjust(5)
     assert len(pool.launcher.states) == 2
-    assert len(pool.launcher.keys) == 2
+    assert len(pool.launcher.keys) == (1 if listed else 2)
     assert len(set(pool.launcher.keys)) == 1
+
+
+def test_a_start_that_failed_is_not_repeated_when_no_job_waits_any_more(pool: Pool) -> None:
+    pool.launcher.lose_answers = True
+    with pytest.raises(EngineError):
+        pool.grow(2)
+    pool.launcher.lose_answers = False
+    pool.launcher.states = {}
+    pool.cancel_waiting()
+    pool.adjust(5)
+    assert pool.launcher.states == {}
+
+
+def test_of_many_ends_in_a_round_some_are_explained_and_the_others_counted(
+    pool: Pool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(pool_keeper, "MOST_EXPLAINED", 1)
+    names = pool.grow(3)
+    pool.adjust(1)
+    for name in names:
+        pool.launcher.end(name, WorkerEnd("preempted"))
+    with caplog.at_level(logging.INFO, pool_keeper.__name__):
+        pool.adjust(1)
+    assert caplog.text.count("ended: preempted") == 1
+    assert "pool gpu: 2 other workers ended" in caplog.text
 
 
 def test_a_worker_that_the_engine_does_not_list_yet_counts(pool: Pool) -> None:
@@ -159,7 +188,7 @@ def test_an_engine_or_a_database_that_fails_is_asked_again(
         raise asyncio.CancelledError
 
     monkeypatch.setattr(pool.keeper, "adjust", adjust)
-    monkeypatch.setattr(pool_keeper, "FAULT_PAUSES", pool_keeper.Backoff(0.0, 0.0))
+    monkeypatch.setattr(pool_keeper, "FAULT_PAUSES", Backoff(0.0, 0.0))
     with pytest.raises(asyncio.CancelledError):
         run(pool.keeper.keep())
     for words in ("pool gpu: no controller", "pool gpu: no database", "RuntimeError: a bug"):
