@@ -173,14 +173,59 @@ def test_a_command_that_is_missing_or_does_not_answer_is_an_error(
     assert time.monotonic() - begun < 30
 
 
+def commands(folder: Path, monkeypatch: pytest.MonkeyPatch, **scripts: str) -> None:
+    """Put shell scripts in the place of commands of Slurm."""
+    programs = folder / "bin"
+    programs.mkdir()
+    for name, script in scripts.items():
+        (programs / name).write_text(f"#!/bin/sh\n{script}\n")
+        (programs / name).chmod(0o700)
+    monkeypatch.setenv("PATH", f"{programs}:/bin")
+
+
+@pytest.mark.parametrize(
+    ("record", "reason", "status"),
+    [
+        ("OUT_OF_MEMORY|0:125", "out-of-memory", -125),
+        ("TIMEOUT|0:0", "deadline", 0),
+        ("PREEMPTED|0:0", "preempted", 0),
+        ("CANCELLED by 1000|0:15", "stopped", -15),
+        ("FAILED|143:0", "stopped", 143),
+        ("FAILED|0:9", "killed", -9),
+        ("FAILED|2:0", "failed", 2),
+        ("NODE_FAIL|1:0", "failed", 1),
+        ("COMPLETED|0:0", "finished", 0),
+        ("SOMETHING_NEW|?", "unknown", None),
+    ],
+)
+def test_when_the_controller_has_forgotten_a_task_the_records_explain_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record: str, reason: str, status: int | None
+) -> None:
+    """The records are scripted, because accounting needs a database server beside the controller."""
+    lines = f"echo '7_1|COMPLETED|0:0'; echo '7_2|{record}'"
+    commands(tmp_path, monkeypatch, squeue="exit 0", sacct=lines)
+    end = asyncio.run(SlurmLauncher(context_of(tmp_path)).why_ended("crew-k1-2"))
+    assert (end.reason, end.status) == (reason, status)
+
+
+def test_without_accounting_the_end_of_a_forgotten_task_is_unknown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commands(tmp_path, monkeypatch, squeue="exit 0", sacct="echo accounting is disabled >&2; exit 1")
+    end = asyncio.run(SlurmLauncher(context_of(tmp_path)).why_ended("crew-k1-2"))
+    assert (end.reason, end.status) == ("unknown", None)
+
+
+def test_logs_that_cannot_be_kept_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commands(tmp_path, monkeypatch, squeue="exit 0", sbatch="exit 0")
+    (tmp_path / "worker-logs").touch()
+    with pytest.raises(EngineError, match="the logs of workers cannot be kept"):
+        asyncio.run(SlurmLauncher(context_of(tmp_path)).start(REQUEST, 1, key="b"))
+
+
 def test_old_logs_of_the_pool_are_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(slurm, "MOST_LOGS", 2)
-    commands = tmp_path / "bin"
-    commands.mkdir()
-    for name in ("squeue", "sbatch"):
-        (commands / name).write_text("#!/bin/sh\nexit 0\n")
-        (commands / name).chmod(0o700)
-    monkeypatch.setenv("PATH", f"{commands}:/bin")
+    commands(tmp_path, monkeypatch, squeue="exit 0", sbatch="exit 0")
     logs = tmp_path / "worker-logs"
     logs.mkdir()
     for age, name in enumerate(("crew-a-3.log", "crew-a-2.log", "crew-a-1.log", "other-a-1.log")):

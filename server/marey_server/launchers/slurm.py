@@ -139,7 +139,10 @@ class SlurmLauncher:
         job_name = f"{self._context.pool}-{key}"
         names = tuple(f"{job_name}-{number}" for number in range(1, count + 1))
         if not await self._tasks(f"--name={job_name}"):
-            self._prepare_logs()
+            try:
+                self._prepare_logs()
+            except OSError as error:
+                raise EngineError(f"the logs of workers cannot be kept: {error}") from error
             await self._run("sbatch", *self._submission(request, count, job_name), str(SCRIPT), *self._command(request))
         return names
 
@@ -184,7 +187,8 @@ class SlurmLauncher:
         options = self._options
         yield from ("--parsable", f"--array=1-{count}", f"--job-name={job_name}", f"--comment={self._comment}")
         yield from ("--requeue", "--nodes=1", "--ntasks=1", "--export=ALL", "--input=/dev/null")
-        yield from ("--open-mode=append", f"--output={self._logs}/%x-%a.log", f"--chdir={self._logs}")
+        folder = str(self._logs).replace("%", "%%")
+        yield from ("--open-mode=append", f"--output={folder}/%x-%a.log", f"--chdir={self._logs}")
         if request.cpus is not None:
             yield f"--cpus-per-task={request.cpus}"
         if request.memory_bytes is not None:
