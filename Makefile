@@ -52,6 +52,7 @@ test: $(VENV)/.installed-dev lint ## In 15 minutes: everything a change can brea
 	$(PYTEST) -n $(PROCESSES) --tier test tests
 
 soak: $(VENV)/.installed-dev lint ## Long forms of all tests, on both databases; EFFORT=20 for more examples, in hours
+	tests/support/install_slurm.sh
 	$(PYTEST) -n $(PROCESSES) --tier soak --effort $(EFFORT) -o timeout=7200 --durations=25 tests
 	$(BIN)/python -m tests.support.motion_fuzz $$((300 * $(EFFORT)))
 	$(BIN)/python -m tests.support.hostile_figures

@@ -11,6 +11,7 @@ from typing import Any
 import typer
 from docs.motion_library import library_page
 from prometheus_client.metrics import MetricWrapperBase
+from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 import marey_server.app  # noqa: F401 - loads every module, and so every class of errors
@@ -21,8 +22,10 @@ from marey_schemas.queries.fields import FACET_PREFIX, FIELDS, OPERATORS, declar
 from marey_schemas.queries.grammar import MOST_CHARACTERS, MOST_COMPARED_VALUES, MOST_CONDITIONS
 from marey_schemas.queue.job_kinds import job_kinds
 from marey_server import errors
+from marey_server.launchers.slurm import SlurmOptions
 from marey_server.process.observe import Metrics
 from marey_server.process.settings import Settings
+from marey_server.process.worker_pools import WorkerPool
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = Path(__file__).parent / "reference"
@@ -148,16 +151,31 @@ attacks](../how-to/see-attacks.md) describes which metrics show an attack.
 
 def settings_page() -> str:
     """Return the page of all settings of a server."""
-    rows = []
-    for name, field in Settings.model_fields.items():
-        default = "" if field.default in (None, PydanticUndefined) else f"`{field.default}`"
-        rows.append((f"`{name}`", f"`MAREY_{name.upper()}`", default, field.description or ""))
+    rows = [(name, f"`MAREY_{name.strip('`').upper()}`", *rest) for name, *rest in _fields_of(Settings)]
     return (
         NOTE
         + "# Settings\n\nIf a setting is given in several places, the first of these counts: the option of "
         "`marey serve`, the environment variable, the file `marey.toml`, the default.\n\n"
         + _table(("setting", "variable", "default", "meaning"), rows)
+        + "## Pools\n\nEach entry of `pools` has these settings, in `marey.toml` below a line `[[pools]]`, in "
+        "`MAREY_POOLS` as a list of JSON objects. [Run workers on Slurm](../how-to/run-workers-on-slurm.md) has an "
+        "example.\n\n"
+        + _table(("setting", "default", "meaning"), _fields_of(WorkerPool))
+        + "## Options of the launcher slurm\n\nIn `launcher_options` for all pools, and in `options` of a pool.\n\n"
+        + _table(("option", "default", "meaning"), _fields_of(SlurmOptions))
     )  # fmt: skip
+
+
+def _fields_of(model: type[BaseModel]) -> list[tuple[str, str, str]]:
+    """Return name, default and description of each field of a model."""
+    return [
+        (
+            f"`{name}`",
+            "" if field.default in (None, PydanticUndefined) else f"`{field.default}`",
+            field.description or "",
+        )
+        for name, field in model.model_fields.items()
+    ]
 
 
 def job_kinds_page() -> str:

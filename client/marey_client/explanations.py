@@ -5,7 +5,9 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
+from marey_client.errors import Forbidden
 from marey_schemas.queue.jobs import Attempt, Job, JobState
+from marey_schemas.queue.workers import Worker
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
@@ -16,20 +18,31 @@ def explain_job(marey: Marey, job_id: str, *, now: datetime | None = None) -> li
     job = marey.jobs.get(job_id)
     attempts = list(marey.jobs.attempts(job_id))
     running = list(marey.jobs.list(job.project, filters={"state": JobState.RUNNING.value}))
-    return explain(job, attempts, running, now or datetime.now(UTC))
+    workers = _alive_workers(marey) if job.state is JobState.QUEUED else None
+    return explain(job, attempts, running, now or datetime.now(UTC), workers)
 
 
-def explain(job: Job, attempts: list[Attempt], running: list[Job], now: datetime) -> list[str]:
+def _alive_workers(marey: Marey) -> list[Worker] | None:
+    """Return the workers that are alive, or None if the caller may not list workers."""
+    try:
+        return [worker for worker in marey.workers() if worker.alive]
+    except Forbidden:
+        return None
+
+
+def explain(
+    job: Job, attempts: list[Attempt], running: list[Job], now: datetime, workers: list[Worker] | None = None
+) -> list[str]:
     """Return sentences that explain the state of a job, the main reason first.
 
-    `running` are the running jobs of the project.
+    `running` are the running jobs of the project; `workers` are the workers that are alive, or None if unknown.
     """
     if job.size is not None and not job.state.terminal and job.children != {"succeeded": job.size}:
         counts = ", ".join(f"{count} {state}" for state, count in sorted(job.children.items()))
         return [f"{job.state}: it gathers {job.size} tasks, of which {counts or 'none has begun'}."]
     reasons = {
         JobState.WAITING: [_why_waiting(job)],
-        JobState.QUEUED: _why_queued(job, running, now),
+        JobState.QUEUED: [_why_queued(job, running, now, workers)],
         JobState.RUNNING: _why_running(job, attempts),
         JobState.SUCCEEDED: ["succeeded" + (f": its result is that of {job.cached_from}." if job.cached_from else ".")],
         JobState.FAILED: [_why_failed(job)],
@@ -46,19 +59,32 @@ def _why_waiting(job: Job) -> str:
     return f"waiting: it depends on {' and '.join(waited_for) or 'other jobs'}; not all of these have succeeded."
 
 
-def _why_queued(job: Job, running: list[Job], now: datetime) -> list[str]:
+def _why_queued(job: Job, running: list[Job], now: datetime, workers: list[Worker] | None) -> str:
     wait_s = (job.run_at - now).total_seconds()
     if wait_s > 0:
-        return [
+        return (
             f"queued: the next attempt starts in {wait_s:.0f} s at the earliest, after attempt {job.attempt} of "
             f"{job.max_attempts}."
-        ]
+        )
+    shown = " ".join(f"{name}={value}" for name, value in sorted(job.labels.items()))
+    wanted = f"jobs of the kind {job.kind}" + (f" and has the labels {shown}" if shown else "")
+    if workers and not any(_may_fit(worker, job) for worker in workers):
+        return f"queued: it needs a worker that runs {wanted}; of the workers that are alive, none does."
     if running:
-        return [f"queued: the project's workers are busy with {len(running)} running jobs."]
-    return [
+        return f"queued: the project's workers are busy with {len(running)} running jobs."
+    if shown:
+        return f"queued: no worker that runs {wanted} has asked for a job of this project."
+    return (
         f"queued: no worker that can run jobs of the kind {job.kind} in this project has asked for one; is "
         "`marey worker` running?"
-    ]
+    )
+
+
+def _may_fit(worker: Worker, job: Job) -> bool:
+    """Return whether a worker runs jobs like this one, or whether its kinds and labels are unknown."""
+    if worker.kinds is None or worker.labels is None:
+        return True
+    return job.kind in worker.kinds and job.labels.items() <= worker.labels.items()
 
 
 def _why_running(job: Job, attempts: list[Attempt]) -> list[str]:

@@ -54,8 +54,9 @@ class FakeServer:
     answered only after the job is removed from `slow`. Results of a job in `unwelcome` are refused. `refusals`
     contains, by job, the status and code of the answer to its completion.
 
-    `order` lists claims and ends of jobs. `claimants` contains, for each claim, the tokens with which it was sent. If
-    `valid_tokens` is set, claims with other tokens are refused.
+    `order` lists claims and ends of jobs. `claimants` contains, for each claim, the tokens with which it was sent,
+    and `announced` contains kinds and labels of the newest claim. If `valid_tokens` is set, claims with other tokens
+    are refused.
     """
 
     def __init__(self) -> None:
@@ -82,6 +83,7 @@ class FakeServer:
         self.may_complete.set()
         self.tokens_seen: set[str] = set()
         self.claims: dict[str, list[dict[str, Any]]] = {}
+        self.announced: dict[str, Any] = {}
         self.claimants: dict[str, set[str]] = defaultdict(set)
         self.valid_tokens: set[str] | None = None
         self.answers_to_lose = 0
@@ -110,6 +112,7 @@ class FakeServer:
 
         A repeated `claim_id` gets the same lease.
         """
+        self.announced = {name: wanted[name] for name in ("kinds", "labels")}
         if wanted["claim_id"] in self.claims:
             return self.claims[wanted["claim_id"]]
         deadline = time.monotonic() + min(wanted["wait_s"], 2)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import os
+import shutil
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
@@ -20,6 +21,9 @@ from tests.support.database_fixtures import BACKENDS
 
 MOCAP_VARIABLE = "MAREY_TEST_MOCAP"
 """Environment variable with the path of the folder of real motion capture."""
+SLURM_PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch")
+SYSTEM_PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
+"""Folders in which daemons are looked for, also by users whose `PATH` does not contain them."""
 EXAMPLES, STEPS = 100, 50
 """Number of examples that Hypothesis draws, and of steps that a state machine takes, in the tier `test`."""
 SOAK_EFFORT = 4
@@ -78,6 +82,10 @@ def _slow(item: pytest.Item) -> bool:
 
 def _soak_only(item: pytest.Item) -> bool:
     return item.get_closest_marker("soak") is not None
+
+
+def _needs_slurm(item: pytest.Item) -> bool:
+    return item.get_closest_marker("slurm") is not None
 
 
 def _on_other_database(item: pytest.Item) -> bool:
@@ -181,6 +189,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     reasons = TIERS[config.getoption("tier")].leaves_out
     if MOCAP_VARIABLE not in os.environ:
         reasons = {"need real motion capture": _needs_mocap, **reasons}
+    if missing := [name for name in SLURM_PROGRAMS if shutil.which(name, path=SYSTEM_PATH) is None]:
+        reasons = {f"need Slurm (tests/support/install_slurm.sh): no {', '.join(missing)}": _needs_slurm, **reasons}
     kept, gone = [], []
     for item in items:
         reason = next((reason for reason, applies in reasons.items() if applies(item)), None)

@@ -225,6 +225,7 @@ class Job(Answer):
         "submission has the member `purged` and no name."
     )
     after: tuple[str, ...] = Field((), description="Jobs that must succeed before this one starts.")
+    labels: dict[str, str] = Field(default_factory=dict, description="Labels that a worker must have to run the job.")
     into: str
     priority: int
     seed: int

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import combinations
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 from marey_schemas.problems import FieldError
 from marey_server.errors import InvalidProblem
@@ -25,6 +25,12 @@ def labels_key(labels: Mapping[str, str]) -> str:
     if len(key) > LONGEST_KEY:
         raise _refusal(f"The labels have {len(key)} characters together; at most {LONGEST_KEY} are allowed.")
     return key
+
+
+def labels_of(key: str) -> dict[str, str]:
+    """Return the labels of which `labels_key` made the text `key`."""
+    pairs = (pair.partition("=") for pair in key.split(",") if pair)
+    return {unquote(name): unquote(value) for name, _, value in pairs}
 
 
 def keys_within(labels: Mapping[str, str]) -> list[str]:

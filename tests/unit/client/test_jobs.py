@@ -8,8 +8,9 @@ import pytest
 from tests.support.scripted_server import ScriptedServer
 
 from marey_client import errors
-from marey_client.explanations import explain
+from marey_client.explanations import explain, explain_job
 from marey_schemas.queue.jobs import Attempt, Job
+from marey_schemas.queue.workers import Worker
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
@@ -66,6 +67,27 @@ def test_waiting_gives_up_when_told_to(script: ScriptedServer) -> None:
 )
 def test_every_state_has_its_reason(members: dict[str, Any], running: list[Job], expected: str) -> None:
     assert expected in explain(job(**members), [], running, NOW)[0]
+
+
+def worker(kinds: tuple[str, ...] | None, labels: dict[str, str] | None) -> Worker:
+    return Worker(name="w", alive=True, seen_at=NOW, running=0, kinds=kinds, labels=labels)
+
+
+def test_a_job_that_no_worker_fits_says_what_a_worker_would_need() -> None:
+    waiting = job(labels={"gpu": "a100"})
+    others = [worker(("align",), {"gpu": "a100"}), worker(("retarget",), {"gpu": "h100"})]
+    needed = "it needs a worker that runs jobs of the kind retarget and has the labels gpu=a100; of the workers"
+    assert needed in explain(waiting, [], [job(state="running")], NOW, others)[0]
+    for fitting in (worker(("retarget",), {"gpu": "a100", "site": "lyon"}), worker(None, None)):
+        assert "busy with 1" in explain(waiting, [], [job(state="running")], NOW, [*others, fitting])[0]
+    assert "and has the labels gpu=a100 has asked for a job" in explain(waiting, [], [], NOW, [])[0]
+
+
+def test_who_may_not_list_workers_gets_an_explanation_all_the_same(script: ScriptedServer) -> None:
+    empty = httpx.Response(200, content=b'{"items": []}')
+    refused = httpx.Response(403, json={"code": "forbidden", "status": 403, "title": "Forbidden", "detail": "no"})
+    script.answers = [answer(), empty, empty, refused]
+    assert "has asked for one" in explain_job(script.marey(), "job_1")[0]
 
 
 def test_earlier_attempts_are_told(script: ScriptedServer) -> None:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marey_server.access.labels import MOST_LABELS, keys_within, labels_key
+from marey_server.access.labels import MOST_LABELS, keys_within, labels_key, labels_of
 from marey_server.errors import InvalidProblem
 
 names = st.text(min_size=1, max_size=8)
@@ -21,6 +21,11 @@ def test_a_worker_matches_exactly_the_jobs_whose_labels_it_carries(job: dict[str
 @given(label_sets, label_sets)
 def test_different_labels_have_different_keys(one: dict[str, str], other: dict[str, str]) -> None:
     assert (labels_key(one) == labels_key(other)) == (one == other)
+
+
+@given(label_sets)
+def test_labels_can_be_read_from_their_text(labels: dict[str, str]) -> None:
+    assert labels_of(labels_key(labels)) == labels
 
 
 def test_a_worker_with_all_its_labels_matches_every_subset() -> None:

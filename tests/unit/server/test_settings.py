@@ -84,6 +84,21 @@ def test_audit_entries_may_be_kept_longer_or_for_ever() -> None:
     assert Settings(audit_days=30, events_days=30).retention.events_days == 30
 
 
+@pytest.mark.parametrize(
+    ("pools", "reason"),
+    [
+        ([{"name": "gpu", "most": 1}, {"name": "gpu", "most": 2}], "several pools have the name 'gpu'"),
+        ([{"name": "gpu", "least": 2, "most": 1}], "least is 2, but must not be greater than most, which is 1"),
+        ([{"name": "GPU", "most": 1}], "should match pattern"),
+        ([{"name": "gpu", "most": 1, "labels": {"a=b": "c"}}], "should match pattern"),
+        ([{"name": "gpu", "most": 1, "cpu": 1}], "Extra inputs are not permitted"),
+    ],
+)
+def test_pools_that_make_no_sense_are_refused(pools: list[dict[str, Any]], reason: str) -> None:
+    with pytest.raises(ValidationError, match=reason):
+        Settings(pools=pools)
+
+
 def test_every_setting_is_documented() -> None:
     undocumented = {name for name, field in Settings.model_fields.items() if not field.description}
     assert undocumented <= {"log_level"}

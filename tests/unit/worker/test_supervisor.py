@@ -14,6 +14,7 @@ from marey_client.blobs import digest_of
 from marey_client.credentials import write_private
 from marey_schemas.queue.jobs import Progress
 from marey_schemas.queue.worker_protocol import FailRequest
+from marey_worker.commands import main
 
 
 def alive(pid: int) -> bool:
@@ -308,6 +309,37 @@ def test_on_sigterm_a_running_job_is_given_back_and_the_exit_status_says_so(
     server.until((tmp_path / "started").exists)
     assert worker.stop() != 0
     assert server.failed[job]["interrupted"] is True
+
+
+@pytest.mark.slow
+def test_a_job_is_given_back_if_its_process_gets_sigterm_before_the_worker(
+    server: FakeServer, start_worker: StartWorker, tmp_path: Path
+) -> None:
+    worker = start_worker()
+    job = server.submit("misbehave", {"how": "wait", "folder": str(tmp_path)})
+    server.until((tmp_path / "started").exists)
+    for child in psutil.Process(worker.process.pid).children(recursive=True):
+        child.terminate()
+    time.sleep(0.3)
+    assert worker.stop() != 0
+    assert server.failed[job]["interrupted"] is True
+
+
+@pytest.mark.slow
+def test_a_worker_announces_its_labels_and_claims_its_kinds_only(server: FakeServer, start_worker: StartWorker) -> None:
+    start_worker("--label", "gpu=a100", "--label", "site=", "--kind", "add")
+    server.submit("misbehave", {"how": "sleep"})
+    server.ended(server.submit("add", {"a": 1, "b": 1}))
+    assert server.announced == {"kinds": ["add"], "labels": {"gpu": "a100", "site": ""}}
+
+
+def test_a_label_without_a_value_is_refused(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["marey_worker", "--label", "gpu"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "argument --label: 'gpu' is not a label; write it like site=lyon" in capsys.readouterr().err
 
 
 @pytest.mark.slow

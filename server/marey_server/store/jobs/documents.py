@@ -9,6 +9,7 @@ from typing import Any
 from sqlalchemy import Row, Select, bindparam, func, select
 
 from marey_schemas.queue.jobs import Job, JobState, Progress
+from marey_server.access.labels import labels_of
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs.commits import shown_commit
@@ -127,6 +128,7 @@ def _document(row: Any, after: tuple[str, ...], children: dict[str, int], at_wor
         params=row.params,
         inputs=row.inputs,
         after=after,
+        labels=labels_of(row.labels_key),
         into=row.into_path,
         priority=row.priority,
         seed=row.seed,
