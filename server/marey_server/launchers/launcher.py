@@ -1,0 +1,148 @@
+"""Protocol between the server and the engines that run workers, such as Slurm.
+
+The queue decides which jobs run; an engine decides where the workers run. No engine is trusted with exactness: it may
+start a worker twice, late, or not at all. The first call of every worker is a claim, so that each job is still run by
+one worker at a time.
+
+The settings name a launcher: `local`, `slurm`, or an entry point of another package in the group `marey.launchers`,
+which is a `MakeLauncher`. The server makes one launcher for each pool of workers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from marey_schemas.queue.log_lines import LogForm
+
+ENTRY_POINTS = "marey.launchers"
+"""Group of entry points in which packages register their launchers."""
+
+WorkerState = Literal["starting", "running", "ended"]
+
+EndReason = Literal[
+    "finished", "stopped", "failed", "killed", "out-of-memory", "deadline", "preempted", "unknown"
+]  # fmt: skip
+"""Reason why a worker ended.
+
+finished: it ended by itself with status 0; stopped: the launcher was asked to stop it; failed: it ended by itself with
+another status, or its machine failed; killed: by a signal that the launcher did not ask for; out-of-memory, deadline,
+preempted: ended by the engine; unknown: the engine no longer knows.
+"""
+
+
+class EngineError(Exception):
+    """Error of an engine that refused a request, or that did not answer in time; the text gives the reason."""
+
+
+class LauncherUnusable(Exception):
+    """Error of a launcher that does not exist, or whose options are invalid; the text gives the reason."""
+
+
+@dataclass(frozen=True)
+class LaunchContext:
+    """What the workers of a pool need to reach the server, and the settings of the launcher.
+
+    Parameters
+    ----------
+    pool : name of the pool: lower-case letters, digits and hyphens, at most 20 characters
+    url : address of the server, as the workers reach it
+    token : token that can do nothing but claim jobs with the labels of the pool. It stays valid when the server starts
+        again. It must not appear in argument lists, in environment variables, or in logs.
+    data : data folder of the server, which no other user can read
+    log_form, log_level : form and level of the logs of workers
+    options : settings `launcher_options`, replaced by the `options` of the pool where both have a value
+    """
+
+    pool: str
+    url: str
+    token: str = field(repr=False)
+    data: Path
+    log_form: LogForm
+    log_level: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class WorkerRequest:
+    """Properties of workers that are to be started; None: the engine's default.
+
+    A worker is ended by the engine after `deadline_s` seconds. `kinds` are the kinds of jobs that it claims; empty: all
+    kinds. `slots` is the number of jobs that it runs at the same time.
+    """
+
+    labels: Mapping[str, str] = field(default_factory=dict)
+    kinds: tuple[str, ...] = ()
+    slots: int = 1
+    cpus: int | None = None
+    memory_bytes: int | None = None
+    gpus: int = 0
+    deadline_s: int | None = None
+
+
+@dataclass(frozen=True)
+class LaunchedWorker:
+    """Worker that the engine knows; `started_at` is None until it runs. The worker claims jobs with the same name."""
+
+    name: str
+    state: WorkerState
+    labels: Mapping[str, str] = field(default_factory=dict)
+    started_at: datetime | None = None
+
+
+@dataclass(frozen=True)
+class WorkerEnd:
+    """End of a worker; `status` is its exit status, or a negative number for a signal."""
+
+    reason: EndReason
+    status: int | None = None
+    detail: str = ""
+
+
+class Launcher(Protocol):
+    """Engine that runs the workers of one pool. All methods raise `EngineError`."""
+
+    outlives_server: bool
+    """Whether workers continue when the server ends. If so, only the leader among several servers uses the launcher."""
+
+    async def start(self, request: WorkerRequest, count: int, *, key: str) -> tuple[str, ...]:
+        """Start `count` workers, and return their names, which contain `key`.
+
+        `key` has lower-case letters and digits, at most 16 characters. If the answer to a start was lost, the start is
+        repeated with the same key and count. A repeated start returns the same names, and starts nothing that the
+        engine knows already.
+        """
+        ...
+
+    async def list(self) -> tuple[LaunchedWorker, ...]:
+        """Return the workers of the pool that the engine knows, including those that earlier servers started."""
+        ...
+
+    async def stop(self, names: tuple[str, ...]) -> None:
+        """Let the workers return their jobs to the queue and end; workers that have not started are never started.
+
+        Names of ended or unknown workers are ignored. This method does not wait until the workers have ended.
+        """
+        ...
+
+    async def why_ended(self, name: str) -> WorkerEnd | None:
+        """Return why a worker ended most recently, or None if it has not ended since its start."""
+        ...
+
+    async def close(self) -> None:
+        """Release what the launcher holds in this process; workers that do not outlive the server are stopped."""
+        ...
+
+
+MakeLauncher = Callable[[LaunchContext], Launcher]
+"""Function that makes the launcher of a pool. Raises `LauncherUnusable`."""
+
+
+def worker_arguments(request: WorkerRequest, url: str) -> tuple[str, ...]:
+    """Return the arguments of a Python interpreter that runs a worker; name and credential are missing."""
+    kinds = (f"--kind={kind}" for kind in request.kinds)
+    labels = (f"--label={name}={value}" for name, value in sorted(request.labels.items()))
+    return ("-m", "marey_worker", "--server", url, "--slots", str(request.slots), *kinds, *labels)
