@@ -20,6 +20,8 @@ pytest_plugins = (
     "tests.support.committing_desk",
 )
 
+pytest.register_assert_rewrite("tests.support.launcher_contract")
+
 MEMORY = Path("/dev/shm")
 ENOUGH_BYTES = 4 << 30
 """Free space that is enough: databases of two test processes and the largest files of tests need less than half."""

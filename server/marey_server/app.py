@@ -26,8 +26,6 @@ from tornado.routing import AnyMatches, Rule
 from tornado.web import Application as TornadoApplication
 from tornado.web import RequestHandler
 
-from marey_schemas.access import TokenCreate
-from marey_schemas.names import MAX_NAME_LENGTH
 from marey_schemas.processes.environment import clean_environment
 from marey_schemas.processes.memory import keep_freed_memory
 from marey_schemas.sizes import KIB, MIB
@@ -43,11 +41,11 @@ from marey_server.http.docs_page import render_page
 from marey_server.http.openapi import build_document
 from marey_server.http.resource import Resource
 from marey_server.http.routes import RouteTable
-from marey_server.launchers.local import local_workers
+from marey_server.launchers.pools import keeping_workers
 from marey_server.process.administrators import TOKEN_FILE, make_first_administrator
 from marey_server.process.children import Children
 from marey_server.process.computing import compute_on_one_thread_each
-from marey_server.process.data_folder import BLOB_FOLDER, WORKER_CACHE, prepare_data_folder
+from marey_server.process.data_folder import BLOB_FOLDER, prepare_data_folder
 from marey_server.process.feed import following_feed
 from marey_server.process.housekeeping import keeping_house
 from marey_server.process.observe import access_log, configure_logging
@@ -55,11 +53,9 @@ from marey_server.process.services import Description, Services
 from marey_server.process.settings import Settings, misspelt_variables
 from marey_server.store import users
 from marey_server.store.blob_backings import DirectoryBlobs
-from marey_server.store.credentials import tokens
 from marey_server.store.database.connections import Database
 from marey_server.store.database.opening import opening
 from marey_server.store.database.schema import upgrade_schema
-from marey_server.store.transaction import Transaction
 from marey_server.store.wakeups import wakeups
 from marey_server.webhooks.delivering import delivering
 
@@ -275,37 +271,16 @@ async def warming(children: Children) -> AsyncIterator[None]:
 
 @asynccontextmanager
 async def serving(settings: Settings) -> AsyncIterator[Running]:
-    """Run a server with its database and local workers while the `async with` block runs; then stop, workers first."""
+    """Run a server with its database and workers while the `async with` block runs; then stop, workers first.
+
+    Workers of engines such as Slurm continue. Raises `CannotListen` and `LauncherUnusable`.
+    """
     database = open_database(settings)
     async with (
         listening(create_app(settings, database)) as running,
-        local_workers(
-            settings.local_workers,
-            url=running.address,
-            token=make_worker_token(database, settings) if settings.local_workers else "",
-            cache=settings.data / WORKER_CACHE,
-            log_form=settings.log_form,
-            log_level=settings.log_level,
-        ),
+        keeping_workers(running.app.services, running.address),
     ):
         yield running
-
-
-def make_worker_token(database: Database, settings: Settings) -> str:
-    """Create a token for the workers that this process starts; a worker can claim jobs with it and do nothing else.
-
-    Tokens of earlier starts at this address are revoked; servers at other addresses with the same database keep
-    their tokens.
-    """
-    address = f"{settings.host}:{settings.port} on {socket.gethostname()}"
-    return database.write(SYSTEM, _replace_worker_token, f"workers beside the server at {address}"[:MAX_NAME_LENGTH])
-
-
-def _replace_worker_token(tx: Transaction, name: str) -> str:
-    tx.principal = users.administrator_principal(tx)
-    tokens.revoke_named(tx, name)
-    wanted = TokenCreate(name=name, scopes=("work",), labels={}, expires_in_s=None)
-    return tokens.create_token(tx, wanted).secret
 
 
 def greeting(settings: Settings, address: str, database: Database) -> Iterator[str]:

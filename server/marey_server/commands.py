@@ -34,11 +34,12 @@ def serve(**settings: Any) -> None:
     with loading_modules():
         from marey_server.app import CannotListen
         from marey_server.app import serve as serve_until_stopped
+        from marey_server.launchers.launcher import LauncherUnusable
         from marey_server.process.computing import leave
         from marey_server.store.database.opening import DatabaseUnusable
 
     chosen = read_settings(**settings)
-    comfort = {"local_workers": 1, "log_form": usual_form()}
+    comfort = {"local_workers": 0 if chosen.pools else 1, "log_form": usual_form()}
     unset = {name: value for name, value in comfort.items() if name not in chosen.model_fields_set}
     try:
         with asyncio.Runner(loop_factory=_new_event_loop) as runner:
@@ -49,6 +50,8 @@ def serve(**settings: Any) -> None:
         raise CommandFailed(
             f"{error}; choose another address with --host, or another port with --port (0: any free port)"
         ) from error
+    except LauncherUnusable as error:
+        raise CommandFailed(f"invalid setting: {error}") from error
     leave()
 
 

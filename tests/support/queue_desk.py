@@ -186,8 +186,8 @@ class Desk:
     # -- working -------------------------------------------------------------------------------------------------------
 
     def claim_many(self, count: int = 256, kinds: tuple[str, ...] = tuple(KINDS), **fields: Any) -> list[Lease]:
-        """Claim up to `count` jobs as the worker `w`, and return their leases."""
-        request = ClaimRequest(worker="w", kinds=kinds, max=count, **fields)
+        """Claim up to `count` jobs, as the worker `w` or the given one, and return their leases."""
+        request = ClaimRequest(**{"worker": "w", "kinds": kinds, "max": count, **fields})
         return self.database.write(self.user, queue.claim, request, self.policy)
 
     def claim(self, **fields: Any) -> Lease:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import platform
 import shutil
+import signal
 import tempfile
 import threading
 import time
@@ -74,6 +75,8 @@ LIBRARIES = ("marey", "numpy", "scipy", "numba")
 log = logging.getLogger(__name__)
 WATCH_EVERY_S = 0.1
 LOG_EVERY_S = 2.0
+STOPPING_S = 2.0
+"""Longest time in seconds between the SIGTERM that ended a child and the one that stops its worker."""
 ANSWER_LIMIT_BYTES = 32 * MIB
 MOST_BLOB_BYTES = 1 << 30
 """Greatest size of a blob that a job may read, because this process, whose memory has no limit, holds it in memory."""
@@ -273,8 +276,11 @@ class RunningAttempt:
         """
         return f"{self._server} {self._lease.project} {name}"
 
-    def _death(self, child: ChildProcess) -> Failed:
+    def _death(self, child: ChildProcess) -> Failed | Stop:
         status = child.wait()
+        # An engine such as Slurm sends SIGTERM to all processes of a worker at once; the child may end first.
+        if status == -signal.SIGTERM and self._watch.stopping.wait(STOPPING_S):
+            return Stop.INTERRUPTED
         detail = signatures.describe_exit(status)
         return Failed("worker-process-died", detail, signatures.of_exit(status), retryable=True)
 

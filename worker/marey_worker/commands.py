@@ -72,6 +72,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m marey_worker", description="Run jobs of a Marey server.")
     parser.add_argument("--server", help="address of the server; default: from MAREY_URL or the stored login")
     parser.add_argument("--slots", type=int, default=1, help="number of jobs that run at the same time; default: 1")
+    parser.add_argument("--kind", action="append", default=[], help="run only jobs of this kind; may be repeated")
+    parser.add_argument(
+        "--label", action="append", default=[], type=_label, metavar="NAME=VALUE",
+        help="label of the worker, which jobs can require; may be repeated",
+    )  # fmt: skip
     parser.add_argument("--name", help="name of the worker, shown to people; default: host name and process id")
     parser.add_argument(
         "--cache", type=Path, help="folder in which downloaded inputs are cached; default: marey/inputs below ~/.cache"
@@ -87,9 +92,24 @@ def main() -> None:
         credential = resolve(given.server, given.token_file, {} if given.attached else None)
         if given.attached:
             credential = Credential(credential.url, sys.stdin.readline().strip())
-        work(credential, slots=given.slots, name=given.name, cache=given.cache, attached=given.attached)
+        work(
+            credential,
+            slots=given.slots,
+            kinds=tuple(given.kind),
+            labels=dict(given.label),
+            name=given.name,
+            cache=given.cache,
+            attached=given.attached,
+        )
     except MareyError as error:
         parser.exit(1, f"marey worker: {error}\n")
+
+
+def _label(text: str) -> tuple[str, str]:
+    name, assigned, value = text.partition("=")
+    if not (name and assigned):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a label; write it like site=lyon")
+    return name, value
 
 
 def _form_named(name: str | None) -> LogForm:

@@ -21,7 +21,7 @@ from marey_client.transport import Transport
 from marey_schemas.backoff import Backoff
 from marey_schemas.processes.child_process import ChildBroken, ChildProcess
 from marey_schemas.queue.job_kinds import job_kinds
-from marey_schemas.queue.worker_protocol import ClaimRequest, Lease
+from marey_schemas.queue.worker_protocol import INTERRUPTED_STATUS, ClaimRequest, Lease
 from marey_worker import faults
 from marey_worker.attempt import RunningAttempt
 from marey_worker.attempt_api import AttemptApi, claim
@@ -33,7 +33,6 @@ log = logging.getLogger(__name__)
 
 CLAIM_WAIT_S = 20.0
 PAUSES = Backoff(first_s=0.5, longest_s=15.0)
-INTERRUPTED_STATUS = 143
 FAILED_STATUS = 1
 JOBS_PER_CHILD = 1000
 CHILD_MODULE = "marey_worker.child"

@@ -16,6 +16,9 @@ from marey_schemas.queue.jobs import ItemInput, JobOutput, JobState, Progress, R
 FAULT_VARIABLE = "MAREY_FAULT"
 """Environment variable with which tests make a server or worker fail at a named point."""
 
+INTERRUPTED_STATUS = 143
+"""Exit status of a worker that returned a job to the queue because it was asked to stop."""
+
 LONGEST_CODE = 128
 LONGEST_DETAIL = 20_000
 LONGEST_SIGNATURE = 255

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from marey_schemas.queue.log_lines import LogForm
+from marey_server.process.data_folder import WORKER_TOKENS
 
 ENTRY_POINTS = "marey.launchers"
 """Group of entry points in which packages register their launchers."""
@@ -55,6 +56,7 @@ class LaunchContext:
     data : data folder of the server, which no other user can read
     log_form, log_level : form and level of the logs of workers
     options : settings `launcher_options`, replaced by the `options` of the pool where both have a value
+    labels : labels of the workers of the pool
     """
 
     pool: str
@@ -64,6 +66,12 @@ class LaunchContext:
     log_form: LogForm
     log_level: str
     options: Mapping[str, Any] = field(default_factory=dict)
+    labels: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def token_file(self) -> Path:
+        """File that contains the token, and that no other user can read."""
+        return self.data / WORKER_TOKENS / self.pool
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""Worker processes that a server starts on its own machine.
+"""Launcher `local`: worker processes on the machine of the server.
 
 A worker gets its token through a pipe to its standard input, which stays open: when the server ends, even by a crash,
 the pipe closes and the worker stops. Secrets are never passed in argument lists or environment variables. A worker gets
-only those environment variables of the server that it needs.
+only those environment variables of the server that it needs. A worker that ends by itself is started again.
 """
 
 from __future__ import annotations
@@ -12,13 +12,21 @@ import logging
 import sys
 import time
 from asyncio.subprocess import Process
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
-from pathlib import Path
+from collections.abc import Mapping
+from datetime import UTC, datetime
 
 from marey_schemas.backoff import Backoff
 from marey_schemas.processes.environment import clean_environment
-from marey_schemas.queue.log_lines import LogForm
+from marey_server.launchers.launcher import (
+    LaunchContext,
+    LaunchedWorker,
+    LauncherUnusable,
+    WorkerEnd,
+    WorkerRequest,
+    WorkerState,
+    worker_arguments,
+)
+from marey_server.process.data_folder import WORKER_CACHE
 
 log = logging.getLogger(__name__)
 
@@ -29,69 +37,106 @@ HEALTHY_AFTER_S = 30.0
 STOP_S = 20.0
 
 
-@asynccontextmanager
-async def local_workers(
-    count: int, *, url: str, token: str, cache: Path, log_form: LogForm, log_level: str
-) -> AsyncIterator[None]:
-    """Keep `count` workers running while the `async with` block runs; then stop the workers.
+class LocalLauncher:
+    """Launcher of worker processes on this machine. Limits of memory, processors and time do not apply to them."""
 
-    Parameters
-    ----------
-    url : address of this server
-    token : token of a user who may run jobs, with the scope `work`
-    cache : folder where the workers keep inputs
-    log_form, log_level : form and level of the workers' logs, which go to the same place as this server's log
-    """
-    logging_as_here = {"MAREY_LOG_FORM": log_form, "MAREY_LOG_LEVEL": log_level}
-    workers = [_LocalWorker(f"local-{number}", url, token, cache, logging_as_here) for number in range(1, count + 1)]
-    keeping = [asyncio.create_task(worker.keep_running()) for worker in workers]
-    try:
-        yield
-    finally:
-        await asyncio.gather(*(worker.stop() for worker in workers))
-        await asyncio.gather(*keeping)
+    outlives_server = False
+
+    def __init__(self, context: LaunchContext) -> None:
+        if context.options:
+            raise LauncherUnusable(f"the launcher `local` has no options, but {min(context.options)} is given")
+        self._context = context
+        self._workers: dict[str, _LocalWorker] = {}
+        self._keeping: dict[str, asyncio.Task[None]] = {}
+
+    async def start(self, request: WorkerRequest, count: int, *, key: str) -> tuple[str, ...]:
+        """Start worker processes, which are restarted, with growing pauses, whenever they end by themselves."""
+        names = tuple(f"{self._context.pool}-{key}-{number}" for number in range(count))
+        for name in names:
+            if name not in self._keeping:
+                worker = self._workers[name] = _LocalWorker(name, request, self._context)
+                self._keeping[name] = asyncio.create_task(worker.keep_running())
+        return names
+
+    async def list(self) -> tuple[LaunchedWorker, ...]:
+        """Return the workers that were not stopped; a worker that waits for its restart is `starting`."""
+        return tuple(worker.shown for name, worker in self._workers.items() if not self._keeping[name].done())
+
+    async def stop(self, names: tuple[str, ...]) -> None:
+        """Send SIGTERM to workers; one that does not end in time is killed."""
+        for name in names:
+            if worker := self._workers.get(name):
+                worker.stop()
+
+    async def why_ended(self, name: str) -> WorkerEnd | None:
+        """Return why a worker ended before its last restart, or when it was stopped."""
+        worker = self._workers.get(name)
+        return None if worker is None else worker.end
+
+    async def close(self) -> None:
+        """Stop all workers, and wait until they have ended."""
+        await self.stop(tuple(self._workers))
+        await asyncio.gather(*self._keeping.values())
 
 
 class _LocalWorker:
     """Worker process that is restarted, with growing pauses, whenever it ends by itself."""
 
-    def __init__(self, name: str, url: str, token: str, cache: Path, environment: dict[str, str]) -> None:
-        self._name = name
-        self._environment = environment
-        self._token = token
+    def __init__(self, name: str, request: WorkerRequest, context: LaunchContext) -> None:
+        self.name = name
+        self.end: WorkerEnd | None = None
+        self._labels: Mapping[str, str] = request.labels
+        self._token = context.token
+        self._environment = {"MAREY_LOG_FORM": context.log_form, "MAREY_LOG_LEVEL": context.log_level}
         self._command = [
-            sys.executable, "-m", "marey_worker", "--attached", "--server", url, "--name", name, "--cache", str(cache),
+            sys.executable, *worker_arguments(request, context.url), "--attached", "--name", name,
+            "--cache", str(context.data / WORKER_CACHE),
         ]  # fmt: skip
-        self._process: Process | None = None
+        self._started_at: datetime | None = None
         self._stopping = asyncio.Event()
 
+    @property
+    def shown(self) -> LaunchedWorker:
+        """The worker as `Launcher.list` returns it."""
+        state: WorkerState = "starting" if self._started_at is None else "running"
+        return LaunchedWorker(self.name, state, self._labels, self._started_at)
+
     async def keep_running(self) -> None:
-        """Start the worker and wait for its end, repeatedly."""
+        """Start the worker and wait for its end, repeatedly, until `stop` is called."""
         quick_ends = 0
         while not self._stopping.is_set():
-            started = time.monotonic()
-            self._process = await self._start()
-            status = await self._process.wait()
+            begun = time.monotonic()
+            failure = await self._run()
+            self._started_at = None
             if self._stopping.is_set():
                 return
-            quick_ends = 0 if time.monotonic() - started > HEALTHY_AFTER_S else quick_ends + 1
+            quick_ends = 0 if time.monotonic() - begun > HEALTHY_AFTER_S else quick_ends + 1
             pause_s = PAUSES.delay_s(quick_ends + 1)
-            log.warning("worker %s ended with status %d; starting it again in %.1f s", self._name, status, pause_s)
-            await self._pause(pause_s)
+            log.warning("worker %s %s; starting it again in %.1f s", self.name, failure, pause_s)
+            await self._is_stopping(pause_s)
 
-    async def stop(self) -> None:
-        """Ask the worker to return its jobs and end; kill it if it does not end in time."""
+    def stop(self) -> None:
+        """Let the worker return its jobs to the queue and end; kill it if it does not end in time."""
         self._stopping.set()
-        process = self._process
-        if process is None or process.returncode is not None:
-            return
-        process.terminate()
+
+    async def _run(self) -> str:
+        """Run the worker once; return in words how it ended."""
         try:
-            await asyncio.wait_for(process.wait(), STOP_S)
-        except TimeoutError:
-            log.warning("worker %s does not stop; killing it", self._name)
-            process.kill()
-            await process.wait()
+            process = await self._start()
+        except OSError as error:
+            self.end = WorkerEnd("failed", None, f"the process could not be started: {error}")
+            return f"could not be started: {error}"
+        ending = asyncio.create_task(process.wait())
+        stopping = asyncio.create_task(self._stopping.wait())
+        try:
+            await asyncio.wait((ending, stopping), return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            stopping.cancel()
+        if not ending.done():
+            await self._terminate(process)
+        status = await ending
+        self.end = _end_of(status, stopped=self._stopping.is_set())
+        return f"ended with status {status}"
 
     async def _start(self) -> Process:
         process = await asyncio.create_subprocess_exec(
@@ -99,11 +144,28 @@ class _LocalWorker:
         )
         assert process.stdin is not None
         process.stdin.write(self._token.encode() + b"\n")
-        log.info("worker %s is process %d", self._name, process.pid)
+        self._started_at = datetime.now(UTC)
+        log.info("worker %s is process %d", self.name, process.pid)
         return process
 
-    async def _pause(self, seconds: float) -> None:
+    async def _terminate(self, process: Process) -> None:
+        process.terminate()
+        try:
+            await asyncio.wait_for(process.wait(), STOP_S)
+        except TimeoutError:
+            log.warning("worker %s does not stop; killing it", self.name)
+            process.kill()
+
+    async def _is_stopping(self, seconds: float) -> None:
         try:
             await asyncio.wait_for(self._stopping.wait(), seconds)
         except TimeoutError:
             return
+
+
+def _end_of(status: int, *, stopped: bool) -> WorkerEnd:
+    if stopped:
+        return WorkerEnd("stopped", status)
+    if status < 0:
+        return WorkerEnd("killed", status, f"signal {-status}")
+    return WorkerEnd("finished" if status == 0 else "failed", status)

@@ -28,11 +28,16 @@ def give_token(tx: Transaction, administrator: str | None, token_file: Path, *, 
     """
     tx.principal = users.administrator_principal(tx, administrator)
     wanted = TokenCreate(name=name, scopes=tx.principal.scopes, expires_in_s=None)
-    secret = tokens.create_token(tx, wanted).secret
-    partial_file = token_file.with_suffix(".partial")
+    write_secret(token_file, tokens.create_token(tx, wanted).secret)
+
+
+def write_secret(file: Path, secret: str) -> None:
+    """Write a secret to a file that only its owner can read, in one step; missing folders are created."""
+    file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    partial_file = file.with_name(f"{file.name}.partial")
     partial_file.unlink(missing_ok=True)
-    with open(os.open(partial_file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
-        file.write(f"{secret}\n")
-        file.flush()
-        os.fsync(file.fileno())
-    partial_file.replace(token_file)
+    with open(os.open(partial_file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as opened:
+        opened.write(f"{secret}\n")
+        opened.flush()
+        os.fsync(opened.fileno())
+    partial_file.replace(file)

@@ -14,6 +14,8 @@ from marey_server.store.database.opening import sqlite_file
 
 BLOB_FOLDER = "blobs"
 WORKER_CACHE = "worker-cache"
+WORKER_TOKENS = "worker-tokens"
+WORKER_LOGS = "worker-logs"
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +30,8 @@ def prepare_data_folder(settings: Settings) -> None:
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     folder = settings.data.resolve()
     make_reserve(folder)
-    own = {folder / name for name in (TOKEN_FILE, BLOB_FOLDER, WORKER_CACHE, RESERVE_FILE, "marey.toml")}
+    folders = (BLOB_FOLDER, WORKER_CACHE, WORKER_TOKENS, WORKER_LOGS)
+    own = {folder / name for name in (TOKEN_FILE, *folders, RESERVE_FILE, "marey.toml")}
     file = sqlite_file(settings.resolved_database_url)
     if file is not None and file.parent.is_dir():
         os.close(os.open(file, os.O_CREAT | os.O_RDWR, 0o600))

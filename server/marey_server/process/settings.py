@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from ipaddress import IPv4Network, IPv6Network
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 from urllib.parse import quote, urlsplit
 
 from pydantic import Field, ValidationInfo, field_validator
@@ -17,6 +17,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
 from marey_schemas.sizes import KIB, MIB
 from marey_server.process.children import ChildLimits
+from marey_server.process.worker_pools import WorkerPools
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.retention import Retention
 from marey_server.store.transaction import Quotas
@@ -271,6 +272,19 @@ class Settings(BaseSettings):
         "ever.",
     )
     local_workers: int = Field(0, ge=0, le=256, description="Number of worker processes that the server starts.")
+    launcher: str = Field(
+        "local",
+        description="Engine that runs the workers in pools: local (processes on the server's machine), slurm, or an "
+        "entry point of another package in the group marey.launchers.",
+    )
+    launcher_options: dict[str, Any] = Field({}, description="Options of the launcher.")
+    pools: WorkerPools = Field((), description="Pools of workers, whose sizes follow the queue; see below.")
+    worker_url: str | None = Field(
+        None,
+        pattern=r"^https?://",
+        description="Address at which workers in pools reach the server. Absent: the address that the server listens "
+        "on.",
+    )
 
     @field_validator("data")
     @classmethod

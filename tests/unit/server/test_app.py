@@ -12,8 +12,8 @@ from tests.support.rest_server import running
 
 from marey_schemas.access import UserChange, UserCreate
 from marey_server.access.principal import SYSTEM
-from marey_server.app import make_worker_token
 from marey_server.errors import NotFoundProblem, UnauthenticatedProblem, UnavailableProblem
+from marey_server.launchers.worker_tokens import make_worker_token
 from marey_server.process.administrators import give_token, make_first_administrator
 from marey_server.process.settings import Settings
 from marey_server.store import leader, users

@@ -1,0 +1,92 @@
+"""Start and stop of all workers of a server: a fixed number on its own machine, and the pools in its settings."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import EntryPoint, entry_points
+from typing import cast
+
+from marey_server.launchers.launcher import (
+    ENTRY_POINTS,
+    LaunchContext,
+    Launcher,
+    LauncherUnusable,
+    MakeLauncher,
+    WorkerRequest,
+)
+from marey_server.launchers.local import LocalLauncher
+from marey_server.launchers.pool_keeper import PoolKeeper
+from marey_server.launchers.worker_tokens import keep_pool_token, make_worker_token
+from marey_server.process.data_folder import WORKER_TOKENS
+from marey_server.process.services import Services
+from marey_server.process.worker_pools import WorkerPool
+
+BUILT_IN = {
+    "local": "marey_server.launchers.local:LocalLauncher",
+    "slurm": "marey_server.launchers.slurm:SlurmLauncher",
+}
+"""Launchers of this package, which are imported only if the settings name them."""
+FIXED_POOL, FIXED_KEY = "local", "fixed"
+"""Parts of the names of the workers in `local_workers`."""
+
+
+@asynccontextmanager
+async def keeping_workers(services: Services, address: str) -> AsyncIterator[None]:
+    """Run the workers of a server that listens on `address` while the `async with` block runs.
+
+    Then the workers on this machine are stopped; workers of other engines continue, and the next server finds them.
+    Raises `LauncherUnusable`.
+    """
+    settings = services.settings
+    keepers = [PoolKeeper(pool, _launcher_of(pool, services, address), services.database) for pool in settings.pools]
+    fixed = None
+    if settings.local_workers:
+        token = make_worker_token(services.database, settings)
+        data = settings.data.absolute()
+        fixed = LocalLauncher(LaunchContext(FIXED_POOL, address, token, data, settings.log_form, settings.log_level))
+        await fixed.start(WorkerRequest(), settings.local_workers, key=FIXED_KEY)
+    tasks = [asyncio.create_task(keeper.keep()) for keeper in keepers]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await asyncio.gather(*(keeper.close() for keeper in keepers), *([fixed.close()] if fixed else []))
+
+
+def find_launcher(name: str) -> MakeLauncher:
+    """Return the function that makes launchers of a kind. Raises `LauncherUnusable`."""
+    if name in BUILT_IN:
+        found = EntryPoint(name, BUILT_IN[name], ENTRY_POINTS)
+    else:
+        others = {one.name: one for one in entry_points(group=ENTRY_POINTS)}
+        if name not in others:
+            known = ", ".join(sorted({*BUILT_IN, *others}))
+            raise LauncherUnusable(f"launcher: there is no launcher {name!r}, only: {known}")
+        found = others[name]
+    try:
+        return cast(MakeLauncher, found.load())
+    except (ImportError, AttributeError) as error:
+        raise LauncherUnusable(f"launcher: {name} cannot be loaded: {error}") from error
+
+
+def _launcher_of(pool: WorkerPool, services: Services, address: str) -> Launcher:
+    settings = services.settings
+    make = find_launcher(settings.launcher)
+    file = settings.data / WORKER_TOKENS / pool.name
+    token = keep_pool_token(services.database, settings, pool.name, pool.labels, file)
+    return make(
+        LaunchContext(
+            pool.name,
+            settings.worker_url or address,
+            token,
+            settings.data.absolute(),
+            settings.log_form,
+            settings.log_level,
+            {**settings.launcher_options, **pool.options},
+            pool.labels,
+        )
+    )

@@ -1,0 +1,153 @@
+"""Rules for launchers, and those for Slurm, checked with a real controller and node daemon."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from tests.support.launcher_contract import REQUEST, Engine, LauncherContract, processes_of
+from tests.support.slurm_cluster import CPUS, SlurmCluster, missing_programs, running_cluster
+
+from marey_server.launchers import slurm
+from marey_server.launchers.launcher import EngineError, LaunchContext, Launcher, LauncherUnusable
+from marey_server.launchers.slurm import SlurmLauncher
+
+MISSING = missing_programs()
+needs_slurm = pytest.mark.skipif(
+    bool(MISSING),
+    reason=f"Slurm is not installed (tests/support/install_slurm.sh installs it): no {', '.join(MISSING)}",
+)
+
+
+def context_of(folder: Path, **options: object) -> LaunchContext:
+    return LaunchContext("crew", "http://127.0.0.1:1", "secret", folder, "text", "info", options)
+
+
+@needs_slurm
+class TestSlurmLauncher(LauncherContract):
+    @pytest.fixture(scope="class")
+    @classmethod
+    def cluster(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[SlurmCluster]:
+        folder = tmp_path_factory.mktemp("slurm")
+        records = folder / "ended"
+        with running_cluster(folder, JobCompType="jobcomp/filetxt", JobCompLoc=str(records)) as cluster:
+            yield cluster
+
+    @pytest.fixture
+    def make_launcher(
+        self, cluster: SlurmCluster, monkeypatch: pytest.MonkeyPatch
+    ) -> Callable[[LaunchContext], Launcher]:
+        monkeypatch.setenv(slurm.CONFIGURATION, str(cluster.configuration))
+        return SlurmLauncher
+
+    def test_resources_and_options_reach_slurm(self, engine: Engine, cluster: SlurmCluster) -> None:
+        wanted = {"partition": "night", "constraint": "fast", "arguments": ["--nice=7"]}
+        launcher = SlurmLauncher(replace(engine.context, options=wanted))
+        request = replace(REQUEST, cpus=2, deadline_s=3601)
+        (name,) = engine.do(launcher.start(request, 1, key="k11"))
+        shown = cluster.ask("scontrol", "show", "job", "--oneliner")
+        (line,) = (line for line in shown.splitlines() if " JobName=crew-k11 " in line)
+        for part in ("Partition=night", "TimeLimit=01:01:00", "NumCPUs=2", "MinMemoryNode=512M", "Requeue=1", "Nice=7"):
+            assert part in line
+        assert "Features=fast" in line
+        engine.do(launcher.stop((name,)))
+        engine.until_ended(name)
+
+    def test_a_worker_that_waits_for_a_node_is_starting_and_never_runs_after_a_stop(self, engine: Engine) -> None:
+        names = engine.start(CPUS + 1, key="k12")
+        engine.until(lambda: sorted(engine.states()[name] for name in names) == ["running"] * CPUS + ["starting"])
+        (waiting,) = (name for name in names if engine.states()[name] == "starting")
+        engine.do(engine.launcher.stop((waiting,)))
+        engine.until_ended(waiting)
+        end = engine.end_of(waiting)
+        assert (end.reason, processes_of(waiting)) == ("stopped", [])
+
+    def test_a_worker_that_ignores_sigterm_is_cancelled(self, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(slurm, "STOP_S", 0.0)
+        (name,) = engine.start(1, key="k13")
+        engine.until_running()
+        (worker,) = processes_of(name)
+        worker.suspend()
+        engine.do(engine.launcher.stop((name,)))
+        engine.do(asyncio.sleep(0.1))
+        engine.do(engine.launcher.stop((name,)))
+        engine.until_ended(name)
+        assert engine.end_of(name).reason == "stopped"
+
+    def test_a_task_that_slurm_runs_again_works_under_the_same_name(
+        self, engine: Engine, cluster: SlurmCluster, tmp_path: Path
+    ) -> None:
+        (name,) = engine.start(1, key="k14")
+        job = engine.submit("wait", tmp_path / "job")
+        engine.until((tmp_path / "job" / "started").exists)
+        (first,) = processes_of(name)
+        task = cluster.ask("squeue", "--noheader", "--name=crew-k14", "--format=%i").strip()
+        cluster.ask("scontrol", "requeue", task)
+        engine.until(lambda: not first.is_running())
+        (tmp_path / "job" / "go").touch()
+        assert engine.marey.jobs.wait(job.id).result["waited"]
+        outcomes = [(attempt.worker, attempt.outcome) for attempt in engine.marey.jobs.attempts(job.id)]
+        assert outcomes == [(name, "interrupted"), (name, "succeeded")]
+
+    def test_a_controller_that_is_away_is_an_error_and_its_workers_go_on(
+        self, engine: Engine, cluster: SlurmCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (name,) = engine.start(1, key="k15")
+        engine.until_running()
+        cluster.controller.terminate()
+        cluster.controller.wait(30)
+        monkeypatch.setattr(slurm, "COMMAND_S", 1.0)
+        for call in (engine.launcher.list(), engine.launcher.start(REQUEST, 1, key="k16")):
+            with pytest.raises(EngineError, match="squeue"):
+                engine.do(call)
+        job = engine.submit("wait", tmp_path / "job")
+        (tmp_path / "job" / "go").touch()
+        assert engine.marey.jobs.wait(job.id).result["waited"]
+        monkeypatch.undo()
+        os.environ[slurm.CONFIGURATION] = str(cluster.configuration)
+        cluster.start_controller()
+        assert engine.states()[name] == "running"
+
+
+def test_an_option_that_slurm_does_not_have_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(LauncherUnusable, match="options of the launcher slurm: partitoin: Extra inputs"):
+        SlurmLauncher(context_of(tmp_path, partitoin="gpu"))
+
+
+def test_a_command_that_is_missing_or_does_not_answer_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    launcher = SlurmLauncher(context_of(tmp_path))
+    with pytest.raises(EngineError, match="squeue cannot be run: No such file"):
+        asyncio.run(launcher.list())
+    silent = tmp_path / "squeue"
+    silent.write_text("#!/bin/sh\nexec /bin/sleep 60\n")
+    silent.chmod(0o700)
+    monkeypatch.setattr(slurm, "COMMAND_S", 0.3)
+    begun = time.monotonic()
+    with pytest.raises(EngineError, match="squeue did not answer within"):
+        asyncio.run(launcher.list())
+    assert time.monotonic() - begun < 30
+
+
+def test_old_logs_of_the_pool_are_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(slurm, "MOST_LOGS", 2)
+    commands = tmp_path / "bin"
+    commands.mkdir()
+    for name in ("squeue", "sbatch"):
+        (commands / name).write_text("#!/bin/sh\nexit 0\n")
+        (commands / name).chmod(0o700)
+    monkeypatch.setenv("PATH", f"{commands}:/bin")
+    logs = tmp_path / "worker-logs"
+    logs.mkdir()
+    for age, name in enumerate(("crew-a-3.log", "crew-a-2.log", "crew-a-1.log", "other-a-1.log")):
+        (logs / name).touch()
+        os.utime(logs / name, (1000 - age, 1000 - age))
+    asyncio.run(SlurmLauncher(context_of(tmp_path)).start(REQUEST, 1, key="b"))
+    assert {file.name for file in logs.iterdir()} == {"crew-a-3.log", "crew-a-2.log", "other-a-1.log"}

@@ -1,0 +1,141 @@
+"""A real Slurm cluster on this machine: controller, node daemon and munge, as Debian packages them, for one user.
+
+`tests/support/install_slurm.sh` installs the programs. The tests run where they are there already.
+"""
+
+from __future__ import annotations
+
+import getpass
+import os
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from tests.support.server_process import reserved_port
+
+PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "scontrol", "sinfo", "squeue")
+CPUS = 4
+MEMORY_MB = 8000
+PATIENCE_S = 60.0
+
+_SEARCH_PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
+
+
+def missing_programs() -> list[str]:
+    """Return the programs that are not installed."""
+    return [name for name in PROGRAMS if shutil.which(name, path=_SEARCH_PATH) is None]
+
+
+class SlurmCluster:
+    """Daemons of a cluster with one node; `settings` replace lines of its configuration."""
+
+    def __init__(self, folder: Path, **settings: str) -> None:
+        self.folder = folder
+        self.configuration = folder / "slurm.conf"
+        self._daemons: list[subprocess.Popen[bytes]] = []
+        for name in ("state", "spool"):
+            (folder / name).mkdir()
+        (folder / "munge.key").write_bytes(os.urandom(1024))
+        (folder / "munge.key").chmod(0o600)
+        self._write_configuration(settings)
+
+    def start(self) -> None:
+        """Start the daemons, and wait until the node accepts jobs."""
+        self._spawn("munged", *self._munge_options(), "--foreground", "--force")
+        self._until((self.folder / "munge.socket").exists)
+        self.start_controller()
+        self._spawn("slurmd", "-D", "-f", str(self.configuration))
+        self._until(lambda: "idle" in self.ask("sinfo", "--noheader", "--format=%T"))
+
+    def start_controller(self) -> None:
+        """Start the controller, which continues with the state that it stored."""
+        self.controller = self._spawn("slurmctld", "-D", "-f", str(self.configuration))
+        self._until(lambda: "UP" in self.ask("scontrol", "ping"))
+
+    def stop(self) -> None:
+        """Stop the daemons that were started last first."""
+        for daemon in reversed(self._daemons):
+            if daemon.poll() is None:
+                daemon.terminate()
+                try:
+                    daemon.wait(PATIENCE_S)
+                except subprocess.TimeoutExpired:
+                    daemon.kill()
+                    daemon.wait()
+
+    def ask(self, program: str, *arguments: str) -> str:
+        """Return the output of a command of Slurm, also if the command fails."""
+        environment = {**os.environ, "SLURM_CONF": str(self.configuration)}
+        done = subprocess.run(
+            [program, *arguments], env=environment, capture_output=True, text=True, timeout=PATIENCE_S
+        )
+        return done.stdout + done.stderr
+
+    def _munge_options(self) -> Iterator[str]:
+        files = {"key-file": "key", "socket": "socket", "pid-file": "pid", "log-file": "log", "seed-file": "seed"}
+        yield from (f"--{option}={self.folder}/munge.{ending}" for option, ending in files.items())
+
+    def _spawn(self, program: str, *arguments: str) -> subprocess.Popen[bytes]:
+        path = shutil.which(program, path=_SEARCH_PATH)
+        assert path is not None
+        with (self.folder / f"{program}.out").open("ab") as output:
+            daemon = subprocess.Popen([path, *arguments], stdin=subprocess.DEVNULL, stdout=output, stderr=output)
+        self._daemons.append(daemon)
+        return daemon
+
+    def _until(self, reached: object) -> None:
+        assert callable(reached)
+        deadline = time.monotonic() + PATIENCE_S
+        while not reached():
+            logs = "\n".join(f"{file}:\n{file.read_text()[-2000:]}" for file in self.folder.glob("*.out"))
+            assert time.monotonic() < deadline, f"Slurm did not start:\n{logs}"
+            time.sleep(0.1)
+
+    def _write_configuration(self, settings: Mapping[str, str]) -> None:
+        host, folder = socket.gethostname().partition(".")[0], self.folder
+        lines = {
+            "ClusterName": "marey",
+            "SlurmctldHost": f"{host}(127.0.0.1)",
+            "SlurmUser": getpass.getuser(),
+            "SlurmdUser": getpass.getuser(),
+            "SlurmctldPort": str(reserved_port()),
+            "SlurmdPort": str(reserved_port()),
+            "AuthType": "auth/munge",
+            "AuthInfo": f"socket={folder}/munge.socket",
+            "StateSaveLocation": f"{folder}/state",
+            "SlurmdSpoolDir": f"{folder}/spool",
+            "SlurmctldPidFile": f"{folder}/slurmctld.pid",
+            "SlurmdPidFile": f"{folder}/slurmd.pid",
+            "ProctrackType": "proctrack/linuxproc",
+            "TaskPlugin": "task/none",
+            "JobAcctGatherType": "jobacct_gather/none",
+            "SelectType": "select/cons_tres",
+            "SelectTypeParameters": "CR_CPU_Memory",
+            "SlurmdParameters": "config_overrides",
+            "MpiDefault": "none",
+            "ReturnToService": "2",
+            "DefMemPerCPU": "512",
+            "KillWait": "5",
+            "MinJobAge": "300",
+            **settings,
+        }
+        text = "".join(f"{name}={value}\n" for name, value in lines.items())
+        text += f"NodeName={host} NodeAddr=127.0.0.1 CPUs={CPUS} RealMemory={MEMORY_MB} Features=fast State=UNKNOWN\n"
+        text += "PartitionName=main Nodes=ALL Default=YES MaxTime=INFINITE State=UP\n"
+        text += "PartitionName=night Nodes=ALL MaxTime=INFINITE State=UP\n"
+        self.configuration.write_text(text)
+
+
+@contextmanager
+def running_cluster(folder: Path, **settings: str) -> Iterator[SlurmCluster]:
+    """Run a cluster while the `with` block runs."""
+    cluster = SlurmCluster(folder, **settings)
+    try:
+        cluster.start()
+        yield cluster
+    finally:
+        cluster.stop()

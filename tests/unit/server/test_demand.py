@@ -1,0 +1,48 @@
+"""Demand for workers: which queued jobs count, and what the given workers run."""
+
+from collections.abc import Sequence
+from functools import partial
+
+from tests.support.queue_desk import Desk
+
+from marey_server.access.principal import SYSTEM
+from marey_server.store.monitoring.demand import Demand, read_demand
+
+GPU = {"gpu": "a100", "site": "lyon"}
+
+
+def demand(desk: Desk, *, kinds: Sequence[str] = (), workers: Sequence[str] = (), limit: int = 100) -> Demand:
+    read = partial(read_demand, labels=GPU, kinds=kinds, workers=workers, limit=limit)
+    return desk.database.read(SYSTEM, read)
+
+
+def test_jobs_that_a_worker_with_the_labels_could_claim_count(desk: Desk) -> None:
+    for labels in ({}, {"gpu": "a100"}, GPU):
+        desk.submit(labels=labels)
+    for labels in ({"gpu": "h100"}, {**GPU, "room": "2"}):
+        desk.submit(labels=labels)
+    first = desk.submit("errand")
+    desk.submit("errand", after=(first,))
+    assert demand(desk).queued == 4
+    assert demand(desk, kinds=("errand",)).queued == 4
+    assert demand(desk, kinds=("sum",)).queued == 0
+    assert demand(desk, limit=2).queued == 2
+
+
+def test_a_job_that_waits_for_its_next_attempt_does_not_count_yet(desk: Desk) -> None:
+    desk.submit()
+    desk.fail(desk.claim(), retryable=True)
+    assert demand(desk).queued == 0
+    desk.clock.advance(3600)
+    assert demand(desk).queued == 1
+
+
+def test_the_jobs_of_the_given_workers_are_counted_until_their_leases_expire(desk: Desk) -> None:
+    for _ in range(4):
+        desk.submit()
+    desk.claim_many(2, worker="gpu-k1-1")
+    desk.claim(worker="gpu-k1-2")
+    desk.claim(worker="other")
+    assert demand(desk, workers=("gpu-k1-1", "gpu-k1-2", "gpu-k1-3")).running == {"gpu-k1-1": 2, "gpu-k1-2": 1}
+    desk.clock.advance(61)
+    assert demand(desk, workers=("gpu-k1-1",)).running == {}
