@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,7 +14,10 @@ from docs.generate import ROOT
 from tests.support.cluster.admission import VERSIONS, validate
 from tests.support.told_commands import unknown_options
 
+from marey_server.launchers.kubernetes.launcher import make_kubernetes_launcher
 from marey_server.launchers.kubernetes.manifests import TOKEN_FILE, USER
+from marey_server.launchers.kubernetes.options import ClusterOptions, read_options
+from marey_server.launchers.pools import find_launcher
 from marey_server.process.settings import Settings
 
 FOLDER = ROOT / "deploy" / "kubernetes"
@@ -123,6 +127,19 @@ def test_the_role_gives_no_rights_outside_the_namespace() -> None:
 def test_a_stopping_server_can_end_its_requests() -> None:
     drain_s = Settings.model_fields["drain_s"].default
     assert min(pod["terminationGracePeriodSeconds"] for pod in pods()) > drain_s
+
+
+def test_the_settings_of_the_page_are_valid(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    settings = yaml.safe_load(re.search(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[1])["data"]
+    for name, text in settings.items():
+        monkeypatch.setenv(name, text)
+    found = Settings()
+    (pool,) = found.pools
+    assert find_launcher(found.launcher) is make_kubernetes_launcher
+    assert read_options({**found.launcher_options, **pool.options}).node_selector == {"accelerator": "a100"}
+    documented = set(re.findall(r"`(\w+)`", re.search(r"\| option .*?\n\n", PAGE, re.DOTALL)[0]))
+    assert set(ClusterOptions.model_fields) <= documented
 
 
 def test_the_page_names_secrets_files_and_commands_that_exist() -> None:

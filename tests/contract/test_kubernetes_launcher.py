@@ -37,7 +37,7 @@ class Bench:
         self.launcher = self.make()
 
     def make(self, pool: str = "crew", **options: Any) -> KubernetesLauncher:
-        usual = {"image": IMAGE, "kubeconfig": self.cluster.kubeconfig, "relist_s": 2, "timeout_s": 5.0}
+        usual = {"image": IMAGE, "kubeconfig": self.cluster.kubeconfig, "relist_s": 2, "timeout_s": 60.0}
         context = LaunchContext(
             pool, "http://marey:8460", SECRET, self._folder, "text", "info", options={**usual, **options}
         )

@@ -24,6 +24,7 @@ from marey_server.process.services import Services
 from marey_server.process.worker_pools import WorkerPool
 
 BUILT_IN = {
+    "kubernetes": "marey_server.launchers.kubernetes.launcher:make_kubernetes_launcher",
     "local": "marey_server.launchers.local:LocalLauncher",
     "slurm": "marey_server.launchers.slurm:SlurmLauncher",
 }

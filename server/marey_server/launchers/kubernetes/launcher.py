@@ -206,7 +206,7 @@ class KubernetesLauncher:
                 log.warning("worker %s cannot start: %s", name, reason)
         self._blocked = blocked
 
-    async def _all(self, calls: Iterable[Awaitable[T]]) -> list[T]:
+    async def _all(self, calls: Iterable[Awaitable[T]]) -> Sequence[T]:
         """Make all calls, some at the same time; afterwards, raise the first error."""
 
         async def limited(call: Awaitable[T]) -> T:
