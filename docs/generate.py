@@ -297,10 +297,11 @@ def pool_manifest() -> str:
     (container,) = deployment["spec"]["template"]["spec"]["containers"]
     container["image"] = "marey-worker"  # the overlays replace this name
     note = "# Written by `make docs` from server/marey_server/launchers/kubernetes/manifests.py; change it there.\n"
-    return note + yaml.dump(deployment, Dumper=_Dumper, sort_keys=False)
+    text: str = yaml.dump(deployment, Dumper=_Dumper, sort_keys=False)
+    return note + text
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
     """Writer of YAML that repeats equal values, so that each is read where it is used."""
 
     def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002 - the signature of PyYAML

@@ -21,18 +21,22 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StubCluster]:
         yield stub
 
 
+def making(cluster: StubCluster, **options: bool) -> Callable[[LaunchContext], Launcher]:
+    """Return a function that makes launchers for the stub cluster."""
+    usual = {"image": IMAGE, "kubeconfig": cluster.kubeconfig, "timeout_s": 60.0}
+    return lambda context: make_kubernetes_launcher(replace(context, options=usual | options))
+
+
 class TestKubernetesLauncher(LauncherContract):
-    @pytest.fixture(params=["jobs", "indexed"])
-    def make_launcher(
-        self, cluster: StubCluster, request: pytest.FixtureRequest
-    ) -> Callable[[LaunchContext], Launcher]:
-        options = {
-            "image": IMAGE,
-            "kubeconfig": cluster.kubeconfig,
-            "indexed": request.param == "indexed",
-            "timeout_s": 60.0,
-        }
-        return lambda context: make_kubernetes_launcher(replace(context, options=options))
+    @pytest.fixture
+    def make_launcher(self, cluster: StubCluster) -> Callable[[LaunchContext], Launcher]:
+        return making(cluster)
+
+
+class TestIndexedJobs(LauncherContract):
+    @pytest.fixture
+    def make_launcher(self, cluster: StubCluster) -> Callable[[LaunchContext], Launcher]:
+        return making(cluster, indexed=True)
 
 
 def test_the_settings_can_name_the_launcher() -> None:

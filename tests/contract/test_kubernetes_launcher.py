@@ -13,8 +13,11 @@ from typing import Any, TypeVar
 import pytest
 from tests.support.cluster.stub import IMAGE, StubCluster, running_cluster
 
+from marey_schemas.backoff import Backoff
 from marey_server.launchers.kubernetes import view
 from marey_server.launchers.kubernetes.launcher import KubernetesLauncher, make_kubernetes_launcher
+from marey_server.launchers.kubernetes.manifests import Pool, worker_job
+from marey_server.launchers.kubernetes.options import read_options
 from marey_server.launchers.launcher import EngineError, LaunchContext, LauncherUnusable, WorkerEnd, WorkerRequest
 
 T = TypeVar("T")
@@ -90,7 +93,11 @@ def bench(cluster: StubCluster, tmp_path: Path) -> Iterator[Bench]:
 def test_each_worker_is_a_job_with_a_secret_that_ends_with_it(bench: Bench, cluster: StubCluster) -> None:
     names = bench.start(2)
     assert names == ("marey-crew-k1-0", "marey-crew-k1-1")
-    assert {job["metadata"]["name"] for job in cluster.all("jobs")} == set(names)
+    jobs = {job["metadata"]["name"]: job for job in cluster.all("jobs")}
+    assert jobs.keys() == set(names)
+    pool = Pool("crew", "http://marey:8460", read_options({"image": IMAGE}), log_form="text")
+    for name in names:
+        assert jobs[name]["spec"] == worker_job(pool, name)["spec"]
     bench.until(dict.fromkeys(names, "running"))
     secrets = {one["metadata"]["name"]: one["data"]["worker.token"] for one in cluster.all("secrets")}
     assert secrets == dict.fromkeys(names, base64.b64encode(SECRET.encode()).decode())
@@ -312,7 +319,7 @@ def test_a_version_that_the_cluster_has_forgotten_is_listed_again(bench: Bench, 
 def test_a_cluster_that_fails_is_reported_and_followed_again(
     bench: Bench, cluster: StubCluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(view, "PAUSES", view.Backoff(first_s=0.05, longest_s=0.2))
+    monkeypatch.setattr(view, "PAUSES", Backoff(first_s=0.05, longest_s=0.2))
     cluster.faults.status = 503
     for call in (lambda: bench.states(), lambda: bench.start(), lambda: bench.end("marey-crew-k1-0")):
         with pytest.raises(EngineError, match="the cluster answers 503: a fault of the stub"):

@@ -32,6 +32,7 @@ class Controllers:
 
     def step(self) -> None:
         """Compare all objects with their specifications once."""
+        self.objects.delete_orphans()
         self._admit_queued()
         for job in self.objects.select("jobs"):
             if condition(job, "Complete") or condition(job, "Failed"):

@@ -90,6 +90,14 @@ class Objects:
             return
         self.change(kind, name, lambda pod: pod["metadata"].setdefault("deletionTimestamp", now()))
 
+    def delete_orphans(self) -> None:
+        """Delete the objects whose owners do not exist."""
+        present = {document["metadata"]["uid"] for document in self._documents.values()}
+        for (kind, name), document in list(self._documents.items()):
+            owners = document["metadata"].get("ownerReferences", ())
+            if owners and not any(owner["uid"] in present for owner in owners):
+                self.mark_deleted(kind, name)
+
     def owned_by(self, owner: Document) -> list[tuple[str, Document]]:
         """Return the objects with a reference to their owner."""
         uid = owner["metadata"]["uid"]

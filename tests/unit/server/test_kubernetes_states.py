@@ -99,7 +99,9 @@ def test_each_index_is_a_worker_with_its_own_state() -> None:
     assert not has_ended(whole, "w-5")
 
 
-def test_a_container_that_cannot_start_says_why() -> None:
+def test_a_pod_that_cannot_start_says_why() -> None:
+    unscheduled = [{"type": "PodScheduled", "status": "False", "reason": "Unschedulable", "message": "no GPU is free"}]
+    assert blocked_reason(pod("Pending", conditions=unscheduled)) == "Unschedulable: no GPU is free"
     waiting = {"waiting": {"reason": "ImagePullBackOff", "message": "not found"}}
     assert blocked_reason(pod("Pending", waiting)) == "ImagePullBackOff: not found"
     assert blocked_reason(pod("Pending", {"waiting": {"reason": "ContainerCreating"}})) is None

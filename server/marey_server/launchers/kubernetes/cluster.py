@@ -10,6 +10,7 @@ import json
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import aiohttp
@@ -72,12 +73,13 @@ class Cluster:
     async def close(self) -> None:
         """Close all connections."""
         if self._api is not None:
-            await self._api.close()
+            await self._api.close()  # type: ignore[no-untyped-call]
 
     async def create_job(self, job: Manifest) -> Manifest:
         """Create a Job. Raises `ObjectExists`."""
+        body = client.V1Job.model_validate(job)
         return await self._answer(lambda api: _batch(api).create_namespaced_job_without_preload_content(
-            self._namespace, job, field_validation="Strict", _request_timeout=self._timeout_s
+            self._namespace, body, field_validation="Strict", _request_timeout=self._timeout_s
         ))  # fmt: skip
 
     async def read_job(self, name: str) -> Manifest:
@@ -100,8 +102,9 @@ class Cluster:
 
     async def create_secret(self, secret: Manifest) -> None:
         """Create a Secret. Raises `ObjectExists`."""
+        body = client.V1Secret.model_validate(secret)
         await self._answer(lambda api: _core(api).create_namespaced_secret_without_preload_content(
-            self._namespace, secret, field_validation="Strict", _request_timeout=self._timeout_s
+            self._namespace, body, field_validation="Strict", _request_timeout=self._timeout_s
         ))  # fmt: skip
 
     async def read_log(self, pod: str) -> str:
@@ -116,14 +119,18 @@ class Cluster:
         objects: dict[str, Manifest] = {}
         token: str | None = None
         while True:
-            page = await self._answer(lambda api, token=token: _lister(api, kind)(
-                self._namespace, label_selector=selector, limit=PAGE, _continue=token,
-                _request_timeout=self._timeout_s,
-            ))  # fmt: skip
+            page = await self._answer(partial(self._page, kind, selector, token))
             objects |= {one["metadata"]["name"]: one for one in page["items"]}
             token = page["metadata"].get("continue") or None
             if token is None:
                 return Listed(objects, page["metadata"]["resourceVersion"])
+
+    def _page(
+        self, kind: Kind, selector: str, token: str | None, api: client.ApiClient
+    ) -> Awaitable[aiohttp.ClientResponse]:
+        return _lister(api, kind)(
+            self._namespace, label_selector=selector, limit=PAGE, _continue=token, _request_timeout=self._timeout_s
+        )
 
     async def watch(self, kind: Kind, selector: str, version: str, seconds: int) -> AsyncIterator[Change]:
         """Yield the changes since `version` for a number of seconds, or until the connection ends.
@@ -173,9 +180,11 @@ async def _configuration(options: ClusterOptions) -> client.Configuration:
     configuration = client.Configuration()
     try:
         if options.kubeconfig is None:
-            config.load_incluster_config(client_configuration=configuration)
+            config.load_incluster_config(  # type: ignore[no-untyped-call]
+                client_configuration=configuration
+            )
         else:
-            await config.load_kube_config(
+            await config.load_kube_config(  # type: ignore[no-untyped-call]
                 str(options.kubeconfig),
                 context=options.context,
                 client_configuration=configuration,

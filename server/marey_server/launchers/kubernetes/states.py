@@ -134,11 +134,14 @@ def _reason(pod: Document, ended: Document, signal: int) -> tuple[EndReason, str
 
 
 def blocked_reason(pod: Document) -> str | None:
-    """Return why the container of a pod cannot start, such as a missing image, or None."""
+    """Return why a pod cannot start, such as a missing image or no suitable node, or None."""
     waiting = (_container_status(pod).get("state") or {}).get("waiting") or {}
-    if waiting.get("reason") in (None, "ContainerCreating", "PodInitializing"):
+    conditions = pod.get("status", {}).get("conditions") or ()
+    unscheduled = (one for one in conditions if one["type"] == "PodScheduled" and one["status"] == "False")
+    found = next(unscheduled, waiting)
+    if found.get("reason") in (None, "ContainerCreating", "PodInitializing"):
         return None
-    return ": ".join(filter(None, (waiting["reason"], waiting.get("message"))))
+    return ": ".join(filter(None, (found["reason"], found.get("message"))))
 
 
 def _container_status(pod: Document) -> Document:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -17,6 +18,8 @@ log = logging.getLogger(__name__)
 
 KINDS: tuple[Kind, ...] = ("jobs", "pods")
 PAUSES = Backoff(first_s=0.5, longest_s=15.0)
+MOST_DELETED = 256
+"""Number of deleted Jobs whose ids are remembered, until every list that began before has ended."""
 SHORT_WATCH_S = 1.0
 """Duration in seconds of a watch that counts as failed, so that a cluster that ends every watch is not flooded."""
 
@@ -37,6 +40,7 @@ class ClusterView:
         self._listed_at: dict[Kind, float] = {}
         self._tasks: list[asyncio.Task[None]] = []
         self._changing: list[_Changed] = []
+        self._deleted: deque[str] = deque(maxlen=MOST_DELETED)
 
     async def refresh(self) -> None:
         """Make sure that the copy is not outdated. Raises `EngineError` if the cluster does not answer."""
@@ -66,7 +70,9 @@ class ClusterView:
         self._put("jobs", job["metadata"]["name"], job)
 
     def drop_job(self, name: str) -> None:
-        """Remove a Job that was just deleted; a list that was requested before does not bring it back."""
+        """Remove a Job that was just deleted; neither a list nor a watch that began before brings it back."""
+        if (job := self.jobs.get(name)) is not None:
+            self._deleted.append(job["metadata"]["uid"])
         self._put("jobs", name, None)
 
     async def close(self) -> None:
@@ -80,7 +86,7 @@ class ClusterView:
         """Replace the copies of a kind by those that the cluster has now; return the version of the list."""
         with self._noting_changes() as changed:
             listed = await self._cluster.list(kind, self._selector)
-        self._objects[kind] = dict(listed.objects)
+        self._objects[kind] = {name: one for name, one in listed.objects.items() if not self._is_deleted(one)}
         for of_kind, name, document in changed:
             if of_kind == kind:
                 self._apply(kind, name, document)
@@ -116,10 +122,13 @@ class ClusterView:
             changed.append((kind, name, document))
 
     def _apply(self, kind: Kind, name: str, document: Manifest | None) -> None:
-        if document is None:
+        if document is None or self._is_deleted(document):
             self._objects[kind].pop(name, None)
         else:
             self._objects[kind][name] = document
+
+    def _is_deleted(self, document: Manifest) -> bool:
+        return document["metadata"]["uid"] in self._deleted
 
     @contextmanager
     def _noting_changes(self) -> Iterator[_Changed]:
