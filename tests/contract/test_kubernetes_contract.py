@@ -14,7 +14,7 @@ from marey_server.launchers.launcher import LaunchContext, Launcher
 from marey_server.launchers.pools import find_launcher
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="class")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StubCluster]:
     """A stub cluster, whose folder with the files of Secrets is none of the folders that a test searches for tokens."""
     with running_cluster(tmp_path_factory.mktemp("contract") / "cluster") as stub:

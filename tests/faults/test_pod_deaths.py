@@ -70,7 +70,7 @@ def submit(marey: Marey, folder: Path) -> Job:
 def finish(marey: Marey, job: Job, folder: Path) -> list[str | None]:
     """Let a job end, check that it succeeded, and return the outcomes of its attempts."""
     (folder / "go").touch()
-    assert marey.jobs.wait(job.id, timeout_s=PATIENCE_S).result == {"waited": True}
+    assert marey.jobs.wait(job.id, timeout_s=PATIENCE_S).state == "succeeded"
     return [attempt.outcome for attempt in marey.jobs.attempts(job.id)]
 
 
