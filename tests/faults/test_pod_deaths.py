@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
+from docs.generate import POOL_MANIFEST
 from tests.support.attached_worker import python_path
+from tests.support.cluster.admission import admit
 from tests.support.cluster.kubelet import MAREY
 from tests.support.cluster.objects import Document
 from tests.support.cluster.stub import IMAGE, StubCluster, running_cluster
@@ -78,6 +82,11 @@ def ended_pods(cluster: StubCluster) -> list[Document]:
     return [pod for pod in cluster.all("pods") if pod["status"]["phase"] in ("Succeeded", "Failed")]
 
 
+def state_of(pod: Document) -> Document | None:
+    """Return the state of the container of a pod, if it has one."""
+    return next((one["state"] for one in pod["status"].get("containerStatuses", ())), None)
+
+
 def test_workers_survive_the_server_and_a_silent_cluster(
     cluster: StubCluster, server: ServerProcess, tmp_path: Path
 ) -> None:
@@ -124,6 +133,36 @@ def test_a_pod_that_exits_with_status_0_has_not_completed_its_job(
         assert ended[0]["status"]["phase"] == "Succeeded", cluster.described()
         cluster.kubelet.images[IMAGE] = MAREY
         assert finish(marey, job, folder) == ["lost", "succeeded"]
+    server.check_database()
+
+
+def test_the_shipped_deployment_waits_for_its_token_and_restarts_dead_workers(
+    cluster: StubCluster, tmp_path: Path, database_url: str
+) -> None:
+    server = ServerProcess(tmp_path, database_url, PYTHONPATH=python_path(), **QUICK_LEASES).start()
+    try:
+        deployment = yaml.safe_load(POOL_MANIFEST.read_text(encoding="utf-8"))
+        (container,) = deployment["spec"]["template"]["spec"]["containers"]
+        container["image"] = IMAGE
+        container["args"] = [server.url if word == "http://marey:8460" else word for word in container["args"]]
+        admit(deployment)
+        cluster.apply(deployment)
+        waiting = {"reason": "ContainerCreating", "message": ""}
+        cluster.wait_for(lambda: [state_of(pod) for pod in cluster.all("pods")] == [{"waiting": waiting}] * 2)
+        data = {"worker.token": base64.b64encode(server.token.encode()).decode()}
+        cluster.apply({"kind": "Secret", "metadata": {"name": "marey-worker-token"}, "data": data})
+        folder = tmp_path / "job"
+        with server.client() as marey:
+            job = submit(marey, folder)
+            cluster.wait_for((folder / "started").exists, PATIENCE_S)
+            (attempt,) = marey.jobs.attempts(job.id)
+            cluster.run(lambda: cluster.kubelet.kill(str(attempt.worker)))
+            assert finish(marey, job, folder) == ["lost", "succeeded"]
+        cluster.wait_for(lambda: len(cluster.running_pods()) == 2)
+        assert len(cluster.kubelet.commands) == 3
+    finally:
+        cluster.run(lambda: cluster.objects.delete("deployments", "marey-pool"))
+        server.stop()
     server.check_database()
 
 
