@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import datetime
 import logging
 import sys
 from collections.abc import Coroutine, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import pytest
+from kubernetes.aio.config import incluster_config
 from tests.support.cluster.stub import IMAGE, StubCluster, running_cluster
+from tests.support.webhook_receiver import SELF_SIGNED
 
 from marey_schemas.backoff import Backoff
 from marey_server.launchers.kubernetes import view
@@ -355,6 +359,40 @@ def test_the_shipped_role_is_enough_and_gives_no_more(bench: Bench, cluster: Stu
     assert not rights.allows("get", "", "secrets")
     assert not rights.allows("list", "", "secrets")
     assert not rights.allows("create", "apps", "deployments")
+
+
+def test_a_server_in_a_pod_uses_the_newest_token_of_its_service_account(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    certificate, token = tmp_path / "ca.crt", tmp_path / "token"
+    certificate.write_text(SELF_SIGNED)
+    token.write_text("old-token")
+    monkeypatch.setattr(incluster_config, "SERVICE_CERT_FILENAME", str(certificate))
+    monkeypatch.setattr(incluster_config, "SERVICE_TOKEN_FILENAME", str(token))
+    with running_cluster(tmp_path / "cluster", certificate) as cluster:
+        cluster.kubelet.images[IMAGE] = WAITS
+        cluster.api.callers["old-token"] = cluster.api.callers["server-token"]
+        monkeypatch.setenv("KUBERNETES_SERVICE_HOST", "127.0.0.1")
+        monkeypatch.setenv("KUBERNETES_SERVICE_PORT", cluster.url.rpartition(":")[2])
+        bench = Bench(cluster, tmp_path)
+        bench.launcher = bench.make(kubeconfig=None)
+        names = bench.start()
+        bench.until({names[0]: "running"})
+        token.write_text("server-token")
+        del cluster.api.callers["old-token"]
+        tomorrow = SimpleNamespace(datetime=Tomorrow, timedelta=datetime.timedelta)
+        monkeypatch.setattr(incluster_config, "datetime", tomorrow)  # the client reads the token again each minute
+        assert bench.start(2) == ("marey-crew-k1-0", "marey-crew-k1-1")
+        bench.do(bench.launcher.stop(bench.start(2)))
+        bench.close()
+
+
+class Tomorrow(datetime.datetime):
+    """Clock of the next day."""
+
+    @classmethod
+    def now(cls, tz: datetime.tzinfo | None = None) -> Tomorrow:
+        return super().now(tz) + datetime.timedelta(days=1)
 
 
 def test_an_invalid_kubeconfig_is_an_error_of_the_engine(bench: Bench, tmp_path: Path) -> None:

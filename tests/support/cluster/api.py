@@ -75,8 +75,8 @@ class _Handler(RequestHandler):
         return kind, name, subresource
 
     def _authorise(self, verb: str | None) -> None:
-        token = self.request.headers.get("Authorization", "").removeprefix("Bearer ")
-        if token not in self.api.callers:
+        scheme, _, token = self.request.headers.get("Authorization", "").partition(" ")
+        if scheme.lower() != "bearer" or token not in self.api.callers:
             raise Refused(401, "Unauthorized", "Unauthorized")
         usual = {"GET": "get" if self.name else "list", "POST": "create", "DELETE": "delete", "PUT": "update",
                  "PATCH": "patch"}[self.request.method or ""]  # fmt: skip

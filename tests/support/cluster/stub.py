@@ -30,7 +30,7 @@ PATIENCE_S = 90.0
 class StubCluster:
     """Cluster with one namespace. Its pods are processes of this machine that run the command of their image."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, certificate: Path | None = None) -> None:
         self.objects = Objects()
         self.kubelet = Kubelet(self.objects, folder / "pods", {IMAGE: MAREY})
         self.controllers = Controllers(self.objects)
@@ -38,6 +38,7 @@ class StubCluster:
         self.api = Api(self.objects, callers, self.kubelet.log_of)
         self.url = ""
         self._folder = folder
+        self._certificate = certificate
         self._loop: asyncio.AbstractEventLoop | None = None
 
     @property
@@ -96,10 +97,11 @@ class StubCluster:
     async def serve(self, ready: threading.Event, stop: asyncio.Event) -> None:
         """Serve the API and run the controllers until `stop` is set."""
         self._loop = asyncio.get_running_loop()
-        server = HTTPServer(self.api.application())
+        secure = None if self._certificate is None else {"certfile": str(self._certificate)}
+        server = HTTPServer(self.api.application(), ssl_options=secure)
         sockets = bind_sockets(0, "127.0.0.1")
         server.add_sockets(sockets)
-        self.url = f"http://127.0.0.1:{sockets[0].getsockname()[1]}"
+        self.url = f"http{'s' if secure else ''}://127.0.0.1:{sockets[0].getsockname()[1]}"
         ready.set()
         try:
             while not stop.is_set():
@@ -114,10 +116,10 @@ class StubCluster:
 
 
 @contextlib.contextmanager
-def running_cluster(folder: Path) -> Iterator[StubCluster]:
-    """Run a stub cluster until the `with` block ends."""
+def running_cluster(folder: Path, certificate: Path | None = None) -> Iterator[StubCluster]:
+    """Run a stub cluster until the `with` block ends; with a file of a certificate and its key, over TLS."""
     (folder / "pods").mkdir(parents=True)
-    stub, ready = StubCluster(folder), threading.Event()
+    stub, ready = StubCluster(folder, certificate), threading.Event()
     stops: list[Callable[[], object]] = []
 
     async def main() -> None:

@@ -166,7 +166,7 @@ class Cluster:
                 yield response
         except TimeoutError:
             raise EngineError("the cluster does not answer in time") from None
-        except (aiohttp.ClientError, OSError, ValueError) as error:
+        except (aiohttp.ClientError, ConfigException, OSError, ValueError) as error:
             raise EngineError(f"no valid answer from the cluster: {type(error).__name__}: {error}") from error
 
     async def _connected(self) -> client.ApiClient:

@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 
 KINDS: tuple[Kind, ...] = ("jobs", "pods")
 PAUSES = Backoff(first_s=0.5, longest_s=15.0)
-MOST_DELETED = 256
+MOST_DELETED = 1024
 """Number of deleted Jobs whose ids are remembered, until every list that began before has ended."""
 SHORT_WATCH_S = 1.0
 """Duration in seconds of a watch that counts as failed, so that a cluster that ends every watch is not flooded."""
