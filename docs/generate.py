@@ -1,4 +1,4 @@
-"""Generates reference pages from the code: `python -m docs.generate`; with `--check`, only compares the pages."""
+"""Generates reference pages and a manifest from the code: `python -m docs.generate`; `--check` only compares them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import typer
+import yaml
 from docs.motion_library import library_page
 from prometheus_client.metrics import MetricWrapperBase
 from pydantic import BaseModel
@@ -22,6 +23,8 @@ from marey_schemas.queries.fields import FACET_PREFIX, FIELDS, OPERATORS, declar
 from marey_schemas.queries.grammar import MOST_CHARACTERS, MOST_COMPARED_VALUES, MOST_CONDITIONS
 from marey_schemas.queue.job_kinds import job_kinds
 from marey_server import errors
+from marey_server.launchers.kubernetes.manifests import Pool, pool_deployment
+from marey_server.launchers.kubernetes.options import ClusterOptions
 from marey_server.launchers.slurm import SlurmOptions
 from marey_server.process.observe import Metrics
 from marey_server.process.settings import Settings
@@ -29,6 +32,7 @@ from marey_server.process.worker_pools import WorkerPool
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = Path(__file__).parent / "reference"
+POOL_MANIFEST = ROOT / "deploy" / "kubernetes" / "base" / "workers.yaml"
 UNKNOWN = "…"
 """Text in place of a value that is known only at run time."""
 NOTE = "<!-- Written by `make docs` from the code; change it there. -->\n\n"
@@ -303,17 +307,41 @@ def _cell(text: object) -> str:
     return " ".join(str(text or "").split()).replace("|", "\\|")
 
 
+def pool_manifest() -> str:
+    """Return the Deployment of a fixed number of workers, whose pods are like those that the launcher starts."""
+    image = f"marey-worker@sha256:{'0' * 64}"
+    pool = Pool("pool", "http://marey:8460", ClusterOptions(image=image))
+    deployment = pool_deployment(pool, replicas=2, secret="marey-worker-token")  # noqa: S106 - the name of a Secret
+    (container,) = deployment["spec"]["template"]["spec"]["containers"]
+    container["image"] = "marey-worker"  # the overlays replace this name
+    note = "# Written by `make docs` from server/marey_server/launchers/kubernetes/manifests.py; change it there.\n"
+    text: str = yaml.dump(deployment, Dumper=_Dumper, sort_keys=False)
+    return note + text
+
+
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
+    """Writer of YAML that repeats equal values, so that each is read where it is used."""
+
+    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002 - the signature of PyYAML
+        return True
+
+
+def files() -> dict[Path, str]:
+    """Return the text of every generated file, by its path."""
+    return {REFERENCE / name: text for name, text in pages().items()} | {POOL_MANIFEST: pool_manifest()}
+
+
 def main() -> int:
-    """Write the pages that are out of date; with `--check`, only name these pages, and return 1 if there are any."""
-    stale = [name for name, text in pages().items() if not _is(REFERENCE / name, text)]
-    if "--check" in sys.argv[1:]:
-        for name in stale:
-            sys.stderr.write(f"docs/reference/{name} is out of date; run `make docs`\n")
-        return int(bool(stale))
-    for name in stale:
-        (REFERENCE / name).write_text(pages()[name], encoding="utf-8")
-        sys.stdout.write(f"wrote docs/reference/{name}\n")
-    return 0
+    """Write the files that are out of date; with `--check`, only name these files, and return 1 if there are any."""
+    stale = {file: text for file, text in files().items() if not _is(file, text)}
+    for file, text in stale.items():
+        name = file.relative_to(ROOT)
+        if "--check" in sys.argv[1:]:
+            sys.stderr.write(f"{name} is out of date; run `make docs`\n")
+        else:
+            file.write_text(text, encoding="utf-8")
+            sys.stdout.write(f"wrote {name}\n")
+    return int(bool(stale) and "--check" in sys.argv[1:])
 
 
 def _is(file: Path, text: str) -> bool:

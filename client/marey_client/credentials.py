@@ -161,6 +161,7 @@ def _forbidden_rights(path: Path) -> int:
 
     systemd gives a service read access to its credentials by an access control list. Its mask appears as the group's
     right to read, although the group has no access.
+    In a pod, Kubernetes gives it by a group that no other process has; the manifest of the pod sets the variable.
     """
     credentials = os.environ.get("CREDENTIALS_DIRECTORY")
     return 0o037 if credentials and path.absolute().parent == Path(credentials) else 0o077

@@ -10,6 +10,7 @@ T = TypeVar("T")
 
 KIB = 1024
 MIB = 1024 * KIB
+GIB = 1024 * MIB
 
 
 def batched(values: Iterable[T], size: int) -> Iterator[list[T]]:

@@ -5,7 +5,7 @@ import shlex
 from pathlib import Path
 
 import pytest
-from docs.generate import REFERENCE, ROOT, pages
+from docs.generate import ROOT, files
 from tests.support.told_commands import unknown_options
 from tests.support.who_may import table
 
@@ -15,7 +15,7 @@ WRITTEN = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
 
 
 def test_the_pages_that_come_from_the_code_are_current() -> None:
-    stale = [name for name, text in pages().items() if (REFERENCE / name).read_text(encoding="utf-8") != text]
+    stale = [str(file) for file, text in files().items() if file.read_text(encoding="utf-8") != text]
     assert stale == [], "run `make docs`"
 
 

@@ -104,7 +104,7 @@ def processes_of(name: str) -> list[psutil.Process]:
     found = []
     for process in psutil.process_iter(["cmdline"]):
         command = process.info["cmdline"] or []
-        if "marey_worker" in command and name in command and process.status() != psutil.STATUS_ZOMBIE:
+        if {"marey_worker", "worker"} & set(command) and name in command and process.status() != psutil.STATUS_ZOMBIE:
             found.append(process)
     return found
 

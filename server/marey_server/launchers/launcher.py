@@ -4,8 +4,8 @@ The queue decides which jobs run; an engine decides where the workers run. No en
 start a worker twice, late, or not at all. The first call of every worker is a claim, so that each job is still run by
 one worker at a time.
 
-The settings name a launcher: `local`, `slurm`, or an entry point of another package in the group `marey.launchers`,
-which is a `MakeLauncher`. The server makes one launcher for each pool of workers.
+The settings name a launcher: `local`, `slurm`, `kubernetes`, or an entry point of another package in the group
+`marey.launchers`, which is a `MakeLauncher`. The server makes one launcher for each pool of workers.
 """
 
 from __future__ import annotations

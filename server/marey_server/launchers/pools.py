@@ -27,6 +27,7 @@ from marey_server.process.worker_pools import WorkerPool
 log = logging.getLogger(__name__)
 
 BUILT_IN = {
+    "kubernetes": "marey_server.launchers.kubernetes.launcher:make_kubernetes_launcher",
     "local": "marey_server.launchers.local:LocalLauncher",
     "slurm": "marey_server.launchers.slurm:SlurmLauncher",
 }

@@ -277,8 +277,8 @@ class Settings(BaseSettings):
     local_workers: int = Field(0, ge=0, le=256, description="Number of worker processes that the server starts.")
     launcher: str = Field(
         "local",
-        description="Engine that runs the workers in pools: local (processes on the server's machine), slurm, or an "
-        "entry point of another package in the group marey.launchers.",
+        description="Engine that runs the workers in pools: local (processes on the server's machine), slurm, "
+        "kubernetes, or an entry point of another package in the group marey.launchers.",
     )
     launcher_options: dict[str, Any] = Field({}, description="Options of the launcher.")
     pools: WorkerPools = Field((), description="Pools of workers, whose sizes follow the queue; see below.")

@@ -1,0 +1,1 @@
+"""Launcher that runs workers as Jobs of a Kubernetes cluster."""

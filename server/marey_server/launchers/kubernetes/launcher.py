@@ -1,0 +1,220 @@
+"""Launcher that runs each worker as a Job of a Kubernetes cluster, or workers that start together as an Indexed Job."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Iterable, Sequence
+from typing import TypeVar
+
+from marey_server.launchers.kubernetes.cluster import Cluster, NoSuchObject, ObjectExists
+from marey_server.launchers.kubernetes.manifests import Manifest, Pool, job_labels, token_secret, worker_job
+from marey_server.launchers.kubernetes.options import ClusterOptions, read_options
+from marey_server.launchers.kubernetes.states import (
+    blocked_reason,
+    end_of,
+    group_pods,
+    has_ended,
+    has_terminated,
+    launched_workers,
+    worker_names,
+    worker_of,
+)
+from marey_server.launchers.kubernetes.view import ClusterView
+from marey_server.launchers.launcher import (
+    EngineError,
+    LaunchContext,
+    LaunchedWorker,
+    LauncherUnusable,
+    WorkerEnd,
+    WorkerRequest,
+)
+
+log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+REQUESTS_AT_ONCE = 8
+MOST_REMEMBERED = 1024
+"""Number of stopped workers, and of workers whose blocked start was logged, that are remembered."""
+
+
+def make_kubernetes_launcher(context: LaunchContext) -> KubernetesLauncher:
+    """Return the launcher of a pool. Raises `LauncherUnusable` if an option is invalid."""
+    try:
+        options = read_options(context.options)
+    except ValueError as error:
+        raise LauncherUnusable(str(error)) from error
+    return KubernetesLauncher(context, options)
+
+
+class KubernetesLauncher:
+    """Launcher whose workers are pods. They continue when the server ends."""
+
+    outlives_server = True
+
+    def __init__(self, context: LaunchContext, options: ClusterOptions) -> None:
+        self._context = context
+        self._options = options
+        self._cluster = Cluster(options)
+        selector = ",".join(f"{name}={text}" for name, text in job_labels(context.pool, options).items())
+        self._view = ClusterView(self._cluster, selector, relist_s=options.relist_s, timeout_s=options.timeout_s)
+        self._with_token: set[str] = set()
+        self._stopped: dict[str, None] = {}
+        self._blocked: dict[str, str] = {}
+        self._requests = asyncio.Semaphore(REQUESTS_AT_ONCE)
+
+    async def start(self, request: WorkerRequest, count: int, *, key: str) -> tuple[str, ...]:
+        """Create the Jobs of `count` workers. Jobs with these names that exist already are left as they are."""
+        context = self._context
+        pool = Pool(context.pool, context.url, self._options, request, context.log_form, context.log_level)
+        base = f"{self._options.instance}-{context.pool}-{key}"
+        if self._options.indexed and count > 1:
+            jobs = [worker_job(pool, base, count=count)]
+        else:
+            jobs = [worker_job(pool, f"{base}-{number}") for number in range(count)]
+        made = await self._all(self._create(job) for job in jobs)
+        return tuple(name for job in made for name in worker_names(job))
+
+    async def list(self) -> tuple[LaunchedWorker, ...]:
+        """Return the workers of all Jobs of the pool; ended workers stay until the cluster deletes their Jobs."""
+        await self._view.refresh()
+        await self._supply_tokens()
+        self._log_blocked()
+        return tuple(launched_workers(self._view.jobs.values(), self._view.pods.values()))
+
+    async def stop(self, names: tuple[str, ...]) -> None:
+        """Delete the Jobs of workers, or their pods if other workers of an Indexed Job continue."""
+        await self._view.refresh()
+        wanted = set(names)
+        deletions: list[Awaitable[None]] = []
+        without_pod: list[str] = []
+        for job in list(self._view.jobs.values()):
+            active = {name for name in worker_names(job) if not has_ended(job, name)}
+            if not active & wanted:
+                continue
+            if active <= wanted:
+                deletions.append(self._delete_job(job["metadata"]["name"], active))
+                continue
+            pods = {worker_of(pod): pod["metadata"]["name"] for pod in self._view.pods.values()}
+            for name in active & wanted:
+                if name in pods:
+                    deletions.append(self._delete_pod(pods[name], name))
+                else:
+                    without_pod.append(name)
+        await self._all(deletions)
+        if without_pod:
+            raise EngineError(f"workers of a larger Job that have no pods yet cannot be stopped: {sorted(without_pod)}")
+
+    async def why_ended(self, name: str) -> WorkerEnd | None:
+        """Return why a worker ended, from its pod or its Job; `unknown` if the cluster has deleted both."""
+        await self._view.refresh()
+        if name in self._stopped:
+            return WorkerEnd("stopped")
+        if not any(map(has_terminated, self._pods_of(name))):
+            await self._view.list_now()  # the copy of the pods may be older than that of the Jobs
+        pods = self._pods_of(name)
+        job = next((job for job in self._view.jobs.values() if name in worker_names(job)), None)
+        end = end_of(job, pods)
+        if end is None and job is None:
+            return WorkerEnd("unknown", detail="the cluster has no Job of this worker")
+        if end is not None and end.reason == "failed" and pods:
+            return await self._with_log(end, pods[-1]["metadata"]["name"])
+        return end
+
+    async def close(self) -> None:
+        """Close the connections; the workers continue."""
+        await self._view.close()
+        await self._cluster.close()
+
+    # -- Jobs and their tokens --
+
+    async def _create(self, job: Manifest) -> Manifest:
+        name: str = job["metadata"]["name"]
+        try:
+            made = await self._cluster.create_job(job)
+        except ObjectExists:
+            made = await self._cluster.read_job(name)
+            if not job["metadata"]["labels"].items() <= made["metadata"].get("labels", {}).items():
+                raise EngineError(f"the cluster has another Job with the name {name}") from None
+        self._view.put_job(made)
+        await self._supply_token(made)
+        return made
+
+    async def _supply_tokens(self) -> None:
+        """Create the Secrets of Jobs whose server died between the creation of the Job and of its Secret."""
+        jobs = self._view.jobs
+        self._with_token &= jobs.keys()
+        waiting = {worker.name for worker in launched_workers(jobs.values(), self._view.pods.values())
+                   if worker.state == "starting"}  # fmt: skip
+        missing = [job for name, job in jobs.items() if name not in self._with_token and waiting & {*worker_names(job)}]
+        await self._all(self._supply_token(job) for job in missing)
+
+    async def _supply_token(self, job: Manifest) -> None:
+        """Create the Secret with the token of a Job's workers, unless it exists."""
+        name = job["metadata"]["name"]
+        if name in self._with_token:
+            return
+        try:
+            await self._cluster.create_secret(token_secret(job, self._context.token))
+        except ObjectExists:
+            log.debug("the Secret of the Job %s exists", name)
+        self._with_token.add(name)
+
+    async def _delete_job(self, job: str, workers: Iterable[str]) -> None:
+        try:
+            await self._cluster.delete_job(job)
+        except NoSuchObject:
+            log.debug("the Job %s has been deleted already", job)
+        else:
+            self._remember_stopped(workers)
+        self._view.drop_job(job)
+
+    async def _delete_pod(self, pod: str, worker: str) -> None:
+        try:
+            await self._cluster.delete_pod(pod)
+        except NoSuchObject:
+            log.debug("the pod %s has been deleted already", pod)
+        else:
+            self._remember_stopped([worker])
+
+    def _remember_stopped(self, workers: Iterable[str]) -> None:
+        self._stopped |= dict.fromkeys(workers)
+        for name in list(self._stopped)[:-MOST_REMEMBERED]:
+            del self._stopped[name]
+
+    # -- ends --
+
+    def _pods_of(self, worker: str) -> Sequence[Manifest]:
+        """Return the pods of a worker, the newest last."""
+        return group_pods(self._view.pods.values()).get(worker, [])
+
+    async def _with_log(self, end: WorkerEnd, pod: str) -> WorkerEnd:
+        """Return an end with the last lines of the pod's log, if the cluster still has them."""
+        try:
+            lines = await self._cluster.read_log(pod)
+        except EngineError as error:
+            log.debug("the log of the pod %s cannot be read: %s", pod, error)
+            return end
+        return WorkerEnd(end.reason, end.status, f"{end.detail}\n{lines}".strip())
+
+    def _log_blocked(self) -> None:
+        """Log once why a worker cannot start, such as an image that does not exist."""
+        blocked = {name: reason for pod in self._view.pods.values()
+                   if (reason := blocked_reason(pod)) is not None and (name := worker_of(pod)) is not None}  # fmt: skip
+        for name, reason in blocked.items():
+            if name not in self._blocked:
+                log.warning("worker %s cannot start: %s", name, reason)
+        self._blocked = blocked
+
+    async def _all(self, calls: Iterable[Awaitable[T]]) -> Sequence[T]:
+        """Make all calls, some at the same time; afterwards, raise the first error."""
+
+        async def limited(call: Awaitable[T]) -> T:
+            async with self._requests:
+                return await call
+
+        results = await asyncio.gather(*map(limited, calls), return_exceptions=True)
+        for result in results:
+            if isinstance(result, BaseException):
+                raise result
+        return [result for result in results if not isinstance(result, BaseException)]
