@@ -144,7 +144,7 @@ def test_objects_that_were_changed_shortened_or_deleted_are_found(remote: Lab) -
         publish(remote, remote.write(blobs.put_blob, DATA + bytes([number])))
     kept, changed, shortened, deleted = (object_of(remote, digest_of(DATA + bytes([number]))) for number in range(4))
     bucket = storage_of(remote)._store
-    obstore.put(bucket, changed.name, b"x" + DATA[1:] + bytes([1]))
+    obstore.put(bucket, changed.name, bytes([DATA[0] ^ 1]) + DATA[1:] + bytes([1]))
     obstore.put(bucket, shortened.name, DATA[:10])
     obstore.delete(bucket, [deleted.name])
     found = {(one.code, one.subject) for one in fsck.check_store(remote.database)}

@@ -22,6 +22,8 @@ class FaultyS3:
     planned: dict[str, list[Fault]] = field(default_factory=dict)
     seen: list[tuple[str, str]] = field(default_factory=list)
     """Method and path of each request."""
+    authorizations: list[str | None] = field(default_factory=list)
+    """The header Authorization of each request."""
     silent: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
     """Released once for each request that gets no answer."""
     go_on: threading.Event = field(default_factory=threading.Event)
@@ -51,6 +53,7 @@ def faulty_s3(upstream_port: int) -> Iterator[FaultyS3]:
 
         def handle_any(self) -> None:
             body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+            proxy.authorizations.append(self.headers.get("Authorization"))
             fault = proxy.next_fault(self.command, self.path)
             if fault == "silence":
                 proxy.silent.release()
