@@ -4,6 +4,7 @@ import os
 import secrets
 import signal
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import obstore
 import pytest
@@ -82,9 +83,9 @@ def defects(lab: Lab) -> list[str]:
 
 @pytest.mark.parametrize("fault", ["500", "503", "lost request", "lost answer"])
 def test_a_request_that_fails_once_is_repeated(remote: Lab, proxy: FaultyS3, fault: str) -> None:
-    proxy.spoil("PUT", fault)  # type: ignore[arg-type]
+    proxy.spoil("PUT", fault)
     assert remote.write(blobs.put_blob, DATA) == DIGEST
-    proxy.spoil("GET", fault)  # type: ignore[arg-type]
+    proxy.spoil("GET", fault)
     assert remote.read(blobs.read_blob, DIGEST) == DATA
     assert len(objects_in(remote)) == 1
     assert defects(remote) == []
@@ -109,9 +110,7 @@ def test_other_writes_and_reads_go_on_while_the_storage_is_silent(remote: Lab, p
     proxy.spoil("PUT", *["silence"] * 5)
     proxy.spoil("GET", *["silence"] * 5)
     queue_write, queue_read = remote.database.queue_write, remote.database.queue_read
-    waiting = [
-        queue_write(one, remote.owner, lambda tx, one=one: blobs.put_blob(tx, one.key.encode())) for one in callers
-    ]
+    waiting = [queue_write(one, remote.owner, partial(blobs.put_blob, content=one.key.encode())) for one in callers]
     reading = [queue_read(one, remote.owner, lambda tx: blobs.read_blob(tx, DIGEST)) for one in callers]
     for _ in range(10):
         assert proxy.silent.acquire(timeout=30)
@@ -119,7 +118,8 @@ def test_other_writes_and_reads_go_on_while_the_storage_is_silent(remote: Lab, p
     assert made.result(30).name == "other"
     seen = queue_read(Client("reader"), remote.owner, lambda tx: projects.read_project(tx, "other"))
     assert seen.result(30).name == "other"
-    assert not any(future.done() for future in [*waiting, *reading])
+    assert not any(future.done() for future in waiting)
+    assert not any(future.done() for future in reading)
     proxy.go_on.set()
     assert [future.result(60) for future in waiting] == [digest_of(one.key.encode()) for one in callers]
     assert [future.result(60) for future in reading] == [DATA] * 5

@@ -6,6 +6,7 @@ import secrets
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -38,7 +39,7 @@ def proxy(s3_servers: Callable[[str], S3Server]) -> Iterator[FaultyS3]:
 
 
 @pytest.fixture
-def in_bucket(tmp_path: Path, proxy: FaultyS3) -> dict[str, object]:
+def in_bucket(tmp_path: Path, proxy: FaultyS3) -> dict[str, Any]:
     """Settings of a server that keeps blobs in object storage behind the proxy."""
     secret = tmp_path / "secret-key"
     secret.write_text(SECRET_KEY + "\n")
@@ -54,15 +55,15 @@ def in_bucket(tmp_path: Path, proxy: FaultyS3) -> dict[str, object]:
 
 
 @pytest.fixture
-def opened(database_url: str, tmp_path: Path, in_bucket: dict[str, object]) -> Iterator[Database]:
-    database = connect_database(Settings(data=tmp_path, database_url=database_url, **in_bucket))  # type: ignore[arg-type]
+def opened(database_url: str, tmp_path: Path, in_bucket: dict[str, Any]) -> Iterator[Database]:
+    database = connect_database(Settings(data=tmp_path, database_url=database_url, **in_bucket))
     yield database
     database.close()
 
 
 @pytest.fixture
 def server(
-    opened: Database, tmp_path: Path, in_bucket: dict[str, object], monkeypatch: pytest.MonkeyPatch
+    opened: Database, tmp_path: Path, in_bucket: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Server]:
     """A running server whose uploads are moved at once, and that refers readers of 2 MiB or more to the bucket."""
     monkeypatch.setattr(housekeeping, "MOVE_EVERY_S", 0.1)
@@ -159,12 +160,12 @@ def test_a_storage_that_is_killed_and_comes_back_loses_nothing(sqlite_template: 
     storage = seaweedfs(folder)
     secret = tmp_path / "secret-key"
     secret.write_text(SECRET_KEY)
-    settings = {
+    settings: dict[str, Any] = {
         "blobs": "s3", "s3_bucket": "marey", "s3_endpoint": storage.endpoint, "s3_key_id": KEY_ID,
         "s3_secret_key_file": secret, "s3_timeout_s": 2, "database_url": copied_sqlite(sqlite_template, tmp_path),
     }  # fmt: skip
     storage.start()
-    database = connect_database(Settings(data=tmp_path, **settings))  # type: ignore[arg-type]
+    database = connect_database(Settings(data=tmp_path, **settings))
     contents = [os.urandom(300_000) for _ in range(12)]
     statuses: list[int] = []
     began = threading.Event()
@@ -196,16 +197,16 @@ def test_a_storage_that_is_killed_and_comes_back_loses_nothing(sqlite_template: 
 
 
 def test_blobs_are_moved_by_a_command_while_a_server_runs(
-    sqlite_template: Path, tmp_path: Path, in_bucket: dict[str, object], capsys: pytest.CaptureFixture[str]
+    sqlite_template: Path, tmp_path: Path, in_bucket: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    place = {"data": tmp_path, "database_url": copied_sqlite(sqlite_template, tmp_path)}
+    place: dict[str, Any] = {"data": tmp_path, "database_url": copied_sqlite(sqlite_template, tmp_path)}
     contents = [os.urandom(100_000 + number) for number in range(5)]
-    database = connect_database(Settings(**place))  # type: ignore[arg-type]
+    database = connect_database(Settings(**place))
     with running(database, tmp_path) as server:
         owner_token = server.make_project()
         for data in contents:
             assert put(server.client(owner_token), data).status_code == 204
-    database = connect_database(Settings(**place, **in_bucket))  # type: ignore[arg-type]
+    database = connect_database(Settings(**place, **in_bucket))
     with running(database, tmp_path, **in_bucket) as server:
         owner = server.client(owner_token)
         assert [owner.get(f"/blobs/{digest_of(data)}").content for data in contents] == contents
@@ -219,7 +220,7 @@ def test_blobs_are_moved_by_a_command_while_a_server_runs(
 
 
 def test_a_move_that_is_interrupted_says_what_to_do(
-    sqlite_template: Path, tmp_path: Path, in_bucket: dict[str, object], monkeypatch: pytest.MonkeyPatch
+    sqlite_template: Path, tmp_path: Path, in_bucket: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
@@ -233,7 +234,7 @@ def test_a_move_that_is_interrupted_says_what_to_do(
 
 
 def test_doctor_tells_that_the_bucket_is_away_without_its_secret(
-    sqlite_template: Path, tmp_path: Path, in_bucket: dict[str, object], proxy: FaultyS3
+    sqlite_template: Path, tmp_path: Path, in_bucket: dict[str, Any], proxy: FaultyS3
 ) -> None:
     url = copied_sqlite(sqlite_template, tmp_path)
     found = {

@@ -8,9 +8,8 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Literal
 
-Fault = Literal["500", "503", "silence", "lost answer", "lost request", "truncated", "wrong bytes"]
+FAULTS = ("500", "503", "silence", "lost answer", "lost request", "truncated", "wrong bytes")
 
 
 @dataclass
@@ -19,7 +18,7 @@ class FaultyS3:
 
     port: int
     upstream_port: int
-    planned: dict[str, list[Fault]] = field(default_factory=dict)
+    planned: dict[str, list[str]] = field(default_factory=dict)
     seen: list[tuple[str, str]] = field(default_factory=list)
     """Method and path of each request."""
     authorizations: list[str | None] = field(default_factory=list)
@@ -33,11 +32,12 @@ class FaultyS3:
     def endpoint(self) -> str:
         return f"http://127.0.0.1:{self.port}"
 
-    def spoil(self, method: str, *faults: Fault) -> None:
-        """Plan the faults of the next requests with this method, in this order."""
+    def spoil(self, method: str, *faults: str) -> None:
+        """Plan the faults of the next requests with this method, in this order; each is one of `FAULTS`."""
+        assert set(faults) <= set(FAULTS)
         self.planned.setdefault(method, []).extend(faults)
 
-    def next_fault(self, method: str, path: str) -> Fault | None:
+    def next_fault(self, method: str, path: str) -> str | None:
         """Record a request, and return its fault."""
         self.seen.append((method, path))
         waiting = self.planned.get(method)

@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -58,8 +58,9 @@ class S3Server:
         )
         return replace(settings, **changes)  # type: ignore[arg-type]
 
-    def start(self) -> None:
-        """Start the process, wait until it answers, and create the bucket unless it exists."""
+    def start(self, bucket: Bucket | None = None) -> None:
+        """Start the process, wait until it stores objects in `bucket`, and create the bucket unless it exists."""
+        bucket = replace(bucket or self.bucket("first"), timeout_s=5)
         with open(self.folder / "log", "ab") as log:
             self._process = subprocess.Popen(
                 self.command,
@@ -69,18 +70,18 @@ class S3Server:
                 env={"AWS_ACCESS_KEY_ID": KEY_ID, "AWS_SECRET_ACCESS_KEY": SECRET_KEY, "HOME": str(self.folder)},
             )
         deadline = time.monotonic() + START_S
-        while not self._has_bucket():
+        while not self._stores_in(bucket):
             if self._process.poll() is not None or time.monotonic() > deadline:
                 log_text = (self.folder / "log").read_text(errors="replace")
                 raise RuntimeError(f"{self.name} did not start: {log_text[-2000:]}")
             time.sleep(0.1)
 
-    def _has_bucket(self) -> bool:
+    def _stores_in(self, bucket: Bucket) -> bool:
         """Create the bucket unless it exists, and return whether objects can be stored in it."""
         try:
             if self.creates_bucket:
                 httpx.put(f"{self.endpoint}/marey", timeout=5)
-            storage = ObjectStorage(self.bucket("first", timeout_s=5))
+            storage = ObjectStorage(bucket)
             storage.put("first", [b"first"])
             return storage.read("first", 0, 5) == b"first"
         except (httpx.HTTPError, ObjectStorageProblem):
@@ -107,14 +108,21 @@ def moto(folder: Path) -> S3Server:
     return S3Server("moto", port, command, folder, creates_bucket=True)
 
 
-def seaweedfs(folder: Path) -> S3Server:
-    """Return a server that keeps objects on disk and checks signatures."""
+def seaweedfs(folder: Path, command: Sequence[str] = ()) -> S3Server:
+    """Return a server that keeps objects on disk and checks signatures; `command` contains other words than usual."""
     ports = free_ports(10)
     names = (
         "s3.port", "s3.port.grpc", "master.port", "master.port.grpc", "volume.port", "volume.port.grpc", "filer.port",
-        "filer.port.grpc", "s3.port.iceberg",
-        "s3.port.lance",
+        "filer.port.grpc", "s3.port.iceberg", "s3.port.lance",
     )  # fmt: skip
+    options = [f"-{name}={port}" for name, port in zip(names, ports, strict=True)]
+    options += [f"-filer.localSocket={folder / 'filer.sock'}", f"-s3.localSocket={folder / 's3.sock'}"]
+    program = Path(sys.executable).with_name("weed")
+    return S3Server("seaweedfs", ports[0], [str(program), *(command or _usual(folder)), *options], folder)
+
+
+def _usual(folder: Path) -> list[str]:
+    """Return the command of a server with one access key, and write the file of access keys."""
     identity = {
         "name": "marey",
         "credentials": [{"accessKey": KEY_ID, "secretKey": SECRET_KEY}],
@@ -122,16 +130,8 @@ def seaweedfs(folder: Path) -> S3Server:
     }
     (folder / "s3.json").write_text(json.dumps({"identities": [identity]}))
     (folder / "data").mkdir(exist_ok=True)
-    options = [f"-{name}={port}" for name, port in zip(names, ports, strict=True)]
-    options += ["-ip=127.0.0.1", "-ip.bind=127.0.0.1", f"-dir={folder / 'data'}", "-s3", "-iam=false"]
-    options += [
-        f"-s3.config={folder / 's3.json'}",
-        f"-filer.localSocket={folder / 'filer.sock'}",
-        f"-s3.localSocket={folder / 's3.sock'}",
-    ]
-    options += ["-master.volumeSizeLimitMB=64", "-volume.max=16", "-master.telemetry=false"]
-    program = Path(sys.executable).with_name("weed")
-    return S3Server("seaweedfs", ports[0], [str(program), "server", *options], folder)
+    words = ["server", "-ip=127.0.0.1", "-ip.bind=127.0.0.1", f"-dir={folder / 'data'}", "-s3", "-iam=false"]
+    return [*words, f"-s3.config={folder / 's3.json'}", "-master.volumeSizeLimitMB=64", "-master.telemetry=false"]
 
 
 MAKERS = {"moto": moto, "seaweedfs": seaweedfs}

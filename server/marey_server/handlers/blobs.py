@@ -74,7 +74,7 @@ class Blob(BlobSender):
         The answer to a request for a large blob may be 307 with an address at the object storage, where the same
         headers are valid, but no token must be sent.
         """
-        return await self.send_blob(require_digest(digest))
+        return await self.send_blob(require_digest(digest), may_redirect=True)
 
 
 class MissingBlobs(Resource):

@@ -123,11 +123,13 @@ class BlobSender(Resource):
         media_type: str = "application/octet-stream",
         cache_control: str = IMMUTABLE,
         headers: Mapping[str, str] = MappingProxyType({}),
+        may_redirect: bool = False,
     ) -> Rendered | None:
         """Answer with the blob according to Range, If-Range and If-None-Match. Raises `NotFoundProblem`.
 
         By default, clients may cache the blob for a year; pass another `cache_control` if the URL does not
-        contain the digest. `headers` are sent with the bytes.
+        contain the digest. `headers` are sent with the bytes. With `may_redirect`, the answer for a large blob may
+        refer to object storage, which sends other headers.
         """
         etag = entity_tag(digest.removeprefix("sha256:"), "bytes")
         wanted = parse_range(self.request.headers.get("Range"), self.request.headers.get("If-Range"), etag)
@@ -136,7 +138,7 @@ class BlobSender(Resource):
             digest,
             wanted,
             head=self.request.method == "HEAD",
-            redirect_bytes=self.services.settings.s3_redirect_bytes,
+            redirect_bytes=self.services.settings.s3_redirect_bytes if may_redirect else None,
         )
         fields = {
             "ETag": etag,

@@ -62,7 +62,7 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
             (0.0, 0.0, partial(_commit_outputs, listener=listener, longest_wait_s=tick_s)),
             (FORGET_TRIES_EVERY_S, FORGET_TRIES_EVERY_S, _forget_tries),
             (FIRST_GARBAGE_S, GARBAGE_EVERY_S, _collect_garbage),
-            (MOVE_EVERY_S, MOVE_EVERY_S, _move_uploads),
+            (MOVE_EVERY_S, MOVE_EVERY_S, partial(_move_uploads, damaged=set())),
         )
         tasks = [asyncio.create_task(_repeat(services, holder, *chore)) for chore in chores]
         try:
@@ -167,12 +167,17 @@ async def _collect_garbage(services: Services, holder: str) -> None:
         log.info("deleted old rows: %s; deleted unused rows: %s", retired, collected)
 
 
-async def _move_uploads(services: Services, holder: str) -> None:
-    """Move finished uploads from the database to object storage, if the settings say so."""
-    if isinstance(services.database.blobs, ObjectBlobs) and await _write(services, _leads, holder):
-        moved = await asyncio.wrap_future(services.database.submit_move(partial(move_uploads, services.database)))
-        if moved.damaged:
-            log.error("uploads cannot be moved to object storage, because they are damaged: %s", moved.damaged)
+async def _move_uploads(services: Services, holder: str, damaged: set[str]) -> None:
+    """Move finished uploads from the database to object storage, if the settings say so.
+
+    The digests of uploads that cannot be moved are added to `damaged`, so that they are not tried again.
+    """
+    database = services.database
+    if isinstance(database.blobs, ObjectBlobs) and await _write(services, _leads, holder):
+        moved = await asyncio.wrap_future(database.submit_move(partial(move_uploads, database, frozenset(damaged))))
+        damaged.update(moved.damaged)
+        for digest in moved.damaged:
+            log.error("the upload %s is damaged and stays in the database; run `marey db fsck`", digest)
 
 
 async def _in_thread(services: Services, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:

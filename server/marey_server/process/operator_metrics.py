@@ -76,8 +76,9 @@ class OperatorMetrics(Observer):
     def _add_stored(self, registry: CollectorRegistry) -> None:
         self.uploads = Gauge("marey_upload_sessions", "Unfinished uploads.", registry=registry)
         self.stored_bytes = Gauge(
-            "marey_stored_bytes", "Bytes of the revisions of all projects, by backing of blobs (database or "
-            "directory). Bytes that several revisions share count for each of them.", ("backing",), registry=registry,
+            "marey_stored_bytes", "Bytes of the revisions of all projects, by storage of new blobs (database, "
+            "directory or s3). Bytes that several revisions share count for each of them.", ("backing",),
+            registry=registry,
         )  # fmt: skip
         self.disk_free = Gauge("marey_disk_free_bytes", "Free bytes on the disk of the data folder.", registry=registry)
         self.disk_floor = Gauge(

@@ -162,12 +162,12 @@ def _check_objects(database: Database) -> Iterator[list[StoreDefect]]:
     behind = ""
     while rows := database.read(SYSTEM, _in_objects, behind):
         for row in rows:
-            if not isinstance(database.blobs, ObjectBlobs):
+            if isinstance(database.blobs, ObjectBlobs):
+                findings = _compare(row, database.blobs.storage.chunks(StoredObject(row.digest, row.object_id).name))
+                yield findings if findings and row in database.read(SYSTEM, _in_objects, row.digest, same=True) else []
+            else:
                 detail = "it is in object storage, but the settings name no bucket (s3_bucket)"
                 yield [StoreDefect("blob-unreachable", row.digest, detail)]
-                continue
-            findings = _compare(row, database.blobs.storage.chunks(StoredObject(row.digest, row.object_id).name))
-            yield findings if findings and row in database.read(SYSTEM, _in_objects, row.digest, same=True) else []
         behind = rows[-1].digest
 
 

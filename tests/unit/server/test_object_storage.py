@@ -152,8 +152,8 @@ def run_interleaved(
     """Run steps of two writers of the same bytes, a sweeper, and the garbage collection of rows, in this order."""
     actors = {"a": Writer(lab, data), "b": Writer(lab, data), "sweeper": Sweeper(lab, objects)}
     for name in plan:
-        if name == "half an hour":
-            clock.advance(1800)
+        if name == "seven hours":
+            clock.advance(7 * 3600)
         elif name == "a day":
             clock.advance(GRACE_US / 1e6 + 1)
         elif name == "forget":
@@ -162,7 +162,7 @@ def run_interleaved(
             actors[name].step()  # type: ignore[attr-defined]
 
 
-STEPS = ("a", "b", "sweeper", "forget", "half an hour", "a day")
+STEPS = ("a", "b", "sweeper", "forget", "seven hours", "a day")
 LATE_COMMIT = ("a", "a", "a day", "sweeper", "a", "sweeper")
 """A writer that is about to commit sleeps, until its object is swept."""
 DELAYED_DELETION = ("a", "a", "a", "a day", "forget", "sweeper", "b", "b", "b", "sweeper")
@@ -195,7 +195,7 @@ def test_a_late_commit_and_a_delayed_deletion_lose_nothing(
     assert complete(remote, objects, b"bytes")
 
 
-def test_without_the_limit_of_an_hour_a_late_commit_loses_bytes(
+def test_without_the_limit_of_twelve_hours_a_late_commit_loses_bytes(
     remote: Lab, objects: ObjectsInMemory, clock: AdjustableClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(backing, "COMMIT_WITHIN_US", 10 * GRACE_US)

@@ -89,13 +89,17 @@ class MovingCall(Generic[T]):
     def _then(self, submit: Callable[[], Future[U]], go_on: Callable[[Future[U]], None]) -> None:
         try:
             submitted = submit()
-        except Exception as error:  # noqa: BLE001 - such as a full queue, for whoever waits
+        except UnavailableProblem as error:  # the queue is full
             self._result.set_exception(error)
+        except RuntimeError:  # of threads that were stopped
+            self._result.set_exception(_stopping())
         else:
             submitted.add_done_callback(go_on)
 
 
 def _error_of(ended: Future[Any]) -> BaseException | None:
-    if ended.cancelled():
-        return UnavailableProblem("The server is stopping and accepts no more work.", code="draining")
-    return ended.exception()
+    return _stopping() if ended.cancelled() else ended.exception()
+
+
+def _stopping() -> UnavailableProblem:
+    return UnavailableProblem("The server is stopping and accepts no more work.", code="draining")

@@ -26,7 +26,7 @@ from marey_server.store.object_storage.awaiting import (
 from marey_server.store.object_storage.client import ObjectStorage, StoredObject
 from marey_server.store.tables import blob
 
-COMMIT_WITHIN_US = 3600 * 1_000_000
+COMMIT_WITHIN_US = 12 * 3600 * 1_000_000
 """Time after the beginning of a transfer within which the row of the blob must name the object.
 
 Garbage collection deletes objects that no row names a day after their transfer began. So it never deletes an object

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from marey_server.access.principal import SYSTEM
 from marey_server.store.blob_backings import DirectoryBlobs
 from marey_server.store.database.connections import Database
 from marey_server.store.object_storage.backing import ObjectBlobs, may_be_named, name_object
-from marey_server.store.object_storage.client import StoredObject
+from marey_server.store.object_storage.client import ObjectStorageProblem, StoredObject
 from marey_server.store.tables import blob, blob_chunk
 from marey_server.store.transaction import Transaction
 
@@ -58,11 +58,12 @@ def move_blobs(database: Database, moved: Moved, *, progress: Callable[[Moved], 
     _move_all(database, _elsewhere(database), moved, progress)
 
 
-def move_uploads(database: Database) -> Moved:
-    """Move the blobs that arrived as uploads to object storage, if new blobs are stored there."""
+def move_uploads(database: Database, damaged: Collection[str] = ()) -> Moved:
+    """Move the blobs that arrived as uploads, except those in `damaged`, to object storage if new blobs are stored there."""
     moved = Moved()
     if isinstance(database.blobs, ObjectBlobs) and database.blobs.stores_objects:
-        _move_all(database, blob.c.upload_id.is_not(None), moved, lambda _moved: None)
+        which = and_(blob.c.upload_id.is_not(None), blob.c.digest.not_in(sorted(damaged)))
+        _move_all(database, which, moved, lambda _moved: None)
     return moved
 
 
@@ -175,8 +176,13 @@ def _same_place(row: Row[Any]) -> ColumnElement[bool]:
 
 
 def _name_object(tx: Transaction, row: Row[Any], one: StoredObject) -> bool:
-    """Make an object the bytes of a blob, unless the blob was deleted or moved; return whether this was done."""
-    if not may_be_named(one, tx.now_us) or not _take(tx, row):
+    """Make an object the bytes of a blob, unless the blob was deleted or moved; return whether this was done.
+
+    Raises `ObjectStorageProblem` if the transfer of the object took too long.
+    """
+    if not may_be_named(one, tx.now_us):
+        raise ObjectStorageProblem(f"The object storage is too slow: the blob {row.digest} was not stored in time.")
+    if not _take(tx, row):
         return False
     name_object(tx.connection, one)
     faults.point("move.before_commit")

@@ -4,7 +4,7 @@ No object is deleted that a row names, now or later:
 
 * An object gets its name before its transfer begins, and no name is used twice. So a delayed request to delete an
   object cannot delete another copy of the same bytes.
-* A transaction may name an object only within an hour after its transfer began (`COMMIT_WITHIN_US`).
+* A transaction may name an object only within twelve hours after its transfer began (`COMMIT_WITHIN_US`).
 * An object is deleted a day after its transfer began, at the earliest. First a transaction reads the row of the blob
   while no other transaction can write this row. If the row does not name the object, no later transaction will.
 
