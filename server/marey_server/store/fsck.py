@@ -104,8 +104,7 @@ def check_store(
         yield from findings
         if progress is not None:
             progress("objects", number)
-    # Bytes in object storage are read outside the transaction and kept until it has ended, so it is short.
-    rows_at_once = 1 if isinstance(database.blobs, ObjectBlobs) else PAGE
+    rows_at_once = 1 if isinstance(database.blobs, ObjectBlobs) else PAGE  # whose bytes are kept until the page ends
     miscounted = False
     for name, table, check in passes:
         behind, count = "", 0

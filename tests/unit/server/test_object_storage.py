@@ -25,7 +25,7 @@ from marey_server.store.blobs import GRACE_US, digest_of
 from marey_server.store.object_storage import awaiting, backing, sweeping
 from marey_server.store.object_storage.awaiting import BytesAwaited, Carried
 from marey_server.store.object_storage.backing import COMMIT_WITHIN_US, ObjectBlobs
-from marey_server.store.object_storage.client import Bucket, ObjectStorage, StoredObject
+from marey_server.store.object_storage.client import Bucket, ObjectStorage, ObjectStorageProblem, StoredObject
 from marey_server.store.object_storage.moving import CannotMove, Moved, move_blobs, move_uploads
 from marey_server.store.tables import blob_chunk, document, upload_chunk
 from marey_server.store.transaction import Transaction
@@ -224,7 +224,7 @@ def test_a_transfer_that_is_always_too_slow_is_given_up(
         clock.advance(COMMIT_WITHIN_US / 1e6 + 1)
 
     monkeypatch.setattr(objects, "put", put)
-    with pytest.raises(awaiting.ObjectStorageProblem):
+    with pytest.raises(ObjectStorageProblem):
         remote.write(blobs.put_blob, b"slow")
     assert len(puts) == awaiting.MOST_TRANSFERS
     assert remote.read(blobs.sizes_of, [digest_of(b"slow")]) == {}

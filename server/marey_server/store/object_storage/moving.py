@@ -59,7 +59,7 @@ def move_blobs(database: Database, moved: Moved, *, progress: Callable[[Moved], 
 
 
 def move_uploads(database: Database, damaged: Collection[str] = ()) -> Moved:
-    """Move the blobs that arrived as uploads, except those in `damaged`, to object storage if new blobs are stored there."""
+    """Move the blobs that arrived as uploads to object storage, if new blobs are stored there; leave out `damaged`."""
     moved = Moved()
     if isinstance(database.blobs, ObjectBlobs) and database.blobs.stores_objects:
         which = and_(blob.c.upload_id.is_not(None), blob.c.digest.not_in(sorted(damaged)))
