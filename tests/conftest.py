@@ -18,6 +18,7 @@ pytest_plugins = (
     "tests.support.store_fixtures",
     "tests.support.queue_desk",
     "tests.support.committing_desk",
+    "tests.support.s3_servers",
 )
 
 pytest.register_assert_rewrite("tests.support.launcher_contract")

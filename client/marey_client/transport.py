@@ -229,10 +229,18 @@ class Transport:
     def stream(
         self, path: str, *, params: Params | None = None, headers: Mapping[str, str] | None = None
     ) -> Iterator[httpx.Response]:
-        """Request bytes by GET and yield the answer, to be read while it arrives. Retries are left to the caller."""
+        """Request bytes by GET and yield the answer, to be read while it arrives. Retries are left to the caller.
+
+        If the server refers to its object storage, the bytes are read there. Then httpx does not send the token.
+        """
         sent_headers = {"Accept": "*/*", **(headers or {})}
         with self._client.stream(
-            "GET", _quoted(path), params=_present(params), headers=sent_headers, auth=self._auth
+            "GET",
+            _quoted(path),
+            params=_present(params),
+            headers=sent_headers,
+            auth=self._auth,
+            follow_redirects=True,
         ) as response:
             if response.status_code >= 400:
                 response.read()

@@ -52,10 +52,12 @@ from marey_server.process.observe import access_log, configure_logging
 from marey_server.process.services import Description, Services
 from marey_server.process.settings import Settings, misspelt_variables
 from marey_server.store import users
-from marey_server.store.blob_backings import DirectoryBlobs
+from marey_server.store.blob_backings import BlobBacking, DatabaseBlobs, DirectoryBlobs
 from marey_server.store.database.connections import Database
-from marey_server.store.database.opening import opening
+from marey_server.store.database.opening import DatabaseUnusable, opening
 from marey_server.store.database.schema import upgrade_schema
+from marey_server.store.object_storage.backing import ObjectBlobs
+from marey_server.store.object_storage.client import ObjectStorage
 from marey_server.store.wakeups import wakeups
 from marey_server.webhooks.delivering import delivering
 
@@ -216,10 +218,26 @@ def open_database(settings: Settings) -> Database:
 
 def connect_database(settings: Settings) -> Database:
     """Connect to the database without upgrading its tables."""
-    blobs = DirectoryBlobs(settings.data / BLOB_FOLDER) if settings.blobs == "directory" else None
     return Database(
-        settings.resolved_database_url, readers=settings.resolved_database_threads, blobs=blobs, quotas=settings.quotas
+        settings.resolved_database_url,
+        readers=settings.resolved_database_threads,
+        blobs=_backing_of(settings),
+        quotas=settings.quotas,
     )
+
+
+def _backing_of(settings: Settings) -> BlobBacking | ObjectBlobs:
+    """Return the storage of blobs. Raises `DatabaseUnusable` if the package for object storage is not installed."""
+    folder = settings.data / BLOB_FOLDER
+    has_files = settings.blobs == "directory" or (settings.blobs == "s3" and folder.is_dir())
+    local = DirectoryBlobs(folder) if has_files else DatabaseBlobs()
+    if settings.bucket is None:
+        return local
+    try:
+        storage = ObjectStorage(settings.bucket)
+    except ModuleNotFoundError as error:
+        raise DatabaseUnusable('a bucket needs an optional package; run pip install "marey[s3]"') from error
+    return ObjectBlobs(storage, local, stores_objects=settings.blobs == "s3")
 
 
 async def serve(settings: Settings) -> None:

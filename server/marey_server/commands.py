@@ -9,7 +9,8 @@ import asyncio
 import os
 import sqlite3
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -23,6 +24,8 @@ from marey_schemas.processes.memory import loading_modules
 from marey_schemas.queue.log_lines import usual_form
 from marey_schemas.wording import counted, without_prefix
 from marey_server.process.settings import Settings
+
+PROGRESS_EVERY_S = 5.0
 
 
 class CommandFailed(Exception):
@@ -196,6 +199,46 @@ def purge(**settings: Any) -> None:
         on_sqlite = database.is_sqlite
     if on_sqlite:
         _shrink(_sqlite_file(chosen, must_exist=True))
+
+
+def move_blobs(**settings: Any) -> None:
+    """Move all blobs to the storage that the setting `blobs` names, while servers run.
+
+    If the command is stopped, the next run moves the other blobs. Raises `CommandFailed` if blobs cannot be moved.
+    """
+    from marey_server.app import connect_database
+    from marey_server.errors import ApiProblem
+    from marey_server.store.object_storage.moving import CannotMove, Moved, move_blobs
+
+    chosen = read_settings(**settings)
+    if chosen.database_url is None:
+        _sqlite_file(chosen, must_exist=True)
+    moved = Moved()
+    with _database_of(chosen), closing(connect_database(chosen)) as database:
+        try:
+            move_blobs(database, moved, progress=_progress())
+        except KeyboardInterrupt:
+            raise CommandFailed(f"stopped after {moved}; run the command again to move the other blobs") from None
+        except (CannotMove, ApiProblem) as error:
+            raise CommandFailed(f"{error} Before this, the command moved {moved}.") from None
+    _say(f"moved {moved}")
+    for digest in moved.damaged:
+        _say(f"not moved: {digest}, because its bytes are damaged")
+    if moved.damaged:
+        raise CommandFailed(f"damaged blobs were not moved ({len(moved.damaged)}); `marey db fsck` lists all faults")
+
+
+def _progress() -> Callable[[object], None]:
+    """Return a function that prints its argument to standard error, at most once per `PROGRESS_EVERY_S`."""
+    printed_s = time.monotonic()
+
+    def show(state: object) -> None:
+        nonlocal printed_s
+        if time.monotonic() >= printed_s + PROGRESS_EVERY_S:
+            printed_s = time.monotonic()
+            sys.stderr.write(f"moved {state}\n")
+
+    return show
 
 
 def _shrink(file: Path) -> None:

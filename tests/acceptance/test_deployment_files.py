@@ -9,9 +9,11 @@ from typing import Any
 import pytest
 import yaml
 from docs.generate import ROOT
+from tests.support.s3_servers import seaweedfs
 from tests.support.told_commands import unknown_options
 
 from marey_server.process.settings import Settings
+from marey_server.store.object_storage.client import Bucket
 
 UNITS = sorted((ROOT / "deploy" / "systemd").iterdir())
 CONTAINERFILE = ROOT / "deploy" / "containers" / "Containerfile"
@@ -52,8 +54,8 @@ def test_the_started_commands_exist_with_these_options(words: list[str]) -> None
 def test_the_named_settings_and_variables_exist(file: Path) -> None:
     text = file.read_text(encoding="utf-8")
     variables = {f"MAREY_{name.upper()}" for name in Settings.model_fields} | OF_CLIENTS
-    assert set(re.findall(r"\bMAREY_[A-Z_]+", text)) <= variables
-    settings = re.findall(r"(?:^|`)([a-z_]+) = ", text, re.MULTILINE)
+    assert set(re.findall(r"\bMAREY_[A-Z0-9_]+", text)) <= variables
+    settings = re.findall(r"(?:^|`)([a-z0-9_]+) = ", text, re.MULTILINE)
     assert set(settings) <= set(Settings.model_fields)
 
 
@@ -82,6 +84,28 @@ def test_no_secret_is_in_a_file_an_argument_or_a_variable() -> None:
     for unit in UNITS:
         for variable in directives(unit, "Environment"):
             assert not re.search("PASSWORD=|TOKEN|SECRET", variable), variable
+
+
+def test_the_storage_of_the_compose_file_stores_blobs(tmp_path: Path) -> None:
+    """The command of the service and the access keys of the page are used as they are, with other folders and ports."""
+    added = yaml.safe_load((ROOT / "deploy" / "containers" / "object-storage.yml").read_text(encoding="utf-8"))
+    (identities,) = re.findall(r"<<END\n(.*?)END\n", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "s3-identities").write_text(identities.replace("$(cat secrets/s3-secret-key)", "of-the-test"))
+    (tmp_path / "data").mkdir()
+    command = [
+        word.replace("/run/secrets", str(tmp_path)).replace("=/data", f"={tmp_path / 'data'}")
+        for word in added["services"]["storage"]["command"]
+    ]
+    variables = added["services"]["server"]["environment"]
+    server = seaweedfs(tmp_path, command)
+    bucket = Bucket(
+        variables["MAREY_S3_BUCKET"],
+        endpoint=server.endpoint,
+        key_id=variables["MAREY_S3_KEY_ID"],
+        secret_key="of-the-test",
+    )
+    server.start(bucket)
+    server.stop()
 
 
 def test_services_have_time_to_end_their_requests() -> None:

@@ -13,16 +13,25 @@ from sqlalchemy import Connection
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.store_fixtures import Lab
 
+from marey_schemas.items import ItemCreate
+from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import InvalidProblem, NotFoundProblem, StorageFullProblem
-from marey_server.store import blob_backings, blobs, garbage
+from marey_server.store import blob_backings, blobs, garbage, items
 from marey_server.store.blob_backings import CHUNK_BYTES, DatabaseBlobs, DirectoryBlobs, Spool
 from marey_server.store.blobs import digest_of
 from marey_server.store.database.connections import Database
+from marey_server.store.object_storage.awaiting import Carried
+from marey_server.store.object_storage.backing import ObjectBlobs
 from marey_server.store.transaction import Transaction
 
 SIZES = (0, 1, 1000, CHUNK_BYTES - 1, CHUNK_BYTES, CHUNK_BYTES + 1, 3 * CHUNK_BYTES + 17)
 OLD_US = 2 * 24 * 3600 * 1_000_000
+
+
+def written_by(backing: Any) -> type:
+    """Return the class whose method `write` transactions call."""
+    return type(backing.within(Carried(), int)) if isinstance(backing, ObjectBlobs) else type(backing)
 
 
 class BlobBackingContract:
@@ -104,7 +113,7 @@ class BlobBackingContract:
             raise OSError(28, "No space left on device")
 
         with monkeypatch.context() as full:
-            full.setattr(type(backing), "write", fill_up)
+            full.setattr(written_by(backing), "write", fill_up)
             with pytest.raises(StorageFullProblem):
                 store.write(blobs.put_blob, b"too much")
         with pytest.raises(NotFoundProblem):
@@ -157,8 +166,8 @@ class BlobBackingContract:
             found = store.read(blobs.readable, [digest_of(data)])
             assert not found or store.read(blobs.read_blob, digest_of(data)) == data
 
-    def test_it_says_that_it_can_be_written(self, store: Lab, backing: Any) -> None:
-        backing.check_writable()
+    def test_it_says_that_it_can_be_written(self, store: Lab) -> None:
+        store.read(lambda tx: tx.blobs.check_writable())
 
 
 class TestDatabaseBlobs(BlobBackingContract):
@@ -229,3 +238,29 @@ class TestDirectoryBlobs(BlobBackingContract):
         (backing.root / "incoming").rmdir()
         with pytest.raises(OSError, match="incoming"):
             backing.check_writable()
+
+
+class TestObjectBlobs(BlobBackingContract):
+    @pytest.fixture
+    def backing(self, object_blobs: ObjectBlobs) -> ObjectBlobs:
+        return object_blobs
+
+    def test_objects_without_rows_are_swept_and_others_stay(
+        self, store: Lab, backing: ObjectBlobs, clock: AdjustableClock
+    ) -> None:
+        kept = store.write(blobs.put_blob, b"kept")
+        study = ItemCreate(name="s", parts={"study": {"schema": "marey/document@1", "blob": kept}})
+        store.write(items.create_item, "lab", Kind.STUDY, study)
+
+        def fail(tx: Transaction) -> None:
+            blobs.put_blob(tx, b"stray")
+            raise RuntimeError("on the way")
+
+        with pytest.raises(RuntimeError):
+            store.write(fail)
+        assert {one.digest for page in backing.storage.pages() for one in page} == {kept, digest_of(b"stray")}
+        assert garbage.collect_garbage(store.database).stray_objects == 0
+        clock.advance(OLD_US / 1e6)
+        assert garbage.collect_garbage(store.database).stray_objects == 1
+        assert {one.digest for page in backing.storage.pages() for one in page} == {kept}
+        assert store.read(blobs.read_blob, kept) == b"kept"

@@ -15,11 +15,14 @@ from marey_schemas.queue.worker_protocol import CompleteRequest
 from marey_server import faults
 from marey_server.access.principal import Principal
 from marey_server.store import blobs, garbage, items, projects, purging
-from marey_server.store.blob_backings import DirectoryBlobs
+from marey_server.store.blob_backings import DatabaseBlobs, DirectoryBlobs
 from marey_server.store.database.connections import Database
 from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.jobs import completion
 from marey_server.store.jobs.finishing import commit_deferred
+from marey_server.store.object_storage.backing import ObjectBlobs
+from marey_server.store.object_storage.client import Bucket, ObjectStorage
+from marey_server.store.object_storage.moving import Moved, move_blobs
 from marey_server.store.transaction import Transaction
 
 LARGE_FILES = [bytes([number]) * 2**20 for number in range(12)]
@@ -51,12 +54,12 @@ def purge(database: Database, who: Principal) -> None:
 class StoreWriter:
     """Does work in processes, each of which may have a fault.
 
-    Blobs are in `folder`, or in the database if `folder` is empty. The processes are forked from one that has loaded
-    the server, because loading it takes longer than most of the work.
+    Blobs are in `bucket` if it is given, otherwise in `folder`, or in the database if `folder` is empty. The processes
+    are forked from one that has loaded the server, because loading it takes longer than most of the work.
     """
 
-    def __init__(self, url: str, user_id: str, user_name: str, folder: str = "") -> None:
-        self._arguments = (url, Principal("user", user_id, user_name, scopes=("read", "write")), folder)
+    def __init__(self, url: str, user_id: str, user_name: str, folder: str = "", bucket: Bucket | None = None) -> None:
+        self._arguments = (url, Principal("user", user_id, user_name, scopes=("read", "write")), folder, bucket)
         self.digests: list[str] = []
         """Digests of the large files that the last process has stored."""
 
@@ -64,8 +67,8 @@ class StoreWriter:
         """Do `work` in a process; return its exit status: 0, or minus the number of the signal that killed it.
 
         The work `send` or `send-large` stores files, `publish` and `purge` call the functions of these names,
-        `complete JOB FENCE` completes an attempt, `commit-deferred` commits the outputs of jobs with many outputs, and
-        `collect` collects garbage.
+        `complete JOB FENCE` completes an attempt, `commit-deferred` commits the outputs of jobs with many outputs,
+        `collect` collects garbage, and `move` moves all blobs to `bucket`.
         """
         fork_server = multiprocessing.get_context("forkserver")
         fork_server.set_forkserver_preload([__name__])
@@ -85,9 +88,12 @@ class StoreWriter:
         return status
 
 
-def _do(url: str, who: Principal, folder: str, work: str, fault: str, sender: Connection) -> None:
+def _do(
+    url: str, who: Principal, folder: str, bucket: Bucket | None, work: str, fault: str, sender: Connection
+) -> None:
     faults.plan(fault)
-    database = Database(url, blobs=DirectoryBlobs(Path(folder)) if folder else None)
+    local = DirectoryBlobs(Path(folder)) if folder else DatabaseBlobs()
+    database = Database(url, blobs=local if bucket is None else ObjectBlobs(ObjectStorage(bucket), local))
     name, *arguments = work.split()
     if name == "send":
         for data in FILES:
@@ -103,6 +109,8 @@ def _do(url: str, who: Principal, folder: str, work: str, fault: str, sender: Co
         complete(database, arguments[0], int(arguments[1]))
     elif name == "commit-deferred":
         commit_deferred(database)
+    elif name == "move":
+        move_blobs(database, Moved())
     else:
         assert name == "collect"
         garbage.collect_garbage(database, grace_us=ALL_US)

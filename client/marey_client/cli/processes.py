@@ -217,6 +217,16 @@ def purge_database(data: DataFolder = None, database_url: DatabaseUrl = None) ->
     _database("purge", data, database_url)
 
 
+@db.command("move-blobs")
+def move_blobs(data: DataFolder = None, database_url: DatabaseUrl = None) -> None:
+    """Move all blobs to the storage that the setting `blobs` names: files or object storage. Servers may be running.
+
+    The command verifies every blob. It can be stopped with Ctrl-C and run again. First restart all servers with the new
+    settings; otherwise, they cannot read the moved blobs.
+    """
+    _database("move_blobs", data, database_url)
+
+
 @db.command("clock")
 def set_clock(
     set_now: Annotated[

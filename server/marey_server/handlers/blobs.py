@@ -64,13 +64,17 @@ class Blob(BlobSender):
         answer=Bytes,
         answer_types=("application/octet-stream",),
         etag=True,
-        also=((206, None), (416, None)),
+        also=((206, None), (307, None), (416, None)),
         headers=("Range", "If-Range"),
         attempts=True,
     )
     async def get(self, digest: str) -> Rendered | None:
-        """Return the bytes of a blob, or a range of them."""
-        return await self.send_blob(require_digest(digest))
+        """Return the bytes of a blob, or a range of them.
+
+        The answer to a request for a large blob may be 307 with an address at the object storage, where the same
+        headers are valid, but no token must be sent.
+        """
+        return await self.send_blob(require_digest(digest), may_redirect=True)
 
 
 class MissingBlobs(Resource):

@@ -8,7 +8,7 @@ from marey_server.http.caching import NOT_STORED
 from marey_server.http.declarations import Access, Bytes, reads
 from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
-from marey_server.store import fsck
+from marey_server.store.monitoring import readiness
 
 
 class Health(Answer):
@@ -51,7 +51,7 @@ class Readyz(Resource):
             raise UnavailableProblem(
                 "The server is stopping and accepts no more work.", code="draining", headers={"Retry-After": "5"}
             )
-        faults = await self.look_up(fsck.find_faults)
+        faults = await self.look_up(readiness.find_faults)
         if disk_fault := self.services.disk.fault():
             faults = [*faults, disk_fault]
         self.services.note_faults(faults)

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 from urllib.parse import quote
 
 from marey_schemas.sizes import MIB
 from marey_server.errors import DamagedProblem, RangeNotSatisfiableProblem
-from marey_server.http.caching import IMMUTABLE
+from marey_server.http.caching import IMMUTABLE, NOT_STORED
 from marey_server.http.etags import entity_tag, matches
 from marey_server.http.exchange import JOINED_BYTES
 from marey_server.http.reply import Rendered
 from marey_server.http.resource import Resource
 from marey_server.store import blobs
+from marey_server.store.object_storage.backing import ObjectBlobs
+from marey_server.store.object_storage.client import StoredObject
 from marey_server.store.transaction import Transaction
 
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 PIECE_BYTES = MIB
+SIGNED_FOR_S = 60
+"""Seconds for which anybody who has a signed URL can read the blob; a download that has begun may take longer."""
 HELD_BYTES = 2 * PIECE_BYTES
 """Memory that a long blob needs while it is sent: one piece is being sent, and the next one is being read."""
 
@@ -72,20 +78,32 @@ def parse_range(header: str | None, if_range: str | None, etag: str) -> ByteRang
 
 @dataclass(frozen=True, slots=True)
 class _Opened:
-    """Blob about to be sent: its size, the requested range, and the first piece."""
+    """Blob about to be sent: its size, the requested range, and the first piece.
+
+    `stored` is set if the client is to read the bytes from object storage; then there is no first piece.
+    """
 
     size: int
     start: int
     stop: int
-    first: bytes
+    first: bytes = b""
+    stored: StoredObject | None = None
 
 
-def _open_blob(tx: Transaction, digest: str, wanted: ByteRange | None, *, head: bool) -> _Opened:
-    """Find the requested range of a blob, and read its first piece unless only the headers are requested."""
+def _open_blob(
+    tx: Transaction, digest: str, wanted: ByteRange | None, *, head: bool, redirect_bytes: int | None
+) -> _Opened:
+    """Find the requested range of a blob, and read its first piece unless only the headers are requested.
+
+    The piece is not read either if the blob has at least `redirect_bytes` and is in object storage.
+    """
     size = blobs.require_readable(tx, digest)
     start, stop = wanted.within(size) if wanted is not None else (0, size)
-    first = b"" if head else blobs.read_blob(tx, digest, start, min(stop, start + PIECE_BYTES))
-    return _Opened(size, start, stop, first)
+    if head:
+        return _Opened(size, start, stop)
+    if redirect_bytes is not None and size >= redirect_bytes and (stored := blobs.object_of(tx, digest)):
+        return _Opened(size, start, stop, stored=stored)
+    return _Opened(size, start, stop, blobs.read_blob(tx, digest, start, min(stop, start + PIECE_BYTES)))
 
 
 def attachment(file_name: str) -> str:
@@ -105,15 +123,23 @@ class BlobSender(Resource):
         media_type: str = "application/octet-stream",
         cache_control: str = IMMUTABLE,
         headers: Mapping[str, str] = MappingProxyType({}),
+        may_redirect: bool = False,
     ) -> Rendered | None:
         """Answer with the blob according to Range, If-Range and If-None-Match. Raises `NotFoundProblem`.
 
         By default, clients may cache the blob for a year; pass another `cache_control` if the URL does not
-        contain the digest. `headers` are sent with the bytes.
+        contain the digest. `headers` are sent with the bytes. With `may_redirect`, the answer for a large blob may
+        refer to object storage, which sends other headers.
         """
         etag = entity_tag(digest.removeprefix("sha256:"), "bytes")
         wanted = parse_range(self.request.headers.get("Range"), self.request.headers.get("If-Range"), etag)
-        opened = await self.look_up(_open_blob, digest, wanted, head=self.request.method == "HEAD")
+        opened = await self.look_up(
+            _open_blob,
+            digest,
+            wanted,
+            head=self.request.method == "HEAD",
+            redirect_bytes=self.services.settings.s3_redirect_bytes if may_redirect else None,
+        )
         fields = {
             "ETag": etag,
             "Cache-Control": cache_control,
@@ -123,6 +149,8 @@ class BlobSender(Resource):
         }
         if matches(self.request.headers.get("If-None-Match"), etag):
             return Rendered(304, fields, b"")
+        if opened.stored is not None:
+            return await self._redirect(opened.stored)
         if wanted is not None:
             fields["Content-Range"] = f"bytes {opened.start}-{opened.stop - 1}/{opened.size}"
         fields |= {"Content-Type": media_type, "Content-Disposition": disposition, **headers}
@@ -136,6 +164,14 @@ class BlobSender(Resource):
         if sends_pieces:
             await self._send_rest(digest, position, stop)
         return None
+
+    async def _redirect(self, stored: StoredObject) -> Rendered:
+        """Return the answer that refers the client, which may read the blob, to object storage."""
+        backing = self.services.database.blobs
+        assert isinstance(backing, ObjectBlobs)
+        sign = partial(backing.storage.signed_url, stored.name, SIGNED_FOR_S)
+        location = await asyncio.wrap_future(self.services.database.submit_move(sign))
+        return Rendered(307, {"Location": location, "Cache-Control": NOT_STORED, "Vary": "*"}, b"")
 
     async def _send_rest(self, digest: str, position: int, end: int) -> None:
         """Send the pieces after the first one, one at a time, and wait until all are sent."""

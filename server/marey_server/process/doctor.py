@@ -19,7 +19,7 @@ from marey_server.process.settings import Settings, misspelt_variables
 from marey_server.store.clock_setting import read_clock
 from marey_server.store.database.connections import Database
 from marey_server.store.database.opening import DatabaseUnusable, opening, sqlite_file
-from marey_server.store.fsck import find_faults
+from marey_server.store.monitoring.readiness import find_faults
 
 CLOCK_AHEAD_S = 60
 """Number of seconds by which the stored clock may be ahead of the clock of this machine."""

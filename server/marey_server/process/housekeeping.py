@@ -25,6 +25,8 @@ from marey_server.store.garbage import collect_garbage
 from marey_server.store.jobs import reaper
 from marey_server.store.jobs.finishing import commit_deferred
 from marey_server.store.jobs.reaper import StartGrace
+from marey_server.store.object_storage.backing import ObjectBlobs
+from marey_server.store.object_storage.moving import move_uploads
 from marey_server.store.retention import retire
 from marey_server.store.schedules.firing import DUE_AT_ONCE, submit_due
 from marey_server.store.transaction import Transaction
@@ -42,6 +44,7 @@ LEAD_TTL_US = 30_000_000
 LONGEST_TICK_S = 5.0
 GARBAGE_EVERY_S = 3600.0
 FORGET_TRIES_EVERY_S = 60.0
+MOVE_EVERY_S = 10.0
 FIRST_GARBAGE_S = 60.0
 """Seconds from the start to the first garbage collection; short, because some servers run only an hour."""
 
@@ -61,6 +64,7 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
             (0.0, 0.0, partial(_commit_outputs, listener=listener, longest_wait_s=tick_s)),
             (FORGET_TRIES_EVERY_S, FORGET_TRIES_EVERY_S, _forget_tries),
             (FIRST_GARBAGE_S, GARBAGE_EVERY_S, _collect_garbage),
+            (MOVE_EVERY_S, MOVE_EVERY_S, partial(_move_uploads, damaged=set())),
         )
         tasks = [asyncio.create_task(_repeat(services, holder, *chore)) for chore in chores]
         try:
@@ -170,6 +174,19 @@ async def _collect_garbage(services: Services, holder: str) -> None:
         retired = await _in_thread(services, retire, services.database, services.settings.retention)
         collected = await _in_thread(services, collect_garbage, services.database)
         log.info("deleted old rows: %s; deleted unused rows: %s", retired, collected)
+
+
+async def _move_uploads(services: Services, holder: str, damaged: set[str]) -> None:
+    """Move finished uploads from the database to object storage, if the settings say so.
+
+    The digests of uploads that cannot be moved are added to `damaged`, so that they are not tried again.
+    """
+    database = services.database
+    if isinstance(database.blobs, ObjectBlobs) and await _write(services, _leads, holder):
+        moved = await asyncio.wrap_future(database.submit_move(partial(move_uploads, database, frozenset(damaged))))
+        damaged.update(moved.damaged)
+        for digest in moved.damaged:
+            log.error("the upload %s is damaged and stays in the database; run `marey db fsck`", digest)
 
 
 async def _in_thread(services: Services, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:

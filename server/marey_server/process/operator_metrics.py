@@ -78,8 +78,8 @@ class OperatorMetrics(Observer):
     def _add_stored(self, registry: CollectorRegistry) -> None:
         self.uploads = Gauge("marey_upload_sessions", "Unfinished uploads.", registry=registry)
         self.stored_bytes = Gauge(
-            "marey_stored_bytes", "Bytes that the quotas of all projects count, by backing of blobs (database or "
-            "directory): a part of an item counts in each revision that changed it. Bytes that several items or "
+            "marey_stored_bytes", "Bytes that the quotas of all projects count, by storage of new blobs (database, "
+            "directory or s3): a part of an item counts in each revision that changed it. Bytes that several items or "
             "projects share are stored once, but count for each of them. Deleted items take space until they are "
             "purged, but do not count. `marey_database_bytes` shows the space that is taken.", ("backing",),
             registry=registry,

@@ -16,6 +16,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
 from marey_schemas.sizes import KIB, MIB
+from marey_server.process.blob_settings import BlobSettings, read_secret
 from marey_server.process.children import ChildLimits
 from marey_server.process.worker_pools import WorkerPools
 from marey_server.store.jobs.policy import QueuePolicy
@@ -26,7 +27,7 @@ PREFIX = "MAREY_"
 """Prefix of the variables: MAREY_PORT sets `port`. Client, worker and tests have other variables with this prefix."""
 
 
-class Settings(BaseSettings):
+class Settings(BlobSettings):
     """Settings of a server. The environment variable of the setting `data` is MAREY_DATA, and so on."""
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, toml_file="marey.toml", extra="forbid", frozen=True)
@@ -51,9 +52,6 @@ class Settings(BaseSettings):
         ge=1,
         le=128,
         description="Greatest number of reading transactions at the same time. Absent: 2 on SQLite, 8 on Postgres.",
-    )
-    blobs: Literal["database", "directory"] = Field(
-        "database", description="Storage of blobs: in the database, or in the folder `blobs` of the data folder."
     )
     answer_cache_bytes: int = Field(64 * MIB, ge=0, description="Memory in bytes for a cache of encoded documents.")
     trust_proxy: bool = Field(
@@ -306,7 +304,7 @@ class Settings(BaseSettings):
             raise ValueError(
                 "database_url must contain a user and no password, as in postgresql://marey@db.internal/marey"
             )
-        if not _read_password(file):
+        if not read_secret(file):
             raise ValueError(f"{file} is empty, but must contain a password")
         return file
 
@@ -380,15 +378,8 @@ class Settings(BaseSettings):
         if self.database_password_file is None:
             return url
         user, _, place = urlsplit(url).netloc.partition("@")
-        password = quote(_read_password(self.database_password_file), safe="")
+        password = quote(read_secret(self.database_password_file), safe="")
         return url.replace(f"{user}@{place}", f"{user}:{password}@{place}", 1)
-
-
-def _read_password(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8").rstrip("\r\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file} cannot be read: {error}") from None
 
 
 def misspelt_variables(environment: Mapping[str, str]) -> dict[str, str]:

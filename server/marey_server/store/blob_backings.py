@@ -2,7 +2,7 @@
 
 A backing is called inside the transaction that inserts or deletes the blob's row. This row is the lock: no other
 transaction can write or remove the same bytes before this transaction ends. Bytes that are being received are in a
-`Spool`.
+`Spool`. The package `object_storage` contains a further backing, for S3.
 """
 
 from __future__ import annotations
@@ -90,6 +90,10 @@ class BlobBacking(Protocol):
         """
         ...
 
+    def expect(self, connection: Connection, digests: Iterable[str]) -> None:
+        """Prepare to read all bytes of several blobs, if reading them together is faster than one by one."""
+        ...
+
     def release(self, connection: Connection, digest: str) -> None:
         """Free the bytes of a blob whose row this transaction deletes; the transaction may still be rolled back."""
         ...
@@ -174,6 +178,9 @@ class DatabaseBlobs:
             base = position * CHUNK_BYTES
             yield data if start <= base and base + len(data) <= stop else data[max(start - base, 0) : stop - base]
 
+    def expect(self, connection: Connection, digests: Iterable[str]) -> None:
+        """Do nothing: reading blobs together is not faster."""
+
     def _upload_of(self, connection: Connection, digest: str) -> str | None:
         rows = _UPLOAD.run(connection, {"digest": digest})
         return rows[0].upload_id if rows else None
@@ -244,11 +251,12 @@ class DirectoryBlobs:
         _sync_directory(path.parent)
         _sync_directory(self.root)
 
-    def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:  # noqa: ARG002
-        """Yield bytes `start` to `stop` of a blob's file."""
+    def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
+        """Yield bytes `start` to `stop` of a blob's file; without a file, the bytes may still be in the database."""
         try:
             file = self._path(digest).open("rb")
         except FileNotFoundError:
+            yield from DatabaseBlobs().read(connection, digest, start, stop)
             return
         with file:
             file.seek(start)
@@ -256,8 +264,15 @@ class DirectoryBlobs:
                 start += len(chunk)
                 yield chunk
 
+    def expect(self, connection: Connection, digests: Iterable[str]) -> None:
+        """Do nothing: reading blobs together is not faster."""
+
     def release(self, connection: Connection, digest: str) -> None:
-        """Do nothing, because the transaction may still be rolled back; garbage collection removes the file later."""
+        """Delete rows of bytes, if the blob is in the database.
+
+        A file is not removed, because the transaction may still be rolled back; garbage collection removes it later.
+        """
+        DatabaseBlobs().release(connection, digest)
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
         """Yield the digests of old files; remove old unfinished files, which dead processes left."""

@@ -23,6 +23,7 @@ from marey_server.errors import (
 )
 from marey_server.store.blob_backings import CHUNK_BYTES, Spool
 from marey_server.store.jobs import reach
+from marey_server.store.object_storage.client import StoredObject
 from marey_server.store.projects import is_visible, writable_projects
 from marey_server.store.quotas import count_sent
 from marey_server.store.tables import (
@@ -288,6 +289,12 @@ def read_blob(tx: Transaction, digest: str, start: int = 0, stop: int | None = N
     if stop is None:
         stop = int(tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar_one())
     return b"".join(tx.blobs.read(tx.connection, digest, start, stop))
+
+
+def object_of(tx: Transaction, digest: str) -> StoredObject | None:
+    """Return the object with the bytes of a blob; None if they are elsewhere. Access must have been checked before."""
+    found = tx.execute(select(blob.c.object_id).where(blob.c.digest == digest)).scalar()
+    return StoredObject(digest, found) if found else None
 
 
 def read_range(tx: Transaction, digest: str, start: int, stop: int) -> bytes:

@@ -361,11 +361,14 @@ def _attach_stored(
     `bodies` maps the digests of documents to their trees.
     """
     loaded: dict[str, Any] = {}
-    for row in tx.run(_BLOBS_OF_DOCUMENTS, {"digests": padded(bodies)}):
-        holder, key = _place(bodies[row.document_digest], row.pointer)
+    named = tx.run(_BLOBS_OF_DOCUMENTS, {"digests": padded(bodies)})
+    places = [(row, *_place(bodies[row.document_digest], row.pointer)) for row in named]
+    arrays = [
+        (row, holder, key) for row, holder, key in places if is_array_reference(holder[key])
+    ]  # not names of files
+    tx.blobs.expect(tx.connection, [row.blob_digest for row, _, _ in arrays])
+    for row, holder, key in arrays:
         leaf = holder[key]
-        if not is_array_reference(leaf):  # the name of a file
-            continue
         if leaf["content"] not in loaded:
             data = blobs.read_blob(tx, row.blob_digest, 0, row.size_bytes)
             stored = EncodedArray(leaf["dtype"], tuple(leaf["shape"]), data)

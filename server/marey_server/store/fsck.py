@@ -1,12 +1,11 @@
-"""Checks of the store: its readiness to serve, the digests of blobs, and references between rows.
+"""Checks of the store: the digests of blobs, and references between rows.
 
 The checks can run while a server runs, because they use short reads of bounded size.
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -25,7 +24,6 @@ from marey_server.access.webhook_signatures import is_secret
 from marey_server.store import quotas
 from marey_server.store.blobs import digest_of, read_blob
 from marey_server.store.database.connections import Database
-from marey_server.store.database.schema import schema_at_head
 from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.history import revisions_with
 from marey_server.store.datasets.manifests import read_manifest
@@ -33,6 +31,9 @@ from marey_server.store.documents import items_named_in
 from marey_server.store.events import newest_number
 from marey_server.store.items.summaries import summarise
 from marey_server.store.jobs.inputs import NamingJob
+from marey_server.store.object_storage.awaiting import digest_of_chunks
+from marey_server.store.object_storage.backing import ObjectBlobs
+from marey_server.store.object_storage.client import StoredObject
 from marey_server.store.tables import (
     blob,
     collection,
@@ -99,10 +100,15 @@ def check_store(
         ("projects", project, partial(_check_holding, owner=item.c.project_id)),
         ("users", user, partial(_check_holding, owner=item.c.creator_id)),
     )
+    for number, findings in enumerate(_check_objects(database), 1):
+        yield from findings
+        if progress is not None:
+            progress("objects", number)
+    rows_at_once = 1 if isinstance(database.blobs, ObjectBlobs) else PAGE  # whose bytes are kept until the page ends
     miscounted = False
     for name, table, check in passes:
         behind, count = "", 0
-        while page := database.read(SYSTEM, _check_page, table, check, behind):
+        while page := database.read(SYSTEM, _check_page, table, check, behind, rows_at_once):
             behind, count = page[-1][0], count + len(page)
             for _key, findings in page:
                 miscounted = miscounted or any(one.code == MISCOUNTED for one in findings)
@@ -114,10 +120,10 @@ def check_store(
 
 
 def _check_page(
-    tx: Transaction, table: Table, check: Callable[[Transaction, Row[Any]], list[StoreDefect]], behind: str
+    tx: Transaction, table: Table, check: Callable[[Transaction, Row[Any]], list[StoreDefect]], behind: str, limit: int
 ) -> list[tuple[str, list[StoreDefect]]]:
     key = table.primary_key.columns[0]
-    rows = tx.execute(select(table).where(key > behind).order_by(key).limit(PAGE)).all()
+    rows = tx.execute(select(table).where(key > behind).order_by(key).limit(limit)).all()
     return [(row._mapping[key], check(tx, row)) for row in rows]
 
 
@@ -137,15 +143,38 @@ def _check_file(tx: Transaction) -> list[StoreDefect]:
 
 
 def _check_blob(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    hashed, size = hashlib.sha256(), 0
-    for piece in tx.blobs.read(tx.connection, row.digest, 0, row.size_bytes):
-        hashed.update(piece)
-        size += len(piece)
+    if row.object_id is not None:  # see `_check_objects`
+        return []
+    return _compare(row, tx.blobs.read(tx.connection, row.digest, 0, row.size_bytes))
+
+
+def _compare(row: Row[Any], pieces: Iterable[bytes]) -> list[StoreDefect]:
+    """Return a fault if bytes do not have the size and the digest of a blob."""
+    digest, size = digest_of_chunks(pieces)
     if size != row.size_bytes:
         return [StoreDefect("blob-incomplete", row.digest, f"only {size} of {row.size_bytes} bytes are stored")]
-    if f"sha256:{hashed.hexdigest()}" != row.digest:
-        return [StoreDefect("blob-corrupt", row.digest, "the bytes have another digest")]
-    return []
+    return [] if digest == row.digest else [StoreDefect("blob-corrupt", row.digest, "the bytes have another digest")]
+
+
+def _check_objects(database: Database) -> Iterator[list[StoreDefect]]:
+    """Read the objects of all blobs without a transaction; yield the faults of each blob."""
+    behind = ""
+    while rows := database.read(SYSTEM, _in_objects, behind):
+        for row in rows:
+            if isinstance(database.blobs, ObjectBlobs):
+                findings = _compare(row, database.blobs.storage.chunks(StoredObject(row.digest, row.object_id).name))
+                yield findings if findings and row in database.read(SYSTEM, _in_objects, row.digest, same=True) else []
+            else:
+                detail = "it is in object storage, but the settings name no bucket (s3_bucket)"
+                yield [StoreDefect("blob-unreachable", row.digest, detail)]
+        behind = rows[-1].digest
+
+
+def _in_objects(tx: Transaction, behind: str, *, same: bool = False) -> list[Row[Any]]:
+    """Return the next rows, after the digest `behind`, of blobs in object storage; with `same`, the row `behind`."""
+    rows = select(blob.c.digest, blob.c.size_bytes, blob.c.object_id).where(blob.c.object_id.is_not(None))
+    chosen = blob.c.digest == behind if same else blob.c.digest > behind
+    return list(tx.execute(rows.where(chosen).order_by(blob.c.digest).limit(PAGE)))
 
 
 def _check_document(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
@@ -411,15 +440,3 @@ def _check_webhook(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         and tx.execute(select(webhook_delivery.c.id).where(*retried).limit(1)).first() is None,
     }
     return [StoreDefect("webhook-corrupt", row.id, text) for text, is_so in faults.items() if is_so]
-
-
-def find_faults(tx: Transaction) -> list[str]:
-    """Return descriptions, for the operator, of faults that prevent the server from serving requests."""
-    faults = []
-    if not schema_at_head(tx.connection):
-        faults.append("the tables of the database are not those of this version of the server; run `marey db upgrade`")
-    try:
-        tx.blobs.check_writable()
-    except OSError as error:
-        faults.append(f"blobs cannot be written: {error.strerror}")
-    return faults

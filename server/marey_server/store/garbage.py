@@ -27,6 +27,7 @@ from marey_server.store.database.connections import Database
 from marey_server.store.idempotency import LIFETIME_US as KEY_LIFETIME_US
 from marey_server.store.invitations import validity
 from marey_server.store.jobs.fencing import RUNNING
+from marey_server.store.object_storage.sweeping import sweep_objects
 from marey_server.store.tables import (
     attempt_blob,
     blob,
@@ -65,6 +66,7 @@ class Collected:
     tokens: int = 0
     ended_holdings: int = 0
     invitations: int = 0
+    stray_objects: int = 0
 
 
 def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collected:
@@ -76,6 +78,7 @@ def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collecte
         documents=_collect(database, document, delete_documents, grace_us),
         blobs=_collect(database, blob, delete_blobs, grace_us),
         stray_files=_sweep_strays(database, grace_us),
+        stray_objects=sweep_objects(database, grace_us),
         uploads=_delete_uploads(database),
         keys=_delete_expired(database, idempotency_key, _is_old_key),
         coverage_streams=_delete_expired(database, coverage_stream, is_old),
@@ -170,12 +173,16 @@ def _sweep_strays(database: Database, grace_us: int) -> int:
 
 
 def _remove_stray(tx: Transaction, digest: str) -> int:
-    """Remove the bytes of a blob if the blob has no row; return how many blobs were removed.
+    """Remove the file of a blob if the blob has no row or is in object storage; return how many files were removed.
 
-    A lock on the key of the row keeps other writes from storing the bytes at the same time.
+    A lock on the row or its key keeps other writes from storing the bytes at the same time.
     """
     row = {"digest": digest, "size_bytes": 0, "created_us": tx.now_us}
     if tx.execute(tx.insert_or_ignore(blob, row).returning(blob.c.digest)).first() is None:
+        moved = select(blob.c.digest).where(blob.c.digest == digest, blob.c.object_id.is_not(None))
+        if tx.execute(moved.with_for_update()).first() is not None:
+            tx.blobs.remove_stray(digest)
+            return 1
         return 0
     tx.blobs.remove_stray(digest)
     tx.execute(delete(blob).where(blob.c.digest == digest))

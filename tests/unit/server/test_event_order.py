@@ -14,6 +14,7 @@ from tests.support.store_fixtures import Lab
 
 from marey_server.access.principal import SYSTEM
 from marey_server.store import events, projects
+from marey_server.store.blob_backings import DatabaseBlobs
 from marey_server.store.database import schema
 from marey_server.store.database.connections import Database
 from marey_server.store.tables import event, metadata
@@ -24,7 +25,7 @@ from marey_server.store.transaction import Transaction
 def open_transaction(database: Database) -> Iterator[Transaction]:
     """Yield a transaction on a separate connection; it is committed after the `with` block."""
     with database.engine.connect() as connection, connection.begin():
-        yield Transaction(connection, SYSTEM, database.clock, database.blobs)
+        yield Transaction(connection, SYSTEM, database.clock, DatabaseBlobs())
 
 
 class Overlap:

@@ -11,7 +11,6 @@ Each write starts with `BEGIN IMMEDIATE`, and reads run at the same time as writ
 
 from __future__ import annotations
 
-import errno
 import sqlite3
 import threading
 import time
@@ -23,25 +22,33 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import sqlalchemy
 from sqlalchemy import Connection, exc, make_url
 
-from marey_schemas.backoff import Backoff
 from marey_server.access.principal import Principal
-from marey_server.errors import ApiProblem, InvalidProblem, StorageFullProblem, UnavailableProblem
-from marey_server.store import tables
+from marey_server.errors import ApiProblem
 from marey_server.store.blob_backings import BlobBacking, DatabaseBlobs
+from marey_server.store.database.byte_moves import MovingCall, run_and_move
 from marey_server.store.database.clock import Clock, DatabaseClock, save_high_water
 from marey_server.store.database.engines import begin_snapshot, postgres_engine, roll_back, sqlite_engine
+from marey_server.store.database.failures import (
+    FAILURES,
+    READ_TRIES,
+    WRITE_BACKOFF,
+    WRITE_TRIES,
+    no_answer,
+    translated,
+    worth_retrying,
+)
 from marey_server.store.database.lanes import SERVER, Client, Lane
 from marey_server.store.database.opening import sqlite_file
 from marey_server.store.database.write_ahead_log import WriteAheadLog
 from marey_server.store.database.write_lane import WriteLane
+from marey_server.store.object_storage.backing import ObjectBlobs
 from marey_server.store.transaction import IGNORED, Observer, Quotas, Transaction
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-WRITE_TRIES = 5
-WRITE_BACKOFF = Backoff(first_s=0.02, longest_s=0.16, jitter=1.0)
-READ_TRIES = 3
+MOVING_THREADS = 16
+"""Number of threads that move bytes to and from object storage; they are started when they are needed."""
 RESERVED_THREADS = 3
 """Number of threads, and of connections, for short transactions that must not wait for other transactions."""
 SHARED_BY_ALL = 2
@@ -57,7 +64,7 @@ class Database:
         *,
         readers: int = 8,
         clock: Clock | None = None,
-        blobs: BlobBacking | None = None,
+        blobs: BlobBacking | ObjectBlobs | None = None,
         quotas: Quotas | None = None,
         echo: bool = False,
     ) -> None:
@@ -76,7 +83,7 @@ class Database:
         self.clock: Clock = clock or DatabaseClock()
         self._has_own_clock = clock is None
         self._high_water_us = 0
-        self.blobs: BlobBacking = blobs or DatabaseBlobs()
+        self.blobs: BlobBacking | ObjectBlobs = blobs or DatabaseBlobs()
         self.quotas = quotas or Quotas()
         self.observer: Observer = IGNORED
         """Receiver of numbers about the transactions of this process; the server replaces it."""
@@ -85,7 +92,8 @@ class Database:
         self._log = WriteAheadLog(file) if file else None
         self._ordinary = Lane("marey-database", readers, most_each=readers if readers <= SHARED_BY_ALL else readers - 1)
         self._reserved = Lane("marey-reserved", RESERVED_THREADS, most_each=RESERVED_THREADS - 1)
-        self._write_lane = WriteLane(self.write) if self.is_sqlite else None
+        self._moving = Lane("marey-objects", MOVING_THREADS, most_each=MOVING_THREADS - MOVING_THREADS // 4)
+        self._write_lane = WriteLane(self._write) if self.is_sqlite else None
 
     @property
     def shown(self) -> str:
@@ -98,6 +106,8 @@ class Database:
     def lanes(self) -> dict[str, Lane | WriteLane]:
         """The lanes by name."""
         lanes: dict[str, Lane | WriteLane] = {"database": self._ordinary, "database-reserved": self._reserved}
+        if isinstance(self.blobs, ObjectBlobs):
+            lanes["object-storage"] = self._moving
         return lanes if self._write_lane is None else {**lanes, "database-writing": self._write_lane}
 
     @property
@@ -120,20 +130,31 @@ class Database:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
-        """Run `function(tx, ...)` in a read-only transaction in the calling thread; retry if the connection breaks."""
+        """Run `function(tx, ...)` in a read-only transaction in the calling thread; retry if the connection breaks.
+
+        If the function needs bytes from object storage, they are read outside the transaction, and the function runs
+        again.
+        """
+
+        def run(tx: Transaction) -> T:
+            return function(tx, *args, **kwargs)
+
+        return run_and_move(self.blobs, lambda wanted: self._read(principal, wanted), run)
+
+    def _read(self, principal: Principal, function: Callable[[Transaction], T]) -> T:
         for attempt in range(READ_TRIES):
             try:
                 with self._read_engine.connect() as connection, connection.begin() as transaction:
                     begun_us = None if self.is_sqlite else begin_snapshot(connection)
                     tx = self._transaction(connection, principal, begun_us if self._has_own_clock else None)
                     try:
-                        return function(tx, *args, **kwargs)
+                        return function(tx)
                     except ApiProblem:
                         transaction.commit()  # there is nothing to roll back, and see `roll_back`
                         raise
-            except _FAILURES as error:
-                if attempt == READ_TRIES - 1 or not _worth_retrying(error):
-                    raise _translated(error) from error
+            except FAILURES as error:
+                if attempt == READ_TRIES - 1 or not worth_retrying(error):
+                    raise translated(error) from error
         raise AssertionError("unreachable")
 
     def write(
@@ -146,16 +167,24 @@ class Database:
         """Run `function(tx, ...)` and commit, in the calling thread.
 
         The function runs again from the start after a deadlock, a serialisation failure, or a connection that broke
-        before the commit. So the function may change things only through its transaction.
+        before the commit. It also runs again if it needs bytes to be moved to or from object storage, which is done
+        outside the transaction. So the function may change things only through its transaction.
         """
+
+        def run(tx: Transaction) -> T:
+            return function(tx, *args, **kwargs)
+
+        return run_and_move(self.blobs, lambda wanted: self._write(principal, wanted), run)
+
+    def _write(self, principal: Principal, function: Callable[[Transaction], T]) -> T:
         for attempt in range(WRITE_TRIES):
             try:
                 with self._lane, self.engine.connect() as connection:
                     tx = self._transaction(connection, principal)
-                    answer = self._run_and_commit(tx, function, *args, **kwargs)
-            except _FAILURES as error:
-                if attempt == WRITE_TRIES - 1 or not _worth_retrying(error):
-                    raise _translated(error) from error
+                    answer = self._run_and_commit(tx, function)
+            except FAILURES as error:
+                if attempt == WRITE_TRIES - 1 or not worth_retrying(error):
+                    raise translated(error) from error
                 time.sleep(WRITE_BACKOFF.delay_s(attempt + 1))
             else:
                 tx.run_after_commit()
@@ -163,18 +192,13 @@ class Database:
         raise AssertionError("unreachable")
 
     def _transaction(self, connection: Connection, principal: Principal, now_us: int | None = None) -> Transaction:
-        return Transaction(connection, principal, self.clock, self.blobs, self.quotas, self.observer, now_us=now_us)
+        blobs = self.blobs.local if isinstance(self.blobs, ObjectBlobs) else self.blobs  # see `run_and_move`
+        return Transaction(connection, principal, self.clock, blobs, self.quotas, self.observer, now_us=now_us)
 
-    def _run_and_commit(
-        self,
-        tx: Transaction,
-        function: Callable[Concatenate[Transaction, P], T],
-        *args: P.args,
-        **kwargs: P.kwargs,
-    ) -> T:
+    def _run_and_commit(self, tx: Transaction, function: Callable[[Transaction], T]) -> T:
         with tx.connection.begin() as transaction:
             try:
-                answer = function(tx, *args, **kwargs)
+                answer = function(tx)
             except ApiProblem:
                 if not self.is_sqlite:
                     roll_back(tx.connection)
@@ -188,7 +212,7 @@ class Database:
                 if (
                     error.connection_invalidated
                 ):  # nobody knows whether it was committed; doing it again could do it twice
-                    raise _no_answer(
+                    raise no_answer(
                         "The connection to the database broke during the commit, so it is unknown whether "
                         "the change was stored; check before you try again."
                     ) from error
@@ -223,7 +247,7 @@ class Database:
             return function(tx)
 
         lane = self._reserved if reserved else self._ordinary
-        return lane.submit(client, self.read, principal, run)
+        return self._queue(client, run, lambda wanted: lane.submit(client, self._read, principal, wanted))
 
     def queue_write(
         self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False
@@ -234,10 +258,27 @@ class Database:
         the connection. Raises `UnavailableProblem` if too many writes wait.
         """
         client = Client(client.key, client.known)
-        if self._write_lane is not None:
-            return self._write_lane.submit(client, principal, function, reserved=reserved)
-        lane = self._reserved if reserved else self._ordinary
-        return lane.submit(client, self.write, principal, function)
+        write_lane, lane = self._write_lane, self._reserved if reserved else self._ordinary
+        if write_lane is not None:
+            return self._queue(
+                client, function, lambda wanted: write_lane.submit(client, principal, wanted, reserved=reserved)
+            )
+        return self._queue(client, function, lambda wanted: lane.submit(client, self._write, principal, wanted))
+
+    def _queue(
+        self,
+        client: Client,
+        function: Callable[[Transaction], T],
+        submit: Callable[[Callable[[Transaction], T]], Future[T]],
+    ) -> Future[T]:
+        """Submit a function; while bytes are moved for it, it occupies no thread of the lane and no connection."""
+        if not isinstance(self.blobs, ObjectBlobs):
+            return submit(function)
+        return MovingCall(self.blobs, self._moving, client, function, submit).begin()
+
+    def submit_move(self, function: Callable[[], T]) -> Future[T]:
+        """Run a function that moves bytes to or from object storage in a thread; return the future of its result."""
+        return self._moving.submit(SERVER, function)
 
     async def notifications(self, channel: str) -> AsyncGenerator[None]:
         """Listen to a channel of Postgres: yield once when the server listens, and then after each notification.
@@ -254,7 +295,7 @@ class Database:
                 async for _ in connection.notifies():
                     yield
         except driver.Error as error:
-            raise _no_answer("The database connection for notifications has ended.") from error
+            raise no_answer("The database connection for notifications has ended.") from error
 
     def close(self) -> None:
         """Finish the running transactions, then close all connections."""
@@ -262,53 +303,8 @@ class Database:
             self._write_lane.close()
         self._reserved.close()
         self._ordinary.close()
+        self._moving.close()
         if self._log is not None:
             self._log.close()
         self._read_engine.dispose()
         self.engine.dispose()
-
-
-# -- failures ---------------------------------------------------------------------------------------------------------
-
-_FAILURES = (exc.DBAPIError, exc.TimeoutError, OSError, OverflowError, UnicodeEncodeError)
-
-
-def _worth_retrying(error: Exception) -> bool:
-    if not isinstance(error, exc.DBAPIError):
-        return False
-    constraint = getattr(getattr(error.orig, "diag", None), "constraint_name", None)
-    return (
-        error.connection_invalidated
-        or getattr(error.orig, "sqlstate", None) in _TRY_AGAIN
-        or constraint == tables.ONE_RUNS_PER_KEY
-    )
-
-
-_TRY_AGAIN = ("40001", "40P01")
-"""SQLSTATE codes after which a transaction is retried: serialisation failure, deadlock."""
-
-
-def _translated(error: Exception) -> Exception:
-    """Convert a failure of the database into an error of the server, if the caller can react to the failure.
-
-    Other failures are returned unchanged.
-    """
-    if isinstance(error, OSError):
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        return StorageFullProblem("The disk has no space left; nothing was written.") if full else error
-    if isinstance(error, exc.TimeoutError):
-        return _no_answer("All connections to the database are in use; nothing was written.")
-    if isinstance(error, OverflowError | UnicodeEncodeError | exc.DataError):
-        return InvalidProblem("The request contains a number or text that the database cannot store.", code="bad-value")
-    if not isinstance(error, exc.DBAPIError):
-        return error
-    message = str(error.orig)
-    if "disk is full" in message or getattr(error.orig, "sqlstate", None) == "53100":
-        return StorageFullProblem("The disk of the database has no space left; nothing was written.")
-    if isinstance(error, exc.OperationalError) and not message.startswith(("no such", "near ")):  # those are our faults
-        return _no_answer("The database does not answer; nothing was written. Try again.")
-    return error
-
-
-def _no_answer(detail: str) -> UnavailableProblem:
-    return UnavailableProblem(detail, headers={"Retry-After": "2"})

@@ -17,6 +17,7 @@ from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ApiProblem
 from marey_server.store.database.lanes import Client, FairLine, finish
 from marey_server.store.database.prepared import run_text
+from marey_server.store.object_storage.awaiting import BytesAwaited
 from marey_server.store.transaction import Transaction
 
 T = TypeVar("T")
@@ -108,7 +109,7 @@ class WriteLane:
 
 
 def _run(tx: Transaction, one: _Write) -> Callable[[], Any]:
-    """Run a write under a savepoint, and roll it back if it raises an `ApiProblem`.
+    """Run a write under a savepoint, and roll it back if it raises an `ApiProblem`, or needs bytes to be moved.
 
     Returns a function to be called after the commit, which returns the result of the write or raises that error.
     """
@@ -116,7 +117,7 @@ def _run(tx: Transaction, one: _Write) -> Callable[[], Any]:
     run_text(tx.connection, "SAVEPOINT this_write")
     try:
         answer = one.function(own)
-    except ApiProblem as refusal:
+    except (ApiProblem, BytesAwaited) as refusal:
         run_text(tx.connection, "ROLLBACK TO this_write")
         run_text(tx.connection, "RELEASE this_write")
         return _raiser(refusal)
@@ -129,7 +130,7 @@ def _run(tx: Transaction, one: _Write) -> Callable[[], Any]:
     return complete
 
 
-def _raiser(refusal: ApiProblem) -> Callable[[], Any]:
+def _raiser(refusal: ApiProblem | BytesAwaited) -> Callable[[], Any]:
     def complete() -> Any:
         raise refusal
 

@@ -1,6 +1,6 @@
 """Tables of stored bytes, of who may refer to them, and of uploads that are not finished."""
 
-from sqlalchemy import BigInteger, Boolean, Column, ForeignKey, Index, Integer, LargeBinary, Table, false, text
+from sqlalchemy import BigInteger, Boolean, Column, ForeignKey, Index, Integer, LargeBinary, String, Table, false, text
 
 from marey_server.store.tables.columns import DIGEST, ID, Document, Micros, metadata
 
@@ -13,6 +13,7 @@ blob = Table(
     Column("size_bytes", BigInteger, nullable=False),
     Column("created_us", Micros, nullable=False, index=True),
     Column("upload_id", ID),  # of the upload whose pieces are the bytes; null: they are in the backing
+    Column("object_id", String(40)),  # of the object in object storage that has the bytes; null: they are elsewhere
     Index("ix_blob_upload", "upload_id", sqlite_where=_OF_UPLOAD, postgresql_where=_OF_UPLOAD),
 )
 

@@ -1,0 +1,150 @@
+"""Bytes that a transaction needs to move to or from object storage, and their movement outside of transactions.
+
+No transaction may wait for a network. If a transaction needs to store or read an object, it raises `BytesAwaited`,
+which rolls it back. The bytes are moved without a transaction. Then the function of the transaction runs again from
+the start, and finds the bytes among those that were moved.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import NamedTuple, TypeVar, TypeVarTuple
+
+from marey_server import faults
+from marey_server.errors import DamagedProblem
+from marey_server.store.object_storage.client import ObjectStorage, ObjectStorageProblem, StoredObject
+
+A = TypeVarTuple("A")
+T = TypeVar("T")
+
+AT_ONCE = 4
+"""Number of objects that are moved at the same time for one call."""
+MOST_TRANSFERS = 3
+"""How often a call stores an object again because storing it took longer than the row of the blob allows."""
+
+
+class WantedBytes(NamedTuple):
+    """Bytes `start` to `stop` of the blob with a digest; `is_whole` if these are all bytes of the blob."""
+
+    digest: str
+    start: int
+    stop: int
+    is_whole: bool
+
+
+@dataclass
+class Carried:
+    """Bytes that were moved for one call of a function, which may need several transactions."""
+
+    stored: dict[str, StoredObject] = field(default_factory=dict)
+    """Objects that were stored, by the digest of their bytes."""
+    pieces: dict[WantedBytes, bytes] = field(default_factory=dict)
+    """Bytes that were read."""
+    absent: set[StoredObject] = field(default_factory=set)
+    """Objects that were to be read, but do not exist."""
+    fault: str | None = None
+    """Why no object can be stored; set by `ProbeAwaited`."""
+    probed: bool = False
+    looked_again: bool = False
+    transfers: int = 0
+
+
+class BytesAwaited(BaseException):
+    """Raised in a transaction that cannot go on before bytes were moved.
+
+    This is no `Exception`, because it must not be handled as an error of what the transaction does.
+    """
+
+    def move(self, carried: Carried) -> None:
+        """Move the bytes, and record them in `carried`. Must be called without a transaction."""
+
+
+class LookAgain(BytesAwaited):
+    """Raised if bytes are not where the snapshot of the transaction says: they may have been moved meanwhile."""
+
+    def move(self, carried: Carried) -> None:
+        """Record that the next transaction is the second look."""
+        carried.looked_again = True
+
+
+class ProbeAwaited(BytesAwaited):
+    """Raised to check whether objects can be stored."""
+
+    def __init__(self, storage: ObjectStorage) -> None:
+        super().__init__()
+        self._storage = storage
+
+    def move(self, carried: Carried) -> None:
+        """Check the bucket."""
+        carried.fault, carried.probed = self._storage.fault(), True
+
+
+class ObjectsToStore(BytesAwaited):
+    """Raised to store the bytes of blobs as new objects; `contents` maps digests to pieces of bytes."""
+
+    def __init__(self, storage: ObjectStorage, contents: Mapping[str, Iterable[bytes]], now_us: int) -> None:
+        super().__init__()
+        self._storage = storage
+        self._contents = contents
+        self._now_us = now_us
+
+    def move(self, carried: Carried) -> None:
+        """Store each blob under a name that was never used."""
+        carried.transfers += 1
+        if carried.transfers > MOST_TRANSFERS:
+            raise ObjectStorageProblem(
+                "The object storage is too slow: bytes of blobs could not be stored in time.",
+                headers={"Retry-After": "60"},
+            )
+        objects = [StoredObject.new(digest, self._now_us) for digest in self._contents]
+        faults.point("objects.before_put")
+        _in_parallel(self._store, [(one,) for one in objects])
+        faults.point("objects.after_put")
+        carried.stored.update((one.digest, one) for one in objects)
+
+    def _store(self, one: StoredObject) -> None:
+        self._storage.put(one.name, self._contents[one.digest])
+
+
+class ObjectsToRead(BytesAwaited):
+    """Raised to read ranges of bytes of objects."""
+
+    def __init__(self, storage: ObjectStorage, wanted: Sequence[tuple[WantedBytes, StoredObject]]) -> None:
+        super().__init__()
+        self._storage = storage
+        self._wanted = wanted
+
+    def move(self, carried: Carried) -> None:
+        """Read the ranges. Raises `DamagedProblem` if a whole object was read and does not have its digest."""
+        for (wanted, one), data in zip(self._wanted, _in_parallel(self._read, self._wanted), strict=True):
+            if data is None:
+                carried.absent.add(one)
+            else:
+                carried.pieces[wanted] = data
+
+    def _read(self, wanted: WantedBytes, one: StoredObject) -> bytes | None:
+        data = self._storage.read(one.name, wanted.start, wanted.stop)
+        if data is not None and wanted.is_whole and digest_of_chunks([data])[0] != wanted.digest:
+            raise DamagedProblem(
+                f"The bytes of the blob {wanted.digest} were changed in the object storage.", code="blob-damaged"
+            )
+        return data
+
+
+def _in_parallel(function: Callable[[*A], T], arguments: Sequence[tuple[*A]]) -> list[T]:
+    if len(arguments) == 1:
+        return [function(*arguments[0])]
+    with ThreadPoolExecutor(min(AT_ONCE, len(arguments))) as pool:
+        return list(pool.map(lambda one: function(*one), arguments))
+
+
+def digest_of_chunks(chunks: Iterable[bytes]) -> tuple[str, int]:
+    """Return the digest and the number of bytes."""
+    hashed, size_bytes = hashlib.sha256(), 0
+    for chunk in chunks:
+        hashed.update(chunk)
+        size_bytes += len(chunk)
+    return f"sha256:{hashed.hexdigest()}", size_bytes
