@@ -58,6 +58,28 @@ def split(every: dict[str, str], needed: dict[str, set[str]]) -> dict[str, list[
     return homes
 
 
+def with_extras(pin: str, form: str) -> str:
+    """Return a pin whose name has the extras that it has in `form`, which pins the same package."""
+    return form.partition("==")[0] + pin[pin.index("==") :]
+
+
+def further_extras(
+    layer: str, every: dict[str, str], forms: dict[str, dict[str, str]], homes: dict[str, list[str]]
+) -> list[str]:
+    """Return pins of packages of lower layers that this layer needs with extras which no lower layer has.
+
+    A pin without these extras is no pin for pip, and one with them in a lower layer would need the packages that the
+    extras name.
+    """
+    lower = list(layers_of(BELOW[layer]))
+    pins = []
+    for name, form in sorted(forms[layer].items()):
+        written = {forms[one][name].partition("==")[0] for one in lower if name in forms[one]}
+        if any(name in homes[one] for one in lower) and written and form.partition("==")[0] not in written:
+            pins.append(with_extras(every[name], form))
+    return pins
+
+
 def main(options: Sequence[str]) -> int:
     """Resolve all layers together and write their files; return the exit status."""
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
@@ -66,10 +88,13 @@ def main(options: Sequence[str]) -> int:
     wanted = [one for layer in BELOW for one in requirements_of(layer, pyproject)]
     every = pins_in(_resolve(wanted, known, "--generate-hashes", *options))
     chosen = "\n".join(every.values())
-    needed = {layer: set(pins_in(_resolve(requirements_of(layer, pyproject), chosen))) for layer in BELOW}
-    for layer, names in split(every, needed).items():
+    forms = {layer: pins_in(_resolve(requirements_of(layer, pyproject), chosen)) for layer in BELOW}
+    homes = split(every, {layer: set(names) for layer, names in forms.items()})
+    for layer, names in homes.items():
         below = BELOW[layer]
-        lines = ["# Written by `make pins`.", *([f"-r {below}.txt"] if below else []), *(every[name] for name in names)]
+        pins = [with_extras(every[name], forms[layer].get(name, every[name])) for name in names]
+        pins += further_extras(layer, every, forms, homes)
+        lines = ["# Written by `make pins`.", *([f"-r {below}.txt"] if below else []), *pins]
         files[layer].write_text("\n".join(lines) + "\n", "utf-8")
     return 0
 

@@ -5,9 +5,8 @@ The checks can run while a server runs, because they use short reads of bounded 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -31,9 +30,8 @@ from marey_server.store.documents import items_named_in
 from marey_server.store.events import newest_number
 from marey_server.store.items.summaries import summarise
 from marey_server.store.jobs.inputs import NamingJob
-from marey_server.store.object_storage.awaiting import digest_of_chunks
 from marey_server.store.object_storage.backing import ObjectBlobs
-from marey_server.store.object_storage.client import StoredObject
+from marey_server.store.object_storage.checking import PAGE, StoreDefect, check_blob, check_objects
 from marey_server.store.tables import (
     blob,
     collection,
@@ -65,18 +63,8 @@ from marey_versions.records import CommitRecord, entry_of
 from marey_versions.tree.chunks import Branch, DamagedChunk, Leaf, decode
 from marey_versions.tree.reading import Tree
 
-PAGE = 100
 MISCOUNTED = "counter-wrong"
 """Code of defects that `check_store` can repair."""
-
-
-@dataclass(frozen=True, slots=True)
-class StoreDefect:
-    """Defect of the store: a stable code, the place, and a description."""
-
-    code: str
-    subject: str
-    detail: str
 
 
 def check_store(
@@ -88,7 +76,7 @@ def check_store(
     """
     yield from database.read(SYSTEM, _check_file)
     passes: tuple[tuple[str, Table, Callable[[Transaction, Row[Any]], list[StoreDefect]]], ...] = (
-        ("blobs", blob, _check_blob),
+        ("blobs", blob, check_blob),
         ("documents", document, _check_document),
         ("items", item, _check_item),
         ("collections", collection, _check_collection),
@@ -100,7 +88,7 @@ def check_store(
         ("projects", project, partial(_check_holding, owner=item.c.project_id)),
         ("users", user, partial(_check_holding, owner=item.c.creator_id)),
     )
-    for number, findings in enumerate(_check_objects(database), 1):
+    for number, findings in enumerate(check_objects(database), 1):
         yield from findings
         if progress is not None:
             progress("objects", number)
@@ -140,41 +128,6 @@ def _check_file(tx: Transaction) -> list[StoreDefect]:
         )
         for row in dangling
     ]
-
-
-def _check_blob(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    if row.object_id is not None:  # see `_check_objects`
-        return []
-    return _compare(row, tx.blobs.read(tx.connection, row.digest, 0, row.size_bytes))
-
-
-def _compare(row: Row[Any], pieces: Iterable[bytes]) -> list[StoreDefect]:
-    """Return a fault if bytes do not have the size and the digest of a blob."""
-    digest, size = digest_of_chunks(pieces)
-    if size != row.size_bytes:
-        return [StoreDefect("blob-incomplete", row.digest, f"only {size} of {row.size_bytes} bytes are stored")]
-    return [] if digest == row.digest else [StoreDefect("blob-corrupt", row.digest, "the bytes have another digest")]
-
-
-def _check_objects(database: Database) -> Iterator[list[StoreDefect]]:
-    """Read the objects of all blobs without a transaction; yield the faults of each blob."""
-    behind = ""
-    while rows := database.read(SYSTEM, _in_objects, behind):
-        for row in rows:
-            if isinstance(database.blobs, ObjectBlobs):
-                findings = _compare(row, database.blobs.storage.chunks(StoredObject(row.digest, row.object_id).name))
-                yield findings if findings and row in database.read(SYSTEM, _in_objects, row.digest, same=True) else []
-            else:
-                detail = "it is in object storage, but the settings name no bucket (s3_bucket)"
-                yield [StoreDefect("blob-unreachable", row.digest, detail)]
-        behind = rows[-1].digest
-
-
-def _in_objects(tx: Transaction, behind: str, *, same: bool = False) -> list[Row[Any]]:
-    """Return the next rows, after the digest `behind`, of blobs in object storage; with `same`, the row `behind`."""
-    rows = select(blob.c.digest, blob.c.size_bytes, blob.c.object_id).where(blob.c.object_id.is_not(None))
-    chosen = blob.c.digest == behind if same else blob.c.digest > behind
-    return list(tx.execute(rows.where(chosen).order_by(blob.c.digest).limit(PAGE)))
 
 
 def _check_document(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
