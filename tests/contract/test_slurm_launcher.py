@@ -50,7 +50,7 @@ class TestSlurmLauncher(LauncherContract):
         request = replace(REQUEST, cpus=2, deadline_s=3601)
         (name,) = engine.do(launcher.start(request, 1, key="k11"))
         shown = cluster.ask("scontrol", "show", "job", "--oneliner")
-        (line,) = (line for line in shown.splitlines() if " JobName=crew-k11 " in line)
+        (line,) = (line for line in shown.splitlines() if f" JobName={engine.context.pool}-k11 " in line)
         for part in ("Partition=night", "TimeLimit=01:01:00", "NumCPUs=2", "MinMemoryNode=512M", "Requeue=1", "Nice=7"):
             assert part in line
         assert "Features=fast" in line
@@ -85,7 +85,7 @@ class TestSlurmLauncher(LauncherContract):
         job = engine.submit("wait", tmp_path / "job")
         engine.until((tmp_path / "job" / "started").exists)
         (first,) = processes_of(name)
-        task = cluster.ask("squeue", "--noheader", "--name=crew-k14", "--format=%i").strip()
+        task = cluster.ask("squeue", "--noheader", f"--name={engine.context.pool}-k14", "--format=%i").strip()
         cluster.ask("scontrol", "requeue", task)
         engine.until(lambda: not first.is_running())
         (tmp_path / "job" / "go").touch()

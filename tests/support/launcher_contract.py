@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import secrets
 import signal
 import time
 from collections.abc import Callable, Coroutine, Iterator
@@ -37,7 +38,8 @@ class Engine:
         self.server = server
         self.marey: Marey = server.client()
         self.token = self._make_token()
-        self.context = LaunchContext("crew", server.url, self.token, folder, "text", "info", labels=LABELS)
+        pool = f"crew-{secrets.token_hex(4)}"  # another process may test another launcher on this machine
+        self.context = LaunchContext(pool, server.url, self.token, folder, "text", "info", labels=LABELS)
         write_secret(self.context.token_file, self.token)
         self._runner = asyncio.Runner()
         self.launcher = make(self.context)
@@ -101,12 +103,14 @@ class Engine:
 
 def processes_of(name: str) -> list[psutil.Process]:
     """Return the worker processes with this name, without their children."""
-    found = []
-    for process in psutil.process_iter(["cmdline"]):
+    found: dict[int, psutil.Process] = {}
+    for process in psutil.process_iter(["cmdline", "ppid", "status"]):
         command = process.info["cmdline"] or []
-        if {"marey_worker", "worker"} & set(command) and name in command and process.status() != psutil.STATUS_ZOMBIE:
-            found.append(process)
-    return found
+        is_worker = bool({"marey_worker", "worker"} & set(command)) and name in command
+        if is_worker and process.info["status"] != psutil.STATUS_ZOMBIE:
+            found[process.pid] = process
+    # A child that has not loaded its own program yet has the arguments of its parent.
+    return [process for process in found.values() if process.info["ppid"] not in found]
 
 
 @pytest.mark.slow
@@ -174,6 +178,21 @@ class LauncherContract:
         os.kill(process.pid, signal.SIGKILL)
         end = engine.end_of(name)
         assert (end.reason, end.status) == ("killed", -signal.SIGKILL)
+
+    def test_the_job_of_a_worker_that_was_killed_is_run_again_and_published_once(
+        self, engine: Engine, tmp_path: Path
+    ) -> None:
+        engine.start(2, key="k7")
+        job = engine.submit("wait", tmp_path / "job")
+        engine.until((tmp_path / "job" / "started").exists)
+        (first,) = engine.marey.jobs.attempts(job.id)
+        (worker,) = processes_of(first.worker)
+        worker.kill()
+        (tmp_path / "job" / "go").touch()
+        engine.until(lambda: engine.marey.jobs.get(job.id).state == "succeeded")
+        outcomes = [attempt.outcome for attempt in engine.marey.jobs.attempts(job.id)]
+        assert outcomes == ["lost", "succeeded"]
+        assert engine.end_of(first.worker).reason == "killed"
 
     def test_a_start_that_is_repeated_starts_nothing_twice(self, engine: Engine) -> None:
         names = engine.start(2, key="k4")
