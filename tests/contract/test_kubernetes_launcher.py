@@ -193,7 +193,7 @@ def test_workers_of_an_indexed_job_that_has_not_started_are_not_stopped_alone(be
 
 def test_kueue_admits_and_preempts_workers(bench: Bench, cluster: StubCluster) -> None:
     bench.launcher = bench.make(queue="motion")
-    first, second = bench.start(2)
+    first, second = bench.start()[0], bench.start(key="k2")[0]
     bench.until({first: "starting", second: "starting"})
     assert cluster.all("pods") == []
     cluster.controllers.quota = 1

@@ -26,6 +26,8 @@ class Controllers:
     _ended_at: dict[str, float] = field(default_factory=dict)
     _counted: set[str] = field(default_factory=set)
     """Pods whose failure was ignored or counted."""
+    _suspended: set[str] = field(default_factory=set)
+    """Pods that ended because their Job was suspended, which is neither a success nor a failure."""
     _failures: dict[tuple[str, str], int] = field(default_factory=dict)
     _succeeded: set[tuple[str, str]] = field(default_factory=set)
     _duplicated: set[tuple[str, str]] = field(default_factory=set)
@@ -63,7 +65,7 @@ class Controllers:
         pods = [document for kind, document in self.objects.owned_by(job) if kind == "pods"]
         if spec.get("suspend"):
             self._end_pods(pods)
-            self._counted |= {pod["metadata"]["uid"] for pod in pods}
+            self._suspended |= {pod["metadata"]["uid"] for pod in pods}
             self._change_status(name, lambda status: status.pop("startTime", None))
             return
         self._change_status(name, lambda status: status.setdefault("startTime", now()))
@@ -87,7 +89,8 @@ class Controllers:
 
     def _drive_index(self, job: Document, index: str, pods: list[Document]) -> str:
         """Return the state of an index after the missing pods were created."""
-        own = [pod for pod in pods if pod["metadata"]["labels"].get(INDEX_LABEL, "") == index]
+        present = [pod for pod in pods if pod["metadata"]["uid"] not in self._suspended]
+        own = [pod for pod in present if pod["metadata"]["labels"].get(INDEX_LABEL, "") == index]
         limit = job["spec"].get("backoffLimitPerIndex", job["spec"].get("backoffLimit", 6))
         key = (job["metadata"]["uid"], index)
         for pod in own:
