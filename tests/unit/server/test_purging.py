@@ -33,6 +33,7 @@ from marey_server.store.database.prepared import Prepared
 from marey_server.store.datasets import proposals
 from marey_server.store.items.drafts import Draft
 from marey_server.store.jobs import retrying
+from marey_server.store.object_storage.checking import StoreDefect
 from marey_server.store.purging import candidates, versions
 from marey_server.store.tables import blob, collection, revision_part
 from marey_server.store.tables import document as documents
@@ -119,7 +120,7 @@ class House:
 
         return int(self.read(add_up))
 
-    def faults(self) -> list[fsck.StoreDefect]:
+    def faults(self) -> list[StoreDefect]:
         return list(fsck.check_store(self.desk.database))
 
 
