@@ -124,6 +124,23 @@ def test_an_error_of_statements_run_together_is_translated_and_the_connection_go
 
 
 @on_postgres
+def test_a_refused_write_on_a_broken_connection_runs_again_on_another_one(database: Database) -> None:
+    runs = 0
+
+    def lose_once_and_refuse(tx: Transaction) -> None:
+        nonlocal runs
+        runs += 1
+        driver: Any = tx.connection.connection.driver_connection
+        if runs == 1:
+            driver.close()
+        raise NotFoundProblem("There is nothing.")
+
+    with pytest.raises(NotFoundProblem):
+        database.write(SYSTEM, lose_once_and_refuse)
+    assert runs == 2
+
+
+@on_postgres
 def test_an_item_is_read_in_five_round_trips(lab: Lab) -> None:
     rig = lab.add_skeleton()
 

@@ -92,5 +92,6 @@ def roll_back(connection: Connection) -> None:
     Then the next requests on this connection would be slower: their statements would be parsed and planned again. If
     the connection is broken, this function does nothing; the rollback of SQLAlchemy, which follows, reports the fault.
     """
-    driver: Any = connection.connection.driver_connection
-    driver.pgconn.exec_(b"ROLLBACK")
+    driver: Any = None if connection.invalidated else connection.connection.driver_connection
+    if driver is not None and not driver.closed:
+        driver.pgconn.exec_(b"ROLLBACK")

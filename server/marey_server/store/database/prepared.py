@@ -75,7 +75,7 @@ def run_together(connection: Connection, runs: Sequence[tuple[Prepared, Paramete
 
     On Postgres, the driver sends all of them at once, and then waits once.
     """
-    if connection.dialect.name != "postgresql":
+    if connection.dialect.name != "postgresql" or len(runs) < 2:
         return [statement.run(connection, parameters) for statement, parameters in runs]
     forms = [(statement.form(connection.dialect, parameters), parameters) for statement, parameters in runs]
     driver: Any = connection.connection.driver_connection
