@@ -18,7 +18,7 @@ from marey_schemas.encoding.arrays import ArrayError, EncodedArray
 from marey_schemas.encoding.canonical import array_digest, canonical_json
 from marey_versions.archive.checking import check_archive
 from marey_versions.archive.members import MANIFEST, ArchiveMember, BadArchive, MemberKind
-from marey_versions.archive.reading import Archive
+from marey_versions.archive.reading import Archive, Versions
 from marey_versions.archive.writing import ArchiveWriter
 from marey_versions.records import CommitRecord, key_of, revision_content
 from marey_versions.tree.building import build
@@ -415,3 +415,10 @@ def test_only_archives_with_facets_have_the_newer_schema() -> None:
     made.members[ArchiveMember(MemberKind.FACETS, digest_of(data))] = data
     for written, schema in ((example(), b"marey/archive@1"), (made, b"marey/archive@2")):
         assert schema in written.write().getvalue()
+
+
+def test_an_entry_of_a_kind_that_is_not_known_yet_is_named() -> None:
+    store = ChunksInMemory()
+    root = build(store, [(key_of("a", "painting"), {"parts": {}, "tags": []})])
+    with pytest.raises(BadArchive, match=r"painting.*update Marey"):
+        list(Versions(store, {"commit": root}).entries("commit"))
