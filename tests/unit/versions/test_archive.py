@@ -19,7 +19,7 @@ from marey_schemas.encoding.arrays import ArrayError, EncodedArray
 from marey_schemas.encoding.canonical import array_digest, canonical_json
 from marey_versions.archive.checking import check_archive
 from marey_versions.archive.members import MANIFEST, ArchiveMember, BadArchive, MemberKind, differences_member
-from marey_versions.archive.reading import Archive
+from marey_versions.archive.reading import Archive, Versions
 from marey_versions.archive.writing import ArchiveWriter
 from marey_versions.records import CommitRecord, key_of, revision_content
 from marey_versions.tree.building import build
@@ -475,3 +475,10 @@ def test_an_archive_with_the_whole_history_or_a_damaged_difference_is_refused() 
     made.members[ArchiveMember(MemberKind.DIFFERENCES, digest_of(b"other"))] = data
     with pytest.raises(BadArchive, match="no version in the archive contains this member"):
         checked(made.write(base=base))
+
+
+def test_an_entry_of_a_kind_that_is_not_known_yet_is_named() -> None:
+    store = ChunksInMemory()
+    root = build(store, [(key_of("a", "painting"), {"parts": {}, "tags": []})])
+    with pytest.raises(BadArchive, match=r"painting.*update Marey"):
+        list(Versions(store, {"commit": root}).entries("commit"))

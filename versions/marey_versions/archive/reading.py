@@ -30,7 +30,7 @@ from marey_versions.archive.members import (
 )
 from marey_versions.records import CommitRecord, DatasetEntry, entry_of, key_of
 from marey_versions.tree.building import build
-from marey_versions.tree.chunks import ChunksInMemory, Value
+from marey_versions.tree.chunks import ChunksInMemory, DamagedChunk, Value
 from marey_versions.tree.editing import change
 from marey_versions.tree.reading import Tree
 
@@ -225,8 +225,16 @@ class Versions:
     _roots: Mapping[str, str]
 
     def entries(self, commit: str) -> Iterator[DatasetEntry]:
-        """Return the entries of a version, sorted by path."""
-        return (entry_of(key, value) for key, value in Tree(self._store, self._roots[commit]).entries())
+        """Yield the entries of a version, sorted by path.
+
+        Raises `BadArchive` if an entry has a kind that this version of Marey does not know.
+        """
+        for key, value in Tree(self._store, self._roots[commit]).entries():
+            try:
+                entry = entry_of(key, value)
+            except DamagedChunk as error:
+                raise BadArchive(f"the version {commit} cannot be read: {error}; update Marey") from error
+            yield entry
 
 
 def _manifest(data: bytes) -> Manifest:
