@@ -206,9 +206,7 @@ def test_without_the_limit_of_twelve_hours_a_late_commit_loses_bytes(
 def test_with_names_that_are_used_again_a_delayed_deletion_loses_bytes(
     remote: Lab, objects: ObjectsInMemory, clock: AdjustableClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        awaiting.StoredObject, "new", lambda digest, _began_us: StoredObject(digest, f"{0:016x}-{0:016x}")
-    )
+    monkeypatch.setattr(StoredObject, "new", lambda digest, _began_us: StoredObject(digest, f"{0:016x}-{0:016x}"))
     monkeypatch.setattr(backing, "COMMIT_WITHIN_US", 2**62)
     run_interleaved(remote, objects, clock, DELAYED_DELETION, b"bytes")
     assert not complete(remote, objects, b"bytes")
