@@ -165,10 +165,21 @@ def test_readiness_tells_that_the_storage_is_away(remote: Lab, proxy: FaultyS3) 
     proxy.spoil("PUT", "500")
     storage_of(remote)._probed = None
     (fault,) = remote.database.read(SYSTEM, find_faults)
-    assert fault.startswith(f"blobs cannot be written: {proxy.endpoint}, bucket marey ")
+    assert fault == f"blobs cannot be written: {proxy.endpoint}, bucket marey answers with the status 500"
     proxy.spoil("PUT", "500")
     assert remote.database.read(SYSTEM, find_faults) == [fault], "the result is used again"
     assert proxy.planned["PUT"] == ["500"], "the storage was not asked again"
+
+
+def test_refused_credentials_are_told_without_the_secret(lab: Lab, seaweedfs: S3Server) -> None:
+    lab.database.blobs = ObjectBlobs(
+        ObjectStorage(seaweedfs.bucket("any", secret_key="not-the-secret")), DatabaseBlobs()
+    )
+    (fault,) = lab.database.read(SYSTEM, find_faults)
+    assert fault == f"blobs cannot be written: {seaweedfs.endpoint}, bucket marey refuses the credentials"
+    with pytest.raises(ObjectStorageProblem) as refused:
+        lab.write(blobs.put_blob, DATA)
+    assert "not-the-secret" not in f"{refused.value} {refused.value.__cause__}"
 
 
 def test_large_objects_are_sent_in_parts(remote: Lab, proxy: FaultyS3) -> None:

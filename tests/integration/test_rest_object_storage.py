@@ -16,12 +16,15 @@ from tests.support.rest_server import Server, running
 from tests.support.s3_servers import KEY_ID, SECRET_KEY, S3Server, seaweedfs
 
 from marey_client import Marey
+from marey_motion.formats import write_bvh
+from marey_motion.gait import generate_gait
 from marey_schemas.sizes import MIB
 from marey_server import commands
 from marey_server.app import connect_database
 from marey_server.errors import UnavailableProblem
 from marey_server.process import housekeeping
 from marey_server.process.settings import Settings
+from marey_server.store import fsck
 from marey_server.store.database.connections import Database
 
 OCTETS = {"Content-Type": "application/octet-stream"}
@@ -84,6 +87,21 @@ def test_bytes_come_back_whole_and_in_ranges(owner: httpx.Client) -> None:
     assert (part.status_code, part.content) == (206, data[5:100])
     assert part.headers["Content-Range"] == f"bytes 5-99/{len(data)}"
     assert owner.head(path).headers["Content-Length"] == str(len(data))
+
+
+def test_motion_is_imported_and_read(server: Server, owner: httpx.Client, proxy: FaultyS3) -> None:
+    """The import stores a file and the arrays of a clip, for which its transaction runs several times."""
+    parts = [("files", ("walk.bvh", write_bvh(generate_gait(1.2, 0.0, 1.0))))]
+    answer = owner.post("/projects/lab/imports", files=parts)
+    assert [entry["status"] for entry in answer.json()["entries"]] == ["created"]
+    assert len([path for method, path in proxy.seen if method == "PUT" and "/blobs/" in path]) >= 2
+    again = owner.post("/projects/lab/imports", files=parts)
+    assert [entry["status"] for entry in again.json()["entries"]] == ["unchanged"]
+    (clip,) = owner.get("/projects/lab/clips").json()["items"]
+    proxy.seen.clear()
+    assert owner.get(f"/projects/lab/clips/{clip['id']}/parts/motion").status_code == 200
+    assert "GET" in {method for method, _ in proxy.seen}
+    assert list(fsck.check_store(server.database)) == []
 
 
 def test_a_storage_that_is_away_is_a_503_that_says_when_to_try_again(

@@ -26,8 +26,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 PART_BYTES = 8 * MIB
-"""Size of a part of an object; an object of more bytes is sent in several parts. S3 allows 10,000 parts of an object,
-so an object may have 78 GiB; an upload has at most 16 GiB."""
+"""Size of a part of an object; an object of more bytes is sent in several parts.
+
+S3 allows 10,000 parts, which is enough for 78 GiB; an upload has at most 16 GiB.
+"""
 PARTS_AT_ONCE = 2
 CONNECT_TIMEOUT_S = 5.0
 RETRIES = 4
@@ -269,13 +271,12 @@ def _up_to(chunks: Iterator[bytes], size_bytes: int) -> Iterator[bytes]:
 def _reason(error: Exception) -> str:
     """Return the reason of a failed request, in a few words that contain neither a signature nor a credential."""
     text = str(error)
-    if isinstance(error, PermissionError) or "401" in text or "403" in text:
+    found = _STATUS.search(text)
+    status = found[1] if found is not None else ""
+    if status in ("401", "403"):
         return "refuses the credentials"
     if isinstance(error, FileNotFoundError) or "NoSuchBucket" in text:
         return "does not exist"
-    status = _STATUS.search(text)
-    if status is not None:
-        return f"answers with the status {status[1]}"
-    if "timed out" in text or "Timeout" in text or "TimedOut" in text:
-        return "does not answer in time"
-    return "cannot be reached"
+    if status:
+        return f"answers with the status {status}"
+    return "does not answer in time" if "timed out" in text or "TimedOut" in text else "cannot be reached"
