@@ -168,7 +168,8 @@ class Exchange(RequestHandler):
     async def pause(self, seconds: float) -> bool:
         """Wait for `seconds` and return False, or return True as soon as the server is stopping."""
         try:
-            await asyncio.wait_for(self.services.draining.wait(), seconds)
+            async with asyncio.timeout(seconds):
+                await self.services.draining.wait()
         except TimeoutError:
             return False
         return True

@@ -149,14 +149,16 @@ class _LocalWorker:
     async def _terminate(self, process: Process) -> None:
         process.terminate()
         try:
-            await asyncio.wait_for(process.wait(), STOP_S)
+            async with asyncio.timeout(STOP_S):
+                await process.wait()
         except TimeoutError:
             log.warning("worker %s does not stop; killing it", self.name)
             process.kill()
 
     async def _is_stopping(self, seconds: float) -> None:
         try:
-            await asyncio.wait_for(self._stopping.wait(), seconds)
+            async with asyncio.timeout(seconds):
+                await self._stopping.wait()
         except TimeoutError:
             return
 

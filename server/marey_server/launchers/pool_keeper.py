@@ -178,7 +178,8 @@ class PoolKeeper:
 
     async def _ask(self, call: Awaitable[T]) -> T:
         try:
-            return await asyncio.wait_for(call, ENGINE_S)
+            async with asyncio.timeout(ENGINE_S):
+                return await call
         except TimeoutError:
             raise EngineError(f"the engine did not answer within {ENGINE_S:.0f} s") from None
 

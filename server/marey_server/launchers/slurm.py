@@ -257,7 +257,8 @@ class SlurmLauncher:
         except OSError as error:
             raise EngineError(f"{program} cannot be run: {error.strerror}") from error
         try:
-            output, complaint = await asyncio.wait_for(process.communicate(), COMMAND_S)
+            async with asyncio.timeout(COMMAND_S):
+                output, complaint = await process.communicate()
         except TimeoutError:
             raise EngineError(f"{program} did not answer within {COMMAND_S:.0f} s") from None
         finally:

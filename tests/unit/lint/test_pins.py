@@ -33,9 +33,14 @@ def test_every_pin_has_a_version_and_a_hash() -> None:
     assert sum(map(len, PINS.values())) > 100
 
 
-def test_a_package_is_pinned_in_one_file() -> None:
-    names = [name for pins in PINS.values() for name in pins]
-    assert len(names) == len(set(names))
+def test_a_package_is_pinned_in_one_file_and_elsewhere_only_with_further_extras() -> None:
+    texts: dict[str, list[str]] = {}
+    for name, text in [pin for pins in PINS.values() for pin in pins.items()]:
+        texts.setdefault(name, []).append(text)
+    for several in (texts[name] for name in texts if len(texts[name]) > 1):
+        first, *others = (text.partition("==") for text in several)
+        assert all(other[2] == first[2] for other in others), "the same version and hashes"
+        assert all("[" in other[0] != first[0] for other in others)
 
 
 @pytest.mark.parametrize("layer", [layer for layer in BELOW if layer != "build"])

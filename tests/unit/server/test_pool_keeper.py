@@ -14,7 +14,7 @@ from tests.support.queue_desk import Desk
 from marey_schemas.backoff import Backoff
 from marey_server.errors import UnavailableProblem
 from marey_server.launchers import pool_keeper
-from marey_server.launchers.launcher import EngineError, WorkerEnd, WorkerRequest
+from marey_server.launchers.launcher import EngineError, LaunchedWorker, WorkerEnd, WorkerRequest
 from marey_server.launchers.pool_keeper import PoolKeeper
 from marey_server.process.worker_pools import WorkerPool
 
@@ -200,3 +200,23 @@ def test_an_engine_that_does_not_answer_is_an_error(pool: Pool, monkeypatch: pyt
     pool.launcher.silent = True
     with pytest.raises(EngineError, match="the engine did not answer within"):
         pool.adjust()
+
+
+def test_a_keeper_ends_if_it_is_cancelled_while_the_engine_answers(pool: Pool) -> None:
+    """`asyncio.wait_for` of Python 3.11 ignores a cancellation at the moment when it has a result."""
+
+    async def cancel_during_an_answer() -> None:
+        keeping = asyncio.create_task(pool.keeper.keep())
+        listed = pool.launcher.list
+
+        async def list_and_cancel() -> tuple[LaunchedWorker, ...]:
+            keeping.cancel()
+            return await listed()
+
+        pool.launcher.list = list_and_cancel  # type: ignore[method-assign]
+        ended, _ = await asyncio.wait((keeping,), timeout=5)
+        keeping.cancel()
+        assert ended == {keeping}
+        assert keeping.cancelled()
+
+    run(cancel_during_an_answer())

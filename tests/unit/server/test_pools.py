@@ -43,7 +43,9 @@ def other_package(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_launcher_is_found_by_its_name() -> None:
     assert find_launcher("local") is LocalLauncher
     assert find_launcher("cloud") is make_launcher
-    with pytest.raises(LauncherUnusable, match="there is no launcher 'slrum', only: broken, cloud, local, slurm"):
+    with pytest.raises(
+        LauncherUnusable, match="there is no launcher 'slrum', only: broken, cloud, kubernetes, local, slurm"
+    ):
         find_launcher("slrum")
     with pytest.raises(LauncherUnusable, match="broken cannot be loaded: No module named"):
         find_launcher("broken")

@@ -12,7 +12,7 @@ import pytest
 import sqlalchemy
 
 from marey_server.access.principal import SYSTEM
-from marey_server.store.database import connections, write_ahead_log
+from marey_server.store.database import engines, write_ahead_log
 from marey_server.store.database.connections import Database
 from marey_server.store.database.write_ahead_log import WriteAheadLog
 from marey_server.store.tables import server_state
@@ -155,7 +155,7 @@ def count_rows(tx: Transaction) -> int:
 
 
 def test_the_log_of_a_server_stays_short_under_steady_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "SHORT_BYTES", SHORT_BYTES)
+    monkeypatch.setattr(engines, "SHORT_BYTES", SHORT_BYTES)
     database = Database(f"sqlite:///{tmp_path / 'marey.db'}")
     stop = threading.Event()
 
