@@ -162,8 +162,8 @@ def settings_page() -> str:
         "`marey serve`, the environment variable, the file `marey.toml`, the default.\n\n"
         + _table(("setting", "variable", "default", "meaning"), rows)
         + "## Pools\n\nEach entry of `pools` has these settings, in `marey.toml` below a line `[[pools]]`, in "
-        "`MAREY_POOLS` as a list of JSON objects. [Run workers on Slurm](../how-to/run-workers-on-slurm.md) has an "
-        "example.\n\n"
+        "`MAREY_POOLS` as a list of JSON objects. [Run workers on Slurm](../how-to/run-workers-on-slurm.md) and "
+        "[Run Marey on Kubernetes](../how-to/run-on-kubernetes.md) have examples.\n\n"
         + _table(("setting", "default", "meaning"), _fields_of(WorkerPool))
         + "## Options of the launcher slurm\n\nIn `launcher_options` for all pools, and in `options` of a pool.\n\n"
         + _table(("option", "default", "meaning"), _fields_of(SlurmOptions))

@@ -68,8 +68,8 @@ def further_extras(
 ) -> list[str]:
     """Return pins of packages of lower layers that this layer needs with extras which no lower layer has.
 
-    A pin without these extras is no pin for pip, and one with them in a lower layer would need the packages that the
-    extras name.
+    pip does not accept a pin without these extras. A pin with them cannot be in a lower layer, because the packages of
+    the extras are not pinned there.
     """
     lower = list(layers_of(BELOW[layer]))
     pins = []

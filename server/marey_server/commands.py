@@ -218,7 +218,9 @@ def move_blobs(**settings: Any) -> None:
         try:
             move_blobs(database, moved, progress=_progress())
         except KeyboardInterrupt:
-            raise CommandFailed(f"stopped after {moved}; run the command again to move the other blobs") from None
+            raise CommandFailed(
+                f"stopped; {moved} were moved before; run the command again to move the other blobs"
+            ) from None
         except (CannotMove, ApiProblem) as error:
             raise CommandFailed(f"{error} Before this, the command moved {moved}.") from None
     _say(f"moved {moved}")

@@ -94,9 +94,12 @@ class Schedule(Answer):
     next_at: datetime | None = Field(
         description="Time of the next submission; null: the schedule is paused, or the time is being computed."
     )
-    last_at: datetime | None = Field(None, description="Time at which the schedule last submitted or skipped a job.")
+    last_at: datetime | None = Field(
+        None, description="Time at which the schedule last submitted a job, skipped a time, or was refused."
+    )
     last_job: str | None = Field(None, description="Id of the job that was submitted last; it may be deleted already.")
     problem: str | None = Field(
-        None, description="Reason why the last job was not submitted; null if it was submitted or not due yet."
+        None,
+        description="Reason why the last job was not submitted, or why the schedule is paused; null: there is none.",
     )
     rev: int

@@ -1,8 +1,7 @@
 """Protocol between the server and the engines that run workers, such as Slurm.
 
-The queue decides which jobs run; an engine decides where the workers run. No engine is trusted with exactness: it may
-start a worker twice, late, or not at all. The first call of every worker is a claim, so that each job is still run by
-one worker at a time.
+The queue decides which jobs run; an engine decides where the workers run. An engine may start a worker late, twice, or
+not at all. Every worker first claims a job, so each job is still run by one worker at a time.
 
 The settings name a launcher: `local`, `slurm`, `kubernetes`, or an entry point of another package in the group
 `marey.launchers`, which is a `MakeLauncher`. The server makes one launcher for each pool of workers.

@@ -111,7 +111,7 @@ class _LocalWorker:
             quick_ends = 0 if time.monotonic() - begun > HEALTHY_AFTER_S else quick_ends + 1
             pause_s = PAUSES.delay_s(quick_ends + 1)
             log.warning("worker %s %s; starting it again in %.1f s", self.name, failure, pause_s)
-            await self._is_stopping(pause_s)
+            await self._wait_for_stop(pause_s)
 
     def stop(self) -> None:
         """Let the worker return its jobs to the queue and end; kill it if it does not end in time."""
@@ -155,7 +155,7 @@ class _LocalWorker:
             log.warning("worker %s does not stop; killing it", self.name)
             process.kill()
 
-    async def _is_stopping(self, seconds: float) -> None:
+    async def _wait_for_stop(self, seconds: float) -> None:
         try:
             async with asyncio.timeout(seconds):
                 await self._stopping.wait()

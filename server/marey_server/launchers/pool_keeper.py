@@ -112,7 +112,7 @@ class PoolKeeper:
         size = self._size.decide(now_s, queued=demand.queued, running=running, present=len(present))
         if size > len(present) and now_s >= self._start_after_s:
             await self._start(*(self._unanswered or (secrets.token_hex(4), size - len(present))))
-        else:
+        elif size <= len(present):
             self._unanswered = None  # the workers are there, or are no longer needed
         idle = [name for name in present if name not in demand.running]
         superfluous = idle[: max(0, len(present) - size)]

@@ -209,10 +209,20 @@ class SlurmLauncher:
         if self._options.cache is not None:
             yield from ("--cache", str(self._options.cache))
 
+    @property
+    def _job_names(self) -> str:
+        """The pattern of the names of this pool's jobs, and of no other pool's."""
+        return rf"{re.escape(self._context.pool)}-[a-z0-9]+"
+
     def _prepare_logs(self) -> None:
         self._logs.mkdir(exist_ok=True, mode=0o700)
-        logs = sorted(self._logs.glob(f"{self._context.pool}-*.log"), key=lambda file: file.stat().st_mtime)
-        for file in logs[:-MOST_LOGS]:
+        ours = re.compile(rf"{self._job_names}-[0-9]+\.log")
+        times = {}
+        for file in self._logs.iterdir():
+            with suppress(FileNotFoundError):  # another server may delete old logs at the same time
+                if ours.fullmatch(file.name):
+                    times[file] = file.stat().st_mtime
+        for file in sorted(times, key=times.__getitem__)[:-MOST_LOGS]:
             file.unlink(missing_ok=True)
 
     async def _tasks(self, *filters: str) -> tuple[_Task, ...]:
@@ -220,7 +230,7 @@ class SlurmLauncher:
         shown = await self._run(
             "squeue", "--me", "--states=all", "--array", "--noheader", f"--Format={fields}", *filters
         )
-        ours = re.compile(rf"{re.escape(self._context.pool)}-[a-z0-9]+")
+        ours = re.compile(self._job_names)
         rows = (line.split("|") for line in shown.splitlines())
         rows = (row for row in rows if len(row) > len(FIELDS) and row[7] == self._comment)
         return tuple(_task_of(row) for row in rows if ours.fullmatch(row[2]) and row[1].isdecimal())

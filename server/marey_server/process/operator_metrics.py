@@ -85,7 +85,7 @@ class OperatorMetrics(Observer):
             registry=registry,
         )  # fmt: skip
         self.database_bytes = Gauge(
-            "marey_database_bytes", "Space that the database takes on its disk, with the free space inside it. Blobs "
+            "marey_database_bytes", "Space that the database takes on its disk, including free space inside it. Blobs "
             "in the folder `blobs` are not part of it.", registry=registry,
         )  # fmt: skip
         self.disk_free = Gauge("marey_disk_free_bytes", "Free bytes on the disk of the data folder.", registry=registry)

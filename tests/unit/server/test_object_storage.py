@@ -212,6 +212,18 @@ def test_with_names_that_are_used_again_a_delayed_deletion_loses_bytes(
     assert not complete(remote, objects, b"bytes")
 
 
+def test_a_transaction_stores_blobs_in_any_number_of_calls(remote: Lab) -> None:
+    contents = [f"blob {number}".encode() for number in range(awaiting.MOST_TRANSFERS + 2)]
+
+    def put_each(tx: Transaction) -> None:
+        for content in contents:
+            blobs.put_blob(tx, content)
+
+    remote.write(put_each)
+    sizes = remote.read(blobs.sizes_of, [digest_of(content) for content in contents])
+    assert list(sizes.values()) == [len(content) for content in contents]
+
+
 def test_a_transfer_that_is_always_too_slow_is_given_up(
     remote: Lab, objects: ObjectsInMemory, clock: AdjustableClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:

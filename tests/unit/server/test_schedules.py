@@ -137,6 +137,18 @@ def test_a_time_is_skipped_while_the_previous_job_runs(desk: Desk) -> None:
     assert read(desk).problem is None
 
 
+def test_a_refusal_after_a_skipped_time_is_reported(desk: Desk) -> None:
+    create(desk)
+    for _ in range(2):
+        desk.clock.advance(HOUR_S)
+        firing.submit_due(desk.database)
+    desk.complete(desk.claim())
+    desk.database.write(SYSTEM, disable_author)
+    desk.clock.advance(HOUR_S)
+    firing.submit_due(desk.database)
+    assert kinds_of_events(desk) == ["schedule.created", "schedule.submitted", "schedule.refused"]
+
+
 def test_overlapping_jobs_are_submitted_if_the_schedule_allows_them(desk: Desk) -> None:
     create(desk, overlapping=True)
     for _ in range(3):
@@ -262,8 +274,12 @@ def test_a_failing_schedule_does_not_stop_the_others(desk: Desk, monkeypatch: py
     monkeypatch.setattr("marey_server.store.schedules.firing.submit", fail_once)
     assert firing.submit_due(desk.database) == 2
     assert len(jobs_of(desk)) == 1
-    assert firing.submit_due(desk.database) == 1
-    assert len(jobs_of(desk)) == 2
+    assert firing.submit_due(desk.database) == 0, "the failed schedule waits for its next time"
+    assert read(desk, "a").problem == "Failed because of a fault of the server; its log gives the reason."
+    desk.clock.advance(HOUR_S)
+    assert firing.submit_due(desk.database) == 2
+    assert len(jobs_of(desk)) == 3
+    assert read(desk, "a").problem is None
 
 
 def test_after_a_correction_of_the_clock_nothing_is_due(desk: Desk) -> None:

@@ -22,7 +22,7 @@ Cron = Annotated[
     str,
     typer.Option(
         metavar="TIMES",
-        help='Times as minute, hour, day, month and day of the week: "0 3 * * 1-5" is 3:00 on weekdays.',
+        help='Times as minute, hour, day, month and day of the week: "0 3 * * 1-5" means 3:00 from Monday to Friday.',
     ),
 ]
 TimeZone = Annotated[str, typer.Option(metavar="ZONE", help="Time zone of the times, such as Europe/Berlin.")]
@@ -104,7 +104,7 @@ def change(
     job: Annotated[Path | None, typer.Option("--job", help="JSON file of the new job.")] = None,
     overlap: Annotated[
         bool | None,
-        typer.Option("--overlap/--no-overlap", help="Submit a job even if the previous job has not ended, or do not."),
+        typer.Option("--overlap/--no-overlap", help="Whether to submit a job even if the previous job has not ended."),
     ] = None,
     pause: Annotated[bool | None, typer.Option("--pause/--resume", help="Pause the schedule, or resume it.")] = None,
     description: Annotated[str | None, typer.Option(help="New purpose of the schedule.")] = None,

@@ -35,7 +35,7 @@ T = TypeVar("T")
 
 REQUESTS_AT_ONCE = 8
 MOST_REMEMBERED = 1024
-"""Number of stopped workers, and of workers whose blocked start was logged, that are remembered."""
+"""Number of stopped workers that are remembered."""
 
 
 def make_kubernetes_launcher(context: LaunchContext) -> KubernetesLauncher:
@@ -198,7 +198,7 @@ class KubernetesLauncher:
         return WorkerEnd(end.reason, end.status, f"{end.detail}\n{lines}".strip())
 
     def _log_blocked(self) -> None:
-        """Log once why a worker cannot start, such as an image that does not exist."""
+        """Log why workers cannot start, such as an image that does not exist; once as long as one is blocked."""
         blocked = {name: reason for pod in self._view.pods.values()
                    if (reason := blocked_reason(pod)) is not None and (name := worker_of(pod)) is not None}  # fmt: skip
         for name, reason in blocked.items():

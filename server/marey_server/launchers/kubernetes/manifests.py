@@ -195,8 +195,8 @@ def _arguments(pool: Pool, worker_name: str) -> list[str]:
 def _environment(pool: Pool) -> Mapping[str, str]:
     """Return variables of the container.
 
-    The token file is readable for its group, because Kubernetes opens it to the group `fsGroup`, which only the pod
-    has. `CREDENTIALS_DIRECTORY` lets Marey accept this. Otherwise, numeric libraries would start a thread for each
+    Kubernetes makes the token file readable for the group `fsGroup`, which only this pod has; `CREDENTIALS_DIRECTORY`
+    lets Marey accept this. The numbers of threads are limited, because numeric libraries would start a thread for each
     processor of the node.
     """
     own = {"CREDENTIALS_DIRECTORY": TOKEN_FOLDER, "MAREY_LOG_FORM": pool.log_form, "MAREY_LOG_LEVEL": pool.log_level}
@@ -204,7 +204,7 @@ def _environment(pool: Pool) -> Mapping[str, str]:
 
 
 def _resources(pool: Pool) -> Manifest:
-    """Return requests and limits; they are equal, so that the cluster evicts workers late and plans with their peak."""
+    """Return requests and limits; they are equal, so the cluster reserves all the memory that a worker may use."""
     amounts = {"cpu": str(pool.cpus), "memory": str(pool.memory_bytes)}
     if pool.request.gpus:
         amounts[pool.options.gpu_resource] = str(pool.request.gpus)

@@ -27,17 +27,18 @@ def _dumps(value: Any) -> str:
 
 
 def sqlite_engine(url: URL, connections: int, echo: bool, *, begin: str, query_only: bool = False) -> Engine:
+    """Return an engine for SQLite, whose transactions begin with the statement `begin`."""
     engine = sqlalchemy.create_engine(
         url,
         pool_size=connections,
         max_overflow=4,
         echo=echo,
-        hide_parameters=True,  # they hold hashes of secrets, and what fails is logged
+        hide_parameters=True,  # parameters contain hashes of secrets, and failed statements are logged
         json_serializer=_dumps,
         connect_args={"timeout": BUSY_TIMEOUT_MS / 1000, "check_same_thread": False, "isolation_level": None},
         poolclass=sqlalchemy.QueuePool,
     )
-    # No memory map: it saves 15 us of a read of 150 KB, and counts once per connection as memory of the process.
+    # No memory map: it would save 15 us of a read of 150 KB, but every connection would need memory.
     pragmas = [
         f"page_size = {PAGE_BYTES}",
         "journal_mode = WAL",
@@ -59,6 +60,7 @@ def sqlite_engine(url: URL, connections: int, echo: bool, *, begin: str, query_o
 
 
 def postgres_engine(url: URL, connections: int, echo: bool) -> Engine:
+    """Return an engine for Postgres, with limits of time for statements and locks."""
     connect_args: dict[str, Any] = {"application_name": "marey", "connect_timeout": 10}
     if "options" not in url.query:
         connect_args["options"] = " ".join(f"-c {name}={value}" for name, value in _POSTGRES_SETTINGS.items())
@@ -68,7 +70,7 @@ def postgres_engine(url: URL, connections: int, echo: bool) -> Engine:
         max_overflow=4,
         pool_timeout=30,
         echo=echo,
-        hide_parameters=True,  # they hold hashes of secrets, and what fails is logged
+        hide_parameters=True,  # parameters contain hashes of secrets, and failed statements are logged
         isolation_level="READ COMMITTED",
         json_serializer=_dumps,
         connect_args=connect_args,

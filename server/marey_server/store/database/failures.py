@@ -51,7 +51,7 @@ def translated(error: Exception) -> Exception:
     message = str(error.orig)
     if "disk is full" in message or getattr(error.orig, "sqlstate", None) == "53100":
         return StorageFullProblem("The disk of the database has no space left; nothing was written.")
-    if isinstance(error, exc.OperationalError) and not message.startswith(("no such", "near ")):  # those are our faults
+    if isinstance(error, exc.OperationalError) and not message.startswith(("no such", "near ")):  # faults of the server
         return no_answer("The database does not answer; nothing was written. Try again.")
     return error
 

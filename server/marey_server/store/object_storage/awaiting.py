@@ -8,6 +8,7 @@ the start, and finds the bytes among those that were moved.
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -23,7 +24,7 @@ T = TypeVar("T")
 AT_ONCE = 4
 """Number of objects that are moved at the same time for one call."""
 MOST_TRANSFERS = 3
-"""How often a call stores an object again because storing it took longer than the row of the blob allows."""
+"""How often a call stores a blob at most; it stores a blob again if the row could not name the object in time."""
 
 
 class WantedBytes(NamedTuple):
@@ -49,7 +50,8 @@ class Carried:
     """Why no object can be stored; set by `ProbeAwaited`."""
     probed: bool = False
     looked_again: bool = False
-    transfers: int = 0
+    transfers: Counter[str] = field(default_factory=Counter)
+    """How often the bytes of each blob were stored, by digest."""
 
 
 class BytesAwaited(BaseException):
@@ -93,8 +95,8 @@ class ObjectsToStore(BytesAwaited):
 
     def move(self, carried: Carried) -> None:
         """Store each blob under a name that was never used."""
-        carried.transfers += 1
-        if carried.transfers > MOST_TRANSFERS:
+        carried.transfers.update(self._contents.keys())
+        if any(carried.transfers[digest] > MOST_TRANSFERS for digest in self._contents):
             raise ObjectStorageProblem(
                 "The object storage is too slow: bytes of blobs could not be stored in time.",
                 headers={"Retry-After": "60"},

@@ -30,6 +30,8 @@ log = logging.getLogger(__name__)
 DUE_AT_ONCE = 100
 """Greatest number of due schedules that one call of `submit_due` handles."""
 MAX_PROBLEM_LENGTH = 500
+SKIPPED = "Skipped, because the previous job"
+"""Beginning of the problem of a schedule that skipped a time; this is no refusal."""
 
 _SUBMITS = RequiredRole(Role.CONTRIBUTOR, "jobs", guests=False, in_folders=True)
 """Role and scope that the author of a schedule needs whenever a job is submitted."""
@@ -38,7 +40,8 @@ _SUBMITS = RequiredRole(Role.CONTRIBUTOR, "jobs", guests=False, in_folders=True)
 def submit_due(database: Database) -> int:
     """Submit the jobs of the schedules that are due, each in its own transaction; return the number of these schedules.
 
-    An error of one schedule does not keep the others from submitting their jobs.
+    An unexpected error of one schedule does not keep the others from submitting their jobs: the schedule records that
+    it has failed, and goes on at its next time.
     """
     due = database.read(SYSTEM, _find_due)
     for schedule_id in due:
@@ -48,6 +51,7 @@ def submit_due(database: Database) -> int:
             raise
         except Exception:
             log.exception("the schedule %s failed", schedule_id)
+            database.submit_write(SYSTEM, _skip_after_fault, schedule_id).result()
     return len(due)
 
 
@@ -81,17 +85,31 @@ def submit_if_due(tx: Transaction, schedule_id: str) -> None:
     values: dict[str, Any] = {"rev": schedule.c.rev + 1}
     if row.due_us:  # 0: the clock of the database was corrected, so nothing is due
         values |= {"fired_us": tx.now_us} | _submit(tx, row)
-    try:
-        values["due_us"] = next_time_us(row.cron, row.timezone, tx.now_us)
-    except InvalidProblem as problem:
-        values |= {"due_us": None, "problem": problem.detail[:MAX_PROBLEM_LENGTH]}
+    values |= _next_time(tx, row)
     tx.execute(update(schedule).where(schedule.c.id == row.id).values(**values))
+
+
+def _skip_after_fault(tx: Transaction, schedule_id: str) -> None:
+    """Move the due time of a schedule, so that a fault of the server is not repeated every few seconds."""
+    row = tx.execute(select(schedule).where(schedule.c.id == schedule_id).with_for_update()).first()
+    if row is not None and row.due_us is not None:
+        values = _next_time(tx, row) | {"fired_us": tx.now_us, "rev": schedule.c.rev + 1}
+        values.setdefault("problem", "Failed because of a fault of the server; its log gives the reason.")
+        tx.execute(update(schedule).where(schedule.c.id == schedule_id).values(**values))
+
+
+def _next_time(tx: Transaction, row: Row[Any]) -> dict[str, Any]:
+    """Return the new due time of a schedule; the schedule is paused if it has no time in the future."""
+    try:
+        return {"due_us": next_time_us(row.cron, row.timezone, tx.now_us)}
+    except InvalidProblem as problem:
+        return {"due_us": None, "problem": problem.detail[:MAX_PROBLEM_LENGTH]}
 
 
 def _submit(tx: Transaction, row: Row[Any]) -> dict[str, Any]:
     """Submit the job of a due schedule; return the new values of `last_job_id` and `problem`."""
     if not row.overlapping and _is_unfinished(tx, row.last_job_id):
-        return {"problem": f"Skipped, because the previous job {row.last_job_id} has not ended."}
+        return {"problem": f"{SKIPPED} {row.last_job_id} has not ended."}
     author = tx.execute(select(user).where(user.c.id == row.author_id)).one()
     own = tx.beside(Principal("user", author.id, author.name, author.administrator, tuple(row.scopes)))
     own.required_role = _SUBMITS
@@ -104,7 +122,7 @@ def _submit(tx: Transaction, row: Row[Any]) -> dict[str, Any]:
         raise
     except (ApiProblem, ValidationError) as error:
         reason = error.detail if isinstance(error, ApiProblem) else f"The job is no longer valid: {error}"
-        if row.problem is None:
+        if row.problem is None or row.problem.startswith(SKIPPED):
             tx.emit("schedule.refused", row.id, project_id=row.project_id, name=row.name)
         return {"problem": f"Refused for the user {author.name}: {reason}"[:MAX_PROBLEM_LENGTH]}
     tx.after_commit(own.run_after_commit)

@@ -121,7 +121,7 @@ def _check_job(tx: Transaction, row: ProjectRow, job: JobCreate) -> None:
 
 def _require_rights(tx: Transaction, row: ProjectRow, name: str) -> Row[Any]:
     """Return the locked row of a schedule. Raises `ForbiddenProblem` if the caller may not change it."""
-    found = _find(tx, row, name)
+    found = _find(tx, row, name, lock=True)
     if found.author_id != tx.principal.user_id and not roles.includes(row.role, Role.MAINTAINER):
         raise ForbiddenProblem(
             "Only the author of a schedule and maintainers of the project may change or delete it.", code="not-author"
@@ -141,8 +141,9 @@ def _require_free_place(tx: Transaction, row: ProjectRow) -> None:
         )
 
 
-def _find(tx: Transaction, row: ProjectRow, name: str) -> Row[Any]:
-    found = tx.execute(_rows(row).where(schedule.c.name == name)).first()
+def _find(tx: Transaction, row: ProjectRow, name: str, *, lock: bool = False) -> Row[Any]:
+    named = _rows(row).where(schedule.c.name == name)
+    found = tx.execute(named.with_for_update(of=schedule) if lock else named).first()
     if found is None:
         raise _no_schedule(name)
     return found
