@@ -22,6 +22,8 @@ from marey_schemas.encoding.arrayspec import ArrayError, ArraySpec
 from marey_schemas.encoding.canonical import array_digest
 from marey_schemas.encoding.tiles import from_integers, to_integers
 
+INDEX = "<u4"
+"""Type of the indices of frames."""
 MOST_CHANGED = 1 / 2
 """Share of the frames above which an array is sent whole, because its difference would hardly be smaller."""
 _MEMBERS = frozenset({"base", "pointer", "dtype", "shape", "digest", "frames", "difference"})
@@ -79,9 +81,9 @@ class ArrayDifference:
                     return None
         except blocks.BlockError:  # an array that was stored with another layout
             return None
-        frames = np.concatenate(numbers).astype("<u4")
+        frames = np.concatenate(numbers).astype(INDEX)
         difference = EncodedArray.of(np.concatenate(rows))
-        if len(difference.data) >= len(array.data):
+        if len(difference.data) >= len(array.data) or not _is_worthwhile(len(frames), spec):
             return None
         return cls(content, pointer, spec.dtype, spec.shape, digest, frames, difference)
 
@@ -124,18 +126,13 @@ class ArrayDifference:
 
     def _checked(self, spec: ArraySpec) -> tuple[NDArray[np.intp], NDArray[Any]]:
         """Return `frames` and `difference` as arrays; sizes are checked before memory is allocated."""
-        expected = _unsigned(spec)
-        frames, difference = (_decoded(one, spec.nbytes) for one in (self.frames, self.difference))
-        if frames.ndim != 1 or frames.dtype.kind not in "iu":
-            raise ArrayError("bad-array", "the member `frames` of an array difference must be a list of integers")
-        numbers = frames.astype(np.int64)
-        outside = len(numbers) and (numbers[0] < 0 or numbers[-1] >= spec.shape[0])
-        if outside or (np.diff(numbers) <= 0).any():
+        count = _length(self.frames)
+        if not _is_worthwhile(count, spec):
+            raise ArrayError("bad-array", "an array difference must have fewer bytes than the array that it describes")
+        numbers = _decoded("frames", self.frames, ArraySpec(INDEX, (count,)))
+        if (numbers[1:] <= numbers[:-1]).any() or (count and numbers[-1] >= spec.shape[0]):
             raise ArrayError("bad-array", "the frames of an array difference must be ascending indices of the array")
-        if difference.dtype != expected or difference.shape != (len(numbers), _columns(spec)):
-            raise ArrayError(
-                "bad-array", f"the member `difference` must be an array {expected.str} of {len(numbers)} frames"
-            )
+        difference = _decoded("difference", self.difference, ArraySpec(_unsigned(spec).str, (count, _columns(spec))))
         return numbers.astype(np.intp), difference
 
 
@@ -153,11 +150,27 @@ def detach_differences(tree: Any, keep: Callable[[ArrayDifference], None]) -> An
     return [detach_differences(member, keep) for member in tree] if isinstance(tree, list) else tree
 
 
-def _decoded(array: Any, most_bytes: int) -> NDArray[Any]:
-    found = array.decode(max_bytes=most_bytes) if isinstance(array, EncodedArray) else array
-    if not isinstance(found, np.ndarray):
-        raise ArrayError("bad-array", "the members `frames` and `difference` of an array difference must be arrays")
-    return found
+def _length(frames: Any) -> int:
+    """Return the number of frames that a difference announces, before it is decoded."""
+    if not isinstance(frames, EncodedArray | np.ndarray) or len(frames.shape) != 1:
+        raise ArrayError("bad-array", "the member `frames` of an array difference must be a list of integers")
+    return int(frames.shape[0])
+
+
+def _is_worthwhile(count: int, spec: ArraySpec) -> bool:
+    """Return whether the difference of `count` frames has fewer bytes than the array, both decoded."""
+    itemsize = np.dtype(spec.dtype).itemsize
+    return count <= spec.shape[0] and count * (np.dtype(INDEX).itemsize + _columns(spec) * itemsize) <= spec.nbytes
+
+
+def _decoded(member: str, array: Any, expected: ArraySpec) -> NDArray[Any]:
+    """Return a member of a difference as an array; its type and size are checked before it is decoded."""
+    if isinstance(array, EncodedArray):
+        if ArraySpec.parse(array.dtype, array.shape) == expected:
+            return array.decode(max_bytes=expected.nbytes)
+    elif isinstance(array, np.ndarray) and ArraySpec(array.dtype.str, array.shape) == expected:
+        return array
+    raise ArrayError("bad-array", f"the member `{member}` of this array difference must be an array {expected}")
 
 
 def _columns(spec: ArraySpec) -> int:

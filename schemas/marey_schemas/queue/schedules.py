@@ -22,6 +22,7 @@ Cron = Annotated[
     Field(
         min_length=9,
         max_length=MAX_CRON_LENGTH,
+        pattern=r"^[0-9A-Za-z*,/# -]+$",
         description="Times as five fields: minute, hour, day of the month, month, day of the week. `0 3 * * 1-5` means "
         "3:00 from Monday to Friday.",
     ),
@@ -66,7 +67,7 @@ class ScheduleCreate(Request):
 class ScheduleChange(Request):
     """Request to change a schedule; absent fields stay as they are.
 
-    If `job` is given or `paused` is false, the server submits later jobs as the user who makes this change.
+    After any change but a pause or a new description, the server submits jobs as the user who made the change.
     """
 
     cron: Cron | None = None

@@ -133,7 +133,7 @@ class Operation:
     def shows_project(self) -> bool:
         """Whether the operation changes a project and shows its content, so that callers need the scope `read`, too."""
         shows = self.etag or self.names
-        return self.scope == "write" and self.access.role is not None and shows and self.answer is not None
+        return self.scope in ("write", "jobs") and self.access.role is not None and shows and self.answer is not None
 
     @property
     def may_create(self) -> bool:

@@ -28,7 +28,7 @@ from marey_server.store.jobs.reaper import StartGrace
 from marey_server.store.object_storage.backing import ObjectBlobs
 from marey_server.store.object_storage.moving import move_uploads
 from marey_server.store.retention import retire
-from marey_server.store.schedules.firing import DUE_AT_ONCE, submit_due
+from marey_server.store.schedules.firing import submit_due
 from marey_server.store.transaction import Transaction
 from marey_server.store.wakeups import OUTPUTS_TO_COMMIT, Listener, wakeups
 
@@ -148,10 +148,9 @@ async def _merge_waiting(services: Services, holder: str, merges: WaitingMerges)
 
 
 async def _submit_scheduled(services: Services, holder: str) -> None:
-    """Submit the jobs of due schedules."""
-    if await _write(services, _leads, holder):
-        while await _in_thread(services, submit_due, services.database) == DUE_AT_ONCE:
-            pass
+    """Submit the jobs of some due schedules; nothing is submitted while the disk is full."""
+    if services.disk.fault() is None and await _write(services, _leads, holder):
+        await _in_thread(services, submit_due, services.database)
 
 
 async def _commit_outputs(services: Services, holder: str, *, listener: Listener, longest_wait_s: float) -> None:

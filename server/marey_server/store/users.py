@@ -144,7 +144,7 @@ def change_user(
     default = EndTokens.SESSIONS if password_hash is not None else EndTokens.NONE
     ended = request.end_tokens or default
     tokens.end_tokens(tx, row.id, ended)
-    if ended is EndTokens.ALL:
+    if ended is EndTokens.ALL or request.disabled:
         _pause_schedules(tx, row.id)
     _audit_change(tx, row, values, ended)
     return _shown(row)
@@ -152,7 +152,7 @@ def change_user(
 
 def _pause_schedules(tx: Transaction, user_id: str) -> None:
     """Pause the schedules of a user, because somebody else may have created them with a token of the user."""
-    reason = "Paused, because all tokens of the author were revoked."
+    reason = "Paused, because all tokens of the author were revoked, or the author was disabled."
     which = (schedule.c.author_id == user_id, schedule.c.due_us.is_not(None))
     tx.execute(update(schedule).where(*which).values(due_us=None, problem=reason, rev=schedule.c.rev + 1))
 

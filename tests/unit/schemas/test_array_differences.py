@@ -182,8 +182,26 @@ def test_a_difference_that_would_expand_to_gigabytes_is_refused_before_it_takes_
     try:
         with pytest.raises(CodecError, match="larger than"):
             decode_tree(sent, MSGPACK, max_array_bytes=1 << 20)
-        with pytest.raises(ArrayError, match="larger than"):
+        with pytest.raises(ArrayError, match="must be an array <u4"):
             bomb.applied_to(EncodedArray.of(few))
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("dtype", ["|u1", "<u4"])
+def test_a_difference_with_too_many_frames_is_refused_before_it_takes_memory(dtype: str) -> None:
+    """The indices of the frames would take several times the memory of the whole array."""
+    base = EncodedArray.of(np.zeros((1 << 20, 1), "|u1"))
+    frames = EncodedArray.of(np.zeros(1 << 20, dtype))
+    found = ArrayDifference(
+        base="sha256:base", pointer="/poses", dtype="|u1", shape=(1 << 20, 1), digest="sha256:whole", frames=frames,
+        difference=EncodedArray.of(np.zeros((1 << 20, 1), "|u1")),
+    )  # fmt: skip
+    tracemalloc.start()
+    try:
+        with pytest.raises(ArrayError, match="fewer bytes than the array"):
+            found.applied_to(base)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 17
     finally:
         tracemalloc.stop()

@@ -10,14 +10,15 @@ from zoneinfo import ZoneInfo
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from sqlalchemy import select, update
 from tests.support.queue_desk import Desk
 
 from marey_schemas.access import EndTokens, MemberChange, Role, UserChange, UserCreate
-from marey_schemas.queue.jobs import JobCreate
+from marey_schemas.queue.jobs import JobCreate, JobOutputsInput
 from marey_schemas.queue.schedules import Schedule, ScheduleChange, ScheduleCreate
 from marey_server.access.principal import SYSTEM, Principal
-from marey_server.errors import ConflictProblem, InvalidProblem, QuotaExceededProblem
+from marey_server.errors import ConflictProblem, InvalidProblem, QuotaExceededProblem, UnavailableProblem
 from marey_server.store import members, projects, users
 from marey_server.store.jobs.submission import submit
 from marey_server.store.schedules import firing, managing
@@ -65,6 +66,7 @@ def test_a_daily_time_comes_within_a_day_and_after_now(now_s: int, minute: int, 
         ("0 0 31 2 *", "UTC", "/cron"),
         ("* * */20 * 1L", "UTC", "/cron"),
         ("at dawn on monday please", "UTC", "/cron"),
+        ("0 3 * * *", "localtime", "/timezone"),
         ("0 3 * * *", "Mars/Olympus", "/timezone"),
         ("0 3 * * *", "Europe", "/timezone"),
         ("0 3 * * *", "../../etc/passwd", "/timezone"),
@@ -231,6 +233,10 @@ def test_who_sets_the_job_or_resumes_the_schedule_is_its_author(desk: Desk) -> N
     ben = second(desk, Role.OWNER)
     create(desk)
     assert change(desk, ben, description="by ben").author == "ann"
+    assert change(desk, ben, paused=True).author == "ann"
+    assert change(desk, paused=False).author == "ann"
+    assert change(desk, ben, cron="* * * * *").author == "ben", "nobody chooses when another user submits jobs"
+    assert change(desk, timezone="Europe/Berlin").author == "ann"
     assert change(desk, ben, job=JobCreate(kind="errand")).author == "ben"
     assert change(desk, paused=False).author == "ann"
 
@@ -240,6 +246,7 @@ def test_a_refused_job_changes_nothing(desk: Desk) -> None:
         {"job": JobCreate(kind="unknown")},
         {"job": JobCreate(kind="errand", params={"number": "many"})},
         {"job": JobCreate(kind="errand", after=("job_x",))},
+        {"job": JobCreate(kind="square", inputs={"things": JobOutputsInput(job="job_x")})},
         {"cron": "0 3 * * 9"},
         {"timezone": "Nowhere"},
     ):
@@ -282,6 +289,56 @@ def test_a_failing_schedule_does_not_stop_the_others(desk: Desk, monkeypatch: py
     assert read(desk, "a").problem is None
 
 
+def test_a_schedule_that_cannot_be_stored_now_is_tried_again_after_the_others(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    create(desk, "a", overlapping=True)
+    create(desk, "b", overlapping=True)
+    desk.clock.advance(HOUR_S)
+    calls: list[Any] = []
+
+    def fail_once(*args: Any) -> Any:
+        calls.append(args)
+        if len(calls) == 1:
+            raise UnavailableProblem("Busy.")
+        return submit(*args)
+
+    monkeypatch.setattr("marey_server.store.schedules.firing.submit", fail_once)
+    assert (firing.submit_due(desk.database), len(jobs_of(desk))) == (1, 1)
+    assert (firing.submit_due(desk.database), len(jobs_of(desk))) == (1, 2)
+
+
+def test_a_disabled_author_has_no_active_schedules(desk: Desk) -> None:
+    desk.database.write(SYSTEM, users.create_user, UserCreate(name="root", administrator=True))
+    create(desk)
+    desk.database.write(SYSTEM, users.change_user, "ann", UserChange(disabled=True), expected_rev=None)
+    desk.database.write(SYSTEM, users.change_user, "ann", UserChange(disabled=False), expected_rev=None)
+    assert read(desk).paused
+
+
+@pytest.mark.parametrize("cron", ["0 3 * *\u2028*", "0 3 * * \x1b", "0\t3 * * *"])
+def test_an_expression_has_no_control_characters(cron: str) -> None:
+    with pytest.raises(ValidationError):
+        ScheduleCreate(name="s", cron=cron, job=JobCreate(kind="errand"))
+
+
+@pytest.mark.parametrize(("granted", "shown"), [("jobs", False), ("read", True)])
+def test_a_problem_has_no_names_that_the_token_may_not_read(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, granted: str, shown: bool
+) -> None:
+    create(desk)
+    scopes = ["jobs"] if granted == "jobs" else ["jobs", "read"]
+    desk.database.write(SYSTEM, lambda tx: tx.execute(update(schedule).values(scopes=scopes)))
+
+    def refuse(*_args: Any) -> Any:
+        raise ConflictProblem("The result would replace SECRET.", unnamed="The result would replace another item.")
+
+    monkeypatch.setattr("marey_server.store.schedules.firing.submit", refuse)
+    desk.clock.advance(HOUR_S)
+    firing.submit_due(desk.database)
+    assert ("SECRET" in (read(desk).problem or "")) == shown
+
+
 def test_after_a_correction_of_the_clock_nothing_is_due(desk: Desk) -> None:
     create(desk)
     desk.database.write(SYSTEM, lambda tx: tx.execute(update(schedule).values(due_us=0)))
@@ -300,7 +357,7 @@ def test_revoking_all_tokens_of_a_user_pauses_the_schedules_of_the_user(desk: De
     assert not read(desk).paused
     desk.database.write(SYSTEM, users.change_user, "ann", UserChange(end_tokens=EndTokens.ALL), expected_rev=None)
     assert read(desk).paused
-    assert read(desk).problem == "Paused, because all tokens of the author were revoked."
+    assert read(desk).problem == "Paused, because all tokens of the author were revoked, or the author was disabled."
     assert change(desk, paused=False).problem is None
 
 

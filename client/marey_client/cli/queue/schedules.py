@@ -110,7 +110,7 @@ def change(
     description: Annotated[str | None, typer.Option(help="New purpose of the schedule.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Change, pause or resume a schedule. With --job or --resume, the server submits later jobs as you."""
+    """Change, pause or resume a schedule. After any change but --pause and --description, jobs are submitted as you."""
     from marey_schemas.queue.jobs import JobCreate
     from marey_schemas.queue.schedules import ScheduleChange
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import re
 import secrets
+import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -119,6 +120,7 @@ class ObjectStorage:
         self._store = _connect(bucket, bucket.timeout_s, RETRIES)
         self._probe = _connect(bucket, PROBE_TIMEOUT_S, 0)
         self._probed: tuple[float, str | None] | None = None
+        self._probing = threading.Lock()
 
     def put(self, name: str, chunks: Iterable[bytes]) -> None:
         """Store bytes under a new name. The server checks the SHA-256 of the object, or of each of its parts."""
@@ -205,15 +207,16 @@ class ObjectStorage:
         import obstore
         from obstore.exceptions import BaseError
 
-        if self._probed is not None and time.monotonic() < self._probed[0] + PROBE_VALID_S:
-            return self._probed[1]
-        fault = None
-        try:
-            obstore.put(self._probe, PROBE_NAME, b"", use_multipart=False)
-        except (BaseError, OSError) as error:
-            fault = f"{self.bucket.shown} {_reason(error)}"
-        self._probed = (time.monotonic(), fault)
-        return fault
+        with self._probing:  # those who ask meanwhile get the same result
+            if self._probed is not None and time.monotonic() < self._probed[0] + PROBE_VALID_S:
+                return self._probed[1]
+            fault = None
+            try:
+                obstore.put(self._probe, PROBE_NAME, b"", use_multipart=False)
+            except (BaseError, OSError) as error:
+                fault = f"{self.bucket.shown} {_reason(error)}"
+            self._probed = (time.monotonic(), fault)
+            return fault
 
     @contextmanager
     def _reporting(self, action: str) -> Iterator[None]:

@@ -30,6 +30,7 @@ from marey_server.store.tables import (
     job_blob,
     revision,
     revision_part,
+    schedule,
 )
 from marey_server.store.transaction import Transaction, in_lists
 
@@ -40,6 +41,7 @@ def erase(tx: Transaction, project_row: ProjectRow, rows: Sequence[Row[Any]], jo
     forget_in_jobs(tx, frozenset(ids), jobs)
     events.forget_names(tx, ids, "name", "collection")
     events.forget_clips(tx, project_row.id, frozenset(ids))
+    tx.execute(update(schedule).where(schedule.c.project_id == project_row.id).values(problem=None))
     tx.execute(delete(revision_part).where(revision_part.c.item_id.in_(ids)))
     tx.execute(delete(item_tag).where(item_tag.c.item_id.in_(ids)))
     tx.execute(delete(item_facet).where(item_facet.c.item_id.in_(ids)))

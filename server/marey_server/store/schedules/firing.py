@@ -14,6 +14,7 @@ from sqlalchemy import Row, select, update
 
 from marey_schemas.access import Role
 from marey_schemas.queue.jobs import JobCreate
+from marey_server.access import scopes
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.access.roles import RequiredRole
 from marey_server.errors import ApiProblem, ForbiddenProblem, InvalidProblem, UnavailableProblem
@@ -44,15 +45,17 @@ def submit_due(database: Database) -> int:
     it has failed, and goes on at its next time.
     """
     due = database.read(SYSTEM, _find_due)
+    done = len(due)
     for schedule_id in due:
         try:
             database.submit_write(SYSTEM, submit_if_due, schedule_id).result()
-        except UnavailableProblem:
-            raise
+        except UnavailableProblem as problem:
+            log.warning("the schedule %s is tried again later: %s", schedule_id, problem.detail)
+            done -= 1
         except Exception:
             log.exception("the schedule %s failed", schedule_id)
             database.submit_write(SYSTEM, _skip_after_fault, schedule_id).result()
-    return len(due)
+    return done
 
 
 def _find_due(tx: Transaction) -> list[str]:
@@ -121,7 +124,7 @@ def _submit(tx: Transaction, row: Row[Any]) -> dict[str, Any]:
     except UnavailableProblem:
         raise
     except (ApiProblem, ValidationError) as error:
-        reason = error.detail if isinstance(error, ApiProblem) else f"The job is no longer valid: {error}"
+        reason = _reason(error, may_read=scopes.allows(row.scopes, "read", row.project))
         if row.problem is None or row.problem.startswith(SKIPPED):
             tx.emit("schedule.refused", row.id, project_id=row.project_id, name=row.name)
         return {"problem": f"Refused for the user {author.name}: {reason}"[:MAX_PROBLEM_LENGTH]}
@@ -129,6 +132,13 @@ def _submit(tx: Transaction, row: Row[Any]) -> dict[str, Any]:
     due_at = datetime_of(row.due_us).isoformat()
     tx.emit("schedule.submitted", row.id, project_id=row.project_id, name=row.name, job=made.id, due_at=due_at)
     return {"last_job_id": made.id, "problem": None}
+
+
+def _reason(error: ApiProblem | ValidationError, *, may_read: bool) -> str:
+    """Return the reason of a refusal, without names if the token that made the schedule may not read the project."""
+    if isinstance(error, ApiProblem):
+        return error.detail if may_read else error.unnamed or error.detail
+    return f"The job is no longer valid: {error}"
 
 
 def _is_unfinished(tx: Transaction, job_id: str | None) -> bool:

@@ -22,6 +22,7 @@ from marey_server.errors import (
 from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.ids import new_id
+from marey_server.store.jobs.inputs import late_inputs
 from marey_server.store.jobs.submission import check_request
 from marey_server.store.projects import ProjectRow
 from marey_server.store.revs import ExpectedRev, change_row, is_expected, moved_on
@@ -72,7 +73,8 @@ def change_schedule(
 ) -> Schedule:
     """Change, pause or resume a schedule.
 
-    If the job is changed, or the schedule resumed, later jobs are submitted as the caller. Raises `ForbiddenProblem` if
+    After any change but a pause or a new description, jobs are submitted as the caller, so that nobody can let others
+    submit jobs at times that these have not chosen. Raises `ForbiddenProblem` if
     the caller is neither the author of the schedule nor a maintainer of the project. Raises `InvalidProblem` as
     `create_schedule` does.
     """
@@ -84,7 +86,7 @@ def change_schedule(
     if request.job is not None:
         _check_job(tx, row, request.job)
         values["job"] = request.job.model_dump(mode="json", exclude_unset=True)
-    if request.job is not None or request.paused is False:
+    if request.model_dump(exclude_none=True, exclude={"description", "paused"}) or request.paused is False:
         values |= _author(tx) | {"problem": None}
     paused = before.due_us is None if request.paused is None else request.paused
     due_us = next_time_us(values.get("cron", before.cron), values.get("timezone", before.timezone), tx.now_us)
@@ -113,9 +115,9 @@ def _author(tx: Transaction) -> dict[str, Any]:
 
 def _check_job(tx: Transaction, row: ProjectRow, job: JobCreate) -> None:
     """Raise `InvalidProblem`, with pointers into the request, if the job could not be submitted now."""
-    if job.after:
+    for place in ["/job/after"] * bool(job.after) + [place for place, _, _ in late_inputs(job, "/job")]:
         detail = "The job of a schedule cannot wait for other jobs."
-        raise InvalidProblem(detail, errors=[FieldError(pointer="/job/after", code="not-allowed", detail=detail)])
+        raise InvalidProblem(detail, errors=[FieldError(pointer=place, code="not-allowed", detail=detail)])
     check_request(tx, row, job, "/job")
 
 

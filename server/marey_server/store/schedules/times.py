@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from datetime import datetime
-from zoneinfo import ZoneInfo
+from functools import cache
+from zoneinfo import ZoneInfo, available_timezones
 
 from cronsim import CronSim, CronSimError
 
@@ -33,11 +34,15 @@ def next_time_us(cron: str, timezone: str, after_us: int) -> int:
 
 
 def _zone(name: str) -> ZoneInfo:
-    try:
-        return ZoneInfo(name)
-    except (LookupError, OSError, ValueError):  # an unknown name, the name of a folder, a path
-        detail = f"There is no time zone {name!r}. Use a name such as `Europe/Berlin` or `UTC`."
-        raise _invalid("/timezone", detail) from None
+    if name not in _names():
+        raise _invalid("/timezone", f"There is no time zone {name!r}. Use a name such as `Europe/Berlin` or `UTC`.")
+    return ZoneInfo(name)
+
+
+@cache
+def _names() -> set[str]:
+    """Return the names of all time zones, without those whose times depend on the machine."""
+    return available_timezones() - {"localtime", "Factory"}
 
 
 def _reason(error: CronSimError) -> str:
