@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -126,6 +127,13 @@ REQUESTS: dict[str, Sends] = {
     "POST /projects/{project}/pipelines": lambda house, who, at: who.post(
         "/projects/lab/pipelines", json={"steps": {"only": job_into(house, at)}}
     ),
+    "POST /projects/{project}/schedules": lambda house, who, at: schedule(who, job_into(house, at)),
+    "PATCH /projects/{project}/schedules/{schedule}": lambda house, who, at: who.patch(
+        own_schedule(house, who), json={"job": job_into(house, at)}
+    ),
+    "DELETE /projects/{project}/schedules/{schedule}": lambda house, who, at: who.delete(
+        own_schedule(house, who if at == "team" else house.owner)
+    ),
     "POST /jobs/{job}/cancel": lambda house, who, at: who.post(
         f"/jobs/{own_job(house, who if at == 'team' else house.owner)}/cancel"
     ),
@@ -135,8 +143,22 @@ REQUESTS: dict[str, Sends] = {
 }
 """For each operation that a role in a folder allows or forbids: a function that sends the operation for a folder.
 
-Jobs belong to no folder, so the last two functions use a job of `who` for `team`, and a job of the owner for `other`.
+Jobs and schedules belong to no folder, so the last three functions use one of `who` for `team`, and one of the owner
+for `other`.
 """
+
+OF_NO_FOLDER = ("DELETE /projects/{project}/schedules/", "POST /jobs/")
+
+
+def schedule(who: httpx.Client, job: dict[str, Any]) -> httpx.Response:
+    """Create a schedule as somebody."""
+    body = {"name": f"s-{time.monotonic_ns()}", "cron": "0 0 29 2 *", "job": job}
+    return who.post("/projects/lab/schedules", json=body)
+
+
+def own_schedule(house: Studio, who: httpx.Client) -> str:
+    """Create a schedule as somebody; return its path."""
+    return f"/projects/lab/schedules/{schedule(who, job_into(house, 'team')).json()['name']}"
 
 
 def own_job(house: Studio, who: httpx.Client) -> str:
@@ -170,9 +192,9 @@ def test_every_operation_in_folders_follows_the_roles_there(house: Studio) -> No
             inside, outside = send(house, client, "team"), send(house, client, "other")
             if not inside.is_success:
                 wrong.append(f"{name} in team as {user}: {inside.status_code} {inside.text}")
-            if user == "lowered" and name.startswith("POST /jobs/"):
-                continue  # maintainers of the project cancel and retry all jobs
-            if outside.status_code != 403 or outside.json()["code"] != "insufficient-role":
+            if user == "lowered" and name.startswith(OF_NO_FOLDER):
+                continue  # maintainers of the project may do this with all jobs and schedules
+            if outside.status_code != 403 or outside.json()["code"] not in ("insufficient-role", "not-author"):
                 wrong.append(f"{name} in other as {user}: {outside.status_code} {outside.text}")
     assert not wrong, "\n".join(wrong)
 
