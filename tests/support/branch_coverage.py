@@ -20,13 +20,13 @@ FLOORS = {
     "marey_motion": 91,
     "marey_reports": 95,
     "marey_client": 73,
-    "marey_server": 89,
+    "marey_server": 88,
     "marey_worker": 44,
 }
 """Minimum coverage in percent, by package: 2 to 3 percentage points below the coverage of a whole run of `make test`.
 
-The worker, and the limits and the fork server in `marey_schemas.processes`, mostly run in child processes, which are
-not measured.
+The launcher `slurm` (1 % of the branches of the server) is measured only where Slurm is installed. The worker, and the
+limits and the fork server in `marey_schemas.processes`, mostly run in child processes, which are not measured.
 """
 
 
