@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -48,7 +47,7 @@ def test_every_manifest_is_part_of_the_base() -> None:
     assert sorted(listed) == [file.name for file in MANIFESTS]
 
 
-@pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl is not installed")
+@pytest.mark.kubectl
 @pytest.mark.parametrize("overlay", OVERLAYS)
 def test_kubectl_renders_an_overlay(overlay: str) -> None:
     command = ["kubectl", "kustomize", str(FOLDER / "overlays" / overlay)]

@@ -88,6 +88,10 @@ def _needs_slurm(item: pytest.Item) -> bool:
     return item.get_closest_marker("slurm") is not None
 
 
+def _needs_kubectl(item: pytest.Item) -> bool:
+    return item.get_closest_marker("kubectl") is not None
+
+
 def _on_other_database(item: pytest.Item) -> bool:
     """Return whether the tier `test` runs this test only on the other database.
 
@@ -191,6 +195,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         reasons = {"need real motion capture": _needs_mocap, **reasons}
     if missing := [name for name in SLURM_PROGRAMS if shutil.which(name, path=SYSTEM_PATH) is None]:
         reasons = {f"need Slurm (tests/support/install_slurm.sh): no {', '.join(missing)}": _needs_slurm, **reasons}
+    if shutil.which("kubectl") is None:
+        reasons = {"need kubectl": _needs_kubectl, **reasons}
     kept, gone = [], []
     for item in items:
         reason = next((reason for reason, applies in reasons.items() if applies(item)), None)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Column, Row, Select, and_, bindparam, exists, func, or_, select, text, update
+from sqlalchemy import Column, Row, Select, Table, and_, bindparam, exists, func, or_, select, text, update
 
 from marey_schemas.access import QuotaChange, QuotasInUse, QuotaUse, Role
 from marey_server.errors import QuotaExceededProblem
@@ -248,6 +248,24 @@ def _hold(tx: Transaction, of: str, owner_id: str, more: Held) -> None:
             rule = _RULES[name]
             remedy = rule.remedy.format(of=of)
             raise _exceeded(subject, f"{of}_{name}", rule.noun, used - added, limit, added, remedy)
+
+
+def require_place(tx: Transaction, project_id: str, table: Table) -> None:
+    """Check that a project may have one more row of a table, which has the column `project_id`.
+
+    The quota is `project_<table>s`, such as `project_webhooks`. Concurrent checks of one project run one after another.
+    Raises `QuotaExceededProblem`.
+    """
+    noun, quota = f"{table.name}s", f"project_{table.name}s"
+    tx.lock(f"{noun} {project_id}")
+    limit = getattr(tx.quotas, quota)
+    used = tx.execute(select(func.count()).where(table.c.project_id == project_id)).scalar_one()
+    if used >= limit:
+        raise QuotaExceededProblem(
+            f"The project has {used:,} {noun}, and the limit is {limit:,}. Delete one that is not needed, or ask the "
+            f"operator to raise the setting `{quota}`.",
+            context={"quota": quota, "used": used, "limit": limit},
+        )
 
 
 def limit_of(tx: Transaction, of: str, name: str, limits: Mapping[str, int]) -> int:

@@ -266,19 +266,23 @@ def test_names_are_unique_and_the_number_is_limited(desk: Desk) -> None:
         create(desk, "another")
 
 
+def fail_once(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    """Let the next submission of a scheduled job fail."""
+    errors = [error]
+
+    def fail_or_submit(*args: Any) -> Any:
+        if errors:
+            raise errors.pop()
+        return submit(*args)
+
+    monkeypatch.setattr("marey_server.store.schedules.firing.submit", fail_or_submit)
+
+
 def test_a_failing_schedule_does_not_stop_the_others(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     create(desk, "a", overlapping=True)
     create(desk, "b", overlapping=True)
     desk.clock.advance(HOUR_S)
-    calls: list[Any] = []
-
-    def fail_once(*args: Any) -> Any:
-        calls.append(args)
-        if len(calls) == 1:
-            raise RuntimeError("a fault of ours")
-        return submit(*args)
-
-    monkeypatch.setattr("marey_server.store.schedules.firing.submit", fail_once)
+    fail_once(monkeypatch, RuntimeError("a fault of ours"))
     assert firing.submit_due(desk.database) == 2
     assert len(jobs_of(desk)) == 1
     assert firing.submit_due(desk.database) == 0, "the failed schedule waits for its next time"
@@ -295,15 +299,7 @@ def test_a_schedule_that_cannot_be_stored_now_is_tried_again_after_the_others(
     create(desk, "a", overlapping=True)
     create(desk, "b", overlapping=True)
     desk.clock.advance(HOUR_S)
-    calls: list[Any] = []
-
-    def fail_once(*args: Any) -> Any:
-        calls.append(args)
-        if len(calls) == 1:
-            raise UnavailableProblem("Busy.")
-        return submit(*args)
-
-    monkeypatch.setattr("marey_server.store.schedules.firing.submit", fail_once)
+    fail_once(monkeypatch, UnavailableProblem("Busy."))
     assert (firing.submit_due(desk.database), len(jobs_of(desk))) == (1, 1)
     assert (firing.submit_due(desk.database), len(jobs_of(desk))) == (1, 2)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import Row, Select, delete, func, select
+from sqlalchemy import Row, Select, delete, select
 
 from marey_schemas.access import Role
 from marey_schemas.items import Page
@@ -17,9 +17,8 @@ from marey_server.errors import (
     ForbiddenProblem,
     InvalidProblem,
     NotFoundProblem,
-    QuotaExceededProblem,
 )
-from marey_server.store import listing, projects
+from marey_server.store import listing, projects, quotas
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.ids import new_id
 from marey_server.store.jobs.inputs import late_inputs
@@ -53,7 +52,7 @@ def create_schedule(tx: Transaction, project: str, request: ScheduleCreate) -> S
     row = projects.require(tx, project)
     _check_job(tx, row, request.job)
     due_us = next_time_us(request.cron, request.timezone, tx.now_us)
-    _require_free_place(tx, row)
+    quotas.require_place(tx, row.id, schedule)
     values = {
         "id": new_id("schedule"), "project_id": row.id, "name": request.name, "cron": request.cron,
         "timezone": request.timezone, "job": request.job.model_dump(mode="json", exclude_unset=True),
@@ -129,18 +128,6 @@ def _require_rights(tx: Transaction, row: ProjectRow, name: str) -> Row[Any]:
             "Only the author of a schedule and maintainers of the project may change or delete it.", code="not-author"
         )
     return found
-
-
-def _require_free_place(tx: Transaction, row: ProjectRow) -> None:
-    tx.lock(f"schedules {row.id}")
-    limit = tx.quotas.project_schedules
-    used = tx.execute(select(func.count()).where(schedule.c.project_id == row.id)).scalar_one()
-    if used >= limit:
-        raise QuotaExceededProblem(
-            f"The project has {used:,} schedules, and the limit is {limit:,}. Delete one that is not needed, or ask "
-            "the operator to raise the setting `project_schedules`.",
-            context={"quota": "project_schedules", "used": used, "limit": limit},
-        )
 
 
 def _find(tx: Transaction, row: ProjectRow, name: str, *, lock: bool = False) -> Row[Any]:

@@ -12,8 +12,8 @@ from marey_schemas.items import Page
 from marey_schemas.webhooks import NewWebhook, Webhook, WebhookChange, WebhookCreate, WebhookRotation
 from marey_server.access.network_addresses import Network, literal_address, may_connect
 from marey_server.access.webhook_signatures import issue_secret
-from marey_server.errors import InvalidProblem, NotFoundProblem, QuotaExceededProblem
-from marey_server.store import events, listing, projects
+from marey_server.errors import InvalidProblem, NotFoundProblem
+from marey_server.store import events, listing, projects, quotas
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.ids import new_id
 from marey_server.store.projects import ProjectRow
@@ -88,7 +88,7 @@ def create_webhook(tx: Transaction, project: str, request: WebhookCreate, networ
     """
     project_row = projects.require(tx, project)
     _require_public(request.url, networks)
-    _require_free_place(tx, project_row)
+    quotas.require_place(tx, project_row.id, webhook)
     secret = issue_secret()
     while events.number_events(tx) == events.NUMBERED_AT_ONCE:
         pass
@@ -101,18 +101,6 @@ def create_webhook(tx: Transaction, project: str, request: WebhookCreate, networ
     tx.execute(insert(webhook).values(**values))
     tx.audit("webhook.created", webhook_id, about=host_of(request.url), project_id=project_row.id)
     return _with_secret(tx, project_row, webhook_id, secret)
-
-
-def _require_free_place(tx: Transaction, project_row: ProjectRow) -> None:
-    tx.lock(f"webhooks {project_row.id}")
-    limit = tx.quotas.project_webhooks
-    used = tx.execute(select(func.count()).where(webhook.c.project_id == project_row.id)).scalar_one()
-    if used >= limit:
-        raise QuotaExceededProblem(
-            f"The project has {used:,} webhooks, and the limit is {limit:,}. Delete one that is not needed, or ask the "
-            "operator to raise the setting `project_webhooks`.",
-            context={"quota": "project_webhooks", "used": used, "limit": limit},
-        )
 
 
 def host_of(url: str) -> str:
