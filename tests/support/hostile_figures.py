@@ -1,7 +1,7 @@
 """Measurement of a server under attack, and of its effects on other clients: `python -m tests.support.hostile_figures`.
 
 Options: `--shots` is the number of requests that are sent one after another to measure their cost, `--seconds` the
-duration of the attack over 200 connections (0 for none), `--database` the address of a database other than SQLite.
+duration of the attack over 200 connections (0 for none), `--postgres` measures on a Postgres server that it starts.
 
 `docs/explanation/threat-model.md` lists the goals.
 """
@@ -24,6 +24,7 @@ from operator import itemgetter
 from pathlib import Path
 
 import httpx
+from tests.support.database_fixtures import database_address, new_postgres_database, postgres_server
 from tests.support.furnished_house import House, build_house, start_attempt
 from tests.support.hostile_client import (
     ATTACKED,
@@ -200,18 +201,28 @@ def measuring(name: str, companions: Sequence[Companion], cost: ProcessCost) -> 
         print(companion.line(), flush=True)
 
 
+@contextlib.contextmanager
+def database_of(postgres: bool) -> Iterator[str | None]:
+    """Yield the address of a new Postgres database with the usual durability, or None for SQLite."""
+    if not postgres:
+        yield None
+        return
+    with postgres_server(durable=True) as server, new_postgres_database(server, "figures") as url:
+        yield database_address(url)
+
+
 def main() -> None:
     """Run all measurements, and print their results."""
     parser = argparse.ArgumentParser(prog="python -m tests.support.hostile_figures")
     parser.add_argument("--seconds", type=float, default=60)
     parser.add_argument("--shots", type=int, default=1_000)
     parser.add_argument("--nice", type=int, default=0, help="niceness of the hostile program, 0 to 19")
-    parser.add_argument("--database", help="address of an empty Postgres database with the newest schema")
+    parser.add_argument("--postgres", action="store_true", help="measure on Postgres instead of SQLite")
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        process = ServerProcess(Path(folder), given.database, **ATTACKED).start()
+    with tempfile.TemporaryDirectory() as folder, database_of(given.postgres) as address:
+        process = ServerProcess(Path(folder), address, **ATTACKED).start()
         assert process.process is not None
-        database = Database(given.database or f"sqlite:///{process.data / 'marey.db'}")
+        database = Database(address or f"sqlite:///{process.data / 'marey.db'}")
         try:
             house, cost = build_house(People(process.url, database)), ProcessCost(process.process.pid)
             cost.wait_until_idle(STARTING_S)

@@ -174,7 +174,10 @@ class Resource(CallingExchange):
         """
         if error.status >= 500:
             return
-        if delay_s := self.services.refusal_brake.delay_s(self.client.key):
+        key = self.client.key
+        at_once = sum(request.client.key == key for request in self.services.in_flight)
+        brake, waiting = self.services.refusal_brake, len(self.services.turns)
+        if delay_s := brake.delay_s(key, at_once=at_once, waiting=waiting):
             self.services.metrics.delayed.inc()
             self._release_memory()
             await self.pause(delay_s)

@@ -9,6 +9,7 @@ treated as a client without a known token, so that its requests begin after the 
 from __future__ import annotations
 
 import asyncio
+import random
 import time
 
 from marey_schemas.lru import LruCache
@@ -18,12 +19,28 @@ EVERY_S = 0.05
 KEPT_SHARE = 0.9
 """Smallest ratio of a measured lateness to the previous one, so that the lateness decreases slowly."""
 TOLERATED_S = 0.1
-"""Lateness in seconds up to which no refusal is delayed."""
+"""Lateness in seconds up to which no refusal is delayed, unless the client is one of a crowd."""
 DELAY_PER_LATENESS = 10.0
+CROWD = 32
+"""Number of requests that wait for their turn from which on clients with many requests at once are a crowd."""
+FEW_AT_ONCE = 3
+"""Number of requests of a client under way up to which the client is not counted to the crowd.
+
+A program that sends one request after another hardly makes the event loop late. It may be refused often without being
+hostile: it may ask, for example, which of many items exist.
+"""
+TOLERATED_OF_CROWD_S = 0.02
+DELAY_PER_LATENESS_OF_CROWD = 100.0
 LONGEST_S = 5.0
 FREE_REFUSALS = 10
-"""Number of refusals of a client in `WINDOW_S` that are never delayed."""
-WINDOW_S = 10.0
+"""Number of refusals of a client that are never delayed, if it was not refused before."""
+FORGIVEN_EVERY_S = 1.0
+"""Time in seconds after which one refusal of a client no longer counts.
+
+Refusals are forgiven one after another. If all were forgiven at once, hostile clients would come back in waves.
+"""
+MEASURED_S = 10.0
+"""Time in seconds after the last refusal for which the lateness is measured."""
 CLIENTS_REMEMBERED = 10_000
 
 
@@ -38,26 +55,33 @@ class RefusalBrake:
         self._due_s = 0.0
         self._last_refusal_s = 0.0
         self._timer: asyncio.TimerHandle | None = None
-        self._refusals: LruCache[str, tuple[float, int]] = LruCache(max_entries=CLIENTS_REMEMBERED)
-        """Beginning of the window and number of refusals in it, by client."""
+        self._refusals: LruCache[str, tuple[float, float]] = LruCache(max_entries=CLIENTS_REMEMBERED)
+        """Number of refusals that count, and when it was computed, by client."""
 
-    def delay_s(self, client: str) -> float:
-        """Count a refusal of a client, and return the time in seconds that the client must wait for the answer."""
+    def delay_s(self, client: str, *, at_once: int = 1, waiting: int = 0) -> float:
+        """Count a refusal of a client, and return the time in seconds that the client must wait for the answer.
+
+        `at_once` is the number of requests of this client that are under way, `waiting` the number of requests of all
+        clients that wait for their turn.
+        """
         now_s = self._last_refusal_s = time.monotonic()
         if self._timer is None:
             self._measure_later(now_s)
-        since_s, count = self._refusals.get(client) or (now_s, 0)
-        if now_s - since_s > WINDOW_S:
-            since_s, count = now_s, 0
-        self._refusals.put(client, (since_s, count + 1))
-        if self.late_s <= TOLERATED_S or count < FREE_REFUSALS:
+        count = self._count(client, now_s) + 1
+        self._refusals.put(client, (count, now_s))
+        crowd = waiting > CROWD and at_once > FEW_AT_ONCE
+        if self.late_s <= (TOLERATED_OF_CROWD_S if crowd else TOLERATED_S) or count <= FREE_REFUSALS:
             return 0.0
-        return min(LONGEST_S, DELAY_PER_LATENESS * self.late_s)
+        delay_s = (DELAY_PER_LATENESS_OF_CROWD if crowd else DELAY_PER_LATENESS) * self.late_s
+        return random.uniform(0.5, 1.0) * min(LONGEST_S, delay_s)  # not all at once: they would come back at once
 
     def is_often_refused(self, client: str) -> bool:
-        """Return whether a client was refused more than `FREE_REFUSALS` times within `WINDOW_S`."""
-        since_s, count = self._refusals.get(client) or (0.0, 0)
-        return count > FREE_REFUSALS and time.monotonic() - since_s <= WINDOW_S
+        """Return whether more than `FREE_REFUSALS` refusals of a client count."""
+        return self._count(client, time.monotonic()) > FREE_REFUSALS
+
+    def _count(self, client: str, now_s: float) -> float:
+        count, counted_s = self._refusals.get(client) or (0.0, now_s)
+        return max(0.0, count - (now_s - counted_s) / FORGIVEN_EVERY_S)
 
     def _measure_later(self, now_s: float) -> None:
         self._due_s = now_s + EVERY_S
@@ -67,5 +91,5 @@ class RefusalBrake:
         now_s = time.monotonic()
         self.late_s = max(now_s - self._due_s, KEPT_SHARE * self.late_s)
         self._timer = None
-        if now_s - self._last_refusal_s < WINDOW_S:
+        if now_s - self._last_refusal_s < MEASURED_S:
             self._measure_later(now_s)

@@ -8,7 +8,16 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
-from marey_server.process.refusal_brake import FREE_REFUSALS, LONGEST_S, TOLERATED_S, WINDOW_S, RefusalBrake
+from marey_server.process.refusal_brake import (
+    CROWD,
+    FEW_AT_ONCE,
+    FORGIVEN_EVERY_S,
+    FREE_REFUSALS,
+    LONGEST_S,
+    TOLERATED_OF_CROWD_S,
+    TOLERATED_S,
+    RefusalBrake,
+)
 
 
 def in_a_loop(function: Callable[[], Awaitable[None]]) -> Callable[[], None]:
@@ -35,10 +44,10 @@ async def test_a_client_waits_after_its_free_refusals_the_longer_the_later_the_l
     brake = RefusalBrake()
     refused(brake, "a", FREE_REFUSALS)
     delays = []
-    for late_s in (2 * TOLERATED_S, 3 * TOLERATED_S, 1e3):
+    for late_s in (1.2 * TOLERATED_S, 3 * TOLERATED_S, 1e3):
         brake.late_s = late_s
         delays += refused(brake, "a", 1)
-    assert 0 < delays[0] < delays[1] < delays[2] == LONGEST_S
+    assert 0 < delays[0] < delays[1] < delays[2] <= LONGEST_S
     assert refused(brake, "b", FREE_REFUSALS) == [0.0] * FREE_REFUSALS
 
 
@@ -53,22 +62,44 @@ async def test_lateness_is_measured_while_there_are_refusals() -> None:
     assert brake.late_s > 0.1
 
 
-def test_refusals_are_counted_anew_after_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
+@in_a_loop
+async def test_a_client_with_many_requests_at_once_waits_earlier_and_longer_if_a_crowd_waits() -> None:
+    brake = RefusalBrake()
+    refused(brake, "a", FREE_REFUSALS)
+    brake.late_s = 1.5 * TOLERATED_OF_CROWD_S
+    assert brake.delay_s("a", at_once=FEW_AT_ONCE + 1, waiting=CROWD) == 0
+    assert brake.delay_s("a", at_once=FEW_AT_ONCE, waiting=CROWD + 1) == 0
+    brake.late_s = 1.2 * TOLERATED_S
+    alone = brake.delay_s("a", at_once=FEW_AT_ONCE, waiting=CROWD + 1)
+    assert 0 < alone < brake.delay_s("a", at_once=FEW_AT_ONCE + 1, waiting=CROWD + 1)
+
+
+@in_a_loop
+async def test_delays_differ_so_that_hostile_requests_do_not_come_back_in_waves() -> None:
+    brake = RefusalBrake()
+    refused(brake, "a", FREE_REFUSALS)
+    brake.late_s = 1e3
+    delays = refused(brake, "a", 100)
+    assert max(delays) - min(delays) > 0.4 * LONGEST_S
+
+
+def test_refusals_are_forgiven_one_after_another(monkeypatch: pytest.MonkeyPatch) -> None:
     async def main() -> None:
         brake = RefusalBrake()
-        refused(brake, "a", FREE_REFUSALS + 1)
+        refused(brake, "a", FREE_REFUSALS)
         brake.late_s = 1e3
-        later_s = time.monotonic() + WINDOW_S + 1
+        assert all(refused(brake, "a", 2))
+        later_s = time.monotonic() + 4.5 * FORGIVEN_EVERY_S
         monkeypatch.setattr(time, "monotonic", lambda: later_s)
-        assert refused(brake, "a", FREE_REFUSALS + 1) == [0.0] * FREE_REFUSALS + [LONGEST_S]
+        delays = refused(brake, "a", 4)
+        assert delays[:2] == [0.0, 0.0]
+        assert all(delays[2:])
         monkeypatch.undo()
 
     asyncio.run(main())
 
 
-def test_a_client_is_often_refused_after_its_free_refusals_until_the_window_ends(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_client_is_often_refused_until_refusals_are_forgiven(monkeypatch: pytest.MonkeyPatch) -> None:
     async def main() -> None:
         brake = RefusalBrake()
         refused(brake, "a", FREE_REFUSALS)
@@ -76,7 +107,7 @@ def test_a_client_is_often_refused_after_its_free_refusals_until_the_window_ends
         refused(brake, "a", 1)
         assert brake.is_often_refused("a")
         assert not brake.is_often_refused("b")
-        later_s = time.monotonic() + WINDOW_S + 1
+        later_s = time.monotonic() + 2 * FORGIVEN_EVERY_S
         monkeypatch.setattr(time, "monotonic", lambda: later_s)
         assert not brake.is_often_refused("a")
         monkeypatch.undo()
