@@ -165,8 +165,11 @@ def settings_page() -> str:
         "`MAREY_POOLS` as a list of JSON objects. [Run workers on Slurm](../how-to/run-workers-on-slurm.md) and "
         "[Run Marey on Kubernetes](../how-to/run-on-kubernetes.md) have examples.\n\n"
         + _table(("setting", "default", "meaning"), _fields_of(WorkerPool))
-        + "## Options of the launcher slurm\n\nIn `launcher_options` for all pools, and in `options` of a pool.\n\n"
-        + _table(("option", "default", "meaning"), _fields_of(SlurmOptions))
+        + "".join(
+            f"## Options of the launcher {name}\n\nIn `launcher_options` for all pools, and in `options` of a pool.\n\n"
+            + _table(("option", "default", "meaning"), _fields_of(options))
+            for name, options in (("kubernetes", ClusterOptions), ("slurm", SlurmOptions))
+        )
     )  # fmt: skip
 
 

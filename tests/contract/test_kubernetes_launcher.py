@@ -21,7 +21,7 @@ from marey_schemas.backoff import Backoff
 from marey_server.launchers.kubernetes import view
 from marey_server.launchers.kubernetes.launcher import KubernetesLauncher, make_kubernetes_launcher
 from marey_server.launchers.kubernetes.manifests import Pool, worker_job
-from marey_server.launchers.kubernetes.options import read_options
+from marey_server.launchers.kubernetes.options import ClusterOptions
 from marey_server.launchers.launcher import EngineError, LaunchContext, LauncherUnusable, WorkerEnd, WorkerRequest
 
 pytestmark = pytest.mark.slow
@@ -100,7 +100,7 @@ def test_each_worker_is_a_job_with_a_secret_that_ends_with_it(bench: Bench, clus
     assert names == ("marey-crew-k1-0", "marey-crew-k1-1")
     jobs = {job["metadata"]["name"]: job for job in cluster.all("jobs")}
     assert jobs.keys() == set(names)
-    pool = Pool("crew", "http://marey:8460", read_options({"image": IMAGE}), log_form="text")
+    pool = Pool("crew", "http://marey:8460", ClusterOptions(image=IMAGE), log_form="text")
     for name in names:
         assert jobs[name]["spec"] == worker_job(pool, name)["spec"]
     bench.until(dict.fromkeys(names, "running"))

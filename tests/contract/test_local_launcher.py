@@ -64,5 +64,5 @@ class TestLocalLauncher(LauncherContract):
 
 
 def test_options_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(LauncherUnusable, match="the launcher `local` has no options, but partition is given"):
+    with pytest.raises(LauncherUnusable, match="options of the launcher local: partition: Extra inputs"):
         LocalLauncher(LaunchContext("crew", "http://x", "t", tmp_path, "text", "info", {"partition": "gpu"}))

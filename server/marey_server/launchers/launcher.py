@@ -13,10 +13,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 from marey_schemas.queue.log_lines import LogForm
-from marey_server.process.data_folder import WORKER_TOKENS
+from marey_server.process.data_folder import worker_token_file
 
 ENTRY_POINTS = "marey.launchers"
 """Group of entry points in which packages register their launchers."""
@@ -73,7 +75,20 @@ class LaunchContext:
     @property
     def token_file(self) -> Path:
         """File that contains the token, and that no other user can read."""
-        return self.data / WORKER_TOKENS / self.pool
+        return worker_token_file(self.data, self.pool)
+
+
+Options = TypeVar("Options", bound=BaseModel)
+
+
+def read_options(model: type[Options], given: Mapping[str, Any], launcher: str) -> Options:
+    """Return the options of a launcher as a model. Raises `LauncherUnusable`, whose text names each invalid option."""
+    try:
+        return model.model_validate(dict(given))
+    except ValidationError as error:
+        reasons = {".".join(map(str, one["loc"])): one["msg"].removeprefix("Value error, ") for one in error.errors()}
+        faults = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
+        raise LauncherUnusable(f"options of the launcher {launcher}: {faults}") from None
 
 
 @dataclass(frozen=True)

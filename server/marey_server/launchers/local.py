@@ -15,16 +15,18 @@ from asyncio.subprocess import Process
 from collections.abc import Mapping
 from datetime import UTC, datetime
 
+from pydantic import BaseModel, ConfigDict
+
 from marey_schemas.backoff import Backoff
 from marey_schemas.processes.environment import clean_environment
 from marey_server.launchers.launcher import (
     HEALTHY_AFTER_S,
     LaunchContext,
     LaunchedWorker,
-    LauncherUnusable,
     WorkerEnd,
     WorkerRequest,
     WorkerState,
+    read_options,
     worker_arguments,
 )
 from marey_server.process.data_folder import WORKER_CACHE
@@ -35,14 +37,19 @@ PAUSES = Backoff(first_s=0.5, longest_s=30.0, jitter=0.25)
 STOP_S = 20.0
 
 
+class LocalOptions(BaseModel):
+    """Options of the launcher; there are none."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
 class LocalLauncher:
     """Launcher of worker processes on this machine. Limits of memory, processors and time do not apply to them."""
 
     outlives_server = False
 
     def __init__(self, context: LaunchContext) -> None:
-        if context.options:
-            raise LauncherUnusable(f"the launcher `local` has no options, but {min(context.options)} is given")
+        read_options(LocalOptions, context.options, "local")
         self._context = context
         self._workers: dict[str, _LocalWorker] = {}
         self._keeping: dict[str, asyncio.Task[None]] = {}

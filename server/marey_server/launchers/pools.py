@@ -20,7 +20,7 @@ from marey_server.launchers.launcher import (
 from marey_server.launchers.local import LocalLauncher
 from marey_server.launchers.pool_keeper import PoolKeeper
 from marey_server.launchers.worker_tokens import keep_pool_token, make_worker_token
-from marey_server.process.data_folder import WORKER_TOKENS
+from marey_server.process.data_folder import worker_token_file
 from marey_server.process.services import Services
 from marey_server.process.worker_pools import WorkerPool
 
@@ -82,7 +82,7 @@ def find_launcher(name: str) -> MakeLauncher:
 def _launcher_of(pool: WorkerPool, services: Services, address: str) -> Launcher:
     settings = services.settings
     make = find_launcher(settings.launcher)
-    file = settings.data / WORKER_TOKENS / pool.name
+    file = worker_token_file(settings.data, pool.name)
     token = keep_pool_token(services.database, settings, pool.name, pool.labels, file)
     return make(
         LaunchContext(

@@ -20,7 +20,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from marey_schemas.processes.environment import clean_environment
 from marey_schemas.queue.worker_protocol import INTERRUPTED_STATUS
@@ -30,10 +30,10 @@ from marey_server.launchers.launcher import (
     EngineError,
     LaunchContext,
     LaunchedWorker,
-    LauncherUnusable,
     WorkerEnd,
     WorkerRequest,
     WorkerState,
+    read_options,
     worker_arguments,
 )
 from marey_server.process.data_folder import WORKER_LOGS
@@ -122,12 +122,7 @@ class SlurmLauncher:
     outlives_server = True
 
     def __init__(self, context: LaunchContext) -> None:
-        try:
-            self._options = SlurmOptions.model_validate(dict(context.options))
-        except ValidationError as error:
-            wrong = error.errors()[0]
-            place = ".".join(map(str, wrong["loc"]))
-            raise LauncherUnusable(f"options of the launcher slurm: {place}: {wrong['msg']}") from None
+        self._options = read_options(SlurmOptions, context.options, "slurm")
         self._context = context
         self._comment = f"marey {context.url}"
         self._logs = context.data / WORKER_LOGS

@@ -10,6 +10,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings
 
 from marey_schemas.sizes import MIB
+from marey_server.process.secret_files import read_secret
 from marey_server.store.object_storage.client import Bucket
 
 
@@ -94,11 +95,3 @@ class BlobSettings(BaseSettings):
             secret_key=None if self.s3_secret_key_file is None else read_secret(self.s3_secret_key_file),
             timeout_s=self.s3_timeout_s,
         )
-
-
-def read_secret(file: Path) -> str:
-    """Return the secret that a file contains. Raises `ValueError` if the file cannot be read."""
-    try:
-        return file.read_text(encoding="utf-8").rstrip("\r\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file} cannot be read: {error}") from None

@@ -20,6 +20,11 @@ WORKER_LOGS = "worker-logs"
 log = logging.getLogger(__name__)
 
 
+def worker_token_file(data: Path, pool: str) -> Path:
+    """Return the file below the data folder that contains the token of a pool of workers."""
+    return data / WORKER_TOKENS / pool
+
+
 def prepare_data_folder(settings: Settings) -> None:
     """Create the data folder, and deny other users access to the server's files and folders in this folder.
 

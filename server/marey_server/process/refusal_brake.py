@@ -9,9 +9,9 @@ treated as a client without a known token, so that its requests begin after the 
 from __future__ import annotations
 
 import asyncio
-import random
 import time
 
+from marey_schemas.backoff import spread
 from marey_schemas.lru import LruCache
 
 EVERY_S = 0.05
@@ -73,7 +73,7 @@ class RefusalBrake:
         if self.late_s <= (TOLERATED_OF_CROWD_S if crowd else TOLERATED_S) or count <= FREE_REFUSALS:
             return 0.0
         delay_s = (DELAY_PER_LATENESS_OF_CROWD if crowd else DELAY_PER_LATENESS) * self.late_s
-        return random.uniform(0.5, 1.0) * min(LONGEST_S, delay_s)  # not all at once: they would come back at once
+        return spread(min(LONGEST_S, delay_s), 0.5)  # delays that end at once bring all back at once
 
     def is_often_refused(self, client: str) -> bool:
         """Return whether more than `FREE_REFUSALS` refusals of a client count."""

@@ -16,8 +16,9 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
 from marey_schemas.sizes import KIB, MIB
-from marey_server.process.blob_settings import BlobSettings, read_secret
+from marey_server.process.blob_settings import BlobSettings
 from marey_server.process.children import ChildLimits
+from marey_server.process.secret_files import read_secret
 from marey_server.process.worker_pools import WorkerPools
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.retention import Retention

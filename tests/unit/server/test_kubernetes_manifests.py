@@ -9,8 +9,8 @@ from tests.support.cluster.admission import admit
 from tests.support.cluster.objects import Refused
 
 from marey_server.launchers.kubernetes.manifests import Manifest, Pool, pool_deployment, token_secret, worker_job
-from marey_server.launchers.kubernetes.options import ClusterOptions, read_options
-from marey_server.launchers.launcher import WorkerRequest
+from marey_server.launchers.kubernetes.options import ClusterOptions
+from marey_server.launchers.launcher import LauncherUnusable, WorkerRequest, read_options
 
 FILES = Path(__file__).parent / "manifests"
 IMAGE = f"registry.example.org/marey-worker@sha256:{'0' * 64}"
@@ -77,8 +77,8 @@ def test_the_pods_of_a_deployment_are_those_of_a_job() -> None:
     ],
 )
 def test_invalid_options_are_named(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        read_options(options)
+    with pytest.raises(LauncherUnusable, match=message):
+        read_options(ClusterOptions, options, "kubernetes")
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from marey_server.launchers.kubernetes.cluster import Cluster, NoSuchObject, ObjectExists
 from marey_server.launchers.kubernetes.manifests import Manifest, Pool, job_labels, token_secret, worker_job
-from marey_server.launchers.kubernetes.options import ClusterOptions, read_options
+from marey_server.launchers.kubernetes.options import ClusterOptions
 from marey_server.launchers.kubernetes.states import (
     blocked_reason,
     end_of,
@@ -25,9 +25,9 @@ from marey_server.launchers.launcher import (
     EngineError,
     LaunchContext,
     LaunchedWorker,
-    LauncherUnusable,
     WorkerEnd,
     WorkerRequest,
+    read_options,
 )
 
 log = logging.getLogger(__name__)
@@ -40,11 +40,7 @@ MOST_REMEMBERED = 1024
 
 def make_kubernetes_launcher(context: LaunchContext) -> KubernetesLauncher:
     """Return the launcher of a pool. Raises `LauncherUnusable` if an option is invalid."""
-    try:
-        options = read_options(context.options)
-    except ValueError as error:
-        raise LauncherUnusable(str(error)) from error
-    return KubernetesLauncher(context, options)
+    return KubernetesLauncher(context, read_options(ClusterOptions, context.options, "kubernetes"))
 
 
 class KubernetesLauncher:

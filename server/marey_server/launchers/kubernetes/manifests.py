@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from marey_schemas.processes.environment import thread_limits
+from marey_schemas.sizes import MIB
 from marey_server.launchers.kubernetes.options import ClusterOptions
 from marey_server.launchers.launcher import WorkerRequest
 
@@ -48,7 +49,7 @@ class Pool:
 
     @property
     def memory_bytes(self) -> int:
-        return self.request.memory_bytes or self.options.memory_bytes
+        return self.request.memory_bytes or self.options.memory_mb * MIB
 
 
 def job_labels(pool: str, options: ClusterOptions) -> dict[str, str]:

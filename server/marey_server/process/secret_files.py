@@ -1,0 +1,13 @@
+"""Files that contain one secret and nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def read_secret(file: Path) -> str:
+    """Return the secret that a file contains. Raises `ValueError` if the file cannot be read."""
+    try:
+        return file.read_text(encoding="utf-8").rstrip("\r\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{file} cannot be read: {error}") from None
