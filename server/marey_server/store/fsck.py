@@ -23,7 +23,7 @@ from marey_server.access.webhook_signatures import is_secret
 from marey_server.store import quotas
 from marey_server.store.blobs import digest_of, read_blob
 from marey_server.store.database.connections import Database
-from marey_server.store.datasets.chunks import StoredChunks
+from marey_server.store.datasets.chunks import StoredChunks, chunk_in
 from marey_server.store.datasets.history import revisions_with
 from marey_server.store.datasets.manifests import read_manifest
 from marey_server.store.documents import items_named_in
@@ -279,7 +279,7 @@ def _check_upload(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 def _check_chunk(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     """Return the faults of one chunk of a tree of entries: it is damaged, or a chunk below it is missing."""
     try:
-        chunk = decode(row.digest, bytes(row.data))
+        chunk = decode(row.digest, chunk_in(row.data))
     except DamagedChunk as error:
         return [StoreDefect("chunk-corrupt", row.digest, str(error))]
     below = {child.digest for child in chunk.children} if isinstance(chunk, Branch) else set()

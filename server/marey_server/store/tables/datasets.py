@@ -32,7 +32,17 @@ dataset = Table(
     unique_alive("dataset", "project_id", "name"),
 )
 
-dataset_commit = Table(
+
+def _unique_value(name: str, column: str, *within: str) -> Index:
+    """Return a unique index of commits that have a value in `column`; most have none, and do not write to the index."""
+    has_value = text(f"{column} IS NOT NULL")
+    columns = (*within, column)
+    return Index(
+        f"uq_dataset_commit_{name}", *columns, unique=True, sqlite_where=has_value, postgresql_where=has_value
+    )
+
+
+dataset_commit = Table(  # on SQLite, rows are in the index of their key, so that a commit writes one page
     "dataset_commit",
     metadata,
     Column("dataset_id", ID, ForeignKey("dataset.id"), primary_key=True),
@@ -45,8 +55,9 @@ dataset_commit = Table(
     Column("generation", Integer, nullable=False),  # 0, or 1 more than the greatest generation of a parent
     Column("write_id", String(64)),  # the name that the client gave to the commit
     Column("job_id", ID, ForeignKey("job.id")),  # the job that committed its outputs; it commits once
-    Index("uq_dataset_commit_write", "dataset_id", "write_id", unique=True),
-    Index("uq_dataset_commit_job", "job_id", unique=True),
+    _unique_value("write", "write_id", "dataset_id"),
+    _unique_value("job", "job_id"),
+    sqlite_with_rowid=False,
 )
 
 fast_forward = Table(  # merges that moved a branch to an existing commit; other merges are commits with a `write_id`
@@ -58,7 +69,7 @@ fast_forward = Table(  # merges that moved a branch to an existing commit; other
     ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
 )
 
-commit_parent = Table(
+commit_parent = Table(  # on SQLite, as `dataset_commit`
     "commit_parent",
     metadata,
     Column("dataset_id", ID, primary_key=True),
@@ -71,6 +82,7 @@ commit_parent = Table(
         ["dataset_commit.dataset_id", "dataset_commit.digest"],
         name="fk_commit_parent_parent",
     ),
+    sqlite_with_rowid=False,
 )
 
 dataset_ref = Table(  # a branch or a tag
