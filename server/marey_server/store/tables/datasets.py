@@ -37,9 +37,7 @@ def _unique_value(name: str, column: str, *within: str) -> Index:
     """Return a unique index of commits that have a value in `column`; most have none, and do not write to the index."""
     has_value = text(f"{column} IS NOT NULL")
     columns = (*within, column)
-    return Index(
-        f"uq_dataset_commit_{name}", *columns, unique=True, sqlite_where=has_value, postgresql_where=has_value
-    )
+    return Index(f"uq_dataset_commit_{name}", *columns, unique=True, sqlite_where=has_value, postgresql_where=has_value)
 
 
 dataset_commit = Table(  # on SQLite, rows are in the index of their key, so that a commit writes one page
@@ -47,6 +45,7 @@ dataset_commit = Table(  # on SQLite, rows are in the index of their key, so tha
     metadata,
     Column("dataset_id", ID, ForeignKey("dataset.id"), primary_key=True),
     Column("digest", DIGEST, primary_key=True),
+    Column("first_parent", DIGEST),  # not a foreign key, for which each purged commit would be searched for children
     Column("tree", DIGEST, ForeignKey("tree_chunk.digest"), nullable=False),
     Column("author", String(255), nullable=False),
     Column("message", Text, nullable=False),
@@ -69,12 +68,12 @@ fast_forward = Table(  # merges that moved a branch to an existing commit; other
     ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
 )
 
-commit_parent = Table(  # on SQLite, as `dataset_commit`
+commit_parent = Table(  # parents of merges after the first one, so that a plain commit has no row here
     "commit_parent",
     metadata,
     Column("dataset_id", ID, primary_key=True),
     Column("digest", DIGEST, primary_key=True),
-    Column("position", Integer, primary_key=True),
+    Column("position", Integer, primary_key=True),  # 1 for the second parent
     Column("parent", DIGEST, nullable=False),
     ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
     ForeignKeyConstraint(
@@ -82,7 +81,6 @@ commit_parent = Table(  # on SQLite, as `dataset_commit`
         ["dataset_commit.dataset_id", "dataset_commit.digest"],
         name="fk_commit_parent_parent",
     ),
-    sqlite_with_rowid=False,
 )
 
 dataset_ref = Table(  # a branch or a tag
