@@ -5,7 +5,7 @@ The checks can run while a server runs, because they use short reads of bounded 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -123,14 +123,10 @@ def _check_file(tx: Transaction) -> list[StoreDefect]:
     findings = [StoreDefect("broken-database", "database", line) for line in pages]
     dangling = tx.execute(text("PRAGMA foreign_key_check")).mappings()
     return findings + [
-        StoreDefect("dangling-reference", _place_of(row), f"refers to a missing row of {row['parent']}")
+        StoreDefect("dangling-reference", place, f"refers to a missing row of {row['parent']}")
         for row in dangling
+        for place in [row["table"] if row["rowid"] is None else f"{row['table']}/{row['rowid']}"]
     ]
-
-
-def _place_of(row: Mapping[Any, Any]) -> str:
-    """Return the table of a row, and its `rowid` if the table has one."""
-    return str(row["table"]) if row["rowid"] is None else f"{row['table']}/{row['rowid']}"
 
 
 def _check_document(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
@@ -298,8 +294,7 @@ def _check_dataset(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         parents.setdefault(found.digest, []).append(found.parent)
     commits = select(dataset_commit).where(dataset_commit.c.dataset_id == row.id)
     findings = []
-    first_parents: set[str] = set()
-    there: set[str] = set()
+    there, first_parents = set[str](), set[str]()
     for one in tx.execute(commits.execution_options(yield_per=1000)):
         first = () if one.first_parent is None else (one.first_parent,)
         there.add(one.digest)
@@ -307,10 +302,8 @@ def _check_dataset(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         record = CommitRecord(one.tree, (*first, *parents.get(one.digest, ())), one.author, one.message, one.at)
         if record.digest != one.digest:
             findings.append(StoreDefect("commit-corrupt", row.id, f"the commit {one.digest} has another digest"))
-    findings += [
-        StoreDefect("commit-lost", row.id, f"the commit {one} before another commit is missing")
-        for one in sorted(first_parents - there)
-    ]
+    lost = sorted(first_parents - there)
+    findings += [StoreDefect("commit-lost", row.id, f"the parent {one} of a commit is missing") for one in lost]
     return findings + _check_folder(tx, row) + _check_entries(tx, row) + _check_proposals(tx, row)
 
 

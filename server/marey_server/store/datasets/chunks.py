@@ -36,9 +36,10 @@ class StoredChunks:
         wanted = list(digests)
         found = {digest: self.new[digest] for digest in wanted if digest in self.new}
         missing = [digest for digest in wanted if digest not in found]
+        decompressor = zstandard.ZstdDecompressor()
         for some in in_lists(missing):
             rows = self._tx.run(_CHUNKS, {"digests": padded(some)})
-            found.update((row.digest, chunk_in(row.data)) for row in rows)
+            found.update((row.digest, chunk_in(row.data, decompressor)) for row in rows)
         return found
 
     def save(self, chunks: Mapping[str, bytes]) -> None:
@@ -60,10 +61,11 @@ def store_chunks(tx: Transaction, chunks: Mapping[str, bytes]) -> None:
     blobs.insert_new(tx, tree_chunk, rows)
 
 
-def chunk_in(stored: bytes) -> bytes:
+def chunk_in(stored: bytes, decompressor: zstandard.ZstdDecompressor | None = None) -> bytes:
     """Return the bytes of a chunk from the value of `tree_chunk.data`.
 
-    A damaged value is returned as it is. Its digest is not that of the chunk, so `decode` refuses it.
+    If a `decompressor` is given, no new one is made, which would take longer than its use. A damaged value is returned
+    as it is. Its digest is not that of the chunk, so `decode` refuses it.
     """
     data = bytes(stored)
     if not data.startswith(_START_OF_FRAME):
@@ -71,6 +73,6 @@ def chunk_in(stored: bytes) -> bytes:
     try:
         if zstandard.frame_content_size(data) > MOST_CHUNK_BYTES:
             return data
-        return zstandard.ZstdDecompressor().decompress(data, max_output_size=MOST_CHUNK_BYTES)
+        return (decompressor or zstandard.ZstdDecompressor()).decompress(data, max_output_size=MOST_CHUNK_BYTES)
     except zstandard.ZstdError:
         return data
