@@ -150,7 +150,7 @@ def test_many_events_are_numbered_in_parts(lab: Lab, monkeypatch: pytest.MonkeyP
 def older_rows(database: Database) -> list[dict[str, Any]]:
     """Return rows of events; on Postgres, their order by transaction differs from the order of insertion."""
     transactions = [0] * 6 if database.is_sqlite else [9, 5, 9, 7, 5, 8]
-    common = {"at_us": 1, "project_id": None, "kind": "old", "subject": "s", "body": {}}
+    common: dict[str, Any] = {"at_us": 1, "project_id": None, "kind": "old", "subject": "s", "body": {}}
     return [{**common, "seq": 10 * (n + 1), "xid": xid} for n, xid in enumerate(transactions)]
 
 

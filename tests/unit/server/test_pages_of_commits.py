@@ -107,7 +107,7 @@ def test_fsck_reports_a_compressed_chunk_that_is_cut_off(gaits: CommittingDesk, 
 
 def test_fsck_reports_a_first_parent_that_is_missing(gaits: CommittingDesk) -> None:
     gaits.change(PutEntry(path="walk", item=add(gaits, "walk", 1)))
-    first = gaits.head()
+    first = gaits.commit().digest
     gaits.change(PutEntry(path="run", item=add(gaits, "run", 2)))
     database = gaits.desk.database
     assert database.read(SYSTEM, lambda tx: tx.execute(select(commit_parent)).all()) == []

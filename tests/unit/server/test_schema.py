@@ -214,13 +214,10 @@ def test_an_upgrade_keeps_commits_with_their_parents_and_events(gaits: Committin
 
     database.write(SYSTEM, insert_merge)
 
-    def history() -> object:
-        return gaits.read(datasets.list_commits, "lab", "gaits", "main", path="", cursor=None, limit=100).items
-
     def events_of(tx: Transaction) -> object:
         return tx.execute(sqlalchemy.select(metadata.tables["event"]).order_by(text("seq"))).all()
 
-    before, events_before = history(), database.read(SYSTEM, events_of)
+    before, events_before = gaits.log(), database.read(SYSTEM, events_of)
     assert [len(one.parents) for one in before] == [2, 1, 1, 1, 0]
     with database.engine.begin() as connection:
         config = schema._config()
@@ -229,10 +226,10 @@ def test_an_upgrade_keeps_commits_with_their_parents_and_events(gaits: Committin
         count = sqlalchemy.text("SELECT count(*) FROM commit_parent")
         assert connection.execute(count).scalar() == 5
     schema.upgrade_schema(database_url)
-    assert (history(), database.read(SYSTEM, events_of)) == (before, events_before)
+    assert (gaits.log(), database.read(SYSTEM, events_of)) == (before, events_before)
     assert list(fsck.check_store(database)) == []
     gaits.change(PutEntry(path="run", item=walk))
-    assert len(history()) == 6
+    assert len(gaits.log()) == 6
 
 
 def test_a_number_whose_event_was_deleted_by_hand_is_not_given_again_after_the_upgrade(tmp_path: Path) -> None:
