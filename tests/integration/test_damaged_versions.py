@@ -18,9 +18,9 @@ from marey_client import Marey
 from marey_client.errors import RequestFailed
 from marey_server.access.principal import SYSTEM
 from marey_server.store.database.connections import Database
+from marey_server.store.datasets.chunks import chunk_in
 from marey_server.store.datasets.committing import insert_commit
 from marey_server.store.fsck import check_store
-from marey_server.store.datasets.chunks import chunk_in
 from marey_server.store.tables import dataset, dataset_commit, dataset_ref, tree_chunk
 from marey_server.store.transaction import Transaction
 from marey_versions.records import CommitRecord

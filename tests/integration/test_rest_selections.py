@@ -28,9 +28,9 @@ from marey_server.access.principal import SYSTEM
 from marey_server.store import projects
 from marey_server.store.database.connections import Database
 from marey_server.store.datasets import selecting
+from marey_server.store.datasets.chunks import chunk_in
 from marey_server.store.fsck import check_store
 from marey_server.store.items.facets import publish_facets
-from marey_server.store.datasets.chunks import chunk_in
 from marey_server.store.tables import tree_chunk
 from marey_server.store.transaction import Transaction
 
