@@ -18,6 +18,7 @@ from marey_client import Marey
 from marey_client.errors import RequestFailed
 from marey_server.access.principal import SYSTEM
 from marey_server.store.database.connections import Database
+from marey_server.store.datasets.chunks import chunk_in
 from marey_server.store.datasets.committing import insert_commit
 from marey_server.store.fsck import check_store
 from marey_server.store.tables import dataset, dataset_commit, dataset_ref, tree_chunk
@@ -99,7 +100,7 @@ class Versions:
         return self._database.read(SYSTEM, lambda tx: tx.execute(statement).scalar_one())
 
     def chunk(self, digest: str) -> bytes:
-        return bytes(self._read(select(tree_chunk.c.data).where(tree_chunk.c.digest == digest)))
+        return chunk_in(self._read(select(tree_chunk.c.data).where(tree_chunk.c.digest == digest)))
 
     def store(self, data: bytes) -> str:
         """Store the bytes of a chunk and return their digest."""

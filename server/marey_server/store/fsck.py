@@ -23,7 +23,7 @@ from marey_server.access.webhook_signatures import is_secret
 from marey_server.store import quotas
 from marey_server.store.blobs import digest_of, read_blob
 from marey_server.store.database.connections import Database
-from marey_server.store.datasets.chunks import StoredChunks
+from marey_server.store.datasets.chunks import StoredChunks, chunk_in
 from marey_server.store.datasets.history import revisions_with
 from marey_server.store.datasets.manifests import read_manifest
 from marey_server.store.documents import items_named_in
@@ -123,10 +123,9 @@ def _check_file(tx: Transaction) -> list[StoreDefect]:
     findings = [StoreDefect("broken-database", "database", line) for line in pages]
     dangling = tx.execute(text("PRAGMA foreign_key_check")).mappings()
     return findings + [
-        StoreDefect(
-            "dangling-reference", f"{row['table']}/{row['rowid']}", f"refers to a missing row of {row['parent']}"
-        )
+        StoreDefect("dangling-reference", place, f"refers to a missing row of {row['parent']}")
         for row in dangling
+        for place in [row["table"] if row["rowid"] is None else f"{row['table']}/{row['rowid']}"]
     ]
 
 
@@ -279,7 +278,7 @@ def _check_upload(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 def _check_chunk(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     """Return the faults of one chunk of a tree of entries: it is damaged, or a chunk below it is missing."""
     try:
-        chunk = decode(row.digest, bytes(row.data))
+        chunk = decode(row.digest, chunk_in(row.data))
     except DamagedChunk as error:
         return [StoreDefect("chunk-corrupt", row.digest, str(error))]
     below = {child.digest for child in chunk.children} if isinstance(chunk, Branch) else set()
@@ -295,10 +294,16 @@ def _check_dataset(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         parents.setdefault(found.digest, []).append(found.parent)
     commits = select(dataset_commit).where(dataset_commit.c.dataset_id == row.id)
     findings = []
+    there, first_parents = set[str](), set[str]()
     for one in tx.execute(commits.execution_options(yield_per=1000)):
-        record = CommitRecord(one.tree, tuple(parents.get(one.digest, ())), one.author, one.message, one.at)
+        first = () if one.first_parent is None else (one.first_parent,)
+        there.add(one.digest)
+        first_parents.update(first)
+        record = CommitRecord(one.tree, (*first, *parents.get(one.digest, ())), one.author, one.message, one.at)
         if record.digest != one.digest:
             findings.append(StoreDefect("commit-corrupt", row.id, f"the commit {one.digest} has another digest"))
+    lost = sorted(first_parents - there)
+    findings += [StoreDefect("commit-lost", row.id, f"the parent {one} of a commit is missing") for one in lost]
     return findings + _check_folder(tx, row) + _check_entries(tx, row) + _check_proposals(tx, row)
 
 

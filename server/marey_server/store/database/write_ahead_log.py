@@ -22,8 +22,8 @@ from marey_server import faults
 
 log = logging.getLogger(__name__)
 
-PAGE_BYTES = 8192
-"""Size of the pages of new databases; others keep theirs (docs/decisions/0053)."""
+PAGE_BYTES = 4096
+"""Size of the pages of new databases; others keep theirs (docs/decisions/0056)."""
 HEADER_BYTES = 24
 """Size of the header of a page in the log."""
 SHORT_BYTES = 4 * 2**20

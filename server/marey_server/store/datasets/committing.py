@@ -232,15 +232,17 @@ def insert_commit(
     above = select(dataset_commit.c.generation).where(
         dataset_commit.c.dataset_id == dataset_id, dataset_commit.c.digest.in_(record.parents)
     )
+    first_parent = record.parents[0] if record.parents else None
     row = {
-        "dataset_id": dataset_id, "digest": record.digest, "tree": record.tree, "author": record.author,
-        "message": record.message, "at": record.at, "entries": entries, "write_id": write_id, "job_id": job_id,
+        "dataset_id": dataset_id, "digest": record.digest, "first_parent": first_parent, "tree": record.tree,
+        "author": record.author, "message": record.message, "at": record.at, "entries": entries,
+        "write_id": write_id, "job_id": job_id,
         "generation": max((number + 1 for number in tx.execute(above).scalars()), default=0),
     }  # fmt: skip
     tx.execute(insert(dataset_commit).values(**row))
     places = [
         {"dataset_id": dataset_id, "digest": record.digest, "position": place, "parent": parent}
-        for place, parent in enumerate(record.parents)
+        for place, parent in enumerate(record.parents[1:], start=1)
     ]
     if places:
         tx.execute(insert(commit_parent), places)

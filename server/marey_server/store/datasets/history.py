@@ -48,7 +48,7 @@ def _commit(tx: Transaction, dataset_id: str, digest: str) -> Commit:
     row = tx.execute(select(dataset_commit).where(*of_dataset)).first()
     if row is None:
         raise NotFoundProblem(f"The dataset has no commit {digest!r}.", code="no-version")
-    return _shown(row, _parents(tx, dataset_id, [digest]).get(digest, ()))
+    return _shown(row, _parents(tx, dataset_id, [row])[digest])
 
 
 def tree_of(tx: Transaction, dataset_id: str, digest: str) -> str:
@@ -64,15 +64,16 @@ def _shown(row: Row[Any], parents: Sequence[str]) -> Commit:
     )  # fmt: skip
 
 
-def _parents(tx: Transaction, dataset_id: str, digests: Sequence[str]) -> dict[str, list[str]]:
+def _parents(tx: Transaction, dataset_id: str, commits: Sequence[Row[Any]]) -> dict[str, list[str]]:
+    """Return the parents of commits, given as rows, by digest of the commit."""
+    found = {row.digest: [] if row.first_parent is None else [row.first_parent] for row in commits}
     statement = (
         select(commit_parent.c.digest, commit_parent.c.parent)
-        .where(commit_parent.c.dataset_id == dataset_id, commit_parent.c.digest.in_(digests))
+        .where(commit_parent.c.dataset_id == dataset_id, commit_parent.c.digest.in_(found))
         .order_by(commit_parent.c.digest, commit_parent.c.position)
     )
-    found: dict[str, list[str]] = {}
     for row in tx.execute(statement):
-        found.setdefault(row.digest, []).append(row.parent)
+        found[row.digest].append(row.parent)
     return found
 
 
@@ -94,9 +95,9 @@ def list_commits(
     following = found[limit:][:1]
     if path:
         chosen, following = _changing(tx, found, path, limit)
-    parents = _parents(tx, row.id, [one.digest for one, _ in chosen])
+    parents = _parents(tx, row.id, [one for one, _ in chosen])
     return Page(
-        items=tuple(_listed(one, parents.get(one.digest, ()), change) for one, change in chosen),
+        items=tuple(_listed(one, parents[one.digest], change) for one, change in chosen),
         next_cursor=listing.make_cursor(tx, order, identity, [following[0].digest]) if following else None,
     )
 
@@ -173,7 +174,7 @@ def _no_entry(tx: Transaction, dataset_id: str, start: str, path: str, kind: Kin
             continue
         to = path_after(reader, earlier.tree, later.tree, key_of(path, kind), most=MOST_DIFFERENCES)
         done = "removed" if to is None else f"moved to {to!r}"
-        removed_by = _shown(later, _parents(tx, dataset_id, [later.digest]).get(later.digest, ()))
+        removed_by = _shown(later, _parents(tx, dataset_id, [later])[later.digest])
         return NotFoundProblem(
             f"{missing}; it was {done} by the commit {later.digest} ({_first_line(later.message)!r}).",
             code="no-entry",
@@ -218,8 +219,7 @@ class CommitReader:
         if digest not in self._known:
             of_dataset = (dataset_commit.c.dataset_id == self._dataset_id, dataset_commit.c.digest == digest)
             row = self._tx.execute(select(dataset_commit).where(*of_dataset)).one()
-            parents = _parents(self._tx, self._dataset_id, [digest]).get(digest, ())
-            self._known[digest] = _ReadCommit(row, parents)
+            self._known[digest] = _ReadCommit(row, _parents(self._tx, self._dataset_id, [row])[digest])
         return self._known[digest]
 
 

@@ -29,7 +29,7 @@ from marey_server.store.ids import new_id
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.revs import ExpectedRev, change_row
-from marey_server.store.tables import collection, commit_parent, dataset, dataset_commit, dataset_ref
+from marey_server.store.tables import collection, dataset, dataset_commit, dataset_ref
 from marey_server.store.transaction import Transaction
 from marey_versions.tree.chunks import DamagedChunk
 
@@ -345,10 +345,10 @@ def first_parents(dataset_id: str, start: str, steps: int) -> CTE:
     first = (dataset_commit.c.dataset_id == dataset_id, dataset_commit.c.digest == start)
     chain = select(dataset_commit.c.digest, literal_column("0").label("place")).where(*first).cte(recursive=True)
     return chain.union_all(
-        select(commit_parent.c.parent, chain.c.place + 1).where(
-            commit_parent.c.dataset_id == dataset_id,
-            commit_parent.c.digest == chain.c.digest,
-            commit_parent.c.position == 0,
+        select(dataset_commit.c.first_parent, chain.c.place + 1).where(
+            dataset_commit.c.dataset_id == dataset_id,
+            dataset_commit.c.digest == chain.c.digest,
+            dataset_commit.c.first_parent.is_not(None),
             chain.c.place < steps,
         )
     )

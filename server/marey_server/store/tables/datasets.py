@@ -32,11 +32,20 @@ dataset = Table(
     unique_alive("dataset", "project_id", "name"),
 )
 
-dataset_commit = Table(
+
+def _unique_value(name: str, column: str, *within: str) -> Index:
+    """Return a unique index of commits that have a value in `column`; most have none, and do not write to the index."""
+    has_value = text(f"{column} IS NOT NULL")
+    columns = (*within, column)
+    return Index(f"uq_dataset_commit_{name}", *columns, unique=True, sqlite_where=has_value, postgresql_where=has_value)
+
+
+dataset_commit = Table(  # on SQLite, rows are in the index of their key, so that a commit writes one page
     "dataset_commit",
     metadata,
     Column("dataset_id", ID, ForeignKey("dataset.id"), primary_key=True),
     Column("digest", DIGEST, primary_key=True),
+    Column("first_parent", DIGEST),  # not a foreign key, for which each purged commit would be searched for children
     Column("tree", DIGEST, ForeignKey("tree_chunk.digest"), nullable=False),
     Column("author", String(255), nullable=False),
     Column("message", Text, nullable=False),
@@ -45,8 +54,9 @@ dataset_commit = Table(
     Column("generation", Integer, nullable=False),  # 0, or 1 more than the greatest generation of a parent
     Column("write_id", String(64)),  # the name that the client gave to the commit
     Column("job_id", ID, ForeignKey("job.id")),  # the job that committed its outputs; it commits once
-    Index("uq_dataset_commit_write", "dataset_id", "write_id", unique=True),
-    Index("uq_dataset_commit_job", "job_id", unique=True),
+    _unique_value("write", "write_id", "dataset_id"),
+    _unique_value("job", "job_id"),
+    sqlite_with_rowid=False,
 )
 
 fast_forward = Table(  # merges that moved a branch to an existing commit; other merges are commits with a `write_id`
@@ -58,12 +68,12 @@ fast_forward = Table(  # merges that moved a branch to an existing commit; other
     ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
 )
 
-commit_parent = Table(
+commit_parent = Table(  # parents of merges after the first one, so that a plain commit has no row here
     "commit_parent",
     metadata,
     Column("dataset_id", ID, primary_key=True),
     Column("digest", DIGEST, primary_key=True),
-    Column("position", Integer, primary_key=True),
+    Column("position", Integer, primary_key=True),  # 1 for the second parent
     Column("parent", DIGEST, nullable=False),
     ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
     ForeignKeyConstraint(

@@ -13,7 +13,7 @@ def _audit_index(name: str, *columns: str) -> Index:
     return Index(f"ix_event_audit_{name}", *columns, sqlite_where=_AUDITED, postgresql_where=_AUDITED)
 
 
-event = Table(
+event = Table(  # the newest event is never deleted, so that no number is used again
     "event",
     metadata,
     Column("seq", Sequence64, primary_key=True, autoincrement=True),
@@ -26,7 +26,7 @@ event = Table(
     Column("body", Document, nullable=False),
     Column("about", String(1024)),  # name of what an entry of the audit log is about; null for all other events
     Column("token_id", ID),  # of the token with which an entry of the audit log was made
-    Index("uq_event_number", "number", unique=True),
+    Index("uq_event_number", "number", unique=True, sqlite_where=text("number IS NOT NULL")),  # empty on SQLite
     Index("ix_event_feed", "project_id", "number", "seq"),
     _audit_index("at", "at_us", "seq"),
     _audit_index("kind", "kind", "at_us", "seq", "actor"),
@@ -37,7 +37,6 @@ event = Table(
     _audit_index("project_kind", "project_id", "kind", "at_us", "seq", "actor"),
     _audit_index("project_actor", "project_id", "actor", "at_us", "seq", "kind"),
     _audit_index("project_about", "project_id", "about", "at_us", "seq"),
-    sqlite_autoincrement=True,
 )
 
 webhook = Table(
