@@ -122,6 +122,7 @@ class _Git:
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 timeout=FETCH_S,
+                check=False,
                 preexec_fn=_limit_files,
             )
         except FileNotFoundError as error:

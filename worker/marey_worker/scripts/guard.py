@@ -7,6 +7,7 @@ is its first argument.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import resource
@@ -22,7 +23,7 @@ from typing import NoReturn
 
 import psutil
 
-from marey_schemas.processes.limits import die_with_parent
+from marey_schemas.processes.limits import PR_SET_PDEATHSIG, die_with_parent
 from marey_schemas.sizes import MIB
 from marey_worker.scripts.confinement import NotConfinedError, adopt_orphans, confine, separate
 
@@ -88,10 +89,7 @@ def _hold(order: Order, output: int, *, isolated: bool) -> NoReturn:
     In a process namespace of its own, this is the first process: when it ends, the kernel kills all others.
     """
     os.setsid()
-    if not isolated:  # in a new namespace, the parent has no process id, and the kernel ends this process anyway
-        die_with_parent()
-    else:
-        _die_with(signal.SIGKILL)
+    _die_with_parent()
     null = os.open(os.devnull, os.O_RDONLY)
     for number, end in enumerate((null, output, output)):
         os.dup2(end, number)
@@ -101,8 +99,8 @@ def _hold(order: Order, output: int, *, isolated: bool) -> NoReturn:
         confine(Path(order.folder), network=order.network)
         command = os.fork()
         if command == 0:
-            _die_with(signal.SIGKILL)
-            os.execvpe(order.argv[0], order.argv, order.environment)
+            _die_with_parent()
+            os.execvpe(order.argv[0], order.argv, order.environment)  # noqa: S606 - a list without a shell
     except (NotConfinedError, OSError) as error:
         os.write(2, f"the command cannot be started: {error}\n".encode())
         os._exit(NO_PROGRAM_STATUS)
@@ -113,10 +111,9 @@ def _hold(order: Order, output: int, *, isolated: bool) -> NoReturn:
             os._exit(code if code >= 0 else 128 - code)
 
 
-def _die_with(number: signal.Signals) -> None:
-    import ctypes
-
-    ctypes.CDLL(None).prctl(1, number)
+def _die_with_parent() -> None:
+    """Make the kernel kill this process when its parent ends; in a new namespace, the parent has no process id."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _limit(order: Order, *, isolated: bool) -> None:

@@ -48,7 +48,7 @@ def register_script(tx: Transaction, project: str, request: ScriptCreate, allowe
         detail = "This server does not allow the repository; ask its operator to add it to `script_repositories`."
         raise _invalid("/repository", "repository-not-allowed", detail)
     quotas.require_place(tx, row.id, script)
-    values = {
+    values: dict[str, Any] = {
         "id": new_id(SCRIPT), "project_id": row.id, "name": request.name, "description": request.description,
         "declaration": request.declaration.model_dump(mode="json"), "author_id": tx.principal.user_id,
         "created_us": tx.now_us,

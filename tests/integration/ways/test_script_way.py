@@ -1,0 +1,68 @@
+"""Workflow of scripts: the commands and the Python of the how-to page, with a Git repository and a real worker."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from tests.support.command_line import CommandLine
+
+from marey_client import Marey
+from marey_client.project import ProjectHandle
+from marey_motion.formats import write_bvh
+from marey_motion.gait import generate_gait
+from marey_schemas.queue.jobs import ItemInput
+
+pytestmark = pytest.mark.timeout(300)
+
+TEXT = (Path(__file__).parents[3] / "docs" / "how-to" / "run-your-own-scripts.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", TEXT, re.DOTALL)
+
+
+@pytest.fixture
+def lab(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandle:
+    (tmp_path / "walk.bvh").write_bytes(write_bvh(generate_gait(1.3, 0.5, 3.0)))
+    return lab_of(tmp_path / "walk.bvh", collection="studio")
+
+
+def test_the_commands_and_the_python_of_the_page_work_in_their_order(
+    marey: Marey, lab: ProjectHandle, run: CommandLine, script_repositories: Path, tmp_path: Path
+) -> None:
+    script, python = blocks("python")
+    declared = json.loads(blocks("json")[0])
+    declared["repository"], declared["commit"] = committed(script_repositories / "page", {"measure.py": script})
+    (tmp_path / "measure.json").write_text(json.dumps(declared))
+    *commands, removal = [line for block in blocks("sh") for line in block.splitlines()]
+    printed = [run(*shlex.split(line)[1:]).stdout for line in commands]
+    first, second, table = printed[-3:]
+    lengths = [float(re.search(r"path\s+(\S+)", text)[1]) for text in (first, second)]  # type: ignore[index]
+    assert lengths[1] == pytest.approx(2.5 * lengths[0])
+    assert lengths[0] > 100, "centimetres of a walk of three seconds"
+    assert [line.split()[1] for line in table.splitlines()[1:]] == ["2.5", "1.0"], table
+    copies = list(lab.clips.list(collection="measured"))
+    assert [copy.name for copy in copies] == ["measure-copy"]
+    space = {"project": lab, "marey": marey, "ItemInput": ItemInput}
+    exec(compile(python, "run-your-own-scripts.md", "exec"), space)
+    assert space["best"].values == {"factor": 4.0}
+    run(*shlex.split(removal)[1:])
+    assert list(lab.scripts.list()) == []
+
+
+def committed(folder: Path, files: dict[str, str]) -> tuple[str, str]:
+    """Commit files to a new repository; return its address and the name of the commit."""
+    folder.mkdir()
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    who = ["-c", "user.name=tester", "-c", "user.email=tester@example.org"]
+    for words in (["init", "-q"], ["add", "."], [*who, "commit", "-q", "-m", "files"]):
+        subprocess.run(["git", "-C", str(folder), *words], check=True)
+    found = subprocess.run(["git", "-C", str(folder), "rev-parse", "HEAD"], check=True, capture_output=True, text=True)
+    return f"file://{folder}", found.stdout.strip()
