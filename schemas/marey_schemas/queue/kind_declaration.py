@@ -53,8 +53,8 @@ class KindDeclaration:
 
     `exports` is the input whose clips the job writes to files, or `EVERY_INPUT`. Its parameters then extend
     `ConsentOverride`. Unless `allow_expired_consent` is true, the job must refuse the clips of this input that have
-    `consent_ended`. In any case, it must list the ids of these clips as `consent_ended` in its result. The results of an identical job are reused
-    only if the consent has ended for the same clips.
+    `consent_ended`. In any case, it must list the ids of these clips as `consent_ended` in its result. The results of
+    an identical job are reused only if the consent has ended for the same clips.
     """
 
     name: str
