@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -44,9 +45,9 @@ def run(context: Context, params: ScriptParams) -> dict[str, Any]:
         raise JobRefused("no-declaration", "the job has no declaration of its script; submit it to a newer server")
     if landlock_version() == 0:
         raise JobRefused("no-confinement", "this worker cannot confine scripts: it needs Linux 5.13 with Landlock")
-    folder = context.scratch / "run"
+    folder = Path(tempfile.mkdtemp(prefix="run-", dir=context.scratch))
     for below in (CODE, OUTPUTS, "tmp"):
-        (folder / below).mkdir(parents=True)
+        (folder / below).mkdir()
     context.progress(0, 3, "fetching the commit")
     check_out(declared, folder / CODE, os.environ)
     _require_program(declared, folder / CODE)

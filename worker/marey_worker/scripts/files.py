@@ -116,10 +116,11 @@ def _collect_one(name: str, declared: ScriptOutput, outputs: int, target: Path) 
         return None
     except OSError as error:
         raise JobRefused("unsafe-output", f"the output {name!r} is a link, or cannot be read") from error
+    facts = os.fstat(opened)
+    if not stat.S_ISREG(facts.st_mode) or facts.st_nlink != 1:
+        os.close(opened)
+        raise JobRefused("unsafe-output", f"the output {name!r} is not an ordinary file with one name")
     with os.fdopen(opened, "rb") as source:
-        facts = os.fstat(opened)
-        if not stat.S_ISREG(facts.st_mode) or facts.st_nlink != 1:
-            raise JobRefused("unsafe-output", f"the output {name!r} is not an ordinary file with one name")
         if facts.st_size > declared.max_bytes:
             detail = f"the output {name!r} has {facts.st_size:,} bytes; it may have {declared.max_bytes:,}"
             raise JobRefused("output-too-large", detail)
