@@ -40,7 +40,7 @@ OTHER_BYTES = b"bytes of anybody"
 OTHER_DIGEST = f"sha256:{hashlib.sha256(OTHER_BYTES).hexdigest()}"
 MULTIPART = b"--b\r\nContent-Disposition: form-data; name=files; filename=x.bvh\r\n\r\nno motion\r\n--b--\r\n"
 
-BODIES = {
+BODIES: dict[str, Any] = {
     "Login": {"name": "nobody", "password": "wrong wrong wrong"},
     "TokenCreate": {"name": "t", "scopes": ["read"]},
     "TokenRotation": {"rotation_id": "r" * 32},

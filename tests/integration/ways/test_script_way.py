@@ -10,6 +10,7 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -55,7 +56,7 @@ def test_the_commands_and_the_python_of_the_page_work_in_their_order(
     assert [line.split()[1] for line in table.splitlines()[1:]] == ["2.5", "1.0"], table
     copies = list(lab.clips.list(collection="measured"))
     assert [copy.name for copy in copies] == ["measure-copy"]
-    space = {"project": lab, "marey": marey, "ItemInput": ItemInput}
+    space: dict[str, Any] = {"project": lab, "marey": marey, "ItemInput": ItemInput}
     exec(compile(python, "run-your-own-scripts.md", "exec"), space)
     assert space["best"].values == {"factor": 4.0}
     run(*shlex.split(removal)[1:])
@@ -94,7 +95,7 @@ def test_a_cancelled_run_ends_at_once_and_the_run_of_a_killed_worker_is_repeated
     try:
         with process.client() as marey:
             lab = marey.create_project(ProjectCreate(name="lab"))
-            declared = {"argv": ["python", "slow.py", "{parameter:seconds}", "{output:fields}"]}
+            declared: dict[str, Any] = {"argv": ["python", "slow.py", "{parameter:seconds}", "{output:fields}"]}
             declared |= {"parameters": {"seconds": {}}, "outputs": {"fields": {"kind": "fields"}}}
             address, commit = committed(tmp_path / "slow", {"slow.py": SLOW})
             wanted = {"name": "slow", "repository": address, "commit": commit, **declared}
@@ -106,9 +107,9 @@ def test_a_cancelled_run_ends_at_once_and_the_run_of_a_killed_worker_is_repeated
             wait_until(lambda: not script_processes(), "the script of the cancelled job still runs")
             job = lab.scripts.at("slow").run({"seconds": 5})
             wait_until(script_processes, "the script does not run")
-            (worker,) = [
-                one for one in psutil.Process(process.process.pid).children() if "marey_worker" in one.cmdline()
-            ]  # type: ignore[union-attr]
+            assert process.process is not None
+            children = psutil.Process(process.process.pid).children()
+            (worker,) = [one for one in children if "marey_worker" in one.cmdline()]
             (before,) = script_processes()
             worker.kill()
             wait_until(lambda: not before.is_running(), "the script outlives its worker")

@@ -27,7 +27,7 @@ from marey_worker.job_io.staged_results import StagedResults
 from marey_worker.scripts.checkout import check_out
 from marey_worker.scripts.confinement import landlock_version
 from marey_worker.scripts.files import OUTPUTS, collect, output_path, read_fields, write_inputs
-from marey_worker.scripts.guard import End, Order
+from marey_worker.scripts.guard import CommandEnd, GuardedCommand
 
 CODE = "code"
 """Folder of the commit, below the folder of a run."""
@@ -69,7 +69,7 @@ def _require_program(declared: ScriptDeclaration, code: Path) -> None:
 
 def _order(
     context: Context, params: ScriptParams, declared: ScriptDeclaration, folder: Path, inputs: dict[str, str]
-) -> Order:
+) -> GuardedCommand:
     """Return the command with its environment, which contains only what is named here, and its limits."""
     paths = {("input", name): path for name, path in inputs.items()}
     paths |= {("output", name): output_path(name, one) for name, one in declared.outputs.items()}
@@ -86,10 +86,10 @@ def _order(
         **thread_limits(context.threads),
     }
     limits = declared.limits.model_dump()
-    return Order(argv=tuple(argv), folder=str(folder), environment=environment, **limits)
+    return GuardedCommand(argv=tuple(argv), folder=str(folder), environment=environment, **limits)
 
 
-def _run_guarded(order: Order) -> End:
+def _run_guarded(order: GuardedCommand) -> CommandEnd:
     read_end, write_end = os.pipe()
     try:
         guard = subprocess.Popen(  # noqa: S603 - our own interpreter and module
@@ -106,16 +106,16 @@ def _run_guarded(order: Order) -> End:
         said = result.read()
     if guard.returncode != 0 or not said:
         raise RuntimeError(f"the guard of the script ended with status {guard.returncode}; the job's log says why")
-    return End(**json.loads(said))
+    return CommandEnd(**json.loads(said))
 
 
-def _words_of(end: End) -> str:
+def _words_of(end: CommandEnd) -> str:
     how = f"exit status {end.status}" if end.stopped is None else f"stopped: {end.stopped}"
     missing = "" if end.isolated else "; this system allows no namespaces, so only Landlock confined the script"
     return f"{how}{missing}"
 
 
-def _failure(end: End) -> str:
+def _failure(end: CommandEnd) -> str:
     what = f"the script ended with exit status {end.status}" if end.stopped is None else f"stopped: {end.stopped}"
     last = "\n".join(end.tail.splitlines()[-LAST_LINES:])
     return f"{what}; its last output:\n{last}" if last else f"{what}; it printed nothing"

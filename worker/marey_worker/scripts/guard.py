@@ -38,7 +38,7 @@ NO_PROGRAM_STATUS = 127
 
 
 @dataclass(frozen=True)
-class Order:
+class GuardedCommand:
     """Command of a script, its folder, environment and limits."""
 
     argv: tuple[str, ...]
@@ -52,7 +52,7 @@ class Order:
 
 
 @dataclass(frozen=True)
-class End:
+class CommandEnd:
     """End of a command: its exit status (128 plus the number of a signal), or the reason why it was stopped."""
 
     status: int | None
@@ -66,7 +66,7 @@ def main() -> None:
     result = int(sys.argv[1])
     os.set_inheritable(result, False)
     given = json.load(sys.stdin)
-    order = Order(**{**given, "argv": tuple(given["argv"])})
+    order = GuardedCommand(**{**given, "argv": tuple(given["argv"])})
     die_with_parent()
     adopt_orphans()
     isolated = separate(network=order.network)
@@ -79,11 +79,11 @@ def main() -> None:
     os.close(write_end)
     watch = _Watch(order, held, read_end)
     stopped = watch.run()
-    end = End(watch.status, stopped, watch.tail.decode("utf-8", "replace"), isolated)
+    end = CommandEnd(watch.status, stopped, watch.tail.decode("utf-8", "replace"), isolated)
     os.write(result, json.dumps(asdict(end)).encode())
 
 
-def _hold(order: Order, output: int, *, isolated: bool) -> NoReturn:
+def _hold(order: GuardedCommand, output: int, *, isolated: bool) -> NoReturn:
     """Start the confined command, wait for it, and exit with its status.
 
     In a process namespace of its own, this is the first process: when it ends, the kernel kills all others.
@@ -116,7 +116,7 @@ def _die_with_parent() -> None:
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def _limit(order: Order, *, isolated: bool) -> None:
+def _limit(order: GuardedCommand, *, isolated: bool) -> None:
     limits = {
         resource.RLIMIT_CORE: 0,
         resource.RLIMIT_DATA: order.memory_mb * MIB,
@@ -134,7 +134,7 @@ def _limit(order: Order, *, isolated: bool) -> None:
 class _Watch:
     """Watch over a running command: its output and its limits."""
 
-    def __init__(self, order: Order, held: int, output: int) -> None:
+    def __init__(self, order: GuardedCommand, held: int, output: int) -> None:
         self.status: int | None = None
         self.tail = b""
         self._order = order
