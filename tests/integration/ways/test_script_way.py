@@ -53,7 +53,8 @@ def test_the_commands_and_the_python_of_the_page_work_in_their_order(
     lengths = [float(re.search(r"path\s+(\S+)", text)[1]) for text in (first, second)]  # type: ignore[index]
     assert lengths[1] == pytest.approx(2.5 * lengths[0])
     assert lengths[0] > 100, "centimetres of a walk of three seconds"
-    assert [line.split()[1] for line in table.splitlines()[1:]] == ["2.5", "1.0"], table
+    factors = [line.split()[1] for line in table.splitlines() if "job_" in line]
+    assert factors == ["2.5", "1"], table
     copies = list(lab.clips.list(collection="measured"))
     assert [copy.name for copy in copies] == ["measure-copy"]
     space: dict[str, Any] = {"project": lab, "marey": marey, "ItemInput": ItemInput}
