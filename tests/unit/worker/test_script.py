@@ -16,6 +16,7 @@ import psutil
 import pytest
 from tests.support.project_in_memory import ProjectInMemory, add_clip
 
+from marey_motion import read_motion
 from marey_motion.gait import generate_gait
 from marey_schemas.consents import CONSENT_EXPIRED
 from marey_schemas.kinds import Kind
@@ -114,6 +115,23 @@ def test_a_script_reads_clips_and_its_clips_and_fields_and_files_are_stored(repo
     assert clip.item_name == "test-copy"
     poses = np.asarray(clip.parts["motion"]["poses"])
     assert np.abs(poses[:, :3] - given[:, :3]).max() < 1e-4, "metres; the file has centimetres"
+
+
+def test_a_captured_clip_survives_a_script_that_copies_it(repository: Repository, mocap: Path) -> None:
+    file = mocap / "bandai-namco-1" / "dataset-1_dash_normal_001.bvh"
+    captured = read_motion(file.read_bytes(), file.name).clip
+    add_clip(repository.project, "dash", captured)
+    repository.run(
+        "import shutil, sys\nshutil.copyfile(*sys.argv[1:])\n",
+        argv=["python", "run.py", "{input:clips}", "{output:copy}"],
+        inputs={"clips": {"format": "bvh"}},
+        outputs={"copy": {"kind": "clip", "format": "bvh"}},
+    )
+    (copy,) = [one for one in repository.project.staged if one.kind is Kind.CLIP]
+    given = repository.project.parts["clip_dash", 1, "motion"]["poses"]
+    poses = np.asarray(copy.parts["motion"]["poses"])
+    assert poses.shape == given.shape
+    assert np.abs(poses[:, :3] - given[:, :3]).max() < 1e-4
 
 
 def test_a_failing_script_fails_the_job_with_its_status_and_last_lines(repository: Repository) -> None:
