@@ -93,7 +93,9 @@ def resolve_params(tx: Transaction, project: ProjectRow, params: ScriptParams, a
         for name, fault in declared.faults_of(params.values)
     ]
     if faults:
-        raise InvalidProblem(f"The values are not valid: {faults[0].pointer}: {faults[0].detail}", errors=faults)
+        detail = f"The values are not valid: {faults[0].pointer}: {faults[0].detail}"
+        unnamed = "The values are not valid for the parameters of the script."
+        raise InvalidProblem(detail, errors=faults, unnamed=unnamed)
     return params.model_copy(update={"declaration": declared, "values": declared.values_of(params.values)})
 
 
