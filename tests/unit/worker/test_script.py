@@ -120,6 +120,7 @@ def test_a_script_reads_clips_and_its_clips_and_fields_and_files_are_stored(repo
 def test_a_captured_clip_survives_a_script_that_copies_it(repository: Repository, mocap: Path) -> None:
     file = mocap / "bandai-namco-1" / "dataset-1_dash_normal_001.bvh"
     captured = read_motion(file.read_bytes(), file.name).clip
+    assert captured is not None
     add_clip(repository.project, "dash", captured)
     repository.run(
         "import shutil, sys\nshutil.copyfile(*sys.argv[1:])\n",
