@@ -18,6 +18,7 @@ from marey_client.handles.invitations import Invitations
 from marey_client.handles.models import ModelHandle
 from marey_client.handles.pipelines import PipelineRun, submit_pipeline
 from marey_client.handles.schedules import Schedules
+from marey_client.handles.scripts import Scripts
 from marey_client.handles.webhooks import Webhooks
 from marey_client.jobs import Jobs, OnProgress
 from marey_client.project_items import ProjectItems
@@ -123,6 +124,11 @@ class ProjectHandle(ProjectItems):
     def schedules(self) -> Schedules:
         """The schedules of the project, which submit jobs at certain times."""
         return Schedules(self.transport, self.name)
+
+    @cached_property
+    def scripts(self) -> Scripts:
+        """The scripts of the project: commands of pinned Git commits that run as jobs."""
+        return Scripts(self.transport, self.name)
 
     @cached_property
     def webhooks(self) -> Webhooks:

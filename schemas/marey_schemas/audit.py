@@ -46,6 +46,8 @@ AUDIT_WORDS: Mapping[AuditKind, str] = {
     "schedule.created": "created the schedule",
     "schedule.changed": "changed the schedule",
     "schedule.deleted": "deleted the schedule",
+    "script.registered": "registered the script",
+    "script.deleted": "deleted the script",
     "user.created": "created the user",
     "user.changed": "changed the user",
     "user.limited": "changed the quotas of the user",

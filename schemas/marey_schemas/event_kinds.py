@@ -42,6 +42,8 @@ ProjectAuditKind = Literal[
     "schedule.created",
     "schedule.changed",
     "schedule.deleted",
+    "script.registered",
+    "script.deleted",
 ]
 """Kinds of audit entries in a project."""
 

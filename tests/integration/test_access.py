@@ -145,6 +145,8 @@ def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
         "POST /projects/{project}/dataset-purges": "owner",
         "PUT /projects/{project}/collections/{collection}/roles/{user}": "owner",
         "DELETE /projects/{project}/collections/{collection}/roles/{user}": "owner",
+        "POST /projects/{project}/scripts": "maintainer",
+        "DELETE /projects/{project}/scripts/{script}": "maintainer",
         "DELETE /projects/{project}/collections/{collection}": "maintainer",
         "POST /projects/{project}/collections/{collection}/restore": "maintainer",
         "DELETE /projects/{project}/datasets/{dataset}": "maintainer",

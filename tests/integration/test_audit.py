@@ -12,6 +12,7 @@ from typing import Any
 import httpx
 import pytest
 from sqlalchemy import select
+from tests.support.furnished_house import BODIES
 from tests.support.rest_server import ALL_SCOPES, Server
 
 from marey_schemas.access import Role
@@ -209,6 +210,13 @@ def change_schedules(story: Story) -> None:
     story.send(owner, "DELETE", path, None, ("schedule.deleted", *nightly))
 
 
+def change_scripts(story: Story) -> None:
+    owner, measure = story.owner, ("olga", "measure", "lab")
+    body = BODIES["ScriptCreate"] | {"name": "measure"}
+    story.send(owner, "POST", f"{LAB}/scripts", body, ("script.registered", *measure))
+    story.send(owner, "DELETE", f"{LAB}/scripts/measure", None, ("script.deleted", *measure))
+
+
 def _stored_secrets(story: Story) -> list[str]:
     """Return all secrets and hashes of secrets that the tables contain."""
 
@@ -224,7 +232,7 @@ def _stored_secrets(story: Story) -> list[str]:
 
 CHAPTERS = (
     change_users_and_tokens, change_projects_and_members, delete_and_restore, purge, invite, change_folder_roles,
-    change_datasets, change_webhooks, change_schedules,
+    change_datasets, change_webhooks, change_schedules, change_scripts,
 )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import httpx
 import pytest
-from tests.support.furnished_house import HIERARCHY, MOTION, MULTIPART, ROUTES
+from tests.support.furnished_house import BODIES, HIERARCHY, MOTION, MULTIPART, ROUTES
 from tests.support.motion_files import AMC, ASF
 from tests.support.rest_server import Server
 
@@ -127,6 +127,9 @@ REQUESTS: dict[str, Sends] = {
     "POST /projects/{project}/pipelines": lambda house, who, at: who.post(
         "/projects/lab/pipelines", json={"steps": {"only": job_into(house, at)}}
     ),
+    "POST /projects/{project}/scripts/{script}/runs": lambda house, who, at: who.post(
+        "/projects/lab/scripts/measure/runs", json={"into": at}
+    ),
     "POST /projects/{project}/schedules": lambda house, who, at: schedule(who, job_into(house, at)),
     "PATCH /projects/{project}/schedules/{schedule}": lambda house, who, at: who.patch(
         own_schedule(house, who), json={"job": job_into(house, at)}
@@ -178,6 +181,7 @@ def house(server: Server) -> Studio:
     tokens = {name: server.make_user(name) for name in ("raised", "lowered")}
     owner = server.client(server.make_project("lab", raised=Role.READER, lowered=Role.MAINTAINER))
     made = Studio(server, owner, {name: server.client(token) for name, token in tokens.items()})
+    assert owner.post("/projects/lab/scripts", json=BODIES["ScriptCreate"] | {"name": "measure"}).status_code == 201
     for folder, user, role in (("team", "raised", "maintainer"), ("other", "lowered", "reader")):
         made.folders[folder] = made.make("collections", {"path": folder})
         put = owner.put(f"{FOLDERS}/{made.folders[folder]}/roles/{user}", json={"role": role})

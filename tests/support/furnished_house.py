@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import update
-from tests.support.rest_server import People
+from tests.support.rest_server import SCRIPTS_AT, People
 from tests.support.who_may import PEOPLE
 
 from marey_schemas.encoding.canonical import document_digest
@@ -40,7 +40,7 @@ OTHER_BYTES = b"bytes of anybody"
 OTHER_DIGEST = f"sha256:{hashlib.sha256(OTHER_BYTES).hexdigest()}"
 MULTIPART = b"--b\r\nContent-Disposition: form-data; name=files; filename=x.bvh\r\n\r\nno motion\r\n--b--\r\n"
 
-BODIES = {
+BODIES: dict[str, Any] = {
     "Login": {"name": "nobody", "password": "wrong wrong wrong"},
     "TokenCreate": {"name": "t", "scopes": ["read"]},
     "TokenRotation": {"rotation_id": "r" * 32},
@@ -55,6 +55,15 @@ BODIES = {
     "AccountInvitationCreate": {"project": "lab", "role": "reader", "note": CANARY},
     "InvitationAcceptance": {"code": UNKNOWN_CODE},
     "SignUp": {"code": UNKNOWN_CODE, "name": "newcomer", "password": "correct horse"},
+    "ScriptCreate": {
+        "name": "new-script",
+        "description": CANARY,
+        "repository": f"{SCRIPTS_AT}{CANARY}",
+        "commit": "c" * 40,
+        "argv": ["python", "measure.py", "{output:fields}"],
+        "outputs": {"fields": {"kind": "fields"}},
+    },
+    "ScriptRunCreate": {"message": CANARY},
     "CollectionCreate": {"path": CANARY},
     "CollectionChange": {"path": "elsewhere"},
     "ItemCreate": {"name": CANARY, "collection": CANARY, "parts": {"hierarchy": HIERARCHY}},
@@ -275,9 +284,11 @@ def _furnish(owner: Any) -> dict[str, str]:
     job_of_schedule = {"kind": "evaluate", "inputs": {"clips": {"item": made.json()["id"]}}, "message": CANARY}
     schedule = {"name": "nightly", "cron": "0 0 29 2 *", "job": job_of_schedule, "description": CANARY}
     assert owner.post("/projects/lab/schedules", json=schedule).status_code == 201
+    assert owner.post("/projects/lab/scripts", json=BODIES["ScriptCreate"] | {"name": "measure"}).status_code == 201
     invitation = owner.post("/projects/lab/invitations", json=BODIES["InvitationCreate"]).json()["id"]
     return {
         "invitation": invitation, "webhook": hook, "delivery": delivery, "schedule": "nightly",
+        "script": "measure",
         "collection": collection, "item": made.json()["id"], "annotation": annotation.json()["id"], "dataset": CANARY,
         "ref": "spare", "version": "spare", "proposal": "1",
     }  # fmt: skip

@@ -23,6 +23,8 @@ from marey_server.store.database.connections import Database
 
 ALL_SCOPES = ("read", "write", "jobs", "work", "admin")
 USER_SCOPES = ("read", "write", "jobs")
+SCRIPTS_AT = "https://git.invalid/"
+"""Address below which the servers of tests allow the repositories of scripts."""
 PATIENCE_S = 240
 """Longest wait for an answer in seconds: long, because machines may be busy, but shorter than the limit of a test."""
 
@@ -102,7 +104,8 @@ def running(database: Database, folder: Path, **settings: Any) -> Iterator[Serve
 
     async def main() -> None:
         stop = asyncio.Event()
-        chosen = Settings(data=folder, port=0, drain_s=5, **settings)
+        given = {"script_repositories": (SCRIPTS_AT,)} | settings
+        chosen = Settings(data=folder, port=0, drain_s=5, **given)
         children = shared_children() if chosen.child_limits == Settings().child_limits else None
         app = create_app(chosen, database, children)
         try:

@@ -147,9 +147,9 @@ class WorkerProcess(MareyProcess):
 
 
 @contextlib.contextmanager
-def serving(folder: Path, database_url: str | None = None) -> Iterator[ServerProcess]:
+def serving(folder: Path, database_url: str | None = None, **environment: str) -> Iterator[ServerProcess]:
     """Run a server with one worker while the `with` block runs; then check the server's exit status."""
-    process = ServerProcess(folder, database_url).start(workers=1)
+    process = ServerProcess(folder, database_url, **environment).start(workers=1)
     try:
         yield process
     finally:

@@ -17,10 +17,11 @@ from marey_client.credentials import Credential, resolve
 from marey_client.errors import MareyError, NoCredential
 from marey_client.retries import Retries
 from marey_client.transport import Transport
-from marey_schemas.queue.job_kinds import UnknownKindError, find_kind, job_kinds
+from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
 from marey_schemas.queue.log_lines import LogForm, log_to_standard_error, usual_form
+from marey_schemas.queue.scripts import REPOSITORIES_VARIABLE, SCRIPT
 from marey_schemas.sizes import MIB
-from marey_worker.supervisor import Supervisor, WorkerOptions, default_cache
+from marey_worker.supervisor import Supervisor, WorkerOptions, default_cache, runnable_kinds
 
 BRIEF = Retries(tries=6)
 """Retries of an attempt's requests, limited so that a stopping worker does not wait long for an unreachable server."""
@@ -128,10 +129,15 @@ def _level_of(environment: Mapping[str, str]) -> str:
 
 
 def _known_kinds(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the kinds that the worker runs; scripts are among them only if the environment allows a repository."""
     try:
-        return tuple(find_kind(name).name for name in names) or tuple(job_kinds())
-    except UnknownKindError as error:
+        runnable = runnable_kinds(os.environ)
+        found = tuple(find_kind(name).name for name in names)
+    except (UnknownKindError, ValueError) as error:
         raise MareyError(str(error)) from error
+    if SCRIPT in found and SCRIPT not in runnable:
+        raise MareyError(f"a worker runs scripts only if {REPOSITORIES_VARIABLE} lists the repositories it may use")
+    return found or runnable
 
 
 def _stop_at_end_of_input(supervisor: Supervisor) -> None:

@@ -21,6 +21,7 @@ from marey_client.transport import Transport
 from marey_schemas.backoff import Backoff
 from marey_schemas.processes.child_process import ChildBroken, ChildProcess
 from marey_schemas.queue.job_kinds import job_kinds
+from marey_schemas.queue.scripts import SCRIPT, read_repositories
 from marey_schemas.queue.worker_protocol import INTERRUPTED_STATUS, ClaimRequest, Lease
 from marey_worker import faults
 from marey_worker.attempt import RunningAttempt
@@ -48,7 +49,7 @@ class WorkerOptions:
 
     name: str = field(default_factory=lambda: f"{socket.gethostname()}:{os.getpid()}")
     slots: int = 1
-    kinds: tuple[str, ...] = field(default_factory=lambda: tuple(job_kinds()))
+    kinds: tuple[str, ...] = field(default_factory=lambda: runnable_kinds(os.environ))
     labels: Mapping[str, str] = field(default_factory=dict)
     cache: Path = field(default_factory=lambda: default_cache(os.environ))
     cache_bytes: int = 2 << 30
@@ -58,6 +59,15 @@ class WorkerOptions:
     def threads_of_a_slot(self) -> int:
         """Return the number of threads that one job may use."""
         return max(1, self.threads // self.slots)
+
+
+def runnable_kinds(environment: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the kinds that a worker runs by default; scripts only if the environment allows a repository.
+
+    Raises `ValueError` if the list of repositories is malformed.
+    """
+    allowed = read_repositories(environment)
+    return tuple(kind for kind in job_kinds() if kind != SCRIPT or allowed)
 
 
 def default_cache(environment: Mapping[str, str]) -> Path:

@@ -31,7 +31,7 @@ from marey_client.cli import (
 from marey_client.cli.datasets import archives, proposals, versions
 from marey_client.cli.difference import diff
 from marey_client.cli.files import downloading, listing, records, uploading
-from marey_client.cli.queue import jobs, pipelines, schedules
+from marey_client.cli.queue import jobs, pipelines, schedules, scripts
 from marey_client.cli.terminal.invocation import Invocation
 
 app = typer.Typer(
@@ -100,6 +100,7 @@ for register in (
     jobs,
     pipelines,
     schedules,
+    scripts,
     webhooks,
     audit,
 ):

@@ -6,6 +6,7 @@ names a `KindDeclaration`.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from importlib.metadata import entry_points
 from types import MappingProxyType
@@ -16,7 +17,8 @@ from marey_schemas.formats import IMPORTED
 from marey_schemas.kinds import Kind
 from marey_schemas.queue import job_params
 from marey_schemas.queue.jobs import InputSpec
-from marey_schemas.queue.kind_declaration import KindDeclaration
+from marey_schemas.queue.kind_declaration import EVERY_INPUT, KindDeclaration
+from marey_schemas.queue.scripts import SCRIPT, ScriptDeclaration, ScriptParams
 
 ENTRY_POINT_GROUP = "marey.job_kinds"
 MOST_TASKS = 1000
@@ -288,8 +290,37 @@ TREE = KindDeclaration(
     unclear_place=job_params.TreeParams.unclear_place,
 )
 
+RUN_SCRIPT = KindDeclaration(
+    name=SCRIPT,
+    description="Runs a registered script: a command of a pinned Git commit. The script declares the inputs and "
+    "outputs of the job.",
+    params=ScriptParams,
+    implementation="marey_worker.kinds.script:run",
+    version=1,
+    outputs={"clips": Kind.CLIP, "skeletons": Kind.SKELETON, "files": "file"},
+    deterministic=False,
+    exports=EVERY_INPUT,
+)
+
+
+def script_kind(declared: ScriptDeclaration) -> KindDeclaration:
+    """Return the kind `script` with the inputs of one script."""
+    return replace(RUN_SCRIPT, inputs=declared.input_specs())
+
+
+def kind_of_job(name: str, params: Mapping[str, Any]) -> KindDeclaration:
+    """Return the kind of a submitted job, with the inputs of its script if it runs one.
+
+    Raises `UnknownKindError` if there is no such kind, and `ValidationError` if its script is not valid any more.
+    """
+    if name == SCRIPT:
+        return script_kind(ScriptDeclaration.model_validate(params["declaration"]))
+    return find_kind(name)
+
+
 BUILT_IN = (
     IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN, MODEL, TREE,
+    RUN_SCRIPT,
 )  # fmt: skip
 
 

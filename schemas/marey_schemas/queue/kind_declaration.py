@@ -11,6 +11,9 @@ from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.queue.facets import require_facet_names
 from marey_schemas.queue.jobs import InputSpec, JobKind
 
+EVERY_INPUT = "*"
+"""Value of `exports` that stands for all inputs."""
+
 
 @dataclass(frozen=True)
 class KindDeclaration:
@@ -48,10 +51,10 @@ class KindDeclaration:
     `suffix` is appended to the names. `unclear_place` is a function of the parameters and a collection; it returns why
     these do not determine the place of the results, or None if they do.
 
-    `exports` is the input whose clips the job writes to files. Its parameters then extend `ConsentOverride`. Unless
-    `allow_expired_consent` is true, the job must refuse the clips of this input that have `consent_ended`. In any case,
-    it must list the ids of these clips as `consent_ended` in its result. The results of an identical job are reused
-    only if the consent has ended for the same clips.
+    `exports` is the input whose clips the job writes to files, or `EVERY_INPUT`. Its parameters then extend
+    `ConsentOverride`. Unless `allow_expired_consent` is true, the job must refuse the clips of this input that have
+    `consent_ended`. In any case, it must list the ids of these clips as `consent_ended` in its result. The results of
+    an identical job are reused only if the consent has ended for the same clips.
     """
 
     name: str
@@ -82,7 +85,7 @@ class KindDeclaration:
                 f"job kind {self.name}: fan_out names {self.fan_out!r}, which must be an input that takes many items"
             )
         for name in (*self.never_cached_without, *filter(None, [self.named_after, self.exports])):
-            if name not in self.inputs:
+            if name not in self.inputs and name != EVERY_INPUT:
                 raise ValueError(
                     f"job kind {self.name}: never_cached_without, named_after and exports must name inputs of the "
                     f"kind, and {name!r} is none of them"
@@ -108,6 +111,10 @@ class KindDeclaration:
             raise ValueError(f"job kind {self.name}: declare either both of task_count and gathering, or neither")
         if self.task_count is not None and self.fan_out is not None:
             raise ValueError(f"job kind {self.name}: declare fan_out or task_count, not both")
+
+    def is_exported(self, name: str) -> bool:
+        """Return whether the job writes the clips of an input to files."""
+        return self.exports in (name, EVERY_INPUT)
 
     @property
     def code_version(self) -> str:

@@ -25,7 +25,7 @@ from marey_server.handlers import (
     uploads,
     webhooks,
 )
-from marey_server.handlers.queue import jobs, leases, pipelines, schedules
+from marey_server.handlers.queue import jobs, leases, pipelines, schedules, scripts
 from marey_server.handlers.versions import contents, datasets, differences, proposals
 from marey_server.http.resource import Resource
 
@@ -54,6 +54,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     *pipelines.RESOURCES,
     *leases.RESOURCES,
     *schedules.RESOURCES,
+    *scripts.RESOURCES,
     *blobs.RESOURCES,
     *uploads.RESOURCES,
     *events.RESOURCES,

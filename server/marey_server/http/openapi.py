@@ -36,6 +36,7 @@ PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
     "revision": ("Number of the revision.", {"type": "integer", "minimum": 1, "maximum": 999_999_999}),
     "dataset": ("Name of the dataset.", _NAME),
     "ref": ("Name of the branch or tag.", _NAME),
+    "script": ("Name of the script.", _NAME),
     "schedule": ("Name of the schedule.", _NAME),
     "proposal": ("Number of the proposal.", {"type": "integer", "minimum": 1, "maximum": 999_999_999}),
     "invitation": ("Id or prefix of the invitation.", _NAME),

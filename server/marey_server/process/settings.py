@@ -237,6 +237,15 @@ class Settings(BlobSettings):
     project_schedules: int = Field(
         Quotas.project_schedules, ge=0, description="Greatest number of schedules of a project; 0: no schedules."
     )
+    project_scripts: int = Field(
+        Quotas.project_scripts, ge=0, description="Greatest number of scripts of a project; 0: no scripts."
+    )
+    script_repositories: tuple[str, ...] = Field(
+        (),
+        description='Git repositories whose scripts projects may run, such as ["https://git.lab.example/motion/"]; an '
+        "entry that ends in / allows all repositories below it. Empty: no scripts. Workers that run scripts need the "
+        "variable MAREY_SCRIPT_REPOSITORIES, too.",
+    )
     project_invitations: int = Field(
         Quotas.project_invitations, ge=0, description="Greatest number of open invitations to a project."
     )

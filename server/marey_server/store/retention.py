@@ -27,6 +27,7 @@ from marey_server.store.tables import (
     job_log,
     lineage,
     revision,
+    script_run,
     staged_output,
 )
 from marey_server.store.transaction import Transaction
@@ -202,6 +203,6 @@ def _delete_if_unused(tx: Transaction, job_id: str) -> int:
 
 
 def _delete_jobs(tx: Transaction, job_ids: Sequence[str]) -> int:
-    for table in (job_log, staged_output, attempt, job_blob, job_item, job_dependency):
+    for table in (job_log, staged_output, attempt, job_blob, job_item, script_run, job_dependency):
         tx.execute(delete(table).where(table.c.job_id.in_(job_ids)))
     return tx.execute(delete(job).where(job.c.id.in_(job_ids))).rowcount

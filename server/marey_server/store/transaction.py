@@ -53,6 +53,7 @@ class Quotas:
     project_stored_bytes: int = 64 * 2**30
     project_webhooks: int = 20
     project_schedules: int = 100
+    project_scripts: int = 100
     project_invitations: int = 100
     user_invitations: int = 1000
     project_proposal_bytes: int = 64 * 2**20

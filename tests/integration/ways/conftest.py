@@ -5,6 +5,8 @@ a new project `lab`. The project is deleted after the test, which hides its cont
 """
 
 import contextlib
+import json
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -23,8 +25,22 @@ from marey_schemas.access import ProjectCreate
 from marey_schemas.options.imports import ImportOptions
 
 
+@pytest.fixture(scope="session")
+def script_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder whose Git repositories the server and its worker allow for scripts."""
+    return tmp_path_factory.mktemp("repositories")
+
+
+@pytest.fixture
+def script_repositories(script_folder: Path) -> Path:
+    """A folder for the Git repositories of one test."""
+    return Path(tempfile.mkdtemp(dir=script_folder))
+
+
 @pytest.fixture(scope="session", params=BACKENDS)
-def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
+def server(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, script_folder: Path
+) -> Iterator[ServerProcess]:
     """A server that all tests with one kind of database share."""
     folder = tmp_path_factory.mktemp("server")
     with contextlib.ExitStack() as after:
@@ -33,7 +49,9 @@ def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         else:
             postgres = request.getfixturevalue("postgres_url")
             url = database_address(after.enter_context(new_postgres_database(postgres, "ways")))
-        yield after.enter_context(serving(folder, url))
+        yield after.enter_context(
+            serving(folder, url, MAREY_SCRIPT_REPOSITORIES=json.dumps([f"file://{script_folder}/"]))
+        )
 
 
 @pytest.fixture(scope="session")

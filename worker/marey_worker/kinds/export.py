@@ -37,7 +37,7 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
     The result also lists the clips whose consent has ended: these are written only if the parameters of the job allow
     it. Raises `JobRefused` if no clip can be written.
     """
-    exporting = _Exporting(context, params)
+    exporting = ClipFiles(context, params)
     archive = context.scratch / "archive.zip"
     written: set[str] = set()
     given = sorted(context.inputs["clips"], key=lambda pin: (pin.collection, pin.name, pin.item))
@@ -70,8 +70,8 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
     }
 
 
-class _Exporting:
-    """State of a job of the kind `export`."""
+class ClipFiles:
+    """Clips of a job as files of one format; the skeletons of the clips are read once."""
 
     def __init__(self, context: Context, params: ExportParams) -> None:
         self._context = context

@@ -100,7 +100,7 @@ def submit_job(
                 raise WrongUsage(
                     f"jobs of the kind {kind} have no input {role!r}; their inputs are {', '.join(roles) or 'none'}"
                 )
-            places.setdefault(role, []).append(_input_at(marey, Address.within(project, place), roles[role]))
+            places.setdefault(role, []).append(input_of_kind(marey, Address.within(project, place), roles[role]))
         wanted = JobCreate(
             kind=kind,
             inputs={role: tuple(found) if roles[role].many else found[-1] for role, found in places.items()},
@@ -125,7 +125,7 @@ def _kind_of_job(marey: Marey, name: str) -> JobKind:
     return kinds[name]
 
 
-def _input_at(marey: Marey, address: Address, spec: InputSpec) -> JobInput:
+def input_of_kind(marey: Marey, address: Address, spec: InputSpec) -> JobInput:
     """Return the input at an address: an item, a folder if several items are accepted, or the outputs of a job."""
     from marey_schemas.queue.jobs import ItemInput, JobOutputsInput
 

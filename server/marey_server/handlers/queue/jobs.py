@@ -125,15 +125,16 @@ class ProjectJobs(Resource):
         job waits for the other job. With `Prefer: wait=n`, the answer is sent when the new job has ended, at the latest
         after n seconds.
         """
-        submitted = await self.answer_with(lambda made: _accepted(made[0]), submission.submit, project, (body,))
+        submitted = await self.answer_with(lambda made: accepted(made[0]), submission.submit, project, (body,))
         wait_s = wait_preferred(self)
         job_id = submitted.headers["Location"].rpartition("/")[2]
         if wait_s == 0:
             return submitted
-        return _accepted(await wait_for_end(self, job_id, wait_s))
+        return accepted(await wait_for_end(self, job_id, wait_s))
 
 
-def _accepted(job: Job) -> Reply:
+def accepted(job: Job) -> Reply:
+    """Return the answer to a submission: the new job, its address and when to look again."""
     headers = {} if job.state.terminal else {"Retry-After": "1"}
     return Reply(job, location=f"/jobs/{job.id}", headers=headers)
 
@@ -312,7 +313,7 @@ class JobRetry(Resource):
         Unsuccessful jobs on which the job depends are retried, too, and so are jobs that ended only because this job
         did not succeed. So the rest of a pipeline continues.
         """
-        return await self.answer_with(_accepted, retrying.retry_job, job)
+        return await self.answer_with(accepted, retrying.retry_job, job)
 
 
 RESOURCES: tuple[type[Resource], ...] = (

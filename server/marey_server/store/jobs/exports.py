@@ -29,7 +29,8 @@ def ended_inputs(tx: Transaction, kind: KindDeclaration, inputs: Mapping[str, An
     """
     if kind.exports is None:
         return {}
-    return find_ended_consents(tx, (pin["item"] for pin in inputs.get(kind.exports, ()) if "item" in pin))
+    exported = (pin for name, pins in inputs.items() if kind.is_exported(name) for pin in pins)
+    return find_ended_consents(tx, (pin["item"] for pin in exported if "item" in pin))
 
 
 def lease_inputs(tx: Transaction, kind_name: str, inputs: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
@@ -47,7 +48,7 @@ def lease_inputs(tx: Transaction, kind_name: str, inputs: Mapping[str, Any]) -> 
         return dict(inputs)
     return {
         name: [
-            pin | {ENDED: ended[pin["item"]].until} if name == kind.exports and pin["item"] in ended else pin
+            pin | {ENDED: ended[pin["item"]].until} if kind.is_exported(name) and pin["item"] in ended else pin
             for pin in pins
         ]
         for name, pins in inputs.items()

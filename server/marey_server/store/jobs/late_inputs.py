@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 from sqlalchemy import Row, and_, insert, select, update
 
-from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
+from marey_schemas.queue.job_kinds import UnknownKindError, kind_of_job
 from marey_schemas.queue.jobs import FailureReason, InputSpec
 from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_schemas.wording import without_prefix
@@ -80,7 +80,7 @@ def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
     Raises `LateInputError` if this version of the server does not accept the kind or the parameters any more.
     """
     try:
-        kind = find_kind(row.kind)
+        kind = kind_of_job(row.kind, row.params)
         params = kind.params.model_validate(row.params)
     except UnknownKindError as error:
         raise LateInputError(

@@ -10,6 +10,7 @@ from sqlalchemy import ColumnElement, Row, Select, select
 from marey_schemas.access import Role
 from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
 from marey_schemas.queue.jobs import FailureReason, Job, JobState
+from marey_schemas.queue.scripts import SCRIPT
 from marey_server.access import roles
 from marey_server.errors import ConflictProblem
 from marey_server.store.folder_roles.rights import rights_of_caller
@@ -21,6 +22,7 @@ from marey_server.store.jobs.reading import find_job, require_own
 from marey_server.store.jobs.submission import lock_jobs, submit_checked
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
+from marey_server.store.scripts.registry import require_unchanged
 from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import Transaction, in_lists
 
@@ -153,6 +155,8 @@ def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_
             f"accepted: {error}.",
             code="unknown-kind",
         ) from error
+    if row.kind == SCRIPT:
+        require_unchanged(tx, project, row.params)
     pins = _late_pins(row, stand_ins) if row.unbound else _pins_of(tx, row, kind.fan_out)
     if purged := [pin["item"] for many in pins.values() for pin in many if "purged" in pin]:
         detail = f"The job cannot run again: its input {purged[0]} was purged, and the content of this input is gone."

@@ -12,7 +12,7 @@ from sqlalchemy import insert, select
 
 from marey_schemas.access import Role
 from marey_schemas.problems import FieldError
-from marey_schemas.queue.job_kinds import MOST_TASKS, UnknownKindError, find_kind
+from marey_schemas.queue.job_kinds import MOST_TASKS, UnknownKindError, find_kind, script_kind
 from marey_schemas.queue.jobs import Job, JobCreate, JobState
 from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_schemas.queue.pipelines import (
@@ -23,6 +23,7 @@ from marey_schemas.queue.pipelines import (
     job_of_step,
     order_steps,
 )
+from marey_schemas.queue.scripts import ScriptParams
 from marey_server import faults
 from marey_server.access.folder_rights import FolderRights
 from marey_server.access.labels import labels_key
@@ -44,6 +45,7 @@ from marey_server.store.jobs.result_places import find_clash, result_folders
 from marey_server.store.projects import ProjectRow, require
 from marey_server.store.purge_lock import hold_off_purges
 from marey_server.store.quotas import require_room
+from marey_server.store.scripts.registry import record_runs, resolve_params
 from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import Transaction, in_lists
 
@@ -127,6 +129,7 @@ def submit_checked(
     rows = {one.id: new_row(tx, one) for one in everything}
     tx.run_each(_INSERT_JOB, list(rows.values()))
     record_named_items(tx, map(naming, everything), new=True)
+    record_runs(tx, project.id, [(one.id, one.submission.kind.name, one.submission.params) for one in heads])
     _insert_dependencies(tx, submissions, upstream)
     for one in heads:
         staging.keep_named_blobs(tx, one.id, set(staging.named_blobs(one.submission.params)))
@@ -161,6 +164,9 @@ def _check(
         found = field_errors(error, request.params, lambda steps: f"{at}/params{json_pointer(steps)}")
         detail = f"These parameters are not valid for {kind.name}: {found[0].pointer}: {found[0].detail}"
         raise InvalidProblem(detail, errors=found) from error
+    if isinstance(params, ScriptParams):
+        params = resolve_params(tx, project, params, at)
+        kind, request = _with_script(params, request)
     pins = pin_inputs(tx, project, kind, request, known, at)
     if (clash := find_clash(kind, params, pins, request.into)) is not None:
         unnamed = "Two results of the job, or a result and an input, would have the same place, or a path is too long."
@@ -179,6 +185,13 @@ def _check(
         unbound=bool(late),
         commit_to=_target(tx, project, kind, request, at),
     )
+
+
+def _with_script(params: ScriptParams, request: JobCreate) -> tuple[KindDeclaration, JobCreate]:
+    """Return the kind of a job with the inputs of its script, and the request with the limits of the script."""
+    assert params.declaration is not None
+    limits = {"resources": params.declaration.limits.resources}
+    return script_kind(params.declaration), request.model_copy(update=limits)
 
 
 def _target(

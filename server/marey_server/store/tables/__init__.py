@@ -48,6 +48,8 @@ from marey_server.store.tables.queue import (
     job_item,
     job_log,
     schedule,
+    script,
+    script_run,
     staged_output,
 )
 from marey_server.store.tables.serving import (
@@ -107,6 +109,8 @@ __all__ = [
     "revision",
     "revision_part",
     "schedule",
+    "script",
+    "script_run",
     "server_state",
     "sign_in_limit",
     "staged_output",

@@ -199,6 +199,28 @@ staged_output = Table(
     ForeignKeyConstraint(["job_id", "fence"], ["attempt.job_id", "attempt.fence"]),
 )
 
+script = Table(
+    "script",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("project_id", ID, ForeignKey("project.id"), nullable=False),
+    Column("name", Name, nullable=False),
+    Column("description", Text, nullable=False),
+    Column("declaration", Document, nullable=False),  # repository, commit, command, parameters, inputs, outputs, limits
+    Column("author_id", ID, ForeignKey("user.id"), nullable=False),
+    Column("created_us", Micros, nullable=False),
+    Index("uq_script_project_id_name", "project_id", "name", unique=True),
+)
+
+script_run = Table(  # jobs that run scripts, by the name of the script
+    "script_run",
+    metadata,
+    Column("job_id", ID, ForeignKey("job.id"), primary_key=True),
+    Column("project_id", ID, ForeignKey("project.id"), nullable=False),
+    Column("script", Name, nullable=False),
+    Index("ix_script_run_script", "project_id", "script", "job_id"),
+)
+
 schedule = Table(
     "schedule",
     metadata,

@@ -1,0 +1,80 @@
+"""Scripts of a project: commands of pinned Git commits that run as jobs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from marey_client.paging import pages
+from marey_client.transport import Transport
+from marey_schemas.queue.jobs import Job, JobInput
+from marey_schemas.queue.scripts import Script, ScriptCreate, ScriptRun, ScriptRunCreate, Value
+
+
+@dataclass(frozen=True)
+class Scripts:
+    """Scripts of a project."""
+
+    transport: Transport
+    project: str
+
+    @property
+    def url(self) -> str:
+        """The path of the resource, relative to the API's root."""
+        return f"/projects/{self.project}/scripts"
+
+    def register(self, script: ScriptCreate) -> Script:
+        """Register a script.
+
+        Raises `Forbidden` if the server runs no scripts or the caller is no maintainer, `Conflict` if the name is
+        taken, and `Invalid` if the server does not allow the repository.
+        """
+        return self.transport.post(Script, self.url, script)
+
+    def list(self) -> Iterator[Script]:
+        """List the scripts by name."""
+        return pages(self.transport, Script, self.url)
+
+    def at(self, name: str) -> ScriptHandle:
+        """Return a handle of the script with this name; no request is sent."""
+        return ScriptHandle(self.transport, f"{self.url}/{name}")
+
+
+@dataclass(frozen=True)
+class ScriptHandle:
+    """Handle of a script; requests are sent only by its methods."""
+
+    transport: Transport
+    url: str
+
+    def read(self) -> Script:
+        """Return the script with its command, parameters, inputs, outputs and limits."""
+        return self.transport.get(Script, self.url)
+
+    def run(
+        self,
+        values: Mapping[str, Value] | None = None,
+        *,
+        inputs: Mapping[str, JobInput | tuple[JobInput, ...]] | None = None,
+        into: str = "",
+        seed: int = 0,
+        message: str = "",
+    ) -> Job:
+        """Submit a job that runs the script, and return it.
+
+        `values` are the values of its parameters, and `inputs` are items, folders or outputs of other jobs. The clips
+        that the script writes are stored in the folder `into`. Raises `Invalid` if a value or an input is wrong.
+        """
+        request = ScriptRunCreate(
+            values=dict(values or {}), inputs=dict(inputs or {}), into=into, seed=seed, message=message
+        )
+        return self.transport.post(Job, f"{self.url}/runs", request)
+
+    def runs(self, *, sort: str = "-created_at", limit: int = 50) -> tuple[ScriptRun, ...]:
+        """Return the first runs in an order: `created_at`, `fields.<name>` or `values.<name>`; `-` reverses it."""
+        found = pages(self.transport, ScriptRun, f"{self.url}/runs", {"sort": sort, "limit": limit})
+        return tuple(found)
+
+    def delete(self) -> None:
+        """Delete the script; its runs remain."""
+        self.transport.send("DELETE", self.url)

@@ -1,0 +1,88 @@
+"""Runs of scripts: their submission, and lists that are sorted by the fields that the runs logged."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from sqlalchemy import ColumnElement, Row, func, select
+
+from marey_schemas.items import Page
+from marey_schemas.queue.jobs import Job, JobCreate
+from marey_schemas.queue.scripts import SCRIPT, ScriptRun, ScriptRunCreate
+from marey_server.errors import BadRequestProblem
+from marey_server.store import projects
+from marey_server.store.database.clock import datetime_of
+from marey_server.store.jobs.submission import submit
+from marey_server.store.scripts.registry import find_script
+from marey_server.store.tables import job, script_run, user
+from marey_server.store.transaction import Transaction
+
+_SORT = re.compile(r"^(-?)(created_at|(?:(fields|values)\.([A-Za-z][A-Za-z0-9_]{0,62})))$")
+
+
+def run_script(tx: Transaction, project: str, name: str, request: ScriptRunCreate) -> Job:
+    """Submit a job that runs a script. Raises `NotFoundProblem`, and the errors of `submission.submit`."""
+    find_script(tx, projects.require(tx, project), name)
+    params = request.model_dump(mode="json", include={"values", "allow_expired_consent", "consent_reason"})
+    wanted = JobCreate(
+        kind=SCRIPT,
+        inputs=request.inputs,
+        params={"script": name, **params},
+        into=request.into,
+        seed=request.seed,
+        message=request.message,
+    )
+    (made,) = submit(tx, project, (wanted,))
+    return made
+
+
+def list_runs(tx: Transaction, project: str, name: str, *, sort: str, limit: int) -> Page:
+    """Return the first `limit` runs of a script in the given order; runs without the field of the order come last.
+
+    The list also contains runs of an earlier script with the same name. Raises `BadRequestProblem` for another order
+    than `created_at`, `fields.<name>` or `values.<name>`, with or without a leading `-`.
+    """
+    row = projects.require(tx, project)
+    statement = (
+        select(job, user.c.name.label("author"))
+        .select_from(
+            script_run.join(job, job.c.id == script_run.c.job_id).outerjoin(user, user.c.id == job.c.author_id)
+        )
+        .where(script_run.c.project_id == row.id, script_run.c.script == name)
+        .order_by(*_order(tx, sort), job.c.id.desc())
+        .limit(limit)
+    )
+    return Page(items=tuple(map(_shown, tx.execute(statement))))
+
+
+def _order(tx: Transaction, sort: str) -> list[ColumnElement[Any]]:
+    match = _SORT.match(sort)
+    if match is None:
+        raise BadRequestProblem(
+            f"The runs cannot be sorted by {sort!r}; sort them by created_at, fields.<name> or values.<name>.",
+            code="bad-sort",
+        )
+    falls, key, group, field = match.groups()
+    if key == "created_at":
+        return [job.c.created_us.desc() if falls else job.c.created_us.asc()]
+    document = job.c.result if group == "fields" else job.c.params
+    if tx.is_postgres:
+        value: ColumnElement[Any] = func.jsonb_extract_path(document, group, field)
+    else:
+        value = func.json_extract(document, f"$.{group}.{field}")
+    return [(value.desc() if falls else value.asc()).nulls_last()]
+
+
+def _shown(row: Row[Any]) -> ScriptRun:
+    return ScriptRun(
+        job=row.id,
+        state=row.state,
+        values=row.params["values"],
+        fields=(row.result or {}).get("fields", {}),
+        commit=row.params["declaration"]["commit"],
+        seed=row.seed,
+        author=row.author,
+        created_at=datetime_of(row.created_us),
+        finished_at=None if row.finished_us is None else datetime_of(row.finished_us),
+    )

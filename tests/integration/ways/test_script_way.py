@@ -1,0 +1,137 @@
+"""Workflow of scripts: the commands and the Python of the how-to page, with a Git repository and a real worker."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import shlex
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from tests.support.command_line import CommandLine
+from tests.support.server_process import QUICK_LEASES, ServerProcess
+
+from marey_client import Marey
+from marey_client.project import ProjectHandle
+from marey_motion.formats import write_bvh
+from marey_motion.gait import generate_gait
+from marey_schemas.access import ProjectCreate
+from marey_schemas.queue.jobs import ItemInput
+from marey_schemas.queue.scripts import ScriptCreate
+
+pytestmark = pytest.mark.timeout(300)
+
+TEXT = (Path(__file__).parents[3] / "docs" / "how-to" / "run-your-own-scripts.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", TEXT, re.DOTALL)
+
+
+@pytest.fixture
+def lab(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandle:
+    (tmp_path / "walk.bvh").write_bytes(write_bvh(generate_gait(1.3, 0.5, 3.0)))
+    return lab_of(tmp_path / "walk.bvh", collection="studio")
+
+
+def test_the_commands_and_the_python_of_the_page_work_in_their_order(
+    marey: Marey, lab: ProjectHandle, run: CommandLine, script_repositories: Path, tmp_path: Path
+) -> None:
+    script, python = blocks("python")
+    declared = json.loads(blocks("json")[0])
+    declared["repository"], declared["commit"] = committed(script_repositories / "page", {"measure.py": script})
+    (tmp_path / "measure.json").write_text(json.dumps(declared))
+    *commands, removal = [line for block in blocks("sh") for line in block.splitlines()]
+    printed = [run(*shlex.split(line)[1:]).stdout for line in commands]
+    first, second, table = printed[-3:]
+    lengths = [float(re.search(r"path\s+(\S+)", text)[1]) for text in (first, second)]  # type: ignore[index]
+    assert lengths[1] == pytest.approx(2.5 * lengths[0])
+    assert lengths[0] > 100, "centimetres of a walk of three seconds"
+    factors = [line.split()[1] for line in table.splitlines() if "job_" in line]
+    assert factors == ["2.5", "1"], table
+    copies = list(lab.clips.list(collection="measured"))
+    assert [copy.name for copy in copies] == ["measure-copy"]
+    space: dict[str, Any] = {"project": lab, "marey": marey, "ItemInput": ItemInput}
+    exec(compile(python, "run-your-own-scripts.md", "exec"), space)
+    assert space["best"].values == {"factor": 4.0}
+    run(*shlex.split(removal)[1:])
+    assert list(lab.scripts.list()) == []
+
+
+SLOW = """import sys, time
+from pathlib import Path
+print("the script runs", flush=True)
+time.sleep(float(sys.argv[1]))
+Path(sys.argv[2]).write_text('{"slept": 1}')
+"""
+
+
+def script_processes() -> list[psutil.Process]:
+    """Return the processes that run the script `SLOW`, whoever is their parent."""
+    found = []
+    for one in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):
+            if "code/slow.py" in one.cmdline():
+                found.append(one)
+    return found
+
+
+def wait_until(condition: Callable[[], object], what: str) -> None:
+    deadline = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.1)
+
+
+@pytest.mark.slow
+def test_a_cancelled_run_ends_at_once_and_the_run_of_a_killed_worker_is_repeated(tmp_path: Path) -> None:
+    where = {"MAREY_SCRIPT_REPOSITORIES": json.dumps([f"file://{tmp_path}/"])}
+    process = ServerProcess(tmp_path, **where, **QUICK_LEASES).start(workers=1)
+    try:
+        with process.client() as marey:
+            lab = marey.create_project(ProjectCreate(name="lab"))
+            declared: dict[str, Any] = {"argv": ["python", "slow.py", "{parameter:seconds}", "{output:fields}"]}
+            declared |= {"parameters": {"seconds": {}}, "outputs": {"fields": {"kind": "fields"}}}
+            address, commit = committed(tmp_path / "slow", {"slow.py": SLOW})
+            wanted = {"name": "slow", "repository": address, "commit": commit, **declared}
+            lab.scripts.register(ScriptCreate.model_validate(wanted))
+            cancelled = lab.scripts.at("slow").run({"seconds": 600})
+            wait_until(script_processes, "the script does not run")
+            marey.jobs.cancel(cancelled.id)
+            assert marey.jobs.wait(cancelled.id, timeout_s=60, require_success=False).state == "cancelled"
+            wait_until(lambda: not script_processes(), "the script of the cancelled job still runs")
+            job = lab.scripts.at("slow").run({"seconds": 5})
+            wait_until(script_processes, "the script does not run")
+            assert process.process is not None
+            children = psutil.Process(process.process.pid).children()
+            (worker,) = [one for one in children if "marey_worker" in one.cmdline()]
+            (before,) = script_processes()
+            worker.kill()
+            wait_until(lambda: not before.is_running(), "the script outlives its worker")
+            ended = marey.jobs.wait(job.id, timeout_s=120)
+            assert [one.outcome for one in marey.jobs.attempts(job.id)] == ["lost", "succeeded"]
+            assert ended.result is not None
+            assert ended.result["fields"] == {"slept": 1}
+            states = [(one.state, one.fields) for one in lab.scripts.at("slow").runs(sort="fields.slept")]
+            assert states == [("succeeded", {"slept": 1}), ("cancelled", {})]
+    finally:
+        process.stop()
+    process.check_database()
+
+
+def committed(folder: Path, files: dict[str, str]) -> tuple[str, str]:
+    """Commit files to a new repository; return its address and the name of the commit."""
+    folder.mkdir()
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    who = ["-c", "user.name=tester", "-c", "user.email=tester@example.org"]
+    for words in (["init", "-q"], ["add", "."], [*who, "commit", "-q", "-m", "files"]):
+        subprocess.run(["git", "-C", str(folder), *words], check=True)
+    found = subprocess.run(["git", "-C", str(folder), "rev-parse", "HEAD"], check=True, capture_output=True, text=True)
+    return f"file://{folder}", found.stdout.strip()

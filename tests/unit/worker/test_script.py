@@ -1,0 +1,300 @@
+"""The function of the job kind `script`, with a project in memory, real Git repositories and hostile scripts."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from tests.support.project_in_memory import ProjectInMemory, add_clip
+
+from marey_motion import read_motion
+from marey_motion.gait import generate_gait
+from marey_schemas.consents import CONSENT_EXPIRED
+from marey_schemas.kinds import Kind
+from marey_schemas.queue.scripts import REPOSITORIES_VARIABLE, ScriptDeclaration, ScriptParams
+from marey_worker.context import JobRefused
+from marey_worker.kinds import script
+from marey_worker.scripts.checkout import FetchFailed
+from marey_worker.scripts.confinement import landlock_version
+from marey_worker.scripts.files import OUTPUTS, collect, read_fields
+from marey_worker.scripts.guard import LOG_BYTES
+
+pytestmark = pytest.mark.skipif(landlock_version() == 0, reason="scripts need Linux with Landlock")
+
+WRITE_FIELDS = 'import json, sys\njson.dump({"answer": 42, "name": "x", "good": True}, open(sys.argv[-1], "w"))\n'
+LIMITS = {"seconds": 60, "memory_mb": 256, "written_mb": 8, "processes": 16}
+
+
+class Repository:
+    """Git repository of one test, and the runs of its scripts."""
+
+    def __init__(self, folder: Path, project: ProjectInMemory) -> None:
+        self.folder = folder
+        self.project = project
+        self.git("init", "-q", "-b", "main")
+
+    def git(self, *words: str) -> str:
+        who = ["-c", "user.name=tester", "-c", "user.email=tester@example.org"]
+        command = ["git", "-C", str(self.folder), *who, *words]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    def commit(self, **files: str) -> str:
+        for name, text in files.items():
+            (self.folder / f"{name}.py").write_text(text)
+        self.git("add", ".")
+        self.git("commit", "-q", "-m", "files")
+        return self.git("rev-parse", "HEAD")
+
+    def declare(self, commit: str, **changes: Any) -> ScriptDeclaration:
+        declared: dict[str, Any] = {
+            "repository": f"file://{self.folder}", "commit": commit, "argv": ["python", "run.py", "{output:fields}"],
+            "outputs": {"fields": {"kind": "fields"}}, "limits": LIMITS,
+        }  # fmt: skip
+        return ScriptDeclaration.model_validate(declared | changes)
+
+    def run(self, text: str, values: dict[str, Any] | None = None, **changes: Any) -> dict[str, Any]:
+        declared = self.declare(self.commit(run=text), **changes)
+        return script.run(self.project, ScriptParams(script="test", values=values or {}, declaration=declared))
+
+
+@pytest.fixture
+def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Repository:
+    for name in ("scratch", "repository", "cache"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv(REPOSITORIES_VARIABLE, json.dumps([f"file://{tmp_path}/"]))
+    monkeypatch.setenv("MAREY_TOKEN", "a-secret-token")
+    project = ProjectInMemory(tmp_path / "scratch")
+    project.seed = 7
+    return Repository(tmp_path / "repository", project)
+
+
+def refusal(repository: Repository, text: str, **changes: Any) -> JobRefused:
+    with pytest.raises(JobRefused) as refused:
+        repository.run(text, **changes)
+    assert not [one for one in psutil.Process().children(recursive=True) if one.status() != psutil.STATUS_ZOMBIE]
+    return refused.value
+
+
+def test_a_script_reads_clips_and_its_clips_and_fields_and_files_are_stored(repository: Repository) -> None:
+    add_clip(repository.project, "walk", generate_gait(1.4, 0.0, 1.0))
+    add_clip(repository.project, "stroll", generate_gait(1.0, 0.0, 1.0))
+    copy = (
+        "import json, os, shutil, sys\n"
+        "clips, factor, copy, blob, fields = sys.argv[1:]\n"
+        "names = sorted(os.listdir(clips))\n"
+        "listed = json.load(open('inputs.json'))['clips']\n"
+        "shutil.copyfile(os.path.join(clips, names[0]), copy)\n"
+        "open(blob, 'wb').write(b'bytes')\n"
+        "seed, secret = os.environ['MAREY_SEED'], 'MAREY_TOKEN' in os.environ\n"
+        "json.dump({'count': len(names), 'factor': float(factor), 'first': listed[0]['name'], 'seed': int(seed),"
+        " 'secret': secret}, open(fields, 'w'))\n"
+    )
+    result = repository.run(
+        copy,
+        {"factor": 0.5},
+        argv=["python", "run.py", "{input:clips}", "{parameter:factor}", "{output:copy}", "{output:blob}",
+              "{output:fields}"],
+        parameters={"factor": {"type": "number", "default": 1.0}},
+        inputs={"clips": {"format": "bvh", "many": True}},
+        outputs={"copy": {"kind": "clip", "format": "bvh"}, "blob": {"kind": "file"}, "fields": {"kind": "fields"}},
+    )  # fmt: skip
+    assert result["fields"] == {"count": 2, "factor": 0.5, "first": "walk", "seed": 7, "secret": False}
+    assert repository.project.blobs[result["files"]["blob"]["blob"]] == b"bytes"
+    (clip,) = [one for one in repository.project.staged if one.kind is Kind.CLIP]
+    given = repository.project.parts["clip_walk", 1, "motion"]["poses"]
+    assert clip.item_name == "test-copy"
+    poses = np.asarray(clip.parts["motion"]["poses"])
+    assert np.abs(poses[:, :3] - given[:, :3]).max() < 1e-4, "metres; the file has centimetres"
+
+
+def test_a_captured_clip_survives_a_script_that_copies_it(repository: Repository, mocap: Path) -> None:
+    file = mocap / "bandai-namco-1" / "dataset-1_dash_normal_001.bvh"
+    captured = read_motion(file.read_bytes(), file.name).clip
+    assert captured is not None
+    add_clip(repository.project, "dash", captured)
+    repository.run(
+        "import shutil, sys\nshutil.copyfile(*sys.argv[1:])\n",
+        argv=["python", "run.py", "{input:clips}", "{output:copy}"],
+        inputs={"clips": {"format": "bvh"}},
+        outputs={"copy": {"kind": "clip", "format": "bvh"}},
+    )
+    (copy,) = [one for one in repository.project.staged if one.kind is Kind.CLIP]
+    given = repository.project.parts["clip_dash", 1, "motion"]["poses"]
+    poses = np.asarray(copy.parts["motion"]["poses"])
+    assert poses.shape == given.shape
+    assert np.abs(poses[:, :3] - given[:, :3]).max() < 1e-4
+
+
+def test_a_failing_script_fails_the_job_with_its_status_and_last_lines(repository: Repository) -> None:
+    error = refusal(repository, "import sys\nprint('one')\nprint('the reason', file=sys.stderr)\nsys.exit(3)")
+    assert error.code == "script-failed"
+    assert "exit status 3" in error.detail
+    assert error.detail.endswith("the reason")
+
+
+HOSTILE = {
+    "fork bomb": ("import os\nwhile True:\n try: os.fork()\n except OSError: pass", "more than 16 processes"),
+    "endless output": ("while True: print('x' * 1000)", f"printed more than {LOG_BYTES >> 20} MiB"),
+    "many files": (
+        "n = 0\nwhile True:\n n += 1\n open(f'file{n}', 'wb').write(b'x' * 1000000)",
+        "its files took more than 8 MiB",
+    ),
+    "much memory": (
+        "import os\nfor _ in range(4):\n if os.fork() == 0: break\nx = bytearray(b'x') * 200_000_000\n"
+        "import time; time.sleep(30)",
+        "used more than 256 MiB",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", HOSTILE)
+def test_a_script_that_exceeds_a_limit_is_killed_with_all_its_processes(repository: Repository, what: str) -> None:
+    text, reason = HOSTILE[what]
+    error = refusal(repository, text)
+    assert (error.code, reason in error.detail) == ("script-limit", True), error.detail
+
+
+def test_a_script_that_sleeps_past_its_limit_is_killed(repository: Repository) -> None:
+    text = "import os, time\nos.fork()\nos.setsid() if os.fork() == 0 else None\ntime.sleep(60)"
+    error = refusal(repository, text, limits=LIMITS | {"seconds": 2})
+    assert "longer than its limit of 2 s" in error.detail
+
+
+def test_processes_that_outlive_the_command_are_killed(repository: Repository) -> None:
+    daemon = "import os, time\nif os.fork() == 0:\n os.setsid()\n os.close(1); os.close(2)\n time.sleep(600)\n"
+    assert repository.run(daemon + WRITE_FIELDS)["fields"]["answer"] == 42
+    assert not psutil.Process().children(recursive=True)
+
+
+DENIED = {
+    "write outside": "open('{outside}/evil', 'w')",
+    "read outside": "open('{outside}/secret').read()",
+    "list outside": "__import__('os').listdir('{outside}')",
+    "environment of others": "open('/proc/{parent}/environ', 'rb').read()",
+    "one huge file": "open('huge', 'wb').write(bytes(9_000_000))",
+    "one huge allocation": "bytearray(1_000_000_000)",
+    "network": "__import__('socket').create_connection(('127.0.0.1', {port}), 5)",
+    "signal": "__import__('os').kill({parent}, 0)",
+}
+
+
+def test_a_script_cannot_reach_outside(repository: Repository, tmp_path: Path) -> None:
+    (tmp_path / "secret").write_text("secret")
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        port = listening.getsockname()[1]
+        tries = {name: text.format(outside=tmp_path, parent=os.getpid(), port=port) for name, text in DENIED.items()}
+        text = (
+            "import json, sys\n"
+            "def succeeds(code):\n"
+            "    try:\n        eval(code)\n    except BaseException:\n        return False\n    return True\n"
+            f"found = {{name.replace(' ', '_'): succeeds(code) for name, code in {tries!r}.items()}}\n"
+            "found['inside'] = succeeds(\"open('inside', 'w')\")\n"
+            "json.dump(found, open(sys.argv[-1], 'w'))\n"
+        )
+        fields = repository.run(text)["fields"]
+    assert fields == {name.replace(" ", "_"): False for name in DENIED} | {"inside": True}
+    assert not (tmp_path / "evil").exists()
+
+
+def link_folder(file: Path) -> None:
+    file.parent.rmdir()
+    file.parent.symlink_to(file.parents[2] / "repository")
+
+
+def hard_link(file: Path) -> None:
+    (file.parent / "other").touch()
+    file.hardlink_to(file.parent / "other")
+
+
+UNSAFE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "linked folder": (link_folder, "unsafe-output"),
+    "pipe": (os.mkfifo, "unsafe-output"),
+    "hard link": (hard_link, "unsafe-output"),
+    "folder": (Path.mkdir, "unsafe-output"),
+    "nothing": (lambda file: None, "no-output"),
+    "too large": (lambda file: file.write_text("x" * 2000), "output-too-large"),
+    "no JSON": (lambda file: file.write_text("{"), "bad-fields"),
+    "not a number": (lambda file: file.write_text('{"a": NaN}'), "bad-fields"),
+    "long integer": (lambda file: file.write_text('{"a": 1' + "0" * 30 + "}"), "bad-fields"),
+    "nested": (lambda file: file.write_text('{"a": [1]}'), "bad-fields"),
+    "bad name": (lambda file: file.write_text('{"a.b": 1}'), "bad-fields"),
+    "deep": (lambda file: file.write_text("[" * 900), "bad-fields"),
+}
+
+
+@pytest.mark.parametrize("what", UNSAFE)
+def test_an_output_that_is_not_as_declared_fails_the_job(repository: Repository, what: str, tmp_path: Path) -> None:
+    write, code = UNSAFE[what]
+    declared = repository.declare("c" * 40, outputs={"fields": {"kind": "fields", "max_bytes": 1000}})
+    run = tmp_path / "run"
+    (run / OUTPUTS).mkdir(parents=True)
+    write(run / OUTPUTS / "fields.json")
+    with pytest.raises(JobRefused) as refused:
+        read_fields("fields", collect(declared, run, tmp_path / "collected")["fields"])
+    assert refused.value.code == code, refused.value.detail
+
+
+def test_a_link_as_output_fails_the_job(repository: Repository) -> None:
+    assert refusal(repository, "import os, sys; os.symlink('/etc/passwd', sys.argv[-1])").code == "unsafe-output"
+
+
+def test_a_clip_that_cannot_be_read_fails_the_job(repository: Repository) -> None:
+    argv = ["python", "run.py", "{output:clip}"]
+    outputs = {"clip": {"kind": "clip", "format": "bvh"}}
+    error = refusal(repository, "import sys; open(sys.argv[-1], 'w').write('HIER')", argv=argv, outputs=outputs)
+    assert error.code == "bad-clip"
+
+
+def test_only_commits_of_branches_and_tags_of_allowed_repositories_run(
+    repository: Repository, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = repository.commit(run=WRITE_FIELDS)
+    repository.git("commit", "-q", "--amend", "-m", "other")  # `first` is in no branch any more, but still stored
+    params = ScriptParams(script="test", declaration=repository.declare(first))
+    with pytest.raises(JobRefused, match=r"no branch or tag of .* contains the commit"):
+        script.run(repository.project, params)
+    monkeypatch.setenv(REPOSITORIES_VARIABLE, '["https://git.example.org/"]')
+    error = refusal(repository, WRITE_FIELDS + "# again\n")
+    assert error.code == "repository-not-allowed"
+
+
+def test_a_repository_that_cannot_be_read_is_tried_again(repository: Repository) -> None:
+    commit = repository.commit(run=WRITE_FIELDS)
+    declared = repository.declare(commit, repository=f"file://{repository.folder.parent}/missing")
+    with pytest.raises(FetchFailed, match=r"git fetch of .*missing failed"):
+        script.run(repository.project, ScriptParams(script="test", declaration=declared))
+
+
+def test_hooks_and_links_of_the_commit_do_nothing(repository: Repository) -> None:
+    (repository.folder / "leading_out").symlink_to("/etc/passwd")
+    assert refusal(repository, WRITE_FIELDS).code == "unsafe-commit"
+
+
+def test_a_clip_whose_consent_has_ended_is_not_given_to_a_script(repository: Repository) -> None:
+    add_clip(repository.project, "walk", generate_gait(1.4, 0.0, 1.0))
+    (walk,) = repository.project.inputs["clips"]
+    repository.project.inputs["clips"] = (walk.model_copy(update={"consent_ended": "2026-01-31"}),)
+    argv = ["python", "run.py", "{input:clips}", "{output:fields}"]
+    error = refusal(repository, WRITE_FIELDS, argv=argv, inputs={"clips": {"format": "bvh"}})
+    assert error.code == CONSENT_EXPIRED
+
+
+def test_a_program_of_the_commit_runs_without_a_shell(repository: Repository) -> None:
+    program = repository.folder / "tool"
+    program.write_text(f"#!{sys.executable}\n{WRITE_FIELDS}")
+    program.chmod(0o755)
+    argv = ["./tool", "$(touch evil); {x}", "{parameter:text}", "{output:fields}"]
+    values = {"text": "a b; rm -rf ."}
+    result = repository.run("", values, argv=argv, parameters={"text": {"type": "text"}})
+    assert result["fields"] == {"answer": 42, "name": "x", "good": True}
+    assert result["values"] == values

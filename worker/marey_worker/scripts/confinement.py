@@ -1,0 +1,117 @@
+"""Confinement of the processes of a script by the Linux kernel.
+
+Landlock limits the files that the processes can open. Namespaces, where the system lets users create them, hide other
+processes and the network.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import stat
+import struct
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+CLONE_NEWIPC, CLONE_NEWUSER, CLONE_NEWPID, CLONE_NEWNET = 0x08000000, 0x10000000, 0x20000000, 0x40000000
+PR_SET_CHILD_SUBREAPER, PR_SET_NO_NEW_PRIVS = 36, 38
+_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # the same numbers on all architectures
+_PATH_BENEATH = 1
+
+EXECUTE, WRITE_FILE, READ_FILE, READ_DIR, TRUNCATE, IOCTL = 1 << 0, 1 << 1, 1 << 2, 1 << 3, 1 << 14, 1 << 15
+_OF_FILES = EXECUTE | WRITE_FILE | READ_FILE | TRUNCATE | IOCTL
+"""Rights that a rule about a single file may grant."""
+
+PROGRAMS = ("/usr", "/bin", "/lib", "/lib32", "/lib64", "/sbin")
+"""Folders of programs and libraries, which scripts may read."""
+SYSTEM_FILES = (
+    "/etc/ld.so.cache", "/etc/localtime", "/etc/passwd", "/etc/group", "/etc/nsswitch.conf", "/proc/cpuinfo",
+    "/proc/meminfo", "/sys/devices/system/cpu",
+)  # fmt: skip
+"""Further files that programs need, and that contain no secrets."""
+NETWORK_FILES = ("/etc/hosts", "/etc/resolv.conf", "/etc/ssl", "/etc/pki")
+DEVICES = ("/dev/null", "/dev/zero", "/dev/random", "/dev/urandom")
+
+
+class NotConfinedError(Exception):
+    """This system cannot confine a script."""
+
+
+def landlock_version() -> int:
+    """Return the version of Landlock that the kernel has, and 0 if it has none."""
+    if sys.platform != "linux":
+        return 0
+    return max(0, int(_libc().syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), 1)))
+
+
+def separate(*, network: bool) -> bool:
+    """Move the next child of this process to namespaces of its own; return whether the system allowed it.
+
+    This process must have only one thread. Its next child sees no other processes and, unless `network` is true, no
+    network.
+    """
+    user, group = os.geteuid(), os.getegid()
+    flags = CLONE_NEWUSER | CLONE_NEWPID | CLONE_NEWIPC | (0 if network else CLONE_NEWNET)
+    if _libc().unshare(flags) != 0:
+        return False
+    for file, text in (("setgroups", "deny"), ("uid_map", f"1000 {user} 1"), ("gid_map", f"1000 {group} 1")):
+        Path(f"/proc/self/{file}").write_text(text)
+    return True
+
+
+def adopt_orphans() -> None:
+    """Make this process the parent of its descendants whose own parents end."""
+    _libc().prctl(PR_SET_CHILD_SUBREAPER, 1)
+
+
+def confine(writable: Path, *, network: bool) -> None:
+    """Let this process and its future children write only below `writable`, and read only that and installed programs.
+
+    Unless `network` is true, TCP is refused as well, if the kernel supports it. Raises `NotConfinedError`.
+    """
+    version = landlock_version()
+    if version == 0:
+        raise NotConfinedError("the kernel of this machine has no Landlock (Linux 5.13 or later)")
+    everything = _rights_of(version)
+    libc = _libc()
+    tcp = 0 if network or version < 4 else 3
+    scoped = 0 if version < 6 else 3  # abstract sockets and signals
+    fields = struct.pack("=QQQ", everything, tcp, scoped)[: 8 if version < 4 else 16 if version < 6 else 24]
+    ruleset = _check(libc.syscall(_CREATE_RULESET, fields, ctypes.c_size_t(len(fields)), 0))
+    reading = EXECUTE | READ_FILE | READ_DIR
+    readable = [*PROGRAMS, *SYSTEM_FILES, sys.prefix, sys.base_prefix, *(NETWORK_FILES if network else ())]
+    _allow(ruleset, readable, reading & everything)
+    _allow(ruleset, DEVICES, (READ_FILE | WRITE_FILE) & everything)
+    _allow(ruleset, [str(writable)], everything)
+    _check(libc.prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0))
+    _check(libc.syscall(_RESTRICT_SELF, ruleset, 0))
+    os.close(ruleset)
+
+
+def _rights_of(version: int) -> int:
+    """Return all rights to files that a version of Landlock knows."""
+    newest = {1: 12, 2: 13, 3: 14, 4: 14}.get(version, 15)
+    return int((1 << (newest + 1)) - 1)
+
+
+def _allow(ruleset: int, paths: Iterable[str], rights: int) -> None:
+    for path in paths:
+        try:
+            opened = os.open(path, os.O_PATH | os.O_CLOEXEC)
+        except FileNotFoundError:
+            continue
+        granted = rights if stat.S_ISDIR(os.fstat(opened).st_mode) else rights & _OF_FILES
+        rule = struct.pack("=Qi", granted, opened)
+        _check(_libc().syscall(_ADD_RULE, ruleset, _PATH_BENEATH, rule, 0))
+        os.close(opened)
+
+
+def _check(answer: int) -> int:
+    if answer < 0:
+        raise NotConfinedError(f"Landlock cannot be used: {os.strerror(ctypes.get_errno())}")
+    return answer
+
+
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None, use_errno=True)

@@ -1,0 +1,169 @@
+"""Files that scripts read and write: inputs of the job as files, and outputs, which are not trusted."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from marey_motion.errors import MotionError
+from marey_schemas.consents import CONSENT_EXPIRED, CONSENT_REMEDY
+from marey_schemas.item_files import ItemToExport, item_as_json
+from marey_schemas.kinds import PARTS, Kind
+from marey_schemas.queue.job_params import ExportParams
+from marey_schemas.queue.scripts import LONGEST_TEXT, MOST_FIELDS, FieldName, ScriptDeclaration, ScriptOutput, Value
+from marey_schemas.queue.worker_protocol import PinnedInput
+from marey_schemas.sizes import MIB
+from marey_worker.context import Context, JobRefused
+from marey_worker.kinds.export import ClipFiles
+
+INPUTS, OUTPUTS = "inputs", "outputs"
+MOST_FIELD_BYTES = MIB
+
+
+def write_inputs(
+    context: Context, declared: ScriptDeclaration, folder: Path, *, allow_expired_consent: bool
+) -> tuple[dict[str, str], list[str]]:
+    """Write the inputs of a job to `inputs` below a folder; return the path of each, and the ids of the clips whose
+    consent has ended.
+
+    The file `inputs.json` lists the items of each input with the names of their files. Raises `JobRefused` if the
+    consent for a clip has ended and the job does not allow it, and if a clip cannot be written in its format.
+    """
+    paths: dict[str, str] = {}
+    listed: dict[str, list[dict[str, Any]]] = {}
+    ended: list[str] = []
+    for name, one in declared.inputs.items():
+        files = ClipFiles(context, ExportParams(format=one.format))
+        listed[name] = []
+        for number, pin in enumerate(context.inputs[name]):
+            if pin.consent_ended is not None:
+                _check_consent(pin, allowed=allow_expired_consent)
+                ended.append(pin.item)
+            data, ending = _content(context, files, pin)
+            path = f"{INPUTS}/{name}/{number:06d}{ending}" if one.many else f"{INPUTS}/{name}{ending}"
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (folder / path).write_bytes(data)
+            listed[name].append(
+                {"file": path, "item": pin.item, "revision": pin.revision, "name": pin.name, "folder": pin.collection}
+            )
+            paths[name] = f"{INPUTS}/{name}" if one.many else path
+    (folder / "inputs.json").write_text(json.dumps(listed, indent=1))
+    return paths, sorted(set(ended))
+
+
+def _check_consent(pin: PinnedInput, *, allowed: bool) -> None:
+    if not allowed:
+        detail = f"the consent for the clip {pin.path} ended on {pin.consent_ended}. {CONSENT_REMEDY}"
+        raise JobRefused(CONSENT_EXPIRED, detail)
+
+
+def _content(context: Context, files: ClipFiles, pin: PinnedInput) -> tuple[bytes, str]:
+    """Return an item as a file, and the ending of the file's name."""
+    if pin.kind is not Kind.CLIP:
+        ((_, found),) = context.documents_of_each([pin], *PARTS[pin.kind])
+        parts = {name: one for name, one in zip(PARTS[pin.kind], found, strict=True) if one is not None}
+        return item_as_json(ItemToExport(pin.item, pin.kind, pin.name, pin.collection, pin.revision, parts)), ".json"
+    ((_, (info, motion)),) = context.documents_of_each([pin], "info", "motion")
+    try:
+        file = files.file_of(pin, info or {}, motion)
+    except MotionError as error:
+        raise JobRefused(error.code, f"{pin.path} cannot be written for the script: {error}") from error
+    return file.data, Path(file.name).suffix
+
+
+def output_path(name: str, declared: ScriptOutput) -> str:
+    """Return the path of an output, relative to the folder of the run."""
+    return f"{OUTPUTS}/{name}{declared.ending}"
+
+
+def collect(declared: ScriptDeclaration, folder: Path, target: Path) -> dict[str, Path]:
+    """Copy the outputs of a script that has ended from its folder to `target`; return the copy of each output.
+
+    Raises `JobRefused` if a required output is missing, or an output is too large, a link, or not an ordinary file.
+    Only the names below `folder` are trusted: the script may have replaced any file or folder by a link.
+    """
+    run = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        try:
+            outputs = os.open(OUTPUTS, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=run)
+        except OSError as error:
+            raise JobRefused("unsafe-output", "the script has replaced the folder of its outputs") from error
+        try:
+            target.mkdir()
+            found = {
+                name: _collect_one(name, one, outputs, target / (name + one.ending))
+                for name, one in declared.outputs.items()
+            }
+        finally:
+            os.close(outputs)
+    finally:
+        os.close(run)
+    return {name: path for name, path in found.items() if path is not None}
+
+
+def _collect_one(name: str, declared: ScriptOutput, outputs: int, target: Path) -> Path | None:
+    try:
+        opened = os.open(name + declared.ending, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=outputs)
+    except FileNotFoundError:
+        if declared.required:
+            raise JobRefused("no-output", f"the script has not written its output {name!r}") from None
+        return None
+    except OSError as error:
+        raise JobRefused("unsafe-output", f"the output {name!r} is a link, or cannot be read") from error
+    facts = os.fstat(opened)
+    if not stat.S_ISREG(facts.st_mode) or facts.st_nlink != 1:
+        os.close(opened)
+        raise JobRefused("unsafe-output", f"the output {name!r} is not an ordinary file with one name")
+    with os.fdopen(opened, "rb") as source:
+        if facts.st_size > declared.max_bytes:
+            detail = f"the output {name!r} has {facts.st_size:,} bytes; it may have {declared.max_bytes:,}"
+            raise JobRefused("output-too-large", detail)
+        with target.open("xb") as copy:
+            shutil.copyfileobj(source, copy)
+    return target
+
+
+def read_fields(name: str, file: Path) -> dict[str, Value]:
+    """Return the logged fields of a run from its JSON file. Raises `JobRefused` if the file has another form."""
+    if file.stat().st_size > MOST_FIELD_BYTES:
+        raise JobRefused("bad-fields", f"the output {name!r} must have at most {MOST_FIELD_BYTES:,} bytes")
+    try:
+        document = json.loads(file.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise JobRefused("bad-fields", f"the output {name!r} is not a JSON document: {error}") from error
+    if not isinstance(document, Mapping) or len(document) > MOST_FIELDS:
+        detail = f"the output {name!r} must be a JSON object of at most {MOST_FIELDS} fields"
+        raise JobRefused("bad-fields", detail)
+    for field, value in document.items():
+        if (fault := _fault_of(field, value)) is not None:
+            raise JobRefused("bad-fields", f"the field {field!r:.100} of the output {name!r}: {fault}")
+    return dict(document)
+
+
+def _fault_of(field: str, value: Any) -> str | None:
+    if not _is_name(field):
+        return "a name consists of letters, digits and _, and begins with a letter"
+    if isinstance(value, str):
+        return None if len(value) <= LONGEST_TEXT else f"a text may have at most {LONGEST_TEXT} characters"
+    if isinstance(value, bool):
+        return None
+    if isinstance(value, int | float):
+        small = abs(value) < 2**63 if isinstance(value, int) else math.isfinite(value)
+        return None if small else "a number must be finite, and an integer must fit into 64 bits"
+    return "a value must be a number, a text, true or false"
+
+
+def _is_name(field: str) -> bool:
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        TypeAdapter(FieldName).validate_python(field)
+    except ValidationError:
+        return False
+    return True

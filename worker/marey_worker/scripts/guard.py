@@ -1,0 +1,255 @@
+"""Guard of a script: a process that starts the confined command, watches its limits and ends all its processes.
+
+The guard is a process of its own, because only a process with one thread can create namespaces. It reads an order from
+standard input, copies the output of the command to its own standard output, and writes an end to the pipe whose number
+is its first argument.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import resource
+import selectors
+import signal
+import stat
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import NoReturn
+
+import psutil
+
+from marey_schemas.processes.limits import PR_SET_PDEATHSIG, die_with_parent
+from marey_schemas.sizes import MIB
+from marey_worker.scripts.confinement import NotConfinedError, adopt_orphans, confine, separate
+
+LOOK_EVERY_S = 0.05
+MEASURE_EVERY_S = 0.5
+LOG_BYTES = 8 * MIB
+TAIL_BYTES = 2000
+MOST_FILES = 100_000
+OPEN_FILES = 1024
+THREADS_PER_PROCESS = 8
+NO_PROGRAM_STATUS = 127
+
+
+@dataclass(frozen=True)
+class GuardedCommand:
+    """Command of a script, its folder, environment and limits."""
+
+    argv: tuple[str, ...]
+    folder: str
+    environment: dict[str, str]
+    seconds: int
+    memory_mb: int
+    written_mb: int
+    processes: int
+    network: bool
+
+
+@dataclass(frozen=True)
+class CommandEnd:
+    """End of a command: its exit status (128 plus the number of a signal), or the reason why it was stopped."""
+
+    status: int | None
+    stopped: str | None
+    tail: str
+    isolated: bool
+
+
+def main() -> None:
+    """Run the command of the order, and write its end to the pipe."""
+    result = int(sys.argv[1])
+    os.set_inheritable(result, False)
+    given = json.load(sys.stdin)
+    order = GuardedCommand(**{**given, "argv": tuple(given["argv"])})
+    die_with_parent()
+    adopt_orphans()
+    isolated = separate(network=order.network)
+    read_end, write_end = os.pipe()
+    held = os.fork()
+    if held == 0:
+        os.close(read_end)
+        os.close(result)
+        _hold(order, write_end, isolated=isolated)
+    os.close(write_end)
+    watch = _Watch(order, held, read_end)
+    stopped = watch.run()
+    end = CommandEnd(watch.status, stopped, watch.tail.decode("utf-8", "replace"), isolated)
+    os.write(result, json.dumps(asdict(end)).encode())
+
+
+def _hold(order: GuardedCommand, output: int, *, isolated: bool) -> NoReturn:
+    """Start the confined command, wait for it, and exit with its status.
+
+    In a process namespace of its own, this is the first process: when it ends, the kernel kills all others.
+    """
+    os.setsid()
+    _die_with_parent()
+    null = os.open(os.devnull, os.O_RDONLY)
+    for number, end in enumerate((null, output, output)):
+        os.dup2(end, number)
+    os.chdir(order.folder)
+    try:
+        _limit(order, isolated=isolated)
+        confine(Path(order.folder), network=order.network)
+        command = os.fork()
+        if command == 0:
+            _die_with_parent()
+            os.execvpe(order.argv[0], order.argv, order.environment)  # noqa: S606 - a list without a shell
+    except (NotConfinedError, OSError) as error:
+        os.write(2, f"the command cannot be started: {error}\n".encode())
+        os._exit(NO_PROGRAM_STATUS)
+    while True:
+        ended, status = os.wait()
+        if ended == command:
+            code = os.waitstatus_to_exitcode(status)
+            os._exit(code if code >= 0 else 128 - code)
+
+
+def _die_with_parent() -> None:
+    """Make the kernel kill this process when its parent ends; in a new namespace, the parent has no process id."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def _limit(order: GuardedCommand, *, isolated: bool) -> None:
+    limits = {
+        resource.RLIMIT_CORE: 0,
+        resource.RLIMIT_DATA: order.memory_mb * MIB,
+        resource.RLIMIT_FSIZE: order.written_mb * MIB,
+        resource.RLIMIT_NOFILE: OPEN_FILES,
+    }
+    if isolated:  # otherwise, all processes of the user would count
+        limits[resource.RLIMIT_NPROC] = order.processes * THREADS_PER_PROCESS
+    for which, limit in limits.items():
+        _, hard = resource.getrlimit(which)
+        limit = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
+        resource.setrlimit(which, (limit, limit))
+
+
+class _Watch:
+    """Watch over a running command: its output and its limits."""
+
+    def __init__(self, order: GuardedCommand, held: int, output: int) -> None:
+        self.status: int | None = None
+        self.tail = b""
+        self._order = order
+        self._held = held
+        self._output = output
+        self._printed = 0
+        self._deadline = time.monotonic() + order.seconds
+        self._measure_at = 0.0
+
+    def run(self) -> str | None:
+        """Wait for the end of the command; return the reason if it was stopped."""
+        os.set_blocking(self._output, False)
+        with selectors.DefaultSelector() as waiting:
+            waiting.register(self._output, selectors.EVENT_READ)
+            stopped = None
+            while stopped is None and not self._has_ended():
+                if waiting.select(LOOK_EVERY_S) and not self._copy():
+                    time.sleep(LOOK_EVERY_S)  # the command has closed its output
+                stopped = self._exceeded()
+        self._end_all()
+        while stopped is None and self._copy():
+            stopped = self._too_much_output()
+        return stopped
+
+    def _has_ended(self) -> bool:
+        ended, status = os.waitpid(self._held, os.WNOHANG)
+        if ended:
+            self.status = os.waitstatus_to_exitcode(status)
+            if self.status < 0:
+                self.status = 128 - self.status
+        return bool(ended)
+
+    def _copy(self) -> bool:
+        """Copy some output; return whether there was any."""
+        try:
+            piece = os.read(self._output, 64 << 10)
+        except BlockingIOError:
+            return False
+        self._printed += len(piece)
+        sys.stdout.buffer.write(piece)
+        sys.stdout.buffer.flush()
+        self.tail = (self.tail + piece)[-TAIL_BYTES:]
+        return bool(piece)
+
+    def _too_much_output(self) -> str | None:
+        if self._printed > LOG_BYTES:
+            return f"it printed more than {LOG_BYTES // MIB} MiB"
+        return None
+
+    def _exceeded(self) -> str | None:
+        order = self._order
+        if time.monotonic() > self._deadline:
+            return f"it ran longer than its limit of {order.seconds} s"
+        family = list(_descendants())
+        if len(family) > order.processes + 1:  # one process waits for the command
+            return f"it had more than {order.processes} processes at the same time"
+        if sum(map(_resident, family)) > order.memory_mb * MIB:
+            return f"it used more than {order.memory_mb} MiB of memory"
+        if time.monotonic() > self._measure_at:
+            written = _bytes_below(Path(order.folder), order.written_mb * MIB)
+            self._measure_at = time.monotonic() + MEASURE_EVERY_S
+            if written:
+                return f"its files took more than {order.written_mb} MiB, or there were more than {MOST_FILES:,}"
+        return self._too_much_output()
+
+    def _end_all(self) -> None:
+        """Kill all processes of the command, until none is left."""
+        while family := list(_descendants()):
+            for one in family:
+                try:
+                    one.kill()
+                except psutil.NoSuchProcess:
+                    continue
+            self._reap()
+            time.sleep(LOOK_EVERY_S / 10)
+
+    def _reap(self) -> None:
+        try:
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                continue
+        except ChildProcessError:
+            return
+
+
+def _descendants() -> Iterator[psutil.Process]:
+    for one in psutil.Process().children(recursive=True):
+        try:
+            if one.status() != psutil.STATUS_ZOMBIE or one.ppid() == os.getpid():
+                yield one
+        except psutil.NoSuchProcess:
+            continue
+
+
+def _resident(one: psutil.Process) -> int:
+    try:
+        return int(one.memory_info().rss)
+    except psutil.NoSuchProcess:
+        return 0
+
+
+def _bytes_below(folder: Path, limit: int) -> bool:
+    """Return whether the files below a folder take more than `limit` bytes, or are too many; links are not followed."""
+    total = count = 0
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            count += 1
+            try:
+                found = os.lstat(os.path.join(parent, name))
+            except OSError:
+                continue
+            total += found.st_blocks * 512 if stat.S_ISREG(found.st_mode) else 0
+            if total > limit or count > MOST_FILES:
+                return True
+    return False
+
+
+if __name__ == "__main__":
+    main()
