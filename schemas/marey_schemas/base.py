@@ -11,6 +11,7 @@ class Request(BaseModel):
     model_config = ConfigDict(
         extra="forbid", frozen=True, arbitrary_types_allowed=True, populate_by_name=True, serialize_by_alias=True,
         hide_input_in_errors=True,  # a traceback must not print a password
+        defer_build=True,  # validators are built at their first use: a process uses few of the 400 models
     )  # fmt: skip
 
 
@@ -18,8 +19,9 @@ class Answer(BaseModel):
     """Base of answers. Unknown fields are ignored, so that older clients work with servers that add fields."""
 
     model_config = ConfigDict(
-        extra="ignore", frozen=True, arbitrary_types_allowed=True, populate_by_name=True, serialize_by_alias=True
-    )
+        extra="ignore", frozen=True, arbitrary_types_allowed=True, populate_by_name=True, serialize_by_alias=True,
+        defer_build=True,  # see `Request`
+    )  # fmt: skip
 
 
 class Options(Request):

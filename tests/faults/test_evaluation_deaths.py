@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from tests.support.evaluation_takes import write_walks
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
+from tests.support.tiers import is_soak
 
 from marey_client import Marey
 from marey_client.handles.evaluations import EvaluationHandle
@@ -25,11 +26,11 @@ LONG: dict[str, Any] = {
     "name": "walks-eval",
     "speeds_m_s": (1.0, 1.25, 1.5, 1.75, 2.0),
     "turn_rates_deg_s": (-75.0, -50.0, -25.0, 0.0, 25.0, 50.0, 75.0, 100.0),
-    "duration_s": 60.0,
+    "duration_s": 60.0 if is_soak() else 20.0,
     "baseline": False,
     "report": False,
 }
-"""Arguments of an evaluation of 80 trials in 10 tasks."""
+"""Arguments of an evaluation of 80 trials in 10 tasks. A task takes longer than two questions of `wait_until`."""
 
 
 @pytest.fixture
@@ -72,7 +73,7 @@ def wait_until(condition: Callable[[], bool], seconds: float = 120) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
+        time.sleep(0.05)
 
 
 def tasks_of(lab: ProjectHandle, job: Job) -> list[Job]:

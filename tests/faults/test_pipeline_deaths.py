@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
+from tests.support.tiers import is_soak
 
 from marey_client.handles.pipelines import PipelineRun
 from marey_client.imports import LocalFile, find_files
@@ -29,9 +30,9 @@ StartWorker = Callable[..., WorkerProcess]
 
 @pytest.fixture(scope="module")
 def takes(tmp_path_factory: pytest.TempPathFactory) -> list[LocalFile]:
-    """Different short walks as BVH files."""
+    """Different short walks as BVH files: 40, or 18 in the tier `test`; 16 clips make a task."""
     folder = tmp_path_factory.mktemp("takes")
-    for number in range(40):
+    for number in range(40 if is_soak() else 18):
         clip = generate_gait(1.0 + number / 100, 0.0, 0.5, 30)
         (folder / f"walk-{number:02d}.bvh").write_bytes(write_motion(clip, "bvh"))
     return list(find_files([folder]).files)
@@ -102,13 +103,10 @@ def test_a_server_killed_where_a_job_gets_its_inputs_goes_on_with_all_of_them_or
     place: str,
     nth: str,
 ) -> None:
-    server.start()
-    with server.client() as marey:
-        wanted = game_twice(marey.create_project(ProjectCreate(name="lab")), takes, tmp_path)
-    server.stop()
     server.start(fault=f"{place}{nth}:kill")
     with server.client() as marey:
-        run = marey.project("lab").pipeline(wanted)
+        lab = marey.create_project(ProjectCreate(name="lab"))
+        run = lab.pipeline(game_twice(lab, takes, tmp_path))
         start_worker("steady")
         assert server.wait_until_dead() == -signal.SIGKILL
         server.start()
@@ -125,14 +123,10 @@ def test_a_server_killed_where_a_pipeline_is_handed_in_has_all_of_it_or_nothing(
     start_worker: StartWorker,
     place: str,
 ) -> None:
-    server.start()
-    with server.client() as marey:
-        wanted = game_twice(marey.create_project(ProjectCreate(name="lab")), takes, tmp_path)
-    server.stop()
     server.start(fault=f"{place}:kill")
     with server.client() as marey, ThreadPoolExecutor(1) as pool:
-        marey.me()  # a server that was never reached is given up sooner
-        handing_in = pool.submit(marey.project("lab").pipeline, wanted)
+        lab = marey.create_project(ProjectCreate(name="lab"))
+        handing_in = pool.submit(lab.pipeline, game_twice(lab, takes, tmp_path))
         assert server.wait_until_dead() == -signal.SIGKILL
         server.start()
         run = handing_in.result(60)  # the client asks again, with the same Idempotency-Key

@@ -8,9 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tests.support.fake_server import FakeServer
+from tests.support.forked_programs import ForkedProgram, nursery
 
 KINDS_OF_TESTS = Path(__file__).parents[1] / "unit" / "worker" / "thirdparty"
 """Distribution with the kinds of job that only tests know."""
+NAMES_OF_KINDS = ("add", "misbehave", "tally", "make")
+"""Names of these kinds. Their modules are loaded sooner than those of the built-in kinds."""
 
 
 def python_path() -> str:
@@ -22,7 +25,8 @@ class AttachedWorker:
     """A worker process that reads its token from its standard input, and ends when this input is closed.
 
     Its log is a file in `folder`. With a `token_file`, the worker reads the token from this file instead, and does not
-    end with its standard input.
+    end with its standard input. Unless `options` name kinds of job, the worker runs only the kinds of tests. The
+    process is forked by the nursery; with `forked=False` it is new, so that `/proc` shows its own arguments.
     """
 
     LOG = "worker.log"
@@ -34,17 +38,23 @@ class AttachedWorker:
         *options: str,
         env: dict[str, str] | None = None,
         token_file: Path | None = None,
+        forked: bool = True,
     ) -> None:
         self.log = folder / self.LOG
         credential = ["--attached"] if token_file is None else ["--token-file", str(token_file)]
-        command = [sys.executable, "-m", "marey_worker", *credential, "--server", server.url]
+        kinds = [] if "--kind" in options else [word for name in NAMES_OF_KINDS for word in ("--kind", name)]
+        arguments = ["marey_worker", *credential, "--server", server.url, "--cache", str(folder / "cache"), *kinds]
+        environment = {**os.environ, "PYTHONPATH": python_path(), **(env or {})}
         with self.log.open("ab") as log:
-            self.process = subprocess.Popen(
-                [*command, "--cache", str(folder / "cache"), *options],
-                stdin=subprocess.PIPE,
-                stderr=log,
-                env={**os.environ, "PYTHONPATH": python_path(), **(env or {})},
-            )
+            self.process: ForkedProgram | subprocess.Popen[bytes]
+            if forked:
+                self.process = nursery().start(
+                    [*arguments, *options], environment, output=log.fileno(), with_stdin=True
+                )
+            else:
+                command = [sys.executable, "-m", *arguments, *options]
+                self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log, env=environment)
+        assert self.process.stdin is not None
         self.process.stdin.write(b"marey_worker_token\n")
         self.process.stdin.flush()
 
@@ -58,6 +68,7 @@ class AttachedWorker:
         if self.process.poll() is None:
             self.process.kill()
             self.process.wait()
+        assert self.process.stdin is not None
         self.process.stdin.close()
 
 

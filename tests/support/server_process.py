@@ -8,7 +8,6 @@ import random
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Self
 
 import httpx
+from tests.support.forked_programs import ForkedProgram, nursery
 
 from marey_client import Marey
 from marey_client.retries import ONCE, Retries
@@ -37,18 +37,14 @@ class MareyProcess:
 
     def __init__(self, log: Path) -> None:
         self.log = log
-        self.process: subprocess.Popen[bytes] | None = None
+        self.process: ForkedProgram | None = None
 
     def spawn(self, arguments: list[str], environment: dict[str, str], stdin: bytes | None = None) -> None:
         """Start the program; `stdin` is written to it and kept open."""
         surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
         with self.log.open("ab") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", *arguments],
-                env=surroundings | environment,
-                stdin=subprocess.PIPE if stdin is not None else subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
+            self.process = nursery().start(
+                arguments, surroundings | environment, output=log.fileno(), with_stdin=stdin is not None
             )
         if stdin is not None:
             assert self.process.stdin is not None

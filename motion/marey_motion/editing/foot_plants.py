@@ -15,7 +15,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import convolve1d, maximum_filter1d
 
 from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Flags, Floats
@@ -278,6 +277,8 @@ def _enveloped(values: Floats, blend: int) -> Floats:
     The curve is zero in frames farther than 2·`blend` frames from any positive value. It changes slowly, so that the
     body does not bob.
     """
+    from scipy.ndimage import convolve1d, maximum_filter1d  # brings much of scipy: only who needs it shall wait
+
     weights = np.hanning(2 * blend + 3)[1:-1]
     highest = maximum_filter1d(values, 2 * blend + 1, mode="nearest")
     return np.asarray(convolve1d(highest, weights / weights.sum(), mode="nearest"), dtype=np.float64)

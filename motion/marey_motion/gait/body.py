@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve1d, minimum_filter1d
 
 from marey_motion import quaternions
 from marey_motion.arrays import AnyFloats
@@ -60,6 +59,8 @@ class GaitMoments:
         -------
         (n,)    averages, in the same unit
         """
+        from scipy.ndimage import convolve1d  # brings much of scipy: only who needs it shall wait
+
         reach = _reach(window_s, self.frame_rate_hz)
         weights = np.hanning(2 * reach + 3)[1:-1]
         return np.asarray(convolve1d(values, weights / weights.sum(), mode="nearest"))
@@ -80,6 +81,8 @@ class GaitMoments:
         -------
         (n,)    the curve, in the same unit
         """
+        from scipy.ndimage import minimum_filter1d
+
         lowest = minimum_filter1d(limits, 2 * _reach(window_s, self.frame_rate_hz) + 1, mode="nearest")
         return self.settled(lowest, window_s)
 

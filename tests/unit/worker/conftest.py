@@ -22,8 +22,10 @@ def start_worker(server: FakeServer, tmp_path: Path) -> Iterator[StartWorker]:
     """Function that starts a worker of `server`; the workers end with the test."""
     workers: list[AttachedWorker] = []
 
-    def start(*options: str, env: dict[str, str] | None = None, token_file: Path | None = None) -> AttachedWorker:
-        workers.append(AttachedWorker(server, tmp_path, *options, env=env, token_file=token_file))
+    def start(
+        *options: str, env: dict[str, str] | None = None, token_file: Path | None = None, forked: bool = True
+    ) -> AttachedWorker:
+        workers.append(AttachedWorker(server, tmp_path, *options, env=env, token_file=token_file, forked=forked))
         return workers[-1]
 
     yield start

@@ -10,7 +10,8 @@ import sys
 from marey_schemas.queue.job_kinds import job_kinds
 from marey_worker.child import load
 load(list(job_kinds()))
-print(*(name for name in ("scipy.stats", "scipy.signal", "sklearn", "matplotlib") if name in sys.modules))
+avoided = ("scipy.ndimage", "scipy.stats", "scipy.signal", "sklearn", "matplotlib")
+print(*(name for name in avoided if name in sys.modules))
 """
 
 

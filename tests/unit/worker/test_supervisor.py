@@ -140,7 +140,8 @@ def test_the_attempts_own_token_is_used_for_the_attempt(server: FakeServer, star
 
 @pytest.mark.slow
 def test_no_secret_stands_in_arguments_or_environment(server: FakeServer, start_worker: StartWorker) -> None:
-    worker = start_worker(env={"MAREY_DATABASE_URL": "postgresql://marey:hunter2@db/marey", "PGPASSWORD": "hunter2"})
+    secrets = {"MAREY_DATABASE_URL": "postgresql://marey:hunter2@db/marey", "PGPASSWORD": "hunter2"}
+    worker = start_worker(env=secrets, forked=False)
     server.ended(server.submit("add", {"a": 1, "b": 1}))
     process = psutil.Process(worker.process.pid)
     children = process.children(recursive=True)

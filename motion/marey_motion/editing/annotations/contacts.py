@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from marey_motion import kinematics
 from marey_motion.arrays import Floats
@@ -61,6 +60,8 @@ def foot_speed(points: NDArray[np.floating], frame_rate_hz: float) -> Floats:
     -------
     (F,) float64    metres per second
     """
+    from scipy.ndimage import median_filter  # brings much of scipy: only who needs it shall wait
+
     speed = np.linalg.norm(kinematics.velocities(points, frame_rate_hz), axis=-1).min(axis=1)
     width = 2 * int(0.5 * SMOOTHING_S * frame_rate_hz) + 1
     return np.asarray(median_filter(speed.astype(np.float64), size=width, mode="nearest"))

@@ -7,7 +7,6 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from marey_motion import kinematics
 from marey_motion.arrays import Floats
@@ -133,5 +132,7 @@ def _downhill(values: Floats, frame: int, step: Literal[-1, 1], last: int) -> in
 
 
 def _smooth(values: Floats, deviation_s: float, frame_rate_hz: float) -> Floats:
+    from scipy.ndimage import gaussian_filter1d  # brings much of scipy: only who needs it shall wait
+
     smoothed = gaussian_filter1d(values.astype(np.float64), deviation_s * frame_rate_hz, axis=0, mode="nearest")
     return np.asarray(smoothed)

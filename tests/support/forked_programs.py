@@ -1,0 +1,203 @@
+"""Programs that tests start in processes of their own: forked from a process that has imported their modules.
+
+A server needs two seconds of processor time to import its modules, and hardly any to start. The tests start hundreds of
+servers and workers, so each test process starts one *nursery* (`python -m tests.support.forked_programs`), which
+imports the modules once and forks a process for each program. A forked program has the arguments, the environment, the
+folder and the descriptors that a new process would have, runs the module as `python -m` does, and is a process that
+tests can signal, kill and wait for. `tests/unit/server/test_app.py` starts `marey serve` without a nursery.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import json
+import os
+import runpy
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from typing import BinaryIO
+
+MODULES = (
+    "marey_client.cli.app", "marey_client.embedded", "marey_server.app", "marey_server.commands",
+    "marey_worker.commands", "psycopg", "sqlalchemy.dialects.postgresql", "sqlalchemy.dialects.sqlite", "uvloop",
+)  # fmt: skip
+"""Modules of a server and a worker, and those that they import when they open a database or start their event loop."""
+LONGEST_ORDER = 1 << 16
+"""Greatest size of an order, in bytes; it contains all environment variables."""
+_PID, _STATUS = struct.Struct("<q"), struct.Struct("<i")
+
+
+class ForkedProgram:
+    """Process that the nursery has forked. It can be used like `subprocess.Popen`."""
+
+    def __init__(self, pid: int, ended: int, stdin: BinaryIO | None) -> None:
+        self.pid = pid
+        self.stdin = stdin
+        self.returncode: int | None = None
+        self._ended = ended
+
+    def __del__(self) -> None:
+        if self.returncode is None:
+            os.close(self._ended)
+
+    def poll(self) -> int | None:
+        """Return the exit status, or None if the process still runs; a negative number is a signal."""
+        return self._status_within(0)
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Return the exit status when the process has ended. Raises `subprocess.TimeoutExpired`."""
+        status = self._status_within(timeout)
+        if status is None:
+            assert timeout is not None
+            raise subprocess.TimeoutExpired(f"forked program {self.pid}", timeout)
+        return status
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal to the process, unless it has ended."""
+        if self.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        """Send SIGTERM."""
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """Send SIGKILL."""
+        self.send_signal(signal.SIGKILL)
+
+    def _status_within(self, seconds: float | None) -> int | None:
+        if self.returncode is None and select.select([self._ended], [], [], seconds)[0]:
+            told = os.read(self._ended, _STATUS.size)
+            if not told:
+                raise RuntimeError(f"the nursery ended before its program {self.pid}")
+            (self.returncode,) = _STATUS.unpack(told)
+            os.close(self._ended)
+        return self.returncode
+
+
+class Nursery:
+    """The process that forks programs."""
+
+    def __init__(self) -> None:
+        self._orders, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "tests.support.forked_programs", str(theirs.fileno())],
+                env=surroundings | {"OPENBLAS_NUM_THREADS": "1"},
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+            )
+        self._ordering = threading.Lock()
+
+    def start(
+        self, arguments: Sequence[str], environment: Mapping[str, str], *, output: int, with_stdin: bool
+    ) -> ForkedProgram:
+        """Start `python -m` with `arguments`; the output is written to the descriptor `output`."""
+        order = json.dumps({"arguments": arguments, "environment": dict(environment), "folder": os.getcwd()}).encode()
+        assert len(order) < LONGEST_ORDER
+        ended, ending = os.pipe()
+        taken, given = os.pipe() if with_stdin else (os.open(os.devnull, os.O_RDONLY), None)
+        try:
+            with self._ordering:
+                socket.send_fds(self._orders, [order], [taken, output, ending])
+                answer = self._orders.recv(_PID.size)
+        finally:
+            os.close(ending)
+            os.close(taken)
+        if not answer:
+            raise RuntimeError(f"the nursery has ended with status {self._process.wait()}; its error output says why")
+        return ForkedProgram(_PID.unpack(answer)[0], ended, None if given is None else os.fdopen(given, "wb"))
+
+
+@functools.cache
+def nursery() -> Nursery:
+    """Return the nursery of this test process, which ends with the process."""
+    return Nursery()
+
+
+def load_modules() -> None:
+    """Import the modules of a server and of a worker."""
+    from marey_schemas.processes.memory import loading_modules
+
+    with loading_modules():
+        for name in MODULES:
+            importlib.import_module(name)
+    if (threads := len(os.listdir("/proc/self/task"))) > 1:
+        raise RuntimeError(f"only a process with one thread may fork programs, but this one has {threads}")
+
+
+def main() -> list[str]:
+    """Carry out orders until the test process ends; in a forked process, return the arguments of the program."""
+    load_modules()
+    orders = socket.socket(fileno=int(sys.argv[1]))
+    woken, wake = socket.socketpair()
+    woken.setblocking(False)
+    wake.setblocking(False)
+    signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
+    running: dict[int, int] = {}
+    while True:
+        ready, _, _ = select.select([orders, woken], [], [])
+        if woken in ready:
+            woken.recv(4096)
+            tell_statuses(running)
+        if orders in ready:
+            order, descriptors, _, _ = socket.recv_fds(orders, LONGEST_ORDER, 3)
+            if not order:  # the test process has ended
+                sys.exit()
+            taken, output, ending = descriptors
+            pid = os.fork()
+            if pid == 0:
+                signal.set_wakeup_fd(-1)
+                signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+                for source, to in ((taken, 0), (output, 1), (output, 2)):
+                    os.dup2(source, to)
+                for unused in (orders, woken, wake):
+                    unused.close()
+                for descriptor in (taken, output, ending, *running.values()):
+                    os.close(descriptor)
+                return adopt(**json.loads(order))
+            running[pid] = ending
+            os.close(taken)
+            os.close(output)
+            orders.send(_PID.pack(pid))
+
+
+def tell_statuses(running: dict[int, int]) -> None:
+    """Reap the processes that have ended, and write their exit statuses to their descriptors in `running`."""
+    for pid in [*running]:
+        ended, status = os.waitpid(pid, os.WNOHANG)
+        if ended:
+            descriptor = running.pop(pid)
+            with contextlib.suppress(BrokenPipeError):  # no test waits for this process any more
+                os.write(descriptor, _STATUS.pack(os.waitstatus_to_exitcode(status)))
+            os.close(descriptor)
+
+
+def adopt(arguments: list[str], environment: dict[str, str], folder: str) -> list[str]:
+    """Take on the environment and the folder of a program, and read what modules read when they are imported."""
+    from marey_schemas.queue.worker_protocol import FAULT_VARIABLE
+    from marey_server import faults
+
+    os.environ.clear()
+    os.environ.update(environment)
+    os.chdir(folder)
+    sys.path[1:1] = [path for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path not in sys.path]
+    faults.plan(environment.get(FAULT_VARIABLE, ""))
+    return arguments
+
+
+if __name__ == "__main__":
+    module, *sys.argv[1:] = main()
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
