@@ -1,0 +1,197 @@
+"""Turns of projects: from which projects a claim takes its jobs, and how many from each.
+
+A claim serves the project with the fewest running jobs first, and among equals the one that was served least recently.
+So a project with many queued jobs delays the others only by the jobs that it runs already.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, NamedTuple
+
+from sqlalchemy import (
+    CTE,
+    BigInteger,
+    ColumnElement,
+    FromClause,
+    Select,
+    and_,
+    bindparam,
+    exists,
+    func,
+    select,
+    update,
+)
+
+from marey_schemas.access import Role
+from marey_server.store.database.prepared import Prepared
+from marey_server.store.jobs.fencing import QUEUED
+from marey_server.store.tables import LEASED, job, member, project, queue_share
+from marey_server.store.transaction import Transaction
+
+
+class Restriction(NamedTuple):
+    """Limits of a claim on the number and the projects of jobs; kinds and labels are limited separately."""
+
+    one_job: bool
+    named_projects: bool
+    own_projects: bool
+
+
+@dataclass(slots=True, eq=False)
+class Turn:
+    """A project that has jobs which a claim could get, with the numbers on which its turn depends."""
+
+    project_id: str
+    running: int
+    most_running: int | None
+    """Greatest number of running jobs, or None if there is no limit."""
+    served_us: int | None
+    """Time of the last claim of one of its jobs, or None if the project has no row in `queue_share`."""
+
+    @property
+    def places(self) -> int | None:
+        """Number of jobs that may start now, or None if there is no limit."""
+        return None if self.most_running is None else max(0, self.most_running - self.running)
+
+
+# -- which projects have jobs for a claim ------------------------------------------------------------------------------
+
+
+def is_claimable(candidate: FromClause) -> ColumnElement[bool]:
+    """Return the condition that a job can run now, on the worker that claims."""
+    return and_(
+        candidate.c.state == QUEUED,
+        candidate.c.run_at_us <= bindparam("now_us", type_=BigInteger),
+        candidate.c.kind.in_(bindparam("kinds", expanding=True)),
+        candidate.c.labels_key.in_(bindparam("label_keys", expanding=True)),
+    )
+
+
+def _is_workable(project_id: ColumnElement[str], restriction: Restriction) -> ColumnElement[bool]:
+    """Return the condition that the caller, as a worker, may read and write data of a project."""
+    conditions = [project.c.id == project_id, project.c.deleted_us.is_(None)]
+    if restriction.named_projects:
+        conditions.append(project.c.name.in_(bindparam("project_names", expanding=True)))
+    if restriction.own_projects:
+        roles = (Role.MAINTAINER.value, Role.OWNER.value)
+        mine = (member.c.project_id == project.c.id, member.c.user_id == bindparam("user"), member.c.role.in_(roles))
+        conditions.append(exists().where(*mine))
+    return exists().where(*conditions)
+
+
+def projects_with_queued_jobs() -> CTE:
+    """Return the ids of the projects with queued jobs, and one null.
+
+    Each step looks up the next id in the index, so the cost depends on the number of projects, not of jobs.
+    """
+    first, later = job.alias("first"), job.alias("later")
+    found = (
+        select(func.min(first.c.project_id).label("project_id"))
+        .where(first.c.state == QUEUED)
+        .cte("waiting", recursive=True)
+    )
+    following = (
+        select(func.min(later.c.project_id))
+        .where(later.c.state == QUEUED, later.c.project_id > found.c.project_id)
+        .scalar_subquery()
+    )
+    return found.union_all(select(following).where(found.c.project_id.is_not(None)))
+
+
+def count_leased(project_id: ColumnElement[str]) -> ColumnElement[int]:
+    """Return the SQL expression for the number of a project's jobs that workers run."""
+    leased = job.alias("leased")
+    return select(func.count()).select_from(leased).where(leased.c.project_id == project_id, LEASED).scalar_subquery()
+
+
+def _turns_statement(restriction: Restriction) -> Select[Any]:
+    candidate = job.alias("candidate")
+    source: FromClause
+    if restriction.one_job:
+        one = select(candidate.c.project_id).where(candidate.c.id == bindparam("one_job"), is_claimable(candidate))
+        source = one.subquery("waiting")
+        conditions: list[ColumnElement[bool]] = []
+    else:
+        source = projects_with_queued_jobs()
+        has_jobs = exists().where(candidate.c.project_id == source.c.project_id, is_claimable(candidate))
+        conditions = [source.c.project_id.is_not(None), has_jobs]
+    return (
+        select(
+            source.c.project_id,
+            count_leased(source.c.project_id).label("running"),
+            queue_share.c.most_running,
+            queue_share.c.served_us,
+        )
+        .select_from(source.outerjoin(queue_share, queue_share.c.project_id == source.c.project_id))
+        .where(*conditions, _is_workable(source.c.project_id, restriction))
+    )
+
+
+TURNS = {
+    restriction: Prepared(_turns_statement(restriction))
+    for restriction in (Restriction(*flags) for flags in product((False, True), repeat=3))
+}
+"""Statements that return the projects with jobs for a claim; `turns_of` orders their rows."""
+
+
+def turns_of(rows: Iterable[Any]) -> list[Turn]:
+    """Return the turns for the rows of a statement in `TURNS`."""
+    return [Turn(row.project_id, row.running, row.most_running, row.served_us) for row in rows]
+
+
+# -- who is next -------------------------------------------------------------------------------------------------------
+
+
+def next_projects(turns: Sequence[Turn], most: int) -> Iterator[Turn]:
+    """Yield the project of each job of a claim for `most` jobs, as if every project had enough jobs.
+
+    Projects whose limit is reached are left out.
+    """
+    order = [(turn.running, turn.served_us or 0, turn.project_id, turn) for turn in turns if turn.places != 0]
+    heapq.heapify(order)
+    for _ in range(most):
+        if not order:
+            return
+        running, served_us, project_id, turn = order[0]
+        yield turn
+        if turn.most_running is not None and running + 1 >= turn.most_running:
+            heapq.heappop(order)
+        else:
+            heapq.heapreplace(order, (running + 1, served_us, project_id, turn))
+
+
+_SERVE = Prepared(
+    update(queue_share).where(queue_share.c.project_id == bindparam("of")).values(served_us=bindparam("at_us"))
+)
+_this_share = queue_share.alias("this_share")
+_SERVE_UNLESS_LOCKED = Prepared(
+    update(queue_share)
+    .where(
+        queue_share.c.project_id.in_(
+            select(_this_share.c.project_id)
+            .where(_this_share.c.project_id == bindparam("of"))
+            .with_for_update(skip_locked=True)
+        )
+    )
+    .values(served_us=bindparam("at_us"))
+)
+"""As `_SERVE`, but if another claim serves the project at the same time, the time of that claim suffices.
+
+So claims of jobs of the same project do not wait for one another.
+"""
+
+
+def note_served(tx: Transaction, turns: Sequence[Turn], served: Mapping[str, int]) -> None:
+    """Record which projects a claim has served; `served` are the positions of their last jobs in the claim.
+
+    The positions are added to the time, so that of two projects in one claim, the one that was served last waits.
+    """
+    for turn in turns:
+        if turn.project_id in served and turn.served_us is None:
+            tx.execute(tx.insert_or_ignore(queue_share, {"project_id": turn.project_id}))
+    statement = _SERVE_UNLESS_LOCKED if tx.is_postgres else _SERVE
+    tx.run_each(statement, [{"of": one, "at_us": tx.now_us + place} for one, place in sorted(served.items())])
