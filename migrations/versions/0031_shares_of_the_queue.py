@@ -10,7 +10,9 @@ depends_on = None
 
 QUEUED = sa.text("state = 'queued'")
 LEASED = sa.text("state = 'running' AND lease_expires_us IS NOT NULL")
-ORDER = (sa.text("priority DESC"), "run_at_us", "id", "kind", "labels_key")
+BEFORE = (sa.text("priority DESC"), "run_at_us", "id", "kind", "labels_key")
+AFTER = ("project_id", *BEFORE, "state")
+COUNTED = ("project_id", "state", "lease_expires_us")
 
 
 def upgrade() -> None:
@@ -24,13 +26,13 @@ def upgrade() -> None:
         sa.ForeignKeyConstraint(["project_id"], ["project.id"], name="fk_queue_share_project_id_project"),
     )
     op.drop_index("ix_job_claim", "job")
-    op.create_index("ix_job_claim", "job", ["project_id", *ORDER], sqlite_where=QUEUED, postgresql_where=QUEUED)
-    op.create_index("ix_job_leased", "job", ["project_id"], sqlite_where=LEASED, postgresql_where=LEASED)
+    op.create_index("ix_job_claim", "job", list(AFTER), sqlite_where=QUEUED, postgresql_where=QUEUED)
+    op.create_index("ix_job_leased", "job", list(COUNTED), sqlite_where=LEASED, postgresql_where=LEASED)
 
 
 def downgrade() -> None:
     """Drop the table, and restore the indexes."""
     op.drop_index("ix_job_leased", "job")
     op.drop_index("ix_job_claim", "job")
-    op.create_index("ix_job_claim", "job", list(ORDER), sqlite_where=QUEUED, postgresql_where=QUEUED)
+    op.create_index("ix_job_claim", "job", list(BEFORE), sqlite_where=QUEUED, postgresql_where=QUEUED)
     op.drop_table("queue_share")

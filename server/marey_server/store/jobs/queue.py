@@ -41,11 +41,12 @@ from marey_server.access.secret_tokens import IssuedToken, derive_attempt_token,
 from marey_server.errors import ForbiddenProblem, InvalidProblem, LeaseLostProblem
 from marey_server.store.credentials.server_key import read_seal_key
 from marey_server.store.database.prepared import Prepared
-from marey_server.store.jobs.claiming.limits import take_within_limit
+from marey_server.store.jobs.claiming.taking import take_within_limit
 from marey_server.store.jobs.claiming.turns import (
     TURNS,
     Restriction,
     Turn,
+    claim_order,
     is_claimable,
     next_projects,
     note_served,
@@ -251,20 +252,16 @@ def _pick(*, one_job: bool) -> CTE:
     same_key = and_(rival.c.project_id == job.c.project_id, rival.c.concurrency_key == job.c.concurrency_key)
     rival_runs = exists().where(same_key, rival.c.state == RUNNING)
     first_of_key = (
-        select(rival.c.id).where(same_key, claimable(rival)).order_by(*_order(rival)).limit(1).scalar_subquery()
+        select(rival.c.id).where(same_key, claimable(rival)).order_by(*claim_order(rival)).limit(1).scalar_subquery()
     )
     return (
         select(job.c.id)
         .where(claimable(job), or_(job.c.concurrency_key.is_(None), and_(~rival_runs, job.c.id == first_of_key)))
-        .order_by(*_order(job))
+        .order_by(*claim_order(job))
         .limit(bindparam("most"))
         .with_for_update(skip_locked=True)
         .cte("pick")
     )
-
-
-def _order(candidate: FromClause) -> tuple[ColumnElement[Any], ...]:
-    return candidate.c.priority.desc(), candidate.c.run_at_us, candidate.c.id
 
 
 def _pick_order(row: Row[Any]) -> tuple[Any, ...]:
@@ -327,12 +324,10 @@ def _claim_in_turn(tx: Transaction, wanted: _Wanted, turns: Sequence[Turn], most
     If a project has fewer jobs than turns, the other projects share its turns.
     """
     rows: list[Row[Any]] = []
-    served: dict[str, int] = {}
+    served: set[Turn] = set()
     remaining = list(turns)
-    while order := list(next_projects(remaining, most - len(rows))):
-        before = len(rows)
-        last_places = {turn: place for place, turn in enumerate(order)}
-        for turn, share in Counter(order).items():
+    while shares := Counter(next_projects(remaining, most - len(rows))):
+        for turn, share in shares.items():
 
             def take(number: int, turn: Turn = turn) -> list[Row[Any]]:
                 return tx.run(wanted.claim, {**wanted.of_claim, "of_project": turn.project_id, "most": number})
@@ -341,7 +336,7 @@ def _claim_in_turn(tx: Transaction, wanted: _Wanted, turns: Sequence[Turn], most
             rows += taken
             turn.running += len(taken)
             if taken:
-                served[turn.project_id] = before + last_places[turn]
+                served.add(turn)
             if len(taken) < share:  # it has no more jobs for this claim
                 remaining.remove(turn)
     note_served(tx, turns, served)

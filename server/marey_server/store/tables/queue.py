@@ -89,6 +89,7 @@ job = Table(
         "id",
         "kind",
         "labels_key",
+        "state",  # else SQLite reads the row of each job to see its state, although the index contains queued jobs only
         sqlite_where=text("state = 'queued'"),
         postgresql_where=text("state = 'queued'"),
     ),
@@ -114,7 +115,9 @@ job = Table(
         sqlite_where=text("state = 'running'"),
         postgresql_where=text("state = 'running'"),
     ),
-    Index("ix_job_leased", "project_id", sqlite_where=LEASED, postgresql_where=LEASED),  # counted by claims
+    Index(  # counted by claims, without reading rows
+        "ix_job_leased", "project_id", "state", "lease_expires_us", sqlite_where=LEASED, postgresql_where=LEASED
+    ),
     Index(
         ONE_RUNS_PER_KEY,
         "project_id",

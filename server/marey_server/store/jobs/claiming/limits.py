@@ -2,65 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from sqlalchemy import ColumnElement, bindparam, func, select, update
 
-from sqlalchemy import bindparam, func, select, update
-
-from marey_server.store.database.prepared import Prepared
-from marey_server.store.jobs.claiming.turns import Turn, count_leased
-from marey_server.store.tables import queue_share
+from marey_server.store.tables import LEASED, job, queue_share
 from marey_server.store.transaction import Transaction
 
-Take = Callable[[int], list[Any]]
-"""Function that claims up to a number of jobs of one project, and returns their rows."""
 
-_NOW = Prepared(
-    select(queue_share.c.most_running, count_leased(queue_share.c.project_id).label("running")).where(
-        queue_share.c.project_id == bindparam("of")
-    )
-)
+def count_leased(project_id: ColumnElement[str]) -> ColumnElement[int]:
+    """Return the SQL expression for the number of a project's jobs that workers run."""
+    leased = job.alias("leased")
+    return select(func.count()).select_from(leased).where(leased.c.project_id == project_id, LEASED).scalar_subquery()
 
 
-def take_within_limit(tx: Transaction, turn: Turn, most: int, take: Take, *, may_wait: bool) -> list[Any]:
-    """Claim up to `most` jobs of a project, but not more than its limit allows.
-
-    On Postgres, claims of a project with a limit run one after another: each one locks the project, and counts the
-    running jobs again when it has the lock. A claim waits for such a lock only if it holds none (`may_wait`), so no two
-    claims wait for each other. Otherwise, it leaves out a project that another claim has locked. SQLite has only one
-    writer at a time.
-    """
-    if turn.most_running is None:
-        return take(most)
-    if not tx.is_postgres:
-        return take(most if turn.places is None else min(most, turn.places))
-    if not may_wait:
-        locked = tx.execute(select(func.pg_try_advisory_xact_lock(_key_of(turn.project_id)))).scalar_one()
-        return _take_counted(tx, turn, most, take) if locked else []
-    with tx.connection.begin_nested() as savepoint:
-        tx.lock(_lock_of(turn.project_id))
-        rows = _take_counted(tx, turn, most, take)
-        if not rows:
-            savepoint.rollback()  # releases the lock, so that the claim may wait for that of another project
-    return rows
-
-
-def _take_counted(tx: Transaction, turn: Turn, most: int, take: Take) -> list[Any]:
-    (now,) = tx.run(_NOW, {"of": turn.project_id})
-    turn.running, turn.most_running = now.running, now.most_running
-    allowed = most if turn.places is None else min(most, turn.places)
-    return take(allowed) if allowed else []
-
-
-def _lock_of(project_id: str) -> str:
+def name_of_lock(project_id: str) -> str:
+    """Return the name of the lock that claims of a project with a limit hold, and changes of this limit."""
     return f"running jobs {project_id}"
 
 
-def _key_of(project_id: str) -> Any:
-    return func.hashtextextended(_lock_of(project_id), 0)
-
-
-# -- the limit of a project --------------------------------------------------------------------------------------------
+def key_of_lock(project_id: str) -> ColumnElement[int]:
+    """Return the SQL expression for the number by which Postgres knows this lock."""
+    return func.hashtextextended(name_of_lock(project_id), 0)
 
 
 def read_limit(tx: Transaction, project_id: str) -> tuple[int, int | None]:
@@ -75,6 +36,6 @@ def set_limit(tx: Transaction, project_id: str, most_running: int | None) -> Non
 
     The caller must have checked that the principal is an administrator.
     """
-    tx.lock(_lock_of(project_id))
+    tx.lock(name_of_lock(project_id))
     tx.execute(tx.insert_or_ignore(queue_share, {"project_id": project_id}))
     tx.execute(update(queue_share).where(queue_share.c.project_id == project_id).values(most_running=most_running))

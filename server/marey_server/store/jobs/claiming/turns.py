@@ -7,7 +7,7 @@ So a project with many queued jobs delays the others only by the jobs that it ru
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple
@@ -22,14 +22,16 @@ from sqlalchemy import (
     bindparam,
     exists,
     func,
+    literal_column,
     select,
     update,
 )
 
 from marey_schemas.access import Role
 from marey_server.store.database.prepared import Prepared
+from marey_server.store.jobs.claiming.limits import count_leased
 from marey_server.store.jobs.fencing import QUEUED
-from marey_server.store.tables import LEASED, job, member, project, queue_share
+from marey_server.store.tables import job, member, project, queue_share
 from marey_server.store.transaction import Transaction
 
 
@@ -52,6 +54,10 @@ class Turn:
     served_us: int | None
     """Time of the last claim of one of its jobs, or None if the project has no row in `queue_share`."""
 
+    def rank(self) -> tuple[int, int, str]:
+        """Return what orders the turns: the least comes first."""
+        return self.running, self.served_us or 0, self.project_id
+
     @property
     def places(self) -> int | None:
         """Number of jobs that may start now, or None if there is no limit."""
@@ -69,6 +75,11 @@ def is_claimable(candidate: FromClause) -> ColumnElement[bool]:
         candidate.c.kind.in_(bindparam("kinds", expanding=True)),
         candidate.c.labels_key.in_(bindparam("label_keys", expanding=True)),
     )
+
+
+def claim_order(candidate: FromClause) -> tuple[ColumnElement[Any], ...]:
+    """Return the order in which the jobs of a project are claimed."""
+    return candidate.c.priority.desc(), candidate.c.run_at_us, candidate.c.id
 
 
 def _is_workable(project_id: ColumnElement[str], restriction: Restriction) -> ColumnElement[bool]:
@@ -102,12 +113,6 @@ def projects_with_queued_jobs() -> CTE:
     return found.union_all(select(following).where(found.c.project_id.is_not(None)))
 
 
-def count_leased(project_id: ColumnElement[str]) -> ColumnElement[int]:
-    """Return the SQL expression for the number of a project's jobs that workers run."""
-    leased = job.alias("leased")
-    return select(func.count()).select_from(leased).where(leased.c.project_id == project_id, LEASED).scalar_subquery()
-
-
 def _turns_statement(restriction: Restriction) -> Select[Any]:
     candidate = job.alias("candidate")
     source: FromClause
@@ -117,8 +122,14 @@ def _turns_statement(restriction: Restriction) -> Select[Any]:
         conditions: list[ColumnElement[bool]] = []
     else:
         source = projects_with_queued_jobs()
-        has_jobs = exists().where(candidate.c.project_id == source.c.project_id, is_claimable(candidate))
-        conditions = [source.c.project_id.is_not(None), has_jobs]
+        first = (
+            select(candidate.c.id)
+            .where(candidate.c.project_id == source.c.project_id, is_claimable(candidate))
+            .order_by(*claim_order(candidate))  # so that the database reads `ix_job_claim`, up to the first such job
+            .limit(literal_column("1"))
+            .scalar_subquery()
+        )
+        conditions = [source.c.project_id.is_not(None), first.is_not(None)]
     return (
         select(
             source.c.project_id,
@@ -151,7 +162,7 @@ def next_projects(turns: Sequence[Turn], most: int) -> Iterator[Turn]:
 
     Projects whose limit is reached are left out.
     """
-    order = [(turn.running, turn.served_us or 0, turn.project_id, turn) for turn in turns if turn.places != 0]
+    order = [(*turn.rank(), turn) for turn in turns if turn.places != 0]
     heapq.heapify(order)
     for _ in range(most):
         if not order:
@@ -185,13 +196,17 @@ So claims of jobs of the same project do not wait for one another.
 """
 
 
-def note_served(tx: Transaction, turns: Sequence[Turn], served: Mapping[str, int]) -> None:
-    """Record which projects a claim has served; `served` are the positions of their last jobs in the claim.
+def note_served(tx: Transaction, turns: Sequence[Turn], served: Iterable[Turn]) -> None:
+    """Record which projects a claim has served; `turns` are all projects that had jobs, with the numbers after it.
 
-    The positions are added to the time, so that of two projects in one claim, the one that was served last waits.
+    Each project gets a time of its own, so that of two projects in one claim, the one that was served last waits. If
+    only one project had jobs, it took no turn of another one, and nothing is recorded.
     """
-    for turn in turns:
-        if turn.project_id in served and turn.served_us is None:
+    if len(turns) < 2:
+        return
+    in_order = sorted(served, key=Turn.rank)
+    for turn in in_order:
+        if turn.served_us is None:
             tx.execute(tx.insert_or_ignore(queue_share, {"project_id": turn.project_id}))
     statement = _SERVE_UNLESS_LOCKED if tx.is_postgres else _SERVE
-    tx.run_each(statement, [{"of": one, "at_us": tx.now_us + place} for one, place in sorted(served.items())])
+    tx.run_each(statement, [{"of": turn.project_id, "at_us": tx.now_us + at} for at, turn in enumerate(in_order)])
