@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from marey_client.errors import Forbidden
+from marey_client.errors import Forbidden, Unauthenticated
 from marey_schemas.access import RunningJobs
 from marey_schemas.queue.jobs import Attempt, Job, JobState
 from marey_schemas.queue.workers import Worker
@@ -29,7 +29,7 @@ def _limit_of(marey: Marey, job: Job) -> RunningJobs | None:
         return None
     try:
         return marey.project(job.project).quotas().running_jobs
-    except Forbidden:
+    except (Forbidden, Unauthenticated):
         return None
 
 

@@ -440,8 +440,9 @@ def test_eight_claimers_never_exceed_the_limits_of_two_projects(
 
 
 def _running_by_project(tx: Transaction) -> dict[str, int]:
-    counted = select(project.c.name, func.count()).join(job, job.c.project_id == project.c.id)
-    return dict(tx.execute(counted.where(job.c.state == "running").group_by(project.c.name)).tuples().all())
+    counted = select(project.c.name, func.count().label("jobs")).join(job, job.c.project_id == project.c.id)
+    rows = tx.execute(counted.where(job.c.state == "running").group_by(project.c.name))
+    return {row.name: row.jobs for row in rows}
 
 
 def _left(tx: Transaction) -> int:

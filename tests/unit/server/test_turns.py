@@ -11,15 +11,19 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from sqlalchemy import select
 from tests.support.queue_desk import Desk
 from tests.support.tiers import examples
 
 from marey_schemas.access import ProjectCreate
 from marey_schemas.queue.jobs import JobCreate
 from marey_schemas.queue.worker_protocol import ClaimRequest, Lease
-from marey_server.store import projects
+from marey_server.access.principal import SYSTEM
+from marey_server.store import events, projects
 from marey_server.store.jobs import queue
 from marey_server.store.jobs.claiming.turns import Turn
+from marey_server.store.tables import event
+from marey_server.store.wakeups import work_topic
 
 _NUMBERS = itertools.count()
 
@@ -119,7 +123,7 @@ STEPS = st.lists(
 
 @pytest.mark.every_database
 def test_claims_take_the_jobs_that_the_model_takes(desk: Desk) -> None:
-    @settings(max_examples=examples(0.25), deadline=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=examples(30), deadline=None, suppress_health_check=list(HealthCheck))
     @given(steps=STEPS)
     def run(steps: list[tuple[str, int, int]]) -> None:
         play(desk, steps)
@@ -168,6 +172,33 @@ def test_a_limit_holds_jobs_back_and_removing_it_lets_them_go(desk: Desk) -> Non
     assert desk.claim_many() == []
     desk.limit_running(None)
     assert len(desk.claim_many()) == 2
+
+
+def test_the_limit_is_shown_and_recorded_and_changes_the_revision_of_the_project(desk: Desk) -> None:
+    before = desk.database.read(desk.user, projects.read_project, desk.project)
+    desk.limit_running(2)
+    after = desk.database.read(desk.user, projects.read_project, desk.project)
+    assert (before.most_running_jobs, after.most_running_jobs, after.rev) == (None, 2, before.rev + 1)
+    desk.submit_many(*[JobCreate(kind="errand")] * 3)
+    desk.claim_many()
+    shown = desk.database.read(desk.user, projects.read_quotas, desk.project).running_jobs
+    assert (shown.used, shown.allowed) == (2, 2)
+    with desk.database.engine.connect() as connection:
+        bodies = connection.execute(select(event.c.body).where(event.c.kind == "project.limited")).scalars().all()
+    assert [body["limits"] for body in bodies] == [{"running_jobs": 2}]
+
+
+def test_the_end_of_a_job_wakes_workers_for_the_jobs_that_the_limit_held_back(desk: Desk) -> None:
+    desk.submit()
+    desk.limit_running(1)
+    lease = desk.claim()
+    desk.submit("sum")
+    seen = desk.database.read(SYSTEM, events.newest_number)
+    assert work_topic("sum") not in desk.database.read(SYSTEM, events.read_news, seen).topics
+    desk.complete(lease)
+    assert work_topic("sum") in desk.database.read(SYSTEM, events.read_news, seen).topics
+    desk.limit_running(None)
+    assert work_topic("sum") not in desk.database.read(SYSTEM, events.read_news, seen).topics
 
 
 def test_tasks_count_towards_the_limit_but_not_their_parent(desk: Desk) -> None:
