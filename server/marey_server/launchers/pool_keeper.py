@@ -22,7 +22,7 @@ from marey_server.process.worker_pools import WorkerPool
 from marey_server.store import leader
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import SERVER
-from marey_server.store.monitoring.demand import Demand, Reach, read_demand
+from marey_server.store.monitoring.demand import Demand, JobReach, read_demand
 
 T = TypeVar("T")
 
@@ -43,8 +43,8 @@ QUIET_ENDS = ("finished", "stopped", "deadline", "preempted")
 """Reasons of ends that are logged as information, and that do not pause the next start."""
 
 
-def _reach(pool: WorkerPool) -> Reach:
-    return Reach(pool.labels, pool.kinds)
+def _reach(pool: WorkerPool) -> JobReach:
+    return JobReach(pool.labels, pool.kinds)
 
 
 class PoolKeeper:

@@ -6,7 +6,7 @@ from functools import partial
 from tests.support.queue_desk import Desk
 
 from marey_server.access.principal import SYSTEM
-from marey_server.store.monitoring.demand import Demand, Reach, read_demand
+from marey_server.store.monitoring.demand import Demand, JobReach, read_demand
 
 GPU = {"gpu": "a100", "site": "lyon"}
 
@@ -18,9 +18,9 @@ def demand(
     kinds: Sequence[str] = (),
     workers: Sequence[str] = (),
     limit: int = 100,
-    others: Sequence[Reach] = (),
+    others: Sequence[JobReach] = (),
 ) -> Demand:
-    read = partial(read_demand, reach=Reach(labels, kinds), workers=workers, limit=limit, others=others)
+    read = partial(read_demand, reach=JobReach(labels, kinds), workers=workers, limit=limit, others=others)
     return desk.database.read(SYSTEM, read)
 
 
@@ -85,11 +85,11 @@ def test_a_job_counts_only_for_the_pools_with_the_fewest_labels_that_can_run_it(
     for labels in ({}, {}, {"gpu": "a100"}, {"site": "lyon"}):
         desk.submit(labels=labels)
     desk.submit("sum")
-    plain, gpu = Reach({}), Reach({"gpu": "a100"})
-    assert demand(desk, labels={}, others=[Reach(GPU), gpu]).queued == 3
-    assert demand(desk, labels=gpu.labels, others=[Reach(GPU), plain]).queued == 1
+    plain, gpu = JobReach({}), JobReach({"gpu": "a100"})
+    assert demand(desk, labels={}, others=[JobReach(GPU), gpu]).queued == 3
+    assert demand(desk, labels=gpu.labels, others=[JobReach(GPU), plain]).queued == 1
     assert demand(desk, labels=GPU, others=[gpu, plain]).queued == 1
-    errands = Reach({}, ("errand",))
+    errands = JobReach({}, ("errand",))
     assert demand(desk, labels=GPU, others=[errands]).queued == 3
-    assert demand(desk, labels=GPU, others=[Reach({"gpu": "h100"})]).queued == 2
+    assert demand(desk, labels=GPU, others=[JobReach({"gpu": "h100"})]).queued == 2
     assert demand(desk, labels=GPU, kinds=("errand",), others=[errands]).queued == 2

@@ -41,7 +41,6 @@ from marey_server.access.secret_tokens import IssuedToken, derive_attempt_token,
 from marey_server.errors import ForbiddenProblem, InvalidProblem, LeaseLostProblem
 from marey_server.store.credentials.server_key import read_seal_key
 from marey_server.store.database.prepared import Prepared
-from marey_server.store.jobs.claiming.taking import take_within_limit
 from marey_server.store.jobs.claiming.turns import (
     TURNS,
     Restriction,
@@ -50,6 +49,7 @@ from marey_server.store.jobs.claiming.turns import (
     is_claimable,
     next_projects,
     note_served,
+    take_within_limit,
     turns_of,
 )
 from marey_server.store.jobs.events import emit_job_events
@@ -291,7 +291,7 @@ def _require_labels(caller: Principal, request: ClaimRequest) -> None:
 
 
 class _Wanted(NamedTuple):
-    """What a claim asks for, as parameters of the statements."""
+    """Statements of a claim, with the parameters for what it asks for."""
 
     turns: Prepared
     of_turns: Mapping[str, Any]

@@ -33,7 +33,7 @@ class Demand:
 
 
 @dataclass(frozen=True)
-class Reach:
+class JobReach:
     """Jobs that the workers of a pool can run: those that require a subset of `labels`, of these kinds; empty: all."""
 
     labels: Mapping[str, str]
@@ -41,7 +41,7 @@ class Reach:
 
 
 def read_demand(
-    tx: Transaction, reach: Reach, workers: Sequence[str], limit: int, others: Sequence[Reach] = ()
+    tx: Transaction, reach: JobReach, workers: Sequence[str], limit: int, others: Sequence[JobReach] = ()
 ) -> Demand:
     """Return the demand for workers with the given reach.
 
@@ -55,7 +55,7 @@ def read_demand(
     return Demand(_count_queued(tx, _wanted(reach, others), limit), _count_running(tx, workers))
 
 
-def _wanted(reach: Reach, others: Sequence[Reach]) -> ColumnElement[bool]:
+def _wanted(reach: JobReach, others: Sequence[JobReach]) -> ColumnElement[bool]:
     """Return the condition for the labels and kinds of the jobs that count for the workers with this reach."""
     keys: dict[tuple[str, ...], list[str]] = {}
     for key in keys_within(reach.labels):

@@ -7,7 +7,7 @@ So a project with many queued jobs delays the others only by the jobs that it ru
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple
@@ -29,7 +29,7 @@ from sqlalchemy import (
 
 from marey_schemas.access import Role
 from marey_server.store.database.prepared import Prepared
-from marey_server.store.jobs.claiming.limits import count_leased
+from marey_server.store.jobs.claiming.limits import count_leased, key_of_lock, name_of_lock
 from marey_server.store.jobs.fencing import QUEUED
 from marey_server.store.tables import job, member, project, queue_share
 from marey_server.store.transaction import Transaction
@@ -210,3 +210,45 @@ def note_served(tx: Transaction, turns: Sequence[Turn], served: Iterable[Turn]) 
             tx.execute(tx.insert_or_ignore(queue_share, {"project_id": turn.project_id}))
     statement = _SERVE_UNLESS_LOCKED if tx.is_postgres else _SERVE
     tx.run_each(statement, [{"of": turn.project_id, "at_us": tx.now_us + at} for at, turn in enumerate(in_order)])
+
+
+# -- jobs of one project, within its limit -----------------------------------------------------------------------------
+
+Take = Callable[[int], list[Any]]
+"""Function that claims up to a number of jobs of one project, and returns their rows."""
+
+_NOW = Prepared(
+    select(queue_share.c.most_running, count_leased(queue_share.c.project_id).label("running")).where(
+        queue_share.c.project_id == bindparam("of")
+    )
+)
+
+
+def take_within_limit(tx: Transaction, turn: Turn, most: int, take: Take, *, may_wait: bool) -> list[Any]:
+    """Claim up to `most` jobs of a project, but not more than its limit allows.
+
+    On Postgres, claims of a project with a limit run one after another: each one locks the project, and counts the
+    running jobs again when it has the lock. A claim waits for such a lock only if it holds none (`may_wait`), so no two
+    claims wait for each other. Otherwise, it leaves out a project that another claim has locked. SQLite has only one
+    writer at a time.
+    """
+    if turn.most_running is None:
+        return take(most)
+    if not tx.is_postgres:
+        return take(most if turn.places is None else min(most, turn.places))
+    if not may_wait:
+        locked = tx.execute(select(func.pg_try_advisory_xact_lock(key_of_lock(turn.project_id)))).scalar_one()
+        return _take_counted(tx, turn, most, take) if locked else []
+    with tx.connection.begin_nested() as savepoint:
+        tx.lock(name_of_lock(turn.project_id))
+        rows = _take_counted(tx, turn, most, take)
+        if not rows:
+            savepoint.rollback()  # releases the lock, so that the claim may wait for that of another project
+    return rows
+
+
+def _take_counted(tx: Transaction, turn: Turn, most: int, take: Take) -> list[Any]:
+    (now,) = tx.run(_NOW, {"of": turn.project_id})
+    turn.running, turn.most_running = now.running, now.most_running
+    allowed = most if turn.places is None else min(most, turn.places)
+    return take(allowed) if allowed else []
