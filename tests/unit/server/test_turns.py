@@ -188,17 +188,23 @@ def test_the_limit_is_shown_and_recorded_and_changes_the_revision_of_the_project
     assert [body["limits"] for body in bodies] == [{"running_jobs": 2}]
 
 
+def news(desk: Desk, after: int) -> frozenset[str]:
+    """Return the topics that the events after the given number announce."""
+    desk.database.write(SYSTEM, events.number_events)
+    return desk.database.read(SYSTEM, events.read_news, after).topics
+
+
 def test_the_end_of_a_job_wakes_workers_for_the_jobs_that_the_limit_held_back(desk: Desk) -> None:
     desk.submit()
     desk.limit_running(1)
     lease = desk.claim()
     desk.submit("sum")
+    assert work_topic("sum") in news(desk, 0)
     seen = desk.database.read(SYSTEM, events.newest_number)
-    assert work_topic("sum") not in desk.database.read(SYSTEM, events.read_news, seen).topics
     desk.complete(lease)
-    assert work_topic("sum") in desk.database.read(SYSTEM, events.read_news, seen).topics
+    assert work_topic("sum") in news(desk, seen)
     desk.limit_running(None)
-    assert work_topic("sum") not in desk.database.read(SYSTEM, events.read_news, seen).topics
+    assert work_topic("sum") not in news(desk, seen)
 
 
 def test_tasks_count_towards_the_limit_but_not_their_parent(desk: Desk) -> None:
