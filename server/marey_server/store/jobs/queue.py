@@ -42,13 +42,13 @@ from marey_server.errors import ForbiddenProblem, InvalidProblem, LeaseLostProbl
 from marey_server.store.credentials.server_key import read_seal_key
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs.claiming.turns import (
-    TURNS,
     Restriction,
     Turn,
     claim_order,
     is_claimable,
     next_projects,
     note_served,
+    statement_of_turns,
     take_within_limit,
     turns_of,
 )
@@ -315,7 +315,9 @@ def _wanted(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], polic
     if restriction.own_projects:
         projects["user"] = caller.user_id
     lease = {"lease_ttl": policy.lease_ttl_us, "end_grace": policy.end_grace_us}
-    return _Wanted(TURNS[restriction], jobs | projects, _CLAIM_STATEMENTS[restriction.one_job], jobs | lease)
+    return _Wanted(
+        statement_of_turns(restriction), jobs | projects, _CLAIM_STATEMENTS[restriction.one_job], jobs | lease
+    )
 
 
 def _claim_in_turn(tx: Transaction, wanted: _Wanted, turns: Sequence[Turn], most: int) -> list[Row[Any]]:

@@ -142,15 +142,19 @@ def _turns_statement(restriction: Restriction) -> Select[Any]:
     )
 
 
-TURNS = {
+_TURNS = {
     restriction: Prepared(_turns_statement(restriction))
     for restriction in (Restriction(*flags) for flags in product((False, True), repeat=3))
 }
-"""Statements that return the projects with jobs for a claim; `turns_of` orders their rows."""
+
+
+def statement_of_turns(restriction: Restriction) -> Prepared:
+    """Return the statement that finds the projects with jobs for a claim; `turns_of` takes its rows."""
+    return _TURNS[restriction]
 
 
 def turns_of(rows: Iterable[Any]) -> list[Turn]:
-    """Return the turns for the rows of a statement in `TURNS`."""
+    """Return the turns for the rows of a statement of `statement_of_turns`."""
     return [Turn(row.project_id, row.running, row.most_running, row.served_us) for row in rows]
 
 
