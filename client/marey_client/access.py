@@ -6,6 +6,7 @@ import secrets
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import timedelta
+from typing import TypeVar
 
 from marey_client.errors import UnexpectedAnswer
 from marey_client.handles.invitations import AccountInvitations
@@ -35,9 +36,12 @@ ANY_STATE = {"If-Match": "*"}
 """Header that makes the server accept a change even if the resource has changed since the caller read it."""
 
 
-def change_quotas(transport: Transport, path: str, change: QuotaChange) -> QuotasInUse:
+Q = TypeVar("Q", bound=QuotasInUse)
+
+
+def change_quotas(transport: Transport, path: str, change: QuotaChange, answer: type[Q]) -> Q:
     """Change quotas of the project or user at `path`; return all its quotas, and how much of each is used."""
-    return read_model(QuotasInUse, transport.send("PATCH", path, content=as_json(change), repeatable=True))
+    return read_model(answer, transport.send("PATCH", path, content=as_json(change), repeatable=True))
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,7 @@ class Users:
 
     def change_quotas(self, name: str, change: QuotaChange) -> QuotasInUse:
         """Change the quotas of a user; None restores the limit of the server's settings. For administrators."""
-        return change_quotas(self.transport, f"/users/{name}/quotas", change)
+        return change_quotas(self.transport, f"/users/{name}/quotas", change, QuotasInUse)
 
     def enable(self, name: str) -> User:
         """Enable a disabled user again, with the same password and tokens."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from marey_client.errors import Forbidden
+from marey_client.errors import Forbidden, Unauthenticated
+from marey_schemas.access import RunningJobs
 from marey_schemas.queue.jobs import Attempt, Job, JobState
 from marey_schemas.queue.workers import Worker
 
@@ -19,7 +20,17 @@ def explain_job(marey: Marey, job_id: str, *, now: datetime | None = None) -> li
     attempts = list(marey.jobs.attempts(job_id))
     running = list(marey.jobs.list(job.project, filters={"state": JobState.RUNNING.value}))
     workers = _alive_workers(marey) if job.state is JobState.QUEUED else None
-    return explain(job, attempts, running, now or datetime.now(UTC), workers)
+    return explain(job, attempts, running, now or datetime.now(UTC), workers, _limit_of(marey, job))
+
+
+def _limit_of(marey: Marey, job: Job) -> RunningJobs | None:
+    """Return how many jobs of the project run, and the limit; None if unknown, or if the job is not queued."""
+    if job.state is not JobState.QUEUED:
+        return None
+    try:
+        return marey.project(job.project).quotas().running_jobs
+    except (Forbidden, Unauthenticated):
+        return None
 
 
 def _alive_workers(marey: Marey) -> list[Worker] | None:
@@ -31,18 +42,24 @@ def _alive_workers(marey: Marey) -> list[Worker] | None:
 
 
 def explain(
-    job: Job, attempts: list[Attempt], running: list[Job], now: datetime, workers: list[Worker] | None = None
+    job: Job,
+    attempts: list[Attempt],
+    running: list[Job],
+    now: datetime,
+    workers: list[Worker] | None = None,
+    limit: RunningJobs | None = None,
 ) -> list[str]:
     """Return sentences that explain the state of a job, the main reason first.
 
-    `running` are the running jobs of the project; `workers` are the workers that are alive, or None if unknown.
+    `running` are the running jobs of the project; `workers` are the workers that are alive, and `limit` is the
+    limit of running jobs of the project; each is None if unknown.
     """
     if job.size is not None and not job.state.terminal and job.children != {"succeeded": job.size}:
         counts = ", ".join(f"{count} {state}" for state, count in sorted(job.children.items()))
         return [f"{job.state}: it gathers {job.size} tasks, of which {counts or 'none has begun'}."]
     reasons = {
         JobState.WAITING: [_why_waiting(job)],
-        JobState.QUEUED: [_why_queued(job, running, now, workers)],
+        JobState.QUEUED: [_why_queued(job, running, now, workers, limit)],
         JobState.RUNNING: _why_running(job, attempts),
         JobState.SUCCEEDED: ["succeeded" + (f": its result is that of {job.cached_from}." if job.cached_from else ".")],
         JobState.FAILED: [_why_failed(job)],
@@ -59,12 +76,19 @@ def _why_waiting(job: Job) -> str:
     return f"waiting: it depends on {' and '.join(waited_for) or 'other jobs'}; not all of these have succeeded."
 
 
-def _why_queued(job: Job, running: list[Job], now: datetime, workers: list[Worker] | None) -> str:
+def _why_queued(
+    job: Job, running: list[Job], now: datetime, workers: list[Worker] | None, limit: RunningJobs | None
+) -> str:
     wait_s = (job.run_at - now).total_seconds()
     if wait_s > 0:
         return (
             f"queued: the next attempt starts in {wait_s:.0f} s at the earliest, after attempt {job.attempt} of "
             f"{job.max_attempts}."
+        )
+    if limit is not None and limit.allowed is not None and limit.used >= limit.allowed:
+        return (
+            f"queued: the project runs {limit.used} jobs, and its limit is {limit.allowed}; the job can start when "
+            "fewer of them run. An administrator can change the limit (`marey project quota`)."
         )
     shown = " ".join(f"{name}={value}" for name, value in sorted(job.labels.items()))
     wanted = f"jobs of the kind {job.kind}" + (f" and has the labels {shown}" if shown else "")

@@ -37,7 +37,7 @@ from marey_client.requests import (
     retarget_request,
 )
 from marey_client.transport import Params, as_json, read_model
-from marey_schemas.access import Project, ProjectChange, QuotaChange, QuotasInUse
+from marey_schemas.access import Project, ProjectChange, ProjectQuotaChange, ProjectQuotasInUse
 from marey_schemas.audit import AuditEntry
 from marey_schemas.datasets.naming import MAIN
 from marey_schemas.queue.commits import OutputsCommit
@@ -82,13 +82,16 @@ class ProjectHandle(ProjectItems):
             Project, self.transport.send("PATCH", self.url, content=as_json(change), headers={"If-Match": "*"})
         )
 
-    def quotas(self) -> QuotasInUse:
+    def quotas(self) -> ProjectQuotasInUse:
         """Return the number of items and bytes in the project, and the limits."""
-        return self.transport.get(QuotasInUse, f"{self.url}/quotas")
+        return self.transport.get(ProjectQuotasInUse, f"{self.url}/quotas")
 
-    def change_quotas(self, change: QuotaChange) -> QuotasInUse:
-        """Change the quotas of the project; None restores the limit of the server's settings. For administrators."""
-        return change_quotas(self.transport, f"{self.url}/quotas", change)
+    def change_quotas(self, change: ProjectQuotaChange) -> ProjectQuotasInUse:
+        """Change the quotas of the project; None restores the limit of the settings, or no limit of running jobs.
+
+        For administrators.
+        """
+        return change_quotas(self.transport, f"{self.url}/quotas", change, ProjectQuotasInUse)
 
     def delete(self) -> None:
         """Delete the project; `restore` restores it."""

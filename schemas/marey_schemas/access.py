@@ -9,6 +9,9 @@ from pydantic import Field, SecretStr, StringConstraints
 from marey_schemas.base import Answer, Request
 from marey_schemas.names import ProjectName, UserName
 
+MOST_RUNNING = 1_000_000
+"""Greatest limit of running jobs that a project can have."""
+
 
 class Role(StrEnum):
     """Role of a member in a project; each role includes the rights of the roles listed before it."""
@@ -206,6 +209,11 @@ class Project(Answer):
     created_at: datetime
     updated_at: datetime
     deleted_at: datetime | None = None
+    most_running_jobs: int | None = Field(
+        None,
+        description="Greatest number of the project's jobs that run at the same time, as an administrator set it; "
+        "null: no limit, or the caller is not a member.",
+    )
     rev: int
 
 
@@ -221,6 +229,21 @@ class QuotaChange(Request):
     )
 
 
+class ProjectQuotaChange(QuotaChange):
+    """Change of the limits of one project.
+
+    An absent limit stays as it is; null means the limit in the server's settings, or no limit of running jobs.
+    """
+
+    running_jobs: int | None = Field(
+        None,
+        ge=0,
+        le=MOST_RUNNING,
+        description="Greatest number of the project's jobs that workers run at the same time; null: no limit. Jobs "
+        "that run already continue.",
+    )
+
+
 class QuotaUse(Answer):
     """Amount used of one quota, and its limit."""
 
@@ -233,6 +256,19 @@ class QuotasInUse(Answer):
 
     items: QuotaUse
     stored_bytes: QuotaUse
+
+
+class RunningJobs(Answer):
+    """Number of jobs that workers run, and its limit."""
+
+    used: int
+    allowed: int | None = Field(None, description="Greatest number of jobs that run at the same time; null: no limit.")
+
+
+class ProjectQuotasInUse(QuotasInUse):
+    """Used amounts and limits of the quotas of a project."""
+
+    running_jobs: RunningJobs = Field(description="The project's jobs that workers run; parents of tasks do not count.")
 
 
 class MemberChange(Request):

@@ -6,6 +6,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -13,16 +14,17 @@ from sqlalchemy import ColumnElement, func, select, true
 from tests.support.interleaving import Abandoned, Step, interleave
 from tests.support.queue_desk import Desk, output
 
+from marey_schemas.access import ProjectCreate
 from marey_schemas.queue.jobs import JobCreate
 from marey_schemas.queue.worker_protocol import ClaimRequest, CompleteRequest, FailRequest, Heartbeat, Lease
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ApiProblem, ConflictProblem, LeaseLostProblem
-from marey_server.store import leader
+from marey_server.store import leader, projects
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs import completion, exports, fencing, logs, queue, reading, staging, submission
 from marey_server.store.jobs.reaper import reap_page, share_waiting
 from marey_server.store.jobs.result_cache import SHARED_AT_ONCE
-from marey_server.store.tables import attempt, event, job
+from marey_server.store.tables import attempt, event, job, project
 from marey_server.store.transaction import Transaction
 
 pytestmark = pytest.mark.every_database
@@ -378,3 +380,70 @@ def test_without_the_fence_the_stale_worker_gets_through(desk: Desk, act: str, m
     monkeypatch.setattr(completion, "held_parameters", any_fence)
     with pytest.raises((pytest.fail.Exception, AssertionError, LookupError, ApiProblem)):
         stale_worker_story(desk, STALE_ACTS[act])
+
+
+def _claims(database: Database, desk: Desk, most: int) -> Step:
+    request = ClaimRequest(worker="w", kinds=("errand",), max=most)
+    return Step(database, desk.user, lambda tx: queue.claim(tx, request))
+
+
+def test_two_claims_at_once_never_exceed_the_limit_of_a_project(desk: Desk, other: Database) -> None:
+    desk.submit_many(*[JobCreate(kind="errand")] * 6)
+    desk.limit_running(3)
+    one, two = interleave(_claims(desk.database, desk, 2), _claims(other, desk, 2))
+    assert (len(one), len(two)) == (2, 1)
+    assert desk.claim_many() == []
+
+
+def test_without_the_lock_two_claims_at_once_exceed_the_limit(
+    desk: Desk, other: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the lock, the test above must fail on Postgres; SQLite has only one writer at a time."""
+    desk.submit_many(*[JobCreate(kind="errand")] * 6)
+    desk.limit_running(3)
+    monkeypatch.setattr(queue, "take_within_limit", lambda tx, turn, most, take, **_: take(most))
+    one, two = interleave(_claims(desk.database, desk, 2), _claims(other, desk, 2))
+    assert len(one) + len(two) == (3 if desk.database.is_sqlite else 4)
+
+
+def test_eight_claimers_never_exceed_the_limits_of_two_projects(
+    desk: Desk, open_database: Callable[[], Database]
+) -> None:
+    second = replace(desk, project="second")
+    desk.database.write(desk.user, projects.create_project, ProjectCreate(name="second"))
+    desks = {one.project: one for one in (desk, second)}
+    for one in desks.values():
+        one.submit_many(*[JobCreate(kind="errand")] * 30)
+        one.limit_running(3)
+    most: Counter[str] = Counter()
+    done: Counter[str] = Counter()
+
+    def work(database: Database) -> None:
+        while True:
+            leases = database.write(desk.user, queue.claim, ClaimRequest(worker="w", kinds=("errand",), max=2))
+            for name, number in database.read(SYSTEM, _running_by_project).items():
+                most[name] = max(most[name], number)
+            for lease in leases:
+                request = CompleteRequest(write_id="write-one")
+                database.write(
+                    desks[lease.project]._attempt_of(lease), completion.complete, lease.job, lease.fence, request
+                )
+                done[lease.project] += 1
+            if not leases and not desk.database.read(SYSTEM, _left):
+                return
+
+    with ThreadPoolExecutor(8) as pool:
+        for future in [pool.submit(work, database) for database in [open_database() for _ in range(8)]]:
+            future.result(120)
+    assert done == {"lab": 30, "second": 30}
+    assert 1 <= min(most.values()) <= max(most.values()) <= 3
+
+
+def _running_by_project(tx: Transaction) -> dict[str, int]:
+    counted = select(project.c.name, func.count().label("jobs")).join(job, job.c.project_id == project.c.id)
+    rows = tx.execute(counted.where(job.c.state == "running").group_by(project.c.name))
+    return {row.name: row.jobs for row in rows}
+
+
+def _left(tx: Transaction) -> int:
+    return int(tx.execute(select(func.count()).where(job.c.state.in_(["queued", "running"]))).scalar_one())

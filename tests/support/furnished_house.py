@@ -48,6 +48,7 @@ BODIES: dict[str, Any] = {
     "UserChange": {"display_name": "D"},
     "ProjectCreate": {"name": "lab"},  # the name is taken: 409 means that the caller was admitted
     "ProjectChange": {"title": "T"},
+    "ProjectQuotaChange": {"items": 10**6, "running_jobs": 1000},
     "QuotaChange": {"items": 10**6},
     "MemberChange": {"role": "reader"},
     "FolderRoleChange": {"role": "contributor"},

@@ -10,7 +10,7 @@ import pytest
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.store_fixtures import ALL_RIGHTS
 
-from marey_schemas.access import ProjectCreate, UserCreate
+from marey_schemas.access import ProjectCreate, ProjectQuotaChange, UserCreate
 from marey_schemas.base import Request
 from marey_schemas.kinds import Kind
 from marey_schemas.queue import job_kinds
@@ -182,6 +182,11 @@ class Desk:
             )
 
         return self.database.write(self.user, act)
+
+    def limit_running(self, most: int | None) -> None:
+        """Set the limit of running jobs of the project, as an administrator does."""
+        change = ProjectQuotaChange(running_jobs=most)
+        self.database.write(SYSTEM, projects.change_quotas, self.project, change)
 
     # -- working -------------------------------------------------------------------------------------------------------
 

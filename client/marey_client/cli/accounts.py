@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.projects import ByteLimit, DefaultLimits, ItemLimit, print_quotas, quota_change
+from marey_client.cli.projects import ByteLimit, DefaultLimits, ItemLimit, changed_limits, print_quotas
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, UserName, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
@@ -238,9 +238,12 @@ def user_quota(
     as_json: AsJson = False,
 ) -> None:
     """Show a user's quotas: the items and bytes that count, and the limits. Administrators can change the limits."""
-    change = quota_change(items, stored_bytes, defaults)
+    from marey_schemas.access import QuotaChange
+
+    wanted = changed_limits(defaults, items=items, stored_bytes=stored_bytes)
     with connect(context) as marey:
-        found = marey.users.quotas(name) if change is None else marey.users.change_quotas(name, change)
+        users = marey.users
+        found = users.change_quotas(name, QuotaChange.model_validate(wanted)) if wanted else users.quotas(name)
     if as_json:
         return print_json(found)
     return print_quotas(found)

@@ -12,7 +12,7 @@ from marey_client.cli.terminal.output import print_json, print_message, print_pa
 
 if TYPE_CHECKING:
     from marey_client.project import ProjectHandle
-    from marey_schemas.access import QuotaChange, QuotasInUse
+    from marey_schemas.access import QuotasInUse
     from marey_schemas.items import Collection
 
 project = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage projects.")
@@ -29,7 +29,8 @@ DefaultLimits = Annotated[
     bool,
     typer.Option(
         "--defaults",
-        help="Use the limits in the server's settings, except for limits given by `--items` and `--stored-bytes`.",
+        help="Use the limits in the server's settings, and no limit of running jobs, except for limits that other "
+        "options give.",
     ),
 ]
 
@@ -113,32 +114,38 @@ def project_quota(
     name: ProjectName,
     items: ItemLimit = None,
     stored_bytes: ByteLimit = None,
+    running_jobs: Annotated[
+        int | None, typer.Option("--running-jobs", min=0, help="Set the maximum number of jobs that run at once.")
+    ] = None,
     defaults: DefaultLimits = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show the quotas of a project: its items and bytes, and the limits. Administrators can change the limits."""
-    change = quota_change(items, stored_bytes, defaults)
+    """Show the quotas of a project: items, bytes and running jobs, and the limits. Administrators can change limits."""
+    from marey_schemas.access import ProjectQuotaChange
+
+    wanted = changed_limits(defaults, items=items, stored_bytes=stored_bytes, running_jobs=running_jobs)
     with connect(context) as marey:
-        found = marey.project(name).quotas() if change is None else marey.project(name).change_quotas(change)
+        handle = marey.project(name)
+        found = handle.change_quotas(ProjectQuotaChange.model_validate(wanted)) if wanted else handle.quotas()
     if as_json:
         return print_json(found)
     return print_quotas(found)
 
 
-def quota_change(items: int | None, stored_bytes: int | None, defaults: bool) -> QuotaChange | None:
-    """Return the change that the options request, or None if they request none."""
-    from marey_schemas.access import QuotaChange
-
-    given = {"items": items, "stored_bytes": stored_bytes}
-    wanted = {name: limit for name, limit in given.items() if defaults or limit is not None}
-    return QuotaChange.model_validate(wanted) if wanted else None
+def changed_limits(defaults: bool, **given: int | None) -> dict[str, int | None]:
+    """Return the limits that the options change; None stands for the limit of the settings, or for no limit."""
+    return {name: limit for name, limit in given.items() if defaults or limit is not None}
 
 
 def print_quotas(quotas: QuotasInUse) -> None:
     """Print a table of the quotas with their use and limits."""
     rows = [(name.replace("_", " "), quota["used"], quota["allowed"]) for name, quota in quotas.model_dump().items()]
     columns = ("quota", "used", "allowed")
-    print_table(columns, [(name, f"{used:,}", f"{allowed:,}") for name, used, allowed in rows], right=columns[1:])
+    print_table(columns, [(name, f"{used:,}", _limit_text(allowed)) for name, used, allowed in rows], right=columns[1:])
+
+
+def _limit_text(allowed: int | None) -> str:
+    return "no limit" if allowed is None else f"{allowed:,}"
 
 
 @project.command("delete")

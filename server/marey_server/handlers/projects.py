@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from marey_schemas.access import Member, MemberChange, Project, ProjectChange, ProjectCreate, QuotaChange, QuotasInUse
+from marey_schemas.access import (
+    Member,
+    MemberChange,
+    Project,
+    ProjectChange,
+    ProjectCreate,
+    ProjectQuotaChange,
+    ProjectQuotasInUse,
+)
 from marey_server.http.declarations import Access, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
@@ -94,13 +102,13 @@ class ProjectQuotas(Resource):
     path = "/projects/{project}/quotas"
     tag = "Projects"
 
-    @reads(access=Access.READER, answer=QuotasInUse, public=False)
+    @reads(access=Access.READER, answer=ProjectQuotasInUse, public=False)
     async def get(self, project: str) -> Rendered:
-        """Return the number of items and bytes in a project, and the limits."""
+        """Return the number of items, bytes and running jobs of a project, and the limits."""
         return await self.answer(projects.read_quotas, project)
 
-    @writes(access=Access.ADMINISTRATOR, scope="admin", body=QuotaChange, answer=QuotasInUse)
-    async def patch(self, project: str, body: QuotaChange) -> Rendered:
+    @writes(access=Access.ADMINISTRATOR, scope="admin", body=ProjectQuotaChange, answer=ProjectQuotasInUse)
+    async def patch(self, project: str, body: ProjectQuotaChange) -> Rendered:
         """Change the limits of a project."""
         return await self.answer(projects.change_quotas, project, body)
 

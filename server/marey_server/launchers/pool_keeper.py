@@ -9,7 +9,7 @@ import asyncio
 import logging
 import secrets
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 from typing import TypeVar
 
@@ -22,7 +22,7 @@ from marey_server.process.worker_pools import WorkerPool
 from marey_server.store import leader
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import SERVER
-from marey_server.store.monitoring.demand import Demand, read_demand
+from marey_server.store.monitoring.demand import Demand, JobReach, read_demand
 
 T = TypeVar("T")
 
@@ -43,20 +43,27 @@ QUIET_ENDS = ("finished", "stopped", "deadline", "preempted")
 """Reasons of ends that are logged as information, and that do not pause the next start."""
 
 
+def _reach(pool: WorkerPool) -> JobReach:
+    return JobReach(pool.labels, pool.kinds)
+
+
 class PoolKeeper:
-    """Keeper of one pool. `clock_s` is a monotonic clock in seconds."""
+    """Keeper of one pool, beside the other pools of the server. `clock_s` is a monotonic clock in seconds."""
 
     def __init__(
         self,
         pool: WorkerPool,
         launcher: Launcher,
         database: Database,
+        other_pools: Sequence[WorkerPool] = (),
         *,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._pool = pool
         self._launcher = launcher
         self._database = database
+        self._reach = _reach(pool)
+        self._other_reaches = [_reach(other) for other in other_pools]
         self._clock_s = clock_s
         self._lead = f"pool {pool.name}"
         self._holder = secrets.token_hex(8)
@@ -190,7 +197,11 @@ class PoolKeeper:
     async def _read_demand(self, present: list[str]) -> Demand:
         pool = self._pool
         read = partial(
-            read_demand, labels=pool.labels, kinds=pool.kinds, workers=present, limit=pool.most * pool.slots + 1
+            read_demand,
+            reach=self._reach,
+            workers=present,
+            limit=pool.most * pool.slots + 1,
+            others=self._other_reaches,
         )
         return await asyncio.wrap_future(self._database.queue_read(SERVER, SYSTEM, read))
 

@@ -44,7 +44,15 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
     Raises `LauncherUnusable`.
     """
     settings = services.settings
-    keepers = [PoolKeeper(pool, _launcher_of(pool, services, address), services.database) for pool in settings.pools]
+    keepers = [
+        PoolKeeper(
+            pool,
+            _launcher_of(pool, services, address),
+            services.database,
+            [other for other in settings.pools if other.name != pool.name],
+        )
+        for pool in settings.pools
+    ]
     fixed = None
     if settings.local_workers:
         token = make_worker_token(services.database, settings)

@@ -13,7 +13,7 @@ follow the feed, never receive audit entries of a period whose other events were
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from itertools import takewhile
 from typing import Any, NamedTuple
 
@@ -43,8 +43,9 @@ from marey_server.access.roles import require_administrator
 from marey_server.errors import GoneProblem
 from marey_server.store import projects
 from marey_server.store.database.clock import datetime_of
+from marey_server.store.jobs.claiming.turns import claim_order
 from marey_server.store.jobs.fencing import QUEUED
-from marey_server.store.tables import event, job, project, server_state
+from marey_server.store.tables import event, job, project, queue_share, server_state
 from marey_server.store.transaction import Transaction, in_lists
 from marey_server.store.wakeups import events_topic, job_topic, work_topic
 
@@ -263,6 +264,8 @@ def read_news(tx: Transaction, after: int) -> News:
     topics |= {work_topic(row.kind) for row in rows if row.state == "queued" and row.run_at_us <= tx.now_us}
     keys = {(row.project_id, row.concurrency_key) for row in rows if row.finished_us and row.concurrency_key}
     topics |= {work_topic(kind) for kind in _waiting_for_key(tx, keys)}
+    left = {row.project_id for row in rows if row.state not in (None, "running")}
+    topics |= {work_topic(kind) for kind in _waiting_for_place(tx, left)}
     return News(frozenset(topics), rows[-1].number if rows else after, len(rows) < MAX_EVENTS)
 
 
@@ -277,6 +280,22 @@ def _waiting_for_key(tx: Transaction, keys: Iterable[tuple[str, str]]) -> set[st
             .distinct()
         ).scalars()
     }
+
+
+_MOST_READ = 100
+"""Greatest number of queued jobs of a project whose kinds are read when a place for a running job may be free."""
+
+
+def _waiting_for_place(tx: Transaction, projects: Collection[str]) -> set[str]:
+    """Return the kinds of the first queued jobs of those projects that have a limit of running jobs."""
+    limited = select(queue_share.c.project_id).where(queue_share.c.most_running.is_not(None))
+    found: set[str] = set()
+    for some in in_lists(projects):
+        for project_id in tx.execute(limited.where(queue_share.c.project_id.in_(some))).scalars().all():
+            first = select(job.c.kind).where(job.c.project_id == project_id, job.c.state == QUEUED)
+            first = first.order_by(*claim_order(job)).limit(_MOST_READ)
+            found |= set(tx.execute(first).scalars())
+    return found
 
 
 def kinds_due(tx: Transaction, since_us: int) -> tuple[set[str], int]:

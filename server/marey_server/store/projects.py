@@ -27,8 +27,8 @@ from marey_schemas.access import (
     Project,
     ProjectChange,
     ProjectCreate,
-    QuotaChange,
-    QuotasInUse,
+    ProjectQuotaChange,
+    ProjectQuotasInUse,
     Role,
     Visibility,
 )
@@ -51,7 +51,7 @@ from marey_server.store.ids import new_id
 from marey_server.store.invitations.validity import withdraw_unauthorised
 from marey_server.store.rate_limits import RateLimit, key_of
 from marey_server.store.revs import ExpectedRev, change_row
-from marey_server.store.tables import folder_role, invitation, member, project
+from marey_server.store.tables import folder_role, invitation, member, project, queue_share
 from marey_server.store.transaction import Transaction
 
 _HOUR_US = 3600 * 1_000_000
@@ -80,6 +80,7 @@ class ProjectRow:
     updated_us: int
     deleted_us: int | None
     rev: int
+    most_running: int | None
     role: Role
     guest: bool
     """Whether the caller is not a member and may read because the project is public."""
@@ -90,7 +91,8 @@ class ProjectRow:
             id=self.id, name=self.name, title=self.title, description=self.description, visibility=self.visibility,
             role=None if self.guest else self.role, created_at=datetime_of(self.created_us),
             updated_at=datetime_of(self.updated_us),
-            deleted_at=None if self.deleted_us is None else datetime_of(self.deleted_us), rev=self.rev,
+            deleted_at=None if self.deleted_us is None else datetime_of(self.deleted_us),
+            most_running_jobs=None if self.guest else self.most_running, rev=self.rev,
         )  # fmt: skip
 
 
@@ -162,12 +164,13 @@ def require_scope(tx: Transaction, name: str, scope: str) -> None:
 def find_by_id(tx: Transaction, project_id: str) -> ProjectRow:
     """Return a project, even a deleted one, without checking rights; only for internal work of the server."""
     row = tx.execute(_with_role_of(tx.principal.user_id or "").where(project.c.id == project_id)).one()
-    return _row(row, Role.READER, guest=False)
+    return _row(row, Role.READER, row.most_running, guest=False)
 
 
 def _with_role_of(user_id: str | BindParameter[str]) -> Select[Any]:
     mine = and_(member.c.project_id == project.c.id, member.c.user_id == user_id)
-    return select(project, member.c.role).select_from(project.outerjoin(member, mine))
+    shares = project.outerjoin(member, mine).outerjoin(queue_share, queue_share.c.project_id == project.c.id)
+    return select(project, member.c.role, queue_share.c.most_running).select_from(shares)
 
 
 # Almost every request runs `_ALIVE_BY_NAME`.
@@ -181,18 +184,18 @@ _DELETED_BY_NAME = (
 def _as_seen(principal: Principal, row: Row[Any]) -> ProjectRow | None:
     """Return the project with the caller's role in it; None if the caller may not know that it exists."""
     if principal.kind == "attempt":
-        return _row(row, Role.READER, guest=False) if principal.project_id == row.id else None
+        return _row(row, Role.READER, row.most_running, guest=False) if principal.project_id == row.id else None
     if any(scope.partition("!project=")[2] in ("", row.name) for scope in principal.scopes):
         role = Role.OWNER if principal.administrator else row.role
         if role is not None:
-            return _row(row, Role(role), guest=False)
-    return _row(row, Role.READER, guest=True) if row.visibility == Visibility.PUBLIC else None
+            return _row(row, Role(role), row.most_running, guest=False)
+    return _row(row, Role.READER, row.most_running, guest=True) if row.visibility == Visibility.PUBLIC else None
 
 
-def _row(row: Row[Any], role: Role, *, guest: bool) -> ProjectRow:
+def _row(row: Row[Any], role: Role, most_running: int | None, *, guest: bool) -> ProjectRow:
     return ProjectRow(
         row.id, row.name, row.title, row.description, Visibility(row.visibility),
-        row.created_us, row.updated_us, row.deleted_us, row.rev, role, guest,
+        row.created_us, row.updated_us, row.deleted_us, row.rev, most_running, role, guest,
     )  # fmt: skip
 
 
@@ -247,9 +250,9 @@ def list_projects(
     return Page(items=tuple(one.shown() for one in seen if one is not None), next_cursor=next_cursor)
 
 
-def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
-    """Return the number of items and bytes in a project, and the limits."""
-    return quotas.show_quotas(tx, "project", require(tx, name).id)
+def read_quotas(tx: Transaction, name: str) -> ProjectQuotasInUse:
+    """Return the number of items, bytes and running jobs of a project, and the limits."""
+    return quotas.show_project_quotas(tx, require(tx, name).id)
 
 
 # -- changing ---------------------------------------------------------------------------------------------------------
@@ -303,7 +306,7 @@ def create_project(tx: Transaction, request: ProjectCreate) -> Project:
     quotas.require_room(tx, "user_projects")
     made = ProjectRow(
         new_id("project"), request.name, request.title, request.description, request.visibility,
-        tx.now_us, tx.now_us, None, 1, Role.OWNER, False,
+        tx.now_us, tx.now_us, None, 1, None, Role.OWNER, False,
     )  # fmt: skip
     values = {
         "id": made.id, "name": made.name, "title": made.title, "description": made.description,
@@ -360,13 +363,13 @@ def restore_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev = N
     return restored
 
 
-def change_quotas(tx: Transaction, name: str, change: QuotaChange) -> QuotasInUse:
+def change_quotas(tx: Transaction, name: str, change: ProjectQuotaChange) -> ProjectQuotasInUse:
     """Change the quotas of a project, and return all of them and their use. Only administrators may do this."""
     require_administrator(tx.principal)
     found = tx.execute(select(project.c.id).where(project.c.name == name, project.c.deleted_us.is_(None))).scalar()
     if found is None:
         raise NotFoundProblem(f"There is no project {name!r}.", code="no-project")
-    return quotas.change_limits(tx, "project", found, name, change)
+    return quotas.change_project_limits(tx, found, name, change)
 
 
 def _change(
@@ -376,4 +379,4 @@ def _change(
         tx, project, (project.c.id == seen.id, state), {**values, "updated_us": tx.now_us},
         expected_rev=expected_rev, absent=NotFoundProblem(f"There is no project {seen.name!r}.", code="no-project"),
     )  # fmt: skip
-    return _row(row, seen.role, guest=False).shown()
+    return _row(row, seen.role, seen.most_running, guest=False).shown()

@@ -13,11 +13,20 @@ from typing import Any, Literal
 
 from sqlalchemy import Column, Row, Select, Table, and_, bindparam, exists, func, or_, select, text, update
 
-from marey_schemas.access import QuotaChange, QuotasInUse, QuotaUse, Role
+from marey_schemas.access import (
+    ProjectQuotaChange,
+    ProjectQuotasInUse,
+    QuotaChange,
+    QuotasInUse,
+    QuotaUse,
+    Role,
+    RunningJobs,
+)
 from marey_server.errors import QuotaExceededProblem
 from marey_server.store import rate_limits
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.invitations.validity import is_unspent
+from marey_server.store.jobs.claiming.limits import read_limit, set_limit
 from marey_server.store.rate_limits import DailyAmount, key_of
 from marey_server.store.tables import (
     UNFINISHED,
@@ -306,21 +315,47 @@ def show_quotas(tx: Transaction, of: Literal["project", "user"], owner_id: str) 
     )
 
 
-def change_limits(
-    tx: Transaction, of: Literal["project", "user"], owner_id: str, owner_name: str, change: QuotaChange
-) -> QuotasInUse:
-    """Change the quotas of a project or a user, and return all of its quotas and their use.
+def show_project_quotas(tx: Transaction, project_id: str) -> ProjectQuotasInUse:
+    """Return the use and the limits of the quotas of a project, with that of running jobs."""
+    running, limit = read_limit(tx, project_id)
+    shown = show_quotas(tx, "project", project_id)
+    jobs = RunningJobs(used=running, allowed=limit)
+    return ProjectQuotasInUse(items=shown.items, stored_bytes=shown.stored_bytes, running_jobs=jobs)
+
+
+def change_project_limits(
+    tx: Transaction, project_id: str, name: str, change: ProjectQuotaChange
+) -> ProjectQuotasInUse:
+    """Change the quotas of a project, and return all of its quotas and their use.
 
     The caller must have checked that the principal is an administrator.
     """
-    changed = _add(tx, owner_id, Held()).limits | change.model_dump(exclude_unset=True)
+    if "running_jobs" in change.model_fields_set:
+        set_limit(tx, project_id, change.running_jobs)
+        tx.execute(update(project).where(project.c.id == project_id).values(rev=project.c.rev + 1))
+    limits = _change_limits(tx, project_id, change)
+    _, most_running = read_limit(tx, project_id)
+    if most_running is not None:
+        limits = {**limits, "running_jobs": most_running}
+    tx.audit("project.limited", project_id, about=name, project_id=project_id, limits=limits)
+    return show_project_quotas(tx, project_id)
+
+
+def change_user_limits(tx: Transaction, user_id: str, name: str, change: QuotaChange) -> QuotasInUse:
+    """Change the quotas of a user, and return all of its quotas and their use.
+
+    The caller must have checked that the principal is an administrator.
+    """
+    tx.audit("user.limited", user_id, about=name, limits=_change_limits(tx, user_id, change))
+    return show_quotas(tx, "user", user_id)
+
+
+def _change_limits(tx: Transaction, owner_id: str, change: QuotaChange) -> dict[str, int]:
+    """Change the limits of items and bytes, and return those that differ from the settings."""
+    changed = _add(tx, owner_id, Held()).limits | change.model_dump(exclude_unset=True, include=set(COUNTED))
     limits = {name: limit for name, limit in changed.items() if limit is not None}
     tx.execute(update(holding).where(holding.c.owner_id == owner_id).values(limits=limits))
-    if of == "project":
-        tx.audit("project.limited", owner_id, about=owner_name, project_id=owner_id, limits=limits)
-    else:
-        tx.audit("user.limited", owner_id, about=owner_name, limits=limits)
-    return show_quotas(tx, of, owner_id)
+    return limits
 
 
 # -- checks -----------------------------------------------------------------------------------------------------------

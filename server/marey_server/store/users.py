@@ -95,7 +95,7 @@ def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
 def change_quotas(tx: Transaction, name: str, change: QuotaChange) -> QuotasInUse:
     """Change the quotas of a user, and return all of them and their use. Only administrators may do this."""
     require_administrator(tx.principal)
-    return quotas.change_limits(tx, "user", find_user(tx, name).id, name, change)
+    return quotas.change_user_limits(tx, find_user(tx, name).id, name, change)
 
 
 def list_users(tx: Transaction, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT) -> Page:

@@ -486,6 +486,13 @@ def test_quotas_are_shown_and_changed(run: Command, marey: Marey, lab: ProjectHa
     lines = run("project", "quota", "lab", "--defaults", "--items", "1000").stdout.splitlines()
     assert [line.split() for line in lines if "items" in line] == [["items", f"{used:,}", "1,000"]]
     assert lab.quotas().stored_bytes.allowed > 50
+    assert json.loads(run("project", "quota", "lab", "--running-jobs", "20", "--json").stdout)["running_jobs"] == {
+        "used": 0,
+        "allowed": 20,
+    }
+    assert lab.read().most_running_jobs == 20
+    assert "no limit" in run("project", "quota", "lab", "--defaults").stdout
+    assert lab.read().most_running_jobs is None
     run("user", "create", "quincy", "--without-password")
     assert json.loads(run("user", "quota", "quincy", "--items", "7", "--json").stdout)["items"] == {
         "used": 0,

@@ -9,6 +9,7 @@ from tests.support.scripted_server import ScriptedServer
 
 from marey_client import errors
 from marey_client.explanations import explain, explain_job
+from marey_schemas.access import RunningJobs
 from marey_schemas.queue.jobs import Attempt, Job
 from marey_schemas.queue.workers import Worker
 
@@ -83,10 +84,19 @@ def test_a_job_that_no_worker_fits_says_what_a_worker_would_need() -> None:
     assert "and has the labels gpu=a100 has asked for a job" in explain(waiting, [], [], NOW, [])[0]
 
 
+def test_a_job_that_the_limit_of_its_project_holds_back_says_so() -> None:
+    fitting = [worker(("retarget",), {})]
+    full, room = RunningJobs(used=2, allowed=2), RunningJobs(used=1, allowed=2)
+    told = explain(job(), [], [job(state="running")], NOW, fitting, full)[0]
+    assert told.startswith("queued: the project runs 2 jobs, and its limit is 2;")
+    for limit in (room, RunningJobs(used=9), None):
+        assert "busy with 1" in explain(job(), [], [job(state="running")], NOW, fitting, limit)[0]
+
+
 def test_who_may_not_list_workers_gets_an_explanation_all_the_same(script: ScriptedServer) -> None:
     empty = httpx.Response(200, content=b'{"items": []}')
     refused = httpx.Response(403, json={"code": "forbidden", "status": 403, "title": "Forbidden", "detail": "no"})
-    script.answers = [answer(), empty, empty, refused]
+    script.answers = [answer(), empty, empty, refused, refused]
     assert "has asked for one" in explain_job(script.marey(), "job_1")[0]
 
 

@@ -10,7 +10,7 @@ import sqlalchemy
 from alembic import command
 from tests.support.store_fixtures import WRITE, Lab, requiring, skeleton_tree
 
-from marey_schemas.access import QuotaChange
+from marey_schemas.access import ProjectQuotaChange, QuotaChange
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem, QuotaExceededProblem
@@ -60,11 +60,11 @@ def test_administrators_change_limits_of_a_project_and_a_user(lab: Lab) -> None:
     change_project = requiring(WRITE, projects.change_quotas)
     for who in (lab.owner, lab.stranger):
         with pytest.raises((ForbiddenProblem, NotFoundProblem)):
-            lab.write(change_project, lab.name, QuotaChange(items=9), who=who)
+            lab.write(change_project, lab.name, ProjectQuotaChange(items=9), who=who)
         with pytest.raises(ForbiddenProblem):
             lab.write(users.change_quotas, lab.owner.user_name, QuotaChange(items=9), who=who)
-    lab.write(projects.change_quotas, lab.name, QuotaChange(items=3, stored_bytes=10**6), who=root)
-    lab.write(projects.change_quotas, lab.name, QuotaChange(stored_bytes=10**7), who=root)
+    lab.write(projects.change_quotas, lab.name, ProjectQuotaChange(items=3, stored_bytes=10**6), who=root)
+    lab.write(projects.change_quotas, lab.name, ProjectQuotaChange(stored_bytes=10**7), who=root)
     shown = lab.write(users.change_quotas, lab.owner.user_name, QuotaChange(items=3), who=root)
     assert (shown.items.used, shown.items.allowed) == (0, 3)
     for name in "abc":
@@ -73,7 +73,7 @@ def test_administrators_change_limits_of_a_project_and_a_user(lab: Lab) -> None:
         lab.write(create, lab.name, "d")
     shown = lab.read(projects.read_quotas, lab.name, who=lab.reader)
     assert (shown.items.used, shown.items.allowed, shown.stored_bytes.allowed) == (3, 3, 10**7)
-    shown = lab.write(projects.change_quotas, lab.name, QuotaChange(items=None), who=root)
+    shown = lab.write(projects.change_quotas, lab.name, ProjectQuotaChange(items=None), who=root)
     assert (shown.items.allowed, shown.stored_bytes.allowed) == (2, 10**7)
     with pytest.raises(QuotaExceededProblem, match="the limit is 2"):
         lab.write(create, lab.name, "d")
@@ -84,7 +84,7 @@ def test_administrators_change_limits_of_a_project_and_a_user(lab: Lab) -> None:
 def test_lower_limits_than_use_refuse_more_but_not_deletion(lab: Lab) -> None:
     root = lab.sign_up("root", administrator=True)
     first = lab.write(create, lab.name, "first")
-    lab.write(projects.change_quotas, lab.name, QuotaChange(items=0, stored_bytes=0), who=root)
+    lab.write(projects.change_quotas, lab.name, ProjectQuotaChange(items=0, stored_bytes=0), who=root)
     with pytest.raises(QuotaExceededProblem, match="The project has 1 items, the limit is 0"):
         lab.write(create, lab.name, "again")
     lab.write(items.delete_item, lab.name, Kind.SKELETON, first.id, expected_rev=None)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from itertools import product
 from typing import Any, NamedTuple
 
 from sqlalchemy import (
@@ -24,7 +24,6 @@ from sqlalchemy import (
 )
 from sqlalchemy.sql.dml import ReturningUpdate
 
-from marey_schemas.access import Role
 from marey_schemas.problems import FieldError
 from marey_schemas.queue.jobs import Resources
 from marey_schemas.queue.worker_protocol import (
@@ -42,12 +41,22 @@ from marey_server.access.secret_tokens import IssuedToken, derive_attempt_token,
 from marey_server.errors import ForbiddenProblem, InvalidProblem, LeaseLostProblem
 from marey_server.store.credentials.server_key import read_seal_key
 from marey_server.store.database.prepared import Prepared
+from marey_server.store.jobs.claiming.turns import (
+    Restriction,
+    Turn,
+    claim_order,
+    is_claimable,
+    next_projects,
+    note_served,
+    statement_of_turns,
+    take_within_limit,
+    turns_of,
+)
 from marey_server.store.jobs.events import emit_job_events
 from marey_server.store.jobs.exports import lease_inputs
 from marey_server.store.jobs.fencing import (
     COUNT_ATTEMPT,
     HELD,
-    QUEUED,
     RUNNING,
     UNCOUNTED,
     earlier,
@@ -57,7 +66,7 @@ from marey_server.store.jobs.fencing import (
     require_attempt,
 )
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
-from marey_server.store.tables import attempt, job, member, project
+from marey_server.store.tables import attempt, job, project
 from marey_server.store.transaction import Transaction
 
 
@@ -75,9 +84,11 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
     scopes = _require_worker(tx.principal)
     _require_labels(tx.principal, request)
     claim_id = request.claim_id if tx.principal.token_key else None
-    if claim_id is not None and (again := _claimed_before(tx, claim_id, policy)):
-        return again
-    rows = _claim_rows(tx, request, scopes, policy)
+    wanted = _wanted(tx, request, scopes, policy)
+    places, turns = _read_turns(tx, claim_id, wanted)
+    if claim_id is not None and places:
+        return _leases_again(tx, claim_id, places, policy)
+    rows = _claim_in_turn(tx, wanted, turns, request.max)
     if not rows:
         return []
     tokens = [_issue_token(tx, claim_id, row) for row in rows]
@@ -112,17 +123,28 @@ _CLAIMED_BEFORE = Prepared(
 )
 
 
-def _claimed_before(tx: Transaction, claim_id: str, policy: QueuePolicy) -> list[Lease]:
-    """Renew and return the leases of an earlier claim with the same `claim_id`; empty if there was none.
+def _read_turns(tx: Transaction, claim_id: str | None, wanted: _Wanted) -> tuple[list[tuple[str, int]], list[Turn]]:
+    """Return the attempts of an earlier claim with the same `claim_id`, if any, and the projects that have jobs.
 
-    Two concurrent claims with the same `claim_id` run one after the other. Raises `LeaseLostProblem` if all leases of
-    the earlier claim have ended.
+    Two concurrent claims with the same `claim_id` run one after the other.
     """
+    if claim_id is None:
+        return [], turns_of(tx.run(wanted.turns, wanted.of_turns))
     token_id = tx.principal.token_id
     tx.lock(f"claim {token_id} {claim_id}")
-    places = [(row.job_id, row.fence) for row in tx.run(_CLAIMED_BEFORE, {"token": token_id, "claim": claim_id})]
-    if not places:
-        return []
+    before, rows = tx.run_together(
+        (_CLAIMED_BEFORE, {"token": token_id, "claim": claim_id}), (wanted.turns, wanted.of_turns)
+    )
+    return [(row.job_id, row.fence) for row in before], turns_of(rows)
+
+
+def _leases_again(
+    tx: Transaction, claim_id: str, places: Sequence[tuple[str, int]], policy: QueuePolicy
+) -> list[Lease]:
+    """Renew and return the leases of an earlier claim that are still held.
+
+    Raises `LeaseLostProblem` if all of them have ended.
+    """
     renewed = update(job).where(HELD).values(lease_expires_us=_renewed(tx, policy)).returning(*_LEASE_COLUMNS)
     rows = sorted(tx.execute(renewed, held_parameters(places)).all(), key=_pick_order)
     if not rows:
@@ -193,9 +215,9 @@ _LEASE_COLUMNS = (
 )
 
 
-def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
-    """Return the statement that picks jobs and claims them."""
-    pick = _pick(restriction)
+def _claim_statement(*, one_job: bool) -> ReturningUpdate[Any]:
+    """Return the statement that picks jobs of one project and claims them."""
+    pick = _pick(one_job=one_job)
     now_us = bindparam("now_us", type_=BigInteger)
     deadline_us = now_us + cast(job.c.time_limit_s, BigInteger) * SECOND_US
     return (
@@ -214,21 +236,15 @@ def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
     )
 
 
-def _pick(restriction: _Restriction) -> CTE:
+def _pick(*, one_job: bool) -> CTE:
     """Return the query for the ids of the jobs to claim.
 
     Of the jobs with the same concurrency key, the query selects at most one, and none while a job with this key runs.
     """
 
     def claimable(candidate: FromClause) -> ColumnElement[bool]:
-        conditions = [
-            candidate.c.state == QUEUED,
-            candidate.c.run_at_us <= bindparam("now_us", type_=BigInteger),
-            candidate.c.kind.in_(bindparam("kinds", expanding=True)),
-            candidate.c.labels_key.in_(bindparam("label_keys", expanding=True)),
-            _is_workable(candidate, restriction),
-        ]
-        if restriction.one_job:
+        conditions = [candidate.c.project_id == bindparam("of_project"), is_claimable(candidate)]
+        if one_job:
             conditions.append(candidate.c.id == bindparam("one_job"))
         return and_(*conditions)
 
@@ -236,54 +252,23 @@ def _pick(restriction: _Restriction) -> CTE:
     same_key = and_(rival.c.project_id == job.c.project_id, rival.c.concurrency_key == job.c.concurrency_key)
     rival_runs = exists().where(same_key, rival.c.state == RUNNING)
     first_of_key = (
-        select(rival.c.id).where(same_key, claimable(rival)).order_by(*_order(rival)).limit(1).scalar_subquery()
+        select(rival.c.id).where(same_key, claimable(rival)).order_by(*claim_order(rival)).limit(1).scalar_subquery()
     )
     return (
         select(job.c.id)
         .where(claimable(job), or_(job.c.concurrency_key.is_(None), and_(~rival_runs, job.c.id == first_of_key)))
-        .order_by(*_order(job))
+        .order_by(*claim_order(job))
         .limit(bindparam("most"))
         .with_for_update(skip_locked=True)
         .cte("pick")
     )
 
 
-def _order(candidate: FromClause) -> tuple[ColumnElement[Any], ...]:
-    return candidate.c.priority.desc(), candidate.c.run_at_us, candidate.c.id
-
-
 def _pick_order(row: Row[Any]) -> tuple[Any, ...]:
     return -row.priority, row.run_at_us, row.id
 
 
-def _is_workable(candidate: FromClause, restriction: _Restriction) -> ColumnElement[bool]:
-    """Return the condition that the caller, as a worker, may read and write data of the job's project.
-
-    The condition is a correlated subquery, so that the database reads jobs in the order of the queue, and does not
-    begin with the projects.
-    """
-    conditions = [project.c.id == candidate.c.project_id, project.c.deleted_us.is_(None)]
-    if restriction.named_projects:
-        conditions.append(project.c.name.in_(bindparam("project_names", expanding=True)))
-    if restriction.own_projects:
-        roles = (Role.MAINTAINER.value, Role.OWNER.value)
-        mine = (member.c.project_id == project.c.id, member.c.user_id == bindparam("user"), member.c.role.in_(roles))
-        conditions.append(exists().where(*mine))
-    return exists().where(*conditions)
-
-
-class _Restriction(NamedTuple):
-    """Limits of a claim on the number and the projects of jobs; kinds and labels are limited separately."""
-
-    one_job: bool
-    named_projects: bool
-    own_projects: bool
-
-
-_CLAIM_STATEMENTS = {
-    restriction: Prepared(_claim_statement(restriction))
-    for restriction in (_Restriction(*flags) for flags in product((False, True), repeat=3))
-}
+_CLAIM_STATEMENTS = {one_job: Prepared(_claim_statement(one_job=one_job)) for one_job in (False, True)}
 
 
 def _require_worker(caller: Principal) -> list[str]:
@@ -305,24 +290,59 @@ def _require_labels(caller: Principal, request: ClaimRequest) -> None:
         )
 
 
-def _claim_rows(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], policy: QueuePolicy) -> list[Row[Any]]:
+class _Wanted(NamedTuple):
+    """Statements of a claim, with the parameters for what it asks for."""
+
+    turns: Prepared
+    of_turns: Mapping[str, Any]
+    claim: Prepared
+    of_claim: Mapping[str, Any]
+
+
+def _wanted(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], policy: QueuePolicy) -> _Wanted:
     caller = tx.principal
-    restriction = _Restriction(request.job is not None, "work" not in scopes, not caller.administrator)
-    parameters: dict[str, Any] = {
+    restriction = Restriction(request.job is not None, "work" not in scopes, not caller.administrator)
+    jobs: dict[str, Any] = {
         "now_us": tx.now_us,
-        "lease_ttl": policy.lease_ttl_us,
-        "end_grace": policy.end_grace_us,
         "kinds": list(request.kinds),
         "label_keys": keys_within(request.labels),
-        "most": request.max,
     }
     if restriction.one_job:
-        parameters["one_job"] = request.job
+        jobs["one_job"] = request.job
+    projects: dict[str, Any] = {}
     if restriction.named_projects:
-        parameters["project_names"] = [scope.partition("=")[2] for scope in scopes]
+        projects["project_names"] = [scope.partition("=")[2] for scope in scopes]
     if restriction.own_projects:
-        parameters["user"] = caller.user_id
-    return sorted(tx.run(_CLAIM_STATEMENTS[restriction], parameters), key=_pick_order)
+        projects["user"] = caller.user_id
+    lease = {"lease_ttl": policy.lease_ttl_us, "end_grace": policy.end_grace_us}
+    return _Wanted(
+        statement_of_turns(restriction), jobs | projects, _CLAIM_STATEMENTS[restriction.one_job], jobs | lease
+    )
+
+
+def _claim_in_turn(tx: Transaction, wanted: _Wanted, turns: Sequence[Turn], most: int) -> list[Row[Any]]:
+    """Claim up to `most` jobs, and return their rows: from each project as many as its turns in this claim.
+
+    If a project has fewer jobs than turns, the other projects share its turns.
+    """
+    rows: list[Row[Any]] = []
+    served: set[Turn] = set()
+    remaining = list(turns)
+    while shares := Counter(next_projects(remaining, most - len(rows))):
+        for turn, share in shares.items():
+
+            def take(number: int, turn: Turn = turn) -> list[Row[Any]]:
+                return tx.run(wanted.claim, {**wanted.of_claim, "of_project": turn.project_id, "most": number})
+
+            taken = take_within_limit(tx, turn, share, take, may_wait=not rows)
+            rows += taken
+            turn.running += len(taken)
+            if taken:
+                served.add(turn)
+            if len(taken) < share:  # it has no more jobs for this claim
+                remaining.remove(turn)
+    note_served(tx, turns, served)
+    return sorted(rows, key=_pick_order)
 
 
 # -- answers ----------------------------------------------------------------------------------------------------------

@@ -1,18 +1,22 @@
 """Demand for workers with certain labels: the jobs that wait for such workers, and the workers that run jobs.
 
-The number of rows that a query reads is limited, so that its cost does not grow with the length of the queue.
+The number of rows that a query reads is limited, so that its cost does not grow with the length of the queue. It grows
+with the number of projects that have queued jobs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
-from sqlalchemy import and_, exists, func, select
+from sqlalchemy import ColumnElement, FromClause, Select, and_, exists, false, func, or_, select
 
 from marey_server.access.labels import keys_within
+from marey_server.store.jobs.claiming.limits import count_leased
+from marey_server.store.jobs.claiming.turns import projects_with_queued_jobs
 from marey_server.store.jobs.fencing import QUEUED, RUNNING
-from marey_server.store.tables import attempt, job, project
+from marey_server.store.tables import attempt, job, project, queue_share
 from marey_server.store.transaction import Transaction, in_lists
 
 
@@ -28,36 +32,88 @@ class Demand:
     running: Mapping[str, int] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class JobReach:
+    """Jobs that the workers of a pool can run: those that require a subset of `labels`, of these kinds; empty: all."""
+
+    labels: Mapping[str, str]
+    kinds: Sequence[str] = ()
+
+
 def read_demand(
-    tx: Transaction, labels: Mapping[str, str], kinds: Sequence[str], workers: Sequence[str], limit: int
+    tx: Transaction, reach: JobReach, workers: Sequence[str], limit: int, others: Sequence[JobReach] = ()
 ) -> Demand:
-    """Return the demand for workers with these labels.
+    """Return the demand for workers with the given reach.
 
     Parameters
     ----------
-    labels : labels of the workers, which can run jobs that require any subset of these labels
-    kinds : kinds of jobs that the workers run; empty: all kinds
+    reach : jobs that the workers can run
     workers : names of the workers that exist already
     limit : number of queued jobs at which counting stops
+    others : reaches of the other pools; a job counts only for the pools with the fewest labels that can run it
     """
-    return Demand(_count_queued(tx, labels, kinds, limit), _count_running(tx, workers))
+    return Demand(_count_queued(tx, _wanted(reach, others), limit), _count_running(tx, workers))
 
 
-def _count_queued(tx: Transaction, labels: Mapping[str, str], kinds: Sequence[str], limit: int) -> int:
-    """Return the number of jobs that a claim with these labels and kinds could get, at most `limit`.
+def _wanted(reach: JobReach, others: Sequence[JobReach]) -> ColumnElement[bool]:
+    """Return the condition for the labels and kinds of the jobs that count for the workers with this reach."""
+    keys: dict[tuple[str, ...], list[str]] = {}
+    for key in keys_within(reach.labels):
+        simpler = [one for one in others if len(one.labels) < len(reach.labels) and key in keys_within(one.labels)]
+        if all(one.kinds for one in simpler):
+            left_out = {kind for one in simpler for kind in one.kinds}
+            keys.setdefault(tuple(sorted(left_out)), []).append(key)
+    wanted = or_(false(), *(and_(job.c.labels_key.in_(some), job.c.kind.not_in(out)) for out, some in keys.items()))
+    return and_(wanted, job.c.kind.in_(reach.kinds)) if reach.kinds else wanted
 
-    A job that waits only for another job with the same concurrency key is counted, too.
+
+def _count_queued(tx: Transaction, wanted: ColumnElement[bool], limit: int) -> int:
+    """Return the number of jobs that could start now, at most `limit`.
+
+    Of the jobs with the same concurrency key, at most one counts, and none if one of them runs. The jobs of a project
+    with a limit of running jobs count up to this limit.
     """
-    conditions = [
-        job.c.state == QUEUED,
-        job.c.run_at_us <= tx.now_us,
-        job.c.labels_key.in_(keys_within(labels)),
-        exists().where(project.c.id == job.c.project_id, project.c.deleted_us.is_(None)),
-    ]
-    if kinds:
-        conditions.append(job.c.kind.in_(kinds))
-    found = select(job.c.id).where(*conditions).limit(limit).subquery()
-    return int(tx.execute(select(func.count()).select_from(found)).scalar_one())
+    startable = and_(job.c.state == QUEUED, job.c.run_at_us <= tx.now_us, wanted)
+    waiting = projects_with_queued_jobs()
+    projects = tx.execute(
+        select(project.c.id, queue_share.c.most_running, count_leased(project.c.id).label("running"))
+        .select_from(waiting.join(project, project.c.id == waiting.c.project_id))
+        .outerjoin(queue_share, queue_share.c.project_id == project.c.id)
+        .where(project.c.deleted_us.is_(None))
+    ).all()
+    found = 0
+    for row in projects:
+        most = limit - found if row.most_running is None else min(limit - found, row.most_running - row.running)
+        if most > 0:
+            unkeyed = select(job.c.id).where(job.c.project_id == row.id, job.c.concurrency_key.is_(None), startable)
+            counted = _count_rows(tx, unkeyed, most)
+            found += counted if counted == most else counted + _count_rows(tx, _keys(row.id, startable), most - counted)
+    return found
+
+
+def _count_rows(tx: Transaction, rows: Select[Any], most: int) -> int:
+    return int(tx.execute(select(func.count()).select_from(rows.limit(most).subquery())).scalar_one())
+
+
+def _keys(project_id: str, startable: ColumnElement[bool]) -> Select[Any]:
+    """Return the concurrency keys of which one job could start now.
+
+    Each step looks up the next key in the index, so the cost depends on the number of keys, not of jobs.
+    """
+    first, later, rival = job.alias("first"), job.alias("later"), job.alias("rival")
+
+    def queued(one: FromClause) -> ColumnElement[bool]:
+        return and_(one.c.project_id == project_id, one.c.state == QUEUED, one.c.concurrency_key.is_not(None))
+
+    keys = select(func.min(first.c.concurrency_key).label("key")).where(queued(first)).cte("keys", recursive=True)
+    following = select(func.min(later.c.concurrency_key)).where(queued(later), later.c.concurrency_key > keys.c.key)
+    keys = keys.union_all(select(following.scalar_subquery()).where(keys.c.key.is_not(None)))
+    same_key = (rival.c.project_id == project_id, rival.c.concurrency_key == keys.c.key)
+    return select(keys.c.key).where(
+        keys.c.key.is_not(None),
+        exists().where(job.c.project_id == project_id, job.c.concurrency_key == keys.c.key, startable),
+        ~exists().where(*same_key, rival.c.state == RUNNING),
+    )
 
 
 def _count_running(tx: Transaction, workers: Sequence[str]) -> dict[str, int]:

@@ -39,6 +39,7 @@ from marey_server.store.tables.items import (
     revision_part,
 )
 from marey_server.store.tables.queue import (
+    LEASED,
     ONE_RUNS_PER_KEY,
     UNFINISHED,
     attempt,
@@ -47,6 +48,7 @@ from marey_server.store.tables.queue import (
     job_dependency,
     job_item,
     job_log,
+    queue_share,
     schedule,
     script,
     script_run,
@@ -65,6 +67,7 @@ from marey_server.store.tables.serving import (
 __all__ = [
     "INDEXED_CHARACTERS",
     "INDEXED_FACTS",
+    "LEASED",
     "ONE_RUNS_PER_KEY",
     "UNFINISHED",
     "MemberStart",
@@ -106,6 +109,7 @@ __all__ = [
     "proposal_check",
     "proposal_comment",
     "proposal_review",
+    "queue_share",
     "revision",
     "revision_part",
     "schedule",

@@ -22,6 +22,9 @@ from marey_server.store.tables.columns import DIGEST, ID, Document, Micros, Name
 UNFINISHED = text("state IN ('waiting', 'queued', 'running')")
 """Condition of `ix_job_unfinished`, written in the form in which SQLite uses this index."""
 
+LEASED = text("state = 'running' AND lease_expires_us IS NOT NULL")
+"""Condition of `ix_job_leased`: a worker runs the job. A parent job whose tasks run has no lease."""
+
 ONE_RUNS_PER_KEY = "uq_job_concurrency"
 """Index that refuses a second running job of a concurrency key; a claim that violates it is repeated."""
 
@@ -80,11 +83,13 @@ job = Table(
     Index("ix_job_listing", "project_id", "id"),
     Index(
         "ix_job_claim",  # in the order of claims; the columns after the id show whether this worker can run the job
+        "project_id",
         text("priority DESC"),
         "run_at_us",
         "id",
         "kind",
         "labels_key",
+        "state",  # else SQLite reads the row of each job to see its state, although the index contains queued jobs only
         sqlite_where=text("state = 'queued'"),
         postgresql_where=text("state = 'queued'"),
     ),
@@ -110,6 +115,9 @@ job = Table(
         sqlite_where=text("state = 'running'"),
         postgresql_where=text("state = 'running'"),
     ),
+    Index(  # counted by claims, without reading rows
+        "ix_job_leased", "project_id", "state", "lease_expires_us", sqlite_where=LEASED, postgresql_where=LEASED
+    ),
     Index(
         ONE_RUNS_PER_KEY,
         "project_id",
@@ -126,6 +134,14 @@ job = Table(
         sqlite_where=text("retry_of IS NOT NULL"),
         postgresql_where=text("retry_of IS NOT NULL"),
     ),
+)
+
+queue_share = Table(  # only of projects with a limit or an earlier claim
+    "queue_share",
+    metadata,
+    Column("project_id", ID, ForeignKey("project.id"), primary_key=True),
+    Column("most_running", Integer),  # greatest number of jobs with a lease; null: no limit
+    Column("served_us", Micros, nullable=False, default=0, server_default=text("0")),  # last claim of one of its jobs
 )
 
 job_dependency = Table(
