@@ -51,6 +51,10 @@ def serve(
     workers: Annotated[
         int | None, typer.Option(min=0, help="Number of worker processes that the server starts; default: 1.")
     ] = None,
+    processes: Annotated[
+        int | None,
+        typer.Option(min=1, help="Number of server processes that share the port; needs Postgres; default: 1."),
+    ] = None,
     database_url: DatabaseUrl = None,
     log_form: Annotated[
         LogForm | None, typer.Option(help="Format of the log: text (the default at a terminal) or json.")
@@ -59,7 +63,15 @@ def serve(
     """Run a server, with its database and a local worker, until the server is stopped."""
     from marey_client import embedded
 
-    embedded.serve(data=data, host=host, port=port, local_workers=workers, database_url=database_url, log_form=log_form)
+    embedded.serve(
+        data=data,
+        host=host,
+        port=port,
+        local_workers=workers,
+        processes=processes,
+        database_url=database_url,
+        log_form=log_form,
+    )
 
 
 @workers.callback()

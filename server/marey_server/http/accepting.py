@@ -12,11 +12,12 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Collection, Iterable
+from collections.abc import Awaitable, Callable, Collection, Iterable, Sequence
 from typing import Any
 
 from tornado.httpserver import HTTPServer
 from tornado.iostream import IOStream, UnsatisfiableReadError
+from tornado.netutil import bind_sockets
 
 from marey_schemas.sizes import KIB
 from marey_server.process.password_lanes import limited_address
@@ -52,6 +53,24 @@ _TORNADO_400 = b"HTTP/1.1 400 Bad Request\r\n\r\n"
 """Answer of Tornado to a malformed request; answers of resources have headers."""
 _TORNADO_100 = b"HTTP/1.1 100 (Continue)\r\n\r\n"
 _EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+
+
+class CannotListen(Exception):
+    """Error of a server that cannot listen on its address or port; the text contains address, port and reason."""
+
+
+def listen(host: str, port: int) -> list[socket.socket]:
+    """Return listening sockets at an address. Raises `CannotListen`."""
+    try:
+        return bind_sockets(port, host)
+    except OSError as error:
+        raise CannotListen(f"the server cannot listen on {host}, port {port}: {error.strerror}") from error
+
+
+def address_of(sockets: Sequence[socket.socket]) -> str:
+    """Return the address at which clients reach a server with these listening sockets."""
+    host, port = sockets[0].getsockname()[:2]
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def raise_descriptor_limit() -> None:
