@@ -228,14 +228,17 @@ async def _drain(services: Services, server: HTTPServer, connections: Connection
     services.close()
 
 
-def open_database(settings: Settings) -> Database:
+def open_database(settings: Settings, *, while_serving: bool = False) -> Database:
     """Open the database of a server; create its folder, tables and first administrator if they are missing.
 
-    Raises `DatabaseUnusable` if the database cannot be opened or upgraded.
+    Raises `DatabaseUnusable` if the database cannot be opened or upgraded; with `while_serving` also if other processes
+    of the server, which may be of an earlier version, could not go on after the upgrade.
     """
     with opening(settings.resolved_database_url):
         prepare_data_folder(settings)
-        upgrade_schema(settings.resolved_database_url)
+        upgraded = upgrade_schema(settings.resolved_database_url, while_serving=while_serving)
+        if upgraded.waiting:
+            log.info("when all servers have this version, run `marey db upgrade --finish`")
         database = connect_database(settings)
         database.write(SYSTEM, make_first_administrator, settings.data / TOKEN_FILE)
     return database

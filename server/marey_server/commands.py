@@ -108,16 +108,28 @@ def read_settings(**given: Any) -> Settings:
         raise CommandFailed(f"invalid setting: {wrong}") from None
 
 
-def upgrade(**settings: Any) -> None:
-    """Upgrade the tables to the schema of this version."""
+def upgrade(*, while_serving: bool = False, finish: bool = False, **settings: Any) -> None:
+    """Upgrade the tables to the schema of this version; with `finish`, also remove what only earlier versions used.
+
+    Raises `CommandFailed`; with `while_serving` also if servers of the earlier version could not go on.
+    """
     from marey_server.process.data_folder import prepare_data_folder
     from marey_server.store.database.schema import upgrade_schema
 
     chosen = read_settings(**settings)
     with _database_of(chosen) as url:
         prepare_data_folder(chosen)
-        upgrade_schema(url)
+        done = upgrade_schema(url, while_serving=while_serving, finish=finish)
+    if not done.known:
+        _say("a newer version of Marey has added to the tables; this version can serve them")
+        return
     _say("the database's schema is up to date")
+    if done.applied and done.additive:
+        _say("servers of the earlier version can go on, because the upgrade has only added to the tables")
+    elif done.applied:
+        _say("servers of earlier versions can no longer use this database; do not start them")
+    if done.waiting:
+        _say("when all servers have this version, run `marey db upgrade --finish`")
 
 
 def backup(*, target: Path, **settings: Any) -> None:

@@ -73,7 +73,7 @@ async def serve_together(settings: Settings, order: StartOrder, control: socket.
     elif settings.pools:
         find_launcher(settings.launcher)
     async with AsyncExitStack() as stack:
-        database = open_database(own)
+        database = open_database(own, while_serving=not order.first)
         sockets, metrics_sockets = _opened(order.sockets), _opened(order.metrics_sockets)
         app = create_app(own, database)
         running = await stack.enter_async_context(listening(app, sockets, linger_s=LINGER_S))

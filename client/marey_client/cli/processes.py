@@ -177,9 +177,24 @@ def demo(
 
 
 @db.command("upgrade")
-def upgrade_database(data: DataFolder = None, database_url: DatabaseUrl = None) -> None:
-    """Bring the database's schema up to date."""
-    _database("upgrade", data, database_url)
+def upgrade_database(
+    while_serving: Annotated[
+        bool,
+        typer.Option(
+            "--while-serving", help="Refuse an upgrade after which servers of the earlier version could not go on."
+        ),
+    ] = False,
+    finish: Annotated[
+        bool,
+        typer.Option(
+            "--finish", help="Also remove what only earlier versions use; no server of an earlier version may run."
+        ),
+    ] = False,
+    data: DataFolder = None,
+    database_url: DatabaseUrl = None,
+) -> None:
+    """Bring the database's schema up to date, and print whether servers of the earlier version can go on."""
+    _database("upgrade", data, database_url, while_serving=while_serving, finish=finish)
 
 
 @db.command("backup")
