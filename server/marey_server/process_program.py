@@ -47,6 +47,8 @@ FEWEST_CHILDREN = 2
 def main() -> int:
     """Run a server process; return its exit status."""
     control = socket.socket(fileno=os.dup(0))
+    with open(os.devnull) as nothing:
+        os.dup2(nothing.fileno(), 0)  # so that no child process inherits the socket
     try:
         order = StartOrder.receive(control)
         settings = read_settings(**order.settings)

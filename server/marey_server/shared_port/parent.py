@@ -145,7 +145,10 @@ class Parent:
         order = StartOrder(
             self._given, tuple(one.fileno() for one in self._sockets), tuple(one.fileno() for one in own), first
         )
-        started = await ProcessHandle.start(number, order)
+        try:
+            started = await ProcessHandle.start(number, order)
+        except OSError as error:
+            raise ProcessesFailed(f"the server process {number} cannot be started: {error}") from error
         self._living.add(started)
         return started
 
@@ -171,10 +174,17 @@ class Parent:
             await asyncio.sleep(pause_s)
             async with self._changing[number]:
                 if self._current[number] is process:
-                    self._current[number] = await self._start(number)
+                    await self._start_again(number)
             if await self._current[number].until_ready():
                 self._give_workers()
                 self._announce()
+
+    async def _start_again(self, number: int) -> None:
+        """Start the process in a place; if the system starts no process, the next attempt follows after a pause."""
+        try:
+            self._current[number] = await self._start(number)
+        except ProcessesFailed as error:
+            log.error("%s", error)
 
     def _note_end(self, process: ProcessHandle, status: int) -> None:
         """Count a process that ended. Raises `ProcessesFailed` if the processes end again and again."""
@@ -212,7 +222,11 @@ class Parent:
         """Replace all processes; stop and return False when a new process does not become ready."""
         for number in self._changing:
             async with self._changing[number]:
-                new = await self._start(number)
+                try:
+                    new = await self._start(number)
+                except ProcessesFailed as error:
+                    log.error("%s; the earlier processes keep running", error)
+                    return False
                 if not await new.until_ready():
                     self._living.discard(new)
                     log.error(

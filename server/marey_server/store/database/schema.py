@@ -43,7 +43,7 @@ Phase = Literal["before", "stopped", "after"]
 
 @dataclass(frozen=True)
 class SchemaUpgrade:
-    """What an upgrade of the schema has done: applied migrations, and those that wait for the phase `after`."""
+    """Result of an upgrade of the schema: applied migrations, and those that wait for the phase `after`."""
 
     applied: tuple[str, ...]
     waiting: tuple[str, ...]
