@@ -32,6 +32,7 @@ from marey_server.access.principal import SYSTEM
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.handlers.health import RESOURCES as MONITORING
 from marey_server.http.accepting import (
+    ACCEPTED_AT_ONCE,
     ADDRESS_SHARE,
     Connections,
     address_of,
@@ -195,6 +196,7 @@ def accept_connections(app: Application, server: HTTPServer, sockets: Sequence[s
         write_timeout_s=settings.write_timeout_s,
         busy=lambda: {request.stream for request in in_flight if not request.awaits_guest},
         count_closed=lambda reason: app.services.metrics.closed.labels(reason).inc(),
+        at_once=ACCEPTED_AT_ONCE if settings.processes == 1 else 1,  # so that other processes get connections, too
     )
     app.services.metrics.connections.set_function(lambda: len(connections))
     connections.accept_from(sockets)

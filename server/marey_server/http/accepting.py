@@ -192,6 +192,7 @@ class Connections:
     write_timeout_s : time in seconds in which a client must receive `LEAST_TAKEN_BYTES`, or all bytes if fewer wait
     busy : returns the streams on which a request is being answered; all other streams are idle
     count_closed : counts a refused or closed connection by its reason
+    at_once : number of connections accepted in one round of the event loop
     """
 
     def __init__(
@@ -203,6 +204,7 @@ class Connections:
         write_timeout_s: float,
         busy: Callable[[], Collection[object]],
         count_closed: Callable[[str], None],
+        at_once: int = ACCEPTED_AT_ONCE,
     ) -> None:
         self._server = server
         self._most = most
@@ -210,6 +212,7 @@ class Connections:
         self._write_timeout_s = write_timeout_s
         self._busy = busy
         self._count_closed = count_closed
+        self._at_once = at_once
         self._open: dict[_Connection, None] = {}  # in the order of their acceptance
         self._by_address: Counter[str] = Counter()
         self._listening: list[socket.socket] = []
@@ -239,7 +242,7 @@ class Connections:
             self._check.cancel()
 
     def _accept(self, listening: socket.socket) -> None:
-        for _ in range(ACCEPTED_AT_ONCE):
+        for _ in range(self._at_once):
             try:
                 accepted, address = listening.accept()
             except BlockingIOError:
