@@ -140,7 +140,7 @@ def test_a_follower_at_one_process_sees_an_event_of_another_at_once(pair: Pair) 
 
 def test_sign_ins_are_limited_at_all_processes_together(pair: Pair) -> None:
     first, second = pair
-    wrong = {"user": "nobody", "password": "wrong password"}
+    wrong = {"name": "nobody", "password": "wrong password"}
     statuses = []
     for one in (first, second) * 8:
         request = one.build_request("POST", "/login", json=wrong)
