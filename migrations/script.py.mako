@@ -7,6 +7,7 @@ revision = ${repr(up_revision)}
 down_revision = ${repr(down_revision)}
 branch_labels = ${repr(branch_labels)}
 depends_on = ${repr(depends_on)}
+phase = "stopped"  # or "before" if it only adds, or "after"; see marey_server.store.database.schema
 
 
 def upgrade() -> None:

@@ -13,7 +13,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache, partial
@@ -21,7 +21,6 @@ from importlib.metadata import version
 from typing import Any
 
 from tornado.httpserver import HTTPServer
-from tornado.netutil import bind_sockets
 from tornado.routing import AnyMatches, Rule
 from tornado.web import Application as TornadoApplication
 from tornado.web import RequestHandler
@@ -31,10 +30,14 @@ from marey_schemas.processes.memory import keep_freed_memory
 from marey_schemas.sizes import KIB, MIB
 from marey_server.access.principal import SYSTEM
 from marey_server.handlers.catalogue import RESOURCES
+from marey_server.handlers.health import RESOURCES as MONITORING
 from marey_server.http.accepting import (
+    ACCEPTED_AT_ONCE,
     ADDRESS_SHARE,
     Connections,
+    address_of,
     default_connections,
+    listen,
     raise_descriptor_limit,
 )
 from marey_server.http.docs_page import render_page
@@ -48,6 +51,7 @@ from marey_server.process.computing import compute_on_one_thread_each
 from marey_server.process.data_folder import BLOB_FOLDER, prepare_data_folder
 from marey_server.process.feed import following_feed
 from marey_server.process.housekeeping import keeping_house
+from marey_server.process.notices import note_ready, note_stopping
 from marey_server.process.observe import access_log, configure_logging
 from marey_server.process.services import Description, Services
 from marey_server.process.settings import Settings, misspelt_variables
@@ -68,16 +72,12 @@ READ_BUFFER_BYTES = MIB
 FIRST_COMMAND = "marey project create lab"
 
 
-class CannotListen(Exception):
-    """Error of a server that cannot listen on its address or port; the text contains address, port and reason."""
-
-
 class Application(TornadoApplication):
-    """Tornado application: all routes, and the services that their handlers share."""
+    """Tornado application: routes, and the services that their handlers share."""
 
-    def __init__(self, settings: Settings, database: Database, children: Children | None = None) -> None:
-        self.routes = RouteTable(self, RESOURCES)
-        self.services = Services(settings, database, cache(partial(describe, self.routes)), children)
+    def __init__(self, resources: tuple[type[Resource], ...], make_services: Callable[[RouteTable], Services]) -> None:
+        self.routes = RouteTable(self, resources)
+        self.services = make_services(self.routes)
         super().__init__([Rule(AnyMatches(), self.routes)], log_function=self.record_request)
 
     def record_request(self, handler: RequestHandler) -> None:
@@ -116,7 +116,9 @@ def create_app(settings: Settings, database: Database, children: Children | None
 
     Several applications may share the child processes `children`.
     """
-    return Application(settings, database, children)
+    return Application(
+        RESOURCES, lambda routes: Services(settings, database, cache(partial(describe, routes)), children)
+    )
 
 
 def describe(routes: RouteTable) -> Description:
@@ -136,19 +138,18 @@ class Running:
 
 
 @asynccontextmanager
-async def listening(app: Application) -> AsyncIterator[Running]:
-    """Accept requests while the `async with` block runs.
+async def listening(
+    app: Application, sockets: Sequence[socket.socket] | None = None, *, linger_s: float = 0.0
+) -> AsyncIterator[Running]:
+    """Accept requests while the `async with` block runs, at `sockets` or at the address in the settings.
 
-    At the end of the block, new requests are refused. Everything is closed when the running requests have ended, at the
-    latest after `drain_s` seconds. Raises `CannotListen`.
+    At the end of the block, no more connections are accepted. For `linger_s` seconds, requests on open connections are
+    still answered, and the answers ask clients to close the connections. Everything is closed when the running requests
+    have ended, at the latest after `drain_s` more seconds. Raises `CannotListen`.
     """
     settings = app.services.settings
-    try:
-        sockets = bind_sockets(settings.port, settings.host)
-    except OSError as error:
-        raise CannotListen(
-            f"the server cannot listen on {settings.host}, port {settings.port}: {error.strerror}"
-        ) from error
+    if sockets is None:
+        sockets = listen(settings.host, settings.port)
     server = HTTPServer(
         app,
         idle_connection_timeout=settings.header_timeout_s,
@@ -159,16 +160,32 @@ async def listening(app: Application) -> AsyncIterator[Running]:
         max_buffer_size=READ_BUFFER_BYTES,
     )
     connections = accept_connections(app, server, sockets)
-    host, port = sockets[0].getsockname()[:2]
-    shown = f"[{host}]" if ":" in host else host
+    address = address_of(sockets)
     try:
         async with keeping_house(app.services), following_feed(app.services), delivering(app.services):
-            yield Running(app, f"http://{shown}:{port}", server)
+            yield Running(app, address, server)
+            await _part(app.services, connections, linger_s)
     finally:
         await _drain(app.services, server, connections)
 
 
-def accept_connections(app: Application, server: HTTPServer, sockets: list[socket.socket]) -> Connections:
+@asynccontextmanager
+async def showing_metrics(services: Services, sockets: Sequence[socket.socket]) -> AsyncIterator[None]:
+    """Answer requests for metrics and health at further sockets while the `async with` block runs."""
+    server = HTTPServer(
+        Application(MONITORING, lambda _: services),
+        idle_connection_timeout=services.settings.header_timeout_s,
+        max_header_size=services.settings.max_header_bytes,
+    )
+    server.add_sockets(sockets)
+    try:
+        yield
+    finally:
+        server.stop()
+        await server.close_all_connections()
+
+
+def accept_connections(app: Application, server: HTTPServer, sockets: Sequence[socket.socket]) -> Connections:
     """Accept as many connections as the settings allow; return the object that manages them."""
     settings, in_flight = app.services.settings, app.services.in_flight
     most = settings.max_connections or default_connections()
@@ -179,10 +196,20 @@ def accept_connections(app: Application, server: HTTPServer, sockets: list[socke
         write_timeout_s=settings.write_timeout_s,
         busy=lambda: {request.stream for request in in_flight if not request.awaits_guest},
         count_closed=lambda reason: app.services.metrics.closed.labels(reason).inc(),
+        at_once=ACCEPTED_AT_ONCE if settings.processes == 1 else 1,  # so that other processes get connections, too
     )
     app.services.metrics.connections.set_function(lambda: len(connections))
     connections.accept_from(sockets)
     return connections
+
+
+async def _part(services: Services, connections: Connections, linger_s: float) -> None:
+    """Accept no more connections; wait until clients have closed theirs, but at most `linger_s` seconds."""
+    services.parting = True
+    connections.stop()
+    deadline = time.monotonic() + linger_s
+    while len(connections) and time.monotonic() < deadline:
+        await asyncio.sleep(0.02)
 
 
 async def _drain(services: Services, server: HTTPServer, connections: Connections) -> None:
@@ -203,14 +230,17 @@ async def _drain(services: Services, server: HTTPServer, connections: Connection
     services.close()
 
 
-def open_database(settings: Settings) -> Database:
+def open_database(settings: Settings, *, while_serving: bool = False) -> Database:
     """Open the database of a server; create its folder, tables and first administrator if they are missing.
 
-    Raises `DatabaseUnusable` if the database cannot be opened or upgraded.
+    Raises `DatabaseUnusable` if the database cannot be opened or upgraded; with `while_serving` also if other processes
+    of the server, which may be of an earlier version, could not go on after the upgrade.
     """
     with opening(settings.resolved_database_url):
         prepare_data_folder(settings)
-        upgrade_schema(settings.resolved_database_url)
+        upgraded = upgrade_schema(settings.resolved_database_url, while_serving=while_serving)
+        if upgraded.waiting:
+            log.info("when all servers have this version, run `marey db upgrade --finish`")
         database = connect_database(settings)
         database.write(SYSTEM, make_first_administrator, settings.data / TOKEN_FILE)
     return database
@@ -242,25 +272,50 @@ def _backing_of(settings: Settings) -> BlobBacking | ObjectBlobs:
 
 async def serve(settings: Settings) -> None:
     """Run a server until SIGTERM or SIGINT."""
+    prepare_process(settings)
+    stop = stop_event()
+    metrics_sockets = [] if settings.metrics_port is None else listen(settings.host, settings.metrics_port)
+    async with (
+        serving(settings) as running,
+        showing_metrics(running.app.services, metrics_sockets),
+        warming(running.app.services.children) if settings.warm_up else nullcontext(),
+    ):
+        settle(running)
+        note_ready()
+        await stop.wait()
+        note_stopping()
+        log.info("stopping")
+
+
+def prepare_process(settings: Settings) -> None:
+    """Set up the log and the limits of a process that will be a server."""
     configure_logging(settings.log_form, settings.log_level)
     for variable, meant in misspelt_variables(os.environ).items():
         log.warning("%s is not a setting and has no effect; did you mean %s?", variable, meant)
     keep_freed_memory()
     raise_descriptor_limit()
     compute_on_one_thread_each()
+
+
+def stop_event() -> asyncio.Event:
+    """Return an event that SIGTERM or SIGINT sets."""
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    async with (
-        serving(settings) as running,
-        warming(running.app.services.children) if settings.warm_up else nullcontext(),
-    ):
-        gc.freeze()  # a search of all modules for garbage would stop the server for 0.1 s again and again
-        for line in greeting(settings, running.address, running.app.services.database):
+    return stop
+
+
+def settle(running: Running, *, greet: bool = True) -> None:
+    """Finish the start of a server that accepts connections: print the greeting, and exempt its objects from searches.
+
+    A search of all modules for garbage would stop the server for 0.1 s again and again.
+    """
+    gc.freeze()
+    if greet:
+        services = running.app.services
+        for line in greeting(services.settings, running.address, services.database):
             log.info("%s", line)
-        await stop.wait()
-        log.info("stopping")
 
 
 @asynccontextmanager

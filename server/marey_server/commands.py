@@ -10,7 +10,7 @@ import os
 import sqlite3
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -34,20 +34,46 @@ class CommandFailed(Exception):
 
 def serve(**settings: Any) -> None:
     """Run a server and the requested number of workers until SIGTERM or SIGINT."""
-    with loading_modules():
-        from marey_server.app import CannotListen
-        from marey_server.app import serve as serve_until_stopped
-        from marey_server.launchers.launcher import LauncherUnusable
-        from marey_server.process.computing import leave
-        from marey_server.store.database.opening import DatabaseUnusable
-
     chosen = read_settings(**settings)
     comfort = {"local_workers": 0 if chosen.pools else 1, "log_form": usual_form()}
     unset = {name: value for name, value in comfort.items() if name not in chosen.model_fields_set}
+    if chosen.processes > 1:
+        _serve_in_processes({**settings, **unset})
+        return
+    with loading_modules():
+        from marey_server.app import serve as serve_until_stopped
+
+    run_server(serve_until_stopped(read_settings(**settings, **unset)))
+
+
+def _serve_in_processes(given: dict[str, Any]) -> None:
+    """Run several server processes at one port; `given` are the settings that they must not read themselves."""
+    from marey_server.shared_port.parent import serve_in_processes
+
+    chosen = read_settings(**given)
+    if sys.platform == "win32":
+        raise CommandFailed("several server processes cannot share a port on Windows; leave --processes out")
+    if chosen.resolved_database_url.startswith("sqlite"):
+        raise CommandFailed(
+            "several server processes need Postgres, because only one process may write to an SQLite file; "
+            "name a database with --database-url, or leave --processes out"
+        )
+    run_server(serve_in_processes(chosen, {**given, "processes": chosen.processes}))
+
+
+def run_server(server: Coroutine[Any, Any, None]) -> None:
+    """Run the coroutine of a server until it ends. Raises `CommandFailed` with the reason if it cannot start."""
+    with loading_modules():
+        from marey_server.http.accepting import CannotListen
+        from marey_server.launchers.launcher import LauncherUnusable
+        from marey_server.process.computing import leave
+        from marey_server.shared_port.parent import ProcessesFailed
+        from marey_server.store.database.opening import DatabaseUnusable
+
     try:
         with asyncio.Runner(loop_factory=_new_event_loop) as runner:
-            runner.run(serve_until_stopped(read_settings(**settings, **unset)))
-    except DatabaseUnusable as error:
+            runner.run(server)
+    except (DatabaseUnusable, ProcessesFailed) as error:
         raise CommandFailed(str(error)) from error
     except CannotListen as error:
         raise CommandFailed(
@@ -82,16 +108,28 @@ def read_settings(**given: Any) -> Settings:
         raise CommandFailed(f"invalid setting: {wrong}") from None
 
 
-def upgrade(**settings: Any) -> None:
-    """Upgrade the tables to the schema of this version."""
+def upgrade(*, while_serving: bool = False, finish: bool = False, **settings: Any) -> None:
+    """Upgrade the tables to the schema of this version; with `finish`, also remove what only earlier versions used.
+
+    Raises `CommandFailed`; with `while_serving` also if servers of the earlier version could not go on.
+    """
     from marey_server.process.data_folder import prepare_data_folder
     from marey_server.store.database.schema import upgrade_schema
 
     chosen = read_settings(**settings)
     with _database_of(chosen) as url:
         prepare_data_folder(chosen)
-        upgrade_schema(url)
+        done = upgrade_schema(url, while_serving=while_serving, finish=finish)
+    if not done.known:
+        _say("a newer version of Marey has added to the tables; this version can serve them")
+        return
     _say("the database's schema is up to date")
+    if done.applied and done.additive:
+        _say("servers of the earlier version can go on, because the upgrade has only added to the tables")
+    elif done.applied:
+        _say("servers of earlier versions can no longer use this database; do not start them")
+    if done.waiting:
+        _say("when all servers have this version, run `marey db upgrade --finish`")
 
 
 def backup(*, target: Path, **settings: Any) -> None:

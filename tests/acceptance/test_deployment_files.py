@@ -19,7 +19,8 @@ UNITS = sorted((ROOT / "deploy" / "systemd").iterdir())
 CONTAINERFILE = ROOT / "deploy" / "containers" / "Containerfile"
 COMPOSE = ROOT / "docker-compose.yml"
 PAGE = ROOT / "docs" / "how-to" / "deploy.md"
-FILES = [COMPOSE, PAGE, *sorted(file for file in (ROOT / "deploy").rglob("*") if file.is_file())]
+UPGRADE_PAGE = ROOT / "docs" / "how-to" / "upgrade.md"
+FILES = [COMPOSE, PAGE, UPGRADE_PAGE, *sorted(file for file in (ROOT / "deploy").rglob("*") if file.is_file())]
 OF_CLIENTS = {"MAREY_URL"}
 """Variables that clients and workers read."""
 
@@ -39,6 +40,7 @@ def started_commands() -> list[list[str]]:
     assert all(words.pop(0) == "/opt/marey/bin/marey" for words in lines)
     started = re.findall(r"CMD (\[.*\])", CONTAINERFILE.read_text(encoding="utf-8"))
     page = PAGE.read_text(encoding="utf-8")
+    page += UPGRADE_PAGE.read_text(encoding="utf-8")
     told = re.findall(r"^(?:sudo /opt/marey/bin/|docker compose exec server )marey (.*)$", page, re.MULTILINE)
     assert told
     lines += map(shlex.split, told)

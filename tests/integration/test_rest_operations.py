@@ -158,7 +158,7 @@ def test_a_stopping_server_says_that_it_is_not_ready(database: Database, tmp_pat
 
 
 def test_a_database_of_another_version_is_not_ready(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("marey_server.store.monitoring.readiness.schema_at_head", lambda _connection: False)
+    monkeypatch.setattr("marey_server.store.monitoring.readiness.schema_fits", lambda _connection: False)
     operator = server.client(server.make_user("ada", administrator=True)).headers["Authorization"]
     told, not_told = (
         httpx.get(f"{server.address}/readyz", headers=headers) for headers in ({"Authorization": operator}, {})

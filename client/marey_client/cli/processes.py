@@ -51,6 +51,10 @@ def serve(
     workers: Annotated[
         int | None, typer.Option(min=0, help="Number of worker processes that the server starts; default: 1.")
     ] = None,
+    processes: Annotated[
+        int | None,
+        typer.Option(min=1, help="Number of server processes that share the port; needs Postgres; default: 1."),
+    ] = None,
     database_url: DatabaseUrl = None,
     log_form: Annotated[
         LogForm | None, typer.Option(help="Format of the log: text (the default at a terminal) or json.")
@@ -59,7 +63,15 @@ def serve(
     """Run a server, with its database and a local worker, until the server is stopped."""
     from marey_client import embedded
 
-    embedded.serve(data=data, host=host, port=port, local_workers=workers, database_url=database_url, log_form=log_form)
+    embedded.serve(
+        data=data,
+        host=host,
+        port=port,
+        local_workers=workers,
+        processes=processes,
+        database_url=database_url,
+        log_form=log_form,
+    )
 
 
 @workers.callback()
@@ -165,9 +177,24 @@ def demo(
 
 
 @db.command("upgrade")
-def upgrade_database(data: DataFolder = None, database_url: DatabaseUrl = None) -> None:
-    """Bring the database's schema up to date."""
-    _database("upgrade", data, database_url)
+def upgrade_database(
+    while_serving: Annotated[
+        bool,
+        typer.Option(
+            "--while-serving", help="Refuse an upgrade after which servers of the earlier version could not go on."
+        ),
+    ] = False,
+    finish: Annotated[
+        bool,
+        typer.Option(
+            "--finish", help="Also remove what only earlier versions use; no server of an earlier version may run."
+        ),
+    ] = False,
+    data: DataFolder = None,
+    database_url: DatabaseUrl = None,
+) -> None:
+    """Bring the database's schema up to date, and print whether servers of the earlier version can go on."""
+    _database("upgrade", data, database_url, while_serving=while_serving, finish=finish)
 
 
 @db.command("backup")

@@ -12,11 +12,12 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Collection, Iterable
+from collections.abc import Awaitable, Callable, Collection, Iterable, Sequence
 from typing import Any
 
 from tornado.httpserver import HTTPServer
 from tornado.iostream import IOStream, UnsatisfiableReadError
+from tornado.netutil import bind_sockets
 
 from marey_schemas.sizes import KIB
 from marey_server.process.password_lanes import limited_address
@@ -52,6 +53,24 @@ _TORNADO_400 = b"HTTP/1.1 400 Bad Request\r\n\r\n"
 """Answer of Tornado to a malformed request; answers of resources have headers."""
 _TORNADO_100 = b"HTTP/1.1 100 (Continue)\r\n\r\n"
 _EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+
+
+class CannotListen(Exception):
+    """Error of a server that cannot listen on its address or port; the text contains address, port and reason."""
+
+
+def listen(host: str, port: int) -> list[socket.socket]:
+    """Return listening sockets at an address. Raises `CannotListen`."""
+    try:
+        return bind_sockets(port, host)
+    except OSError as error:
+        raise CannotListen(f"the server cannot listen on {host}, port {port}: {error.strerror}") from error
+
+
+def address_of(sockets: Sequence[socket.socket]) -> str:
+    """Return the address at which clients reach a server with these listening sockets."""
+    host, port = sockets[0].getsockname()[:2]
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def raise_descriptor_limit() -> None:
@@ -173,6 +192,7 @@ class Connections:
     write_timeout_s : time in seconds in which a client must receive `LEAST_TAKEN_BYTES`, or all bytes if fewer wait
     busy : returns the streams on which a request is being answered; all other streams are idle
     count_closed : counts a refused or closed connection by its reason
+    at_once : number of connections accepted in one round of the event loop
     """
 
     def __init__(
@@ -184,6 +204,7 @@ class Connections:
         write_timeout_s: float,
         busy: Callable[[], Collection[object]],
         count_closed: Callable[[str], None],
+        at_once: int = ACCEPTED_AT_ONCE,
     ) -> None:
         self._server = server
         self._most = most
@@ -191,6 +212,7 @@ class Connections:
         self._write_timeout_s = write_timeout_s
         self._busy = busy
         self._count_closed = count_closed
+        self._at_once = at_once
         self._open: dict[_Connection, None] = {}  # in the order of their acceptance
         self._by_address: Counter[str] = Counter()
         self._listening: list[socket.socket] = []
@@ -220,7 +242,7 @@ class Connections:
             self._check.cancel()
 
     def _accept(self, listening: socket.socket) -> None:
-        for _ in range(ACCEPTED_AT_ONCE):
+        for _ in range(self._at_once):
             try:
                 accepted, address = listening.accept()
             except BlockingIOError:

@@ -66,6 +66,9 @@ class Description:
 class Services:
     """Shared parts of a server process: database, threads, metrics, and whether the server is draining."""
 
+    parting = False
+    """Whether the process accepts no more connections; then its answers ask clients to close theirs."""
+
     def __init__(
         self,
         settings: Settings,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import os
 from collections.abc import Mapping
 from dataclasses import fields
 from ipaddress import IPv4Network, IPv6Network
@@ -17,7 +16,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
 from marey_schemas.sizes import KIB, MIB
 from marey_server.process.blob_settings import BlobSettings
-from marey_server.process.children import ChildLimits
+from marey_server.process.process_settings import ProcessSettings
 from marey_server.process.secret_files import read_secret
 from marey_server.process.worker_pools import WorkerPools
 from marey_server.store.jobs.policy import QueuePolicy
@@ -28,7 +27,7 @@ PREFIX = "MAREY_"
 """Prefix of the variables: MAREY_PORT sets `port`. Client, worker and tests have other variables with this prefix."""
 
 
-class Settings(BlobSettings):
+class Settings(ProcessSettings, BlobSettings):
     """Settings of a server. The environment variable of the setting `data` is MAREY_DATA, and so on."""
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, toml_file="marey.toml", extra="forbid", frozen=True)
@@ -142,32 +141,6 @@ class Settings(BlobSettings):
         64 * MIB,
         ge=0,
         description="Greatest number of bytes in an import that is done immediately; larger imports become a job.",
-    )
-    child_processes: int | None = Field(
-        None,
-        ge=2,
-        le=64,
-        description="Processes in which the server reads uploaded files and computes on stored data; no user "
-        "can use all of them at the same time. Absent: one more than the number of processors, but at least 3 and at "
-        "most 5.",
-    )
-    warm_up: bool = Field(
-        True,
-        description="Compile missing kernels and start the child processes when the server starts. If false, the first "
-        "requests that need kernels or child processes wait until these are ready.",
-    )
-    child_requests: int = Field(
-        32,
-        ge=2,
-        description="Greatest number of requests that use a child process or wait for one; at most half of them from "
-        "one user. Further requests are answered with 503.",
-    )
-    child_memory_mb: int = Field(1024, ge=64, description="Memory in MiB that a child process may use for a request.")
-    child_processor_s: float = Field(
-        30.0, ge=1, description="Greatest processor time in seconds of a child process for one request."
-    )
-    child_wall_s: float = Field(
-        120.0, ge=1, description="Greatest duration in seconds of a child process for one request."
     )
     lease_ttl_s: float = Field(
         QueuePolicy.lease_ttl_s,
@@ -361,17 +334,6 @@ class Settings(BlobSettings):
     def retention(self) -> Retention:
         """Return the numbers of days for which events, audit entries, logs and jobs are kept."""
         return Retention(self.events_days, self.logs_days, self.jobs_days, self.audit_days)
-
-    @property
-    def child_limits(self) -> ChildLimits:
-        """Return the limits of child processes."""
-        return ChildLimits(
-            children=self.child_processes or min(max(2, os.cpu_count() or 2), 4) + 1,
-            requests=self.child_requests,
-            memory_mb=self.child_memory_mb,
-            processor_s=self.child_processor_s,
-            wall_s=self.child_wall_s,
-        )
 
     @property
     def resolved_database_threads(self) -> int:

@@ -17,6 +17,7 @@ from marey_server.app import open_database
 from marey_server.errors import StorageFullProblem
 from marey_server.process.settings import Settings
 from marey_server.store.database.opening import DatabaseUnusable
+from marey_server.store.database.schema import SERVED_FROM
 from marey_server.store.transaction import Transaction
 
 
@@ -171,6 +172,7 @@ def test_a_disk_without_room_for_the_tables_is_told(
 def test_tables_of_a_newer_version_are_told_and_left_as_they_are(data: Path, command: Callable[..., Any]) -> None:
     with closing(sqlite3.connect(data / "marey.db")) as database, database:
         database.execute("UPDATE alembic_version SET version_num = '9999'")
+        database.execute("UPDATE server_state SET value = '9999' WHERE key = ?", [SERVED_FROM])
     with pytest.raises(
         (commands.CommandFailed, DatabaseUnusable), match="belong to another, perhaps newer, version of Marey"
     ):

@@ -15,7 +15,7 @@ def test_a_store_that_can_serve_has_no_faults(database: Database) -> None:
 
 def test_tables_of_another_version_are_told(database: Database) -> None:
     with database.engine.begin() as connection:
-        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0001'")
     assert "marey db upgrade" in database.read(SYSTEM, find_faults)[0]
 
 

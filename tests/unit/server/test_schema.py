@@ -86,10 +86,10 @@ def test_indexes_over_expressions_are_migrated_too(database: Database) -> None:
 
 def test_a_database_is_at_head_only_after_the_upgrade(database: Database, tmp_path: Path) -> None:
     with database.engine.connect() as connection:
-        assert schema.schema_at_head(connection)
+        assert schema.schema_fits(connection)
     empty = Database(f"sqlite:///{tmp_path}/empty.db")
     with empty.engine.connect() as connection:
-        assert not schema.schema_at_head(connection)
+        assert not schema.schema_fits(connection)
     empty.close()
 
 

@@ -1,10 +1,24 @@
-"""Schema of the database: upgrades, and the check that it is current."""
+"""Schema of the database: upgrades, and the check that this version of the server can serve it.
+
+Each migration has a phase, in its variable `phase`:
+
+* `before`: it only adds. It runs before servers of the new version start, and servers of the earlier version go on.
+* `after`: it removes what only earlier versions use. It runs when no server of an earlier version runs any more;
+  servers of the new version do not need it.
+* `stopped`, also without the variable: it changes what servers use, so no server of an earlier version may run.
+
+The database records the last migration that was not only an addition. A server of an earlier version that knows this
+migration can serve the database, although it does not know the newest ones.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Literal, cast
 
+import sqlalchemy
 from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
@@ -14,37 +28,111 @@ from sqlalchemy import Connection
 from marey_server.access.principal import SYSTEM
 from marey_server.store.credentials.server_key import make_server_key
 from marey_server.store.database.connections import Database
+from marey_server.store.database.opening import DatabaseUnusable
+from marey_server.store.tables import server_state
 from marey_server.store.transaction import Transaction
 
 _INSTALLED = Path(__file__).parents[2] / "migrations"
 _CHECKOUT = Path(__file__).parents[4] / "migrations"
 
+SERVED_FROM = "schema_served_from"
+"""Key of the last migration that was not only an addition; its text sorts like its number."""
 
-def upgrade_schema(url: str) -> None:
-    """Create or upgrade the tables of the database at `url`, all or nothing; concurrent calls run one after another."""
+Phase = Literal["before", "stopped", "after"]
+
+
+@dataclass(frozen=True)
+class SchemaUpgrade:
+    """Result of an upgrade of the schema: applied migrations, and those that wait for the phase `after`."""
+
+    applied: tuple[str, ...]
+    waiting: tuple[str, ...]
+    additive: bool
+    """Whether servers of the earlier version can go on serving."""
+    known: bool = True
+    """Whether this version knows the schema; if not, a newer version has only added to it."""
+
+
+def upgrade_schema(url: str, *, while_serving: bool = False, finish: bool = False) -> SchemaUpgrade:
+    """Create or upgrade the tables of the database at `url`, all or nothing; concurrent calls run one after another.
+
+    Migrations of the phase `after` run only with `finish`, on SQLite (which one server uses), and in a new database.
+    With `while_serving`, raises `DatabaseUnusable` if servers of the earlier version could not go on.
+    """
     database = Database(url, readers=1)
     try:
-        database.write(SYSTEM, _upgrade)
+        return database.write(SYSTEM, _upgrade, while_serving, finish, database.is_sqlite)
     finally:
         database.close()
 
 
-def _upgrade(tx: Transaction) -> None:
+def _upgrade(tx: Transaction, while_serving: bool, finish: bool, one_server: bool) -> SchemaUpgrade:
     tx.lock("schema")
-    config = _config()
-    config.attributes["connection"] = tx.connection
-    command.upgrade(config, "head")
+    current, steps = _current(tx.connection), _steps()
+    if current is not None and current not in steps and _is_served(tx.connection):
+        return SchemaUpgrade((), (), additive=True, known=False)
+    last = _head() if finish or one_server or current is None else _last_needed()
+    pending = [name for name in steps if current is None or current < name]
+    applied = [name for name in pending if name <= last]
+    if finish and while_serving:
+        raise DatabaseUnusable("the last steps of an upgrade run when no server of an earlier version runs")
+    additive = current is None or all(steps[name] == "before" for name in applied)
+    if while_serving and not additive:
+        raise DatabaseUnusable(
+            "this version changes tables that running servers use; stop all servers, and then start the new version"
+        )
+    if applied or current not in steps:  # alembic reports a schema that this version does not know
+        config = _config()
+        config.attributes["connection"] = tx.connection
+        command.upgrade(config, last)
+    _record_served(tx, max(current or "", last))
     make_server_key(tx)
+    return SchemaUpgrade(tuple(applied), tuple(name for name in pending if name > last), additive)
 
 
-def schema_at_head(connection: Connection) -> bool:
-    """Return whether the database has the schema that this version of the server needs."""
-    return MigrationContext.configure(connection).get_current_heads() == _expected_heads()
+def schema_fits(connection: Connection) -> bool:
+    """Return whether this version of the server can serve the database with its present schema."""
+    current = _current(connection)
+    if current in _steps():
+        return current >= _last_needed()
+    return current is not None and _is_served(connection)
+
+
+def _record_served(tx: Transaction, current: str) -> None:
+    changing = [name for name, phase in _steps().items() if name <= current and phase != "before"]
+    key = server_state.c.key == SERVED_FROM
+    tx.execute(sqlalchemy.delete(server_state).where(key))
+    tx.execute(sqlalchemy.insert(server_state).values(key=SERVED_FROM, value=max(changing)))
+
+
+def _is_served(connection: Connection) -> bool:
+    """Return whether a newer version, whose schema this version does not know, has only added to the schema."""
+    if not sqlalchemy.inspect(connection).has_table(server_state.name):
+        return False
+    recorded = sqlalchemy.select(server_state.c.value).where(server_state.c.key == SERVED_FROM)
+    served_from = connection.execute(recorded).scalar_one_or_none()
+    return served_from is not None and served_from in _steps()
+
+
+def _current(connection: Connection) -> str | None:
+    heads = MigrationContext.configure(connection).get_current_heads()
+    return heads[0] if heads else None
 
 
 @lru_cache
-def _expected_heads() -> tuple[str, ...]:
-    return tuple(ScriptDirectory.from_config(_config()).get_heads())
+def _steps() -> dict[str, Phase]:
+    """Return the phases of all migrations that this version knows, in the order in which they run."""
+    scripts = reversed(list(ScriptDirectory.from_config(_config()).walk_revisions()))
+    return {one.revision: cast(Phase, getattr(one.module, "phase", "stopped")) for one in scripts}
+
+
+def _head() -> str:
+    return list(_steps())[-1]
+
+
+def _last_needed() -> str:
+    """Return the last migration that this version needs: all but the last ones of the phase `after`."""
+    return [name for name, phase in _steps().items() if phase != "after"][-1]
 
 
 def _config() -> Config:
