@@ -9,7 +9,7 @@ from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Connection
+from sqlalchemy import Connection, inspect
 
 from marey_server.access.principal import SYSTEM
 from marey_server.store.credentials.server_key import make_server_key
@@ -40,6 +40,11 @@ def _upgrade(tx: Transaction) -> None:
 def schema_at_head(connection: Connection) -> bool:
     """Return whether the database has the schema that this version of the server needs."""
     return MigrationContext.configure(connection).get_current_heads() == _expected_heads()
+
+
+def list_tables(connection: Connection) -> list[str]:
+    """Return the names of all tables in the database's default schema, whichever program has created them."""
+    return sorted(inspect(connection).get_table_names())
 
 
 @lru_cache
