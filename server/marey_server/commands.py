@@ -96,8 +96,8 @@ def upgrade(**settings: Any) -> None:
 
 def require_empty(**settings: Any) -> None:
     """Raise `CommandFailed` if the database has tables; nothing is changed."""
-    from marey_server.app import connect_database
     from marey_server.access.principal import SYSTEM
+    from marey_server.app import connect_database
     from marey_server.store.database.schema import list_tables
 
     chosen = read_settings(**settings)

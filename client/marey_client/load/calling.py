@@ -18,7 +18,7 @@ NO_ANSWER = "no-answer"
 TIMEOUT_S = 60.0
 
 
-class Reply(NamedTuple):
+class LoadAnswer(NamedTuple):
     """Answer to a request: `status` is 0 if there was none; `code` is the short name of an error, empty otherwise."""
 
     status: int
@@ -26,7 +26,7 @@ class Reply(NamedTuple):
     document: dict[str, Any]
 
 
-class Caller:
+class LoadConnection:
     """Connection to a server that is kept open. It may be used by one thread at a time.
 
     Unlike `Transport`, it never repeats a request, because a repeated request would hide an error from the measurement.
@@ -54,7 +54,7 @@ class Caller:
         *,
         token: str | None = None,
         headers: Mapping[str, str] = MappingProxyType({}),
-    ) -> Reply:
+    ) -> LoadAnswer:
         """Send a JSON document by POST; a `token` replaces that of the connection for this request."""
         sent = {**self._headers, **headers}
         if token is not None:
@@ -65,8 +65,8 @@ class Caller:
             body = answer.read()
         except (OSError, http.client.HTTPException):
             self._connection.close()
-            return Reply(0, NO_ANSWER, {})
-        return Reply(answer.status, *_read(answer.status, body))
+            return LoadAnswer(0, NO_ANSWER, {})
+        return LoadAnswer(answer.status, *_read(answer.status, body))
 
 
 def _read(status: int, body: bytes) -> tuple[str, dict[str, Any]]:

@@ -106,7 +106,7 @@ _SAMPLE = re.compile(r"^(\w+)(?:\{([^}]*)\})? (\S+)", re.MULTILINE)
 
 
 class ServerUse:
-    """What a server used while a test ran, from its metrics.
+    """Use of processor time and of the database by a server during a test, from its metrics.
 
     The metrics are those of one server process; behind a proxy that distributes requests to several, they mean little.
     """

@@ -13,34 +13,31 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
-from marey_client.load.calling import NO_ANSWER, Caller, Reply
+from marey_client.load.calling import NO_ANSWER, LoadAnswer, LoadConnection
 from marey_client.load.figures import Replicate
-from marey_client.load.scratch import Scratch
+from marey_client.load.scratch import KIND, Scratch
 
-KIND = "export"
-"""Kind of the submitted jobs: with one tiny clip, real workers need little time for it."""
 SUBMITTERS = 8
 CLAIM_WAIT_S = 1.0
 PAUSE_AFTER_ERROR_S = 0.1
 DRAIN_S = 30.0
 """Longest time for which a run waits for its jobs to end after the last submission."""
-LOOK_EVERY_S = 0.2
+TICK_EVERY_S = 0.2
 LISTED_AT_ONCE = 1000
 
 Tick = Callable[[float], None]
 """Function that is called several times a second with the seconds since the start of the run."""
 
 
-class Run:
+class OfferedLoad:
     """One run: the planned and the actual times of its jobs, and its errors. Times are those of the monotonic clock."""
 
     def __init__(self, scratch: Scratch, *, own_workers: bool) -> None:
         self._scratch = scratch
         self._path = f"/projects/{scratch.project.name}/jobs"
-        self._job = scratch.job(KIND, own_workers=own_workers)
+        self._job = scratch.job(own_workers=own_workers)
         self._stop = threading.Event()
         self._lock = threading.Lock()
         self._threads: list[threading.Thread] = []
@@ -60,16 +57,14 @@ class Run:
     def await_end(self, seconds: float, begun: float, tick: Tick) -> None:
         """Wait until all jobs are completed, at most for the given number of seconds."""
         deadline = time.monotonic() + seconds
-        self._follow(
-            lambda: len(self.completed) >= len(self.planned) or time.monotonic() >= deadline, begun, tick
-        )
+        self._follow(lambda: len(self.completed) >= len(self.planned) or time.monotonic() >= deadline, begun, tick)
 
     def _follow(self, done: Callable[[], bool], begun: float, tick: Tick) -> None:
         while not done():
             if self._failures:
                 raise self._failures[0]
             tick(time.monotonic() - begun)
-            self._stop.wait(LOOK_EVERY_S)
+            self._stop.wait(TICK_EVERY_S)
 
     @contextmanager
     def workers(self, count: int, work_s: float) -> Iterator[None]:
@@ -124,7 +119,7 @@ class Run:
                         time.sleep(work_s)
                     self._complete(caller, lease)
 
-    def _complete(self, caller: Caller, lease: dict[str, object]) -> None:
+    def _complete(self, caller: LoadConnection, lease: dict[str, object]) -> None:
         path = f"/jobs/{lease['job']}/attempts/{lease['fence']}/complete"
         body = {"write_id": secrets.token_hex(16)}
         reply = caller.post(path, body, token=str(lease["attempt_token"]))
@@ -134,7 +129,7 @@ class Run:
         if self._accepted("complete", reply):
             self.completed[str(lease["job"])] = time.monotonic()
 
-    def _accepted(self, what: str, reply: Reply) -> bool:
+    def _accepted(self, what: str, reply: LoadAnswer) -> bool:
         """Return whether a request succeeded; count its error otherwise."""
         if not reply.code:
             return True
@@ -156,9 +151,9 @@ class Run:
 
 
 @contextmanager
-def connection(url: str, token: str) -> Iterator[Caller]:
+def connection(url: str, token: str) -> Iterator[LoadConnection]:
     """Open a connection, and close it at the end of the `with` block."""
-    caller = Caller(url, token)
+    caller = LoadConnection(url, token)
     try:
         yield caller
     finally:
@@ -176,21 +171,19 @@ def run_with_own_workers(
     scratch: Scratch, times_s: Sequence[float], seconds: float, *, workers: int, work_s: float, tick: Tick
 ) -> Replicate:
     """Submit jobs at the given times, run them with simulated workers, and return what was measured."""
-    run = Run(scratch, own_workers=True)
+    run = OfferedLoad(scratch, own_workers=True)
     begun = time.monotonic()
     with run.workers(workers, work_s):
         run.offer(times_s, tick)
         run.await_end(DRAIN_S, begun, tick)
     last = max(run.completed.values(), default=begun)
     starts_s = [run.started[job] - due for job, due in run.planned.items() if job in run.started]
-    return Replicate(
-        max(seconds, last - begun), len(run.planned), len(run.completed), starts_s, dict(run.errors)
-    )
+    return Replicate(max(seconds, last - begun), len(run.planned), len(run.completed), starts_s, dict(run.errors))
 
 
 def run_with_other_workers(scratch: Scratch, times_s: Sequence[float], seconds: float, *, tick: Tick) -> Replicate:
     """Submit jobs at the given times, wait until the workers of the server have run them, and return the figures."""
-    run = Run(scratch, own_workers=False)
+    run = OfferedLoad(scratch, own_workers=False)
     begun = time.monotonic()
     with run.workers(0, 0.0):
         run.offer(times_s, tick)

@@ -1,22 +1,20 @@
-"""Scratch project: a project with one tiny clip and a token, removed at the end of a test."""
+"""Scratch project: a project with a tiny file and a token, removed at the end of a test."""
 
 from __future__ import annotations
 
 import secrets
-import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from marey_client.errors import Conflict, Forbidden, MareyError, NotFound
-from marey_client.imports import LocalFile
+from marey_client.blobs import Blobs
+from marey_client.errors import Conflict, Forbidden, NotFound
 from marey_client.marey import Marey
 from marey_client.project import ProjectHandle
-from marey_schemas.access import NewToken, ProjectCreate, TokenCreate
-from marey_schemas.options.imports import ImportOptions
+from marey_schemas.access import NewToken, ProjectCreate, Scope, TokenCreate
+from marey_schemas.queue.jobs import JobState
 
 PREFIX = "bench-"
 LABEL = "bench"
@@ -24,7 +22,9 @@ LABEL = "bench"
 TOKEN_LIFETIME_S = 6 * 3600
 """Lifetime of the test's token, in case the test is killed before it can revoke the token."""
 CANCELS_AT_ONCE = 4
-FOLDER = "takes"
+KIND = "import"
+"""Kind of the jobs of a test: an import of one tiny clip, for which workers need little time."""
+CLIP_NAME = "clip.bvh"
 
 CLIP = """HIERARCHY
 ROOT Hips
@@ -54,14 +54,14 @@ UNIT_SCALE_M = 0.01
 
 @dataclass(frozen=True)
 class Scratch:
-    """A scratch project and its clip.
+    """A scratch project, and the digest of the file with its clip.
 
     `token` can submit and claim jobs of this project only, so workers that use it never get a job of another project.
     """
 
     marey: Marey
     project: ProjectHandle
-    clip: str
+    digest: str
     token: str
 
     @property
@@ -74,13 +74,18 @@ class Scratch:
         """The labels of jobs that only workers of this test claim."""
         return {LABEL: self.project.name}
 
-    def job(self, kind: str, *, own_workers: bool, **fields: Any) -> dict[str, Any]:
-        """Return the request for a job with the clip as its input.
+    def job(self, *, own_workers: bool, into: str = "") -> dict[str, Any]:
+        """Return the request for a job that imports the clip into a folder.
 
-        With `own_workers`, only the workers of this test claim the job; otherwise, only the server's other workers do.
+        With `own_workers`, only the workers of this test claim the job; otherwise, the server's other workers do.
         """
-        labels = self.labels if own_workers else {}
-        return {"kind": kind, "inputs": {"clips": [{"item": self.clip}]}, "cache": "off", "labels": labels, **fields}
+        return {
+            "kind": KIND,
+            "params": {"files": [{"name": CLIP_NAME, "blob": self.digest}], "unit_scale_m": UNIT_SCALE_M},
+            "into": into,
+            "cache": "off",
+            "labels": self.labels if own_workers else {},
+        }
 
 
 @contextmanager
@@ -95,31 +100,20 @@ def scratch_project(marey: Marey) -> Iterator[Scratch]:
     try:
         made = _make_token(marey, project.name)
         token = made.id
-        yield Scratch(marey, project, _import_clip(project), made.secret)
+        digest = Blobs(marey.transport.with_token(made.secret)).put(CLIP.encode("ascii"))
+        yield Scratch(marey, project, digest, made.secret)
     finally:
         _remove(marey, project, token)
 
 
 def _make_token(marey: Marey, project: str) -> NewToken:
-    scopes = tuple(f"{scope}!project={project}" for scope in ("read", "jobs", "work"))
+    scopes = tuple(f"{scope}!project={project}" for scope in (Scope.READ, Scope.WRITE, Scope.JOBS, Scope.WORK))
     wanted = TokenCreate(name=project, scopes=scopes, expires_in_s=TOKEN_LIFETIME_S)
     try:
         return marey.tokens.create(wanted)
     except Forbidden as error:
         error.add_note("the test needs a token that may also claim jobs; `marey login` stores one")
         raise
-
-
-def _import_clip(project: ProjectHandle) -> str:
-    """Import the clip, and return its id."""
-    with tempfile.TemporaryDirectory(prefix="marey-bench-") as folder:
-        path = Path(folder, "clip.bvh")
-        path.write_text(CLIP, encoding="ascii")
-        files = [LocalFile(f"{FOLDER}/{path.name}", path, path.stat().st_size)]
-        (entry,) = project.imports.upload(files, ImportOptions(unit_scale_m=UNIT_SCALE_M))
-    if entry.item is None:
-        raise MareyError(f"the server did not import the clip of the test: {entry.error}")
-    return entry.item
 
 
 def _remove(marey: Marey, project: ProjectHandle, token: str | None) -> None:
@@ -138,7 +132,7 @@ def _remove(marey: Marey, project: ProjectHandle, token: str | None) -> None:
 def _cancel_jobs(marey: Marey, project: ProjectHandle) -> None:
     """Cancel all jobs of a project that have not ended, because they would count in the caller's quota."""
     with ThreadPoolExecutor(CANCELS_AT_ONCE) as pool:
-        for state in ("waiting", "queued", "running"):
+        for state in (one for one in JobState if not one.terminal):
             jobs = [job.id for job in project.jobs(filters={"state": state})]
             list(pool.map(lambda job: _cancel(marey, job), jobs))
 

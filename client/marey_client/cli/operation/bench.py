@@ -96,9 +96,7 @@ def serve(
         _measure(marey, plan, as_json)
 
 
-def _plan(
-    rates: str, seconds: float, replicates: int, workers: int, work_ms: float, seed: int
-) -> LoadPlan:
+def _plan(rates: str, seconds: float, replicates: int, workers: int, work_ms: float, seed: int) -> LoadPlan:
     """Return the plan of a load test. Raises `WrongUsage` if an option is not valid."""
     from marey_client.load.measuring import LoadPlan
 
