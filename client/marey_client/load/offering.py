@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
+from marey_client.errors import MareyError
 from marey_client.load.calling import NO_ANSWER, LoadAnswer, LoadConnection
 from marey_client.load.figures import Replicate
 from marey_client.load.scratch import KIND, Scratch
@@ -25,7 +26,7 @@ PAUSE_AFTER_ERROR_S = 0.1
 DRAIN_S = 30.0
 """Longest time for which a run waits for its jobs to end after the last submission."""
 TICK_EVERY_S = 0.2
-LISTED_AT_ONCE = 1000
+BATCH = 200
 
 Tick = Callable[[float], None]
 """Function that is called several times a second with the seconds since the start of the run."""
@@ -46,6 +47,7 @@ class OfferedLoad:
         self.started: dict[str, float] = {}
         self.completed: dict[str, float] = {}
         self.errors: Counter[str] = Counter()
+        self.durations_s: dict[str, list[float]] = {"submit": [], "claim": [], "complete": []}
 
     def offer(self, times_s: Sequence[float], tick: Tick) -> None:
         """Submit a job at each of the given times, in seconds from now; return after the last answer."""
@@ -53,6 +55,19 @@ class OfferedLoad:
         planned = iter([begun + after_s for after_s in times_s])
         submitting = [self._thread(self._submit, planned) for _ in range(SUBMITTERS)]
         self._follow(lambda: not any(thread.is_alive() for thread in submitting), begun, tick)
+
+    def submit_backlog(self, count: int) -> None:
+        """Submit jobs in batches, at once, before workers start. Raises `MareyError` if the server refuses them."""
+        left = count
+        with connection(self._scratch.url, self._scratch.token) as caller:
+            while left:
+                portion = min(left, BATCH)
+                reply = caller.post(f"{self._path}/batch", {"jobs": [self._job] * portion})
+                if reply.code:
+                    raise MareyError(f"the server refused a batch of jobs: {reply.document.get('detail', reply.code)}")
+                now = time.monotonic()
+                self.planned |= {job["id"]: now for job in reply.document["jobs"]}
+                left -= portion
 
     def await_end(self, seconds: float, begun: float, tick: Tick) -> None:
         """Wait until all jobs are completed, at most for the given number of seconds."""
@@ -101,7 +116,7 @@ class OfferedLoad:
                     return
                 if self._stop.wait(max(0.0, due - time.monotonic())):
                     return
-                reply = caller.post(self._path, self._job)
+                reply = self._timed("submit", lambda: caller.post(self._path, self._job))
                 if self._accepted("submit", reply):
                     self.planned[reply.document["id"]] = due
 
@@ -109,7 +124,8 @@ class OfferedLoad:
         wanted = {"worker": name, "kinds": [KIND], "labels": self._scratch.labels, "wait_s": CLAIM_WAIT_S}
         with connection(self._scratch.url, self._scratch.token) as caller:
             while not self._stop.is_set():
-                reply = caller.post("/leases", {**wanted, "claim_id": secrets.token_hex(16)})
+                claim = {**wanted, "claim_id": secrets.token_hex(16)}
+                reply = self._timed("claim", lambda claim=claim: caller.post("/leases", claim))  # type: ignore[misc]
                 if not self._accepted("claim", reply):
                     self._stop.wait(PAUSE_AFTER_ERROR_S)
                     continue
@@ -122,12 +138,18 @@ class OfferedLoad:
     def _complete(self, caller: LoadConnection, lease: dict[str, object]) -> None:
         path = f"/jobs/{lease['job']}/attempts/{lease['fence']}/complete"
         body = {"write_id": secrets.token_hex(16)}
-        reply = caller.post(path, body, token=str(lease["attempt_token"]))
+        reply = self._timed("complete", lambda: caller.post(path, body, token=str(lease["attempt_token"])))
         if reply.code == NO_ANSWER:  # it may have arrived; the same id gets the same answer
             self._accepted("complete", reply)
             reply = caller.post(path, body, token=str(lease["attempt_token"]))
         if self._accepted("complete", reply):
             self.completed[str(lease["job"])] = time.monotonic()
+
+    def _timed(self, what: str, send: Callable[[], LoadAnswer]) -> LoadAnswer:
+        begun = time.monotonic()
+        reply = send()
+        self.durations_s[what].append(time.monotonic() - begun)
+        return reply
 
     def _accepted(self, what: str, reply: LoadAnswer) -> bool:
         """Return whether a request succeeded; count its error otherwise."""
