@@ -29,7 +29,7 @@ Replicates = Annotated[
 ]
 Workers = Annotated[int, typer.Option(min=1, help="Number of simulated workers, which compute nothing.")]
 WorkMs = Annotated[float, typer.Option(min=0, help="Milliseconds for which a simulated worker works on each job.")]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of the random times at which jobs are submitted.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -60,7 +60,7 @@ def load(
     from other users. Stop it with Ctrl-C. For administrators, the output shows what the server used.
     """
     plan = _plan(rates, seconds, replicates, 0 if other_workers else workers, work_ms, seed)
-    with connect(context) as marey, _ended_politely():
+    with connect(context) as marey, ended_politely():
         _measure(marey, plan, as_json)
 
 
@@ -92,7 +92,7 @@ def serve(
         from marey_client import embedded
 
         embedded.database("require_empty", data=None, database_url=database_url)
-    with _ended_politely(), own_server(database_url) as marey:
+    with ended_politely(), own_server(database_url) as marey:
         _measure(marey, plan, as_json)
 
 
@@ -111,7 +111,7 @@ def _plan(rates: str, seconds: float, replicates: int, workers: int, work_ms: fl
 
 
 @contextmanager
-def _ended_politely() -> Iterator[None]:
+def ended_politely() -> Iterator[None]:
     """Treat SIGTERM like Ctrl-C while the `with` block runs, so that the scratch project is removed."""
     import signal
 

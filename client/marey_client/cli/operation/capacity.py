@@ -1,0 +1,157 @@
+"""Commands `capacity`, which computes what an amount of work needs, and `bench costs`, which measures and predicts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from marey_client.cli.operation.bench import Seed, WorkMs, bench, ended_politely
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.invocation import AsJson
+from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table, progress
+
+if TYPE_CHECKING:
+    from marey_client.load.calibrating import Calibration
+
+CHECKED = "2,8"
+MOST_CHECKED = 64
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module; `bench costs` is registered with the group `bench`."""
+    app.command()(capacity)
+
+
+def capacity(
+    clips: Annotated[int, typer.Option(min=1, help="Number of clips to import and process.")] = 10_000_000,
+    jobs_per_clip: Annotated[float, typer.Option(min=0, help="Number of jobs for each clip.")] = 1.0,
+    clip_bytes: Annotated[float, typer.Option(min=1, help="Size of an uploaded file, in bytes.")] = 500_000.0,
+    days: Annotated[float, typer.Option(min=0.001, help="Number of days in which all work is done.")] = 30.0,
+    workers: Annotated[int, typer.Option(min=1, help="Number of workers, each with one slot.")] = 1000,
+    servers: Annotated[int, typer.Option(min=1, help="Number of server processes that share a database.")] = 100,
+    database_processors: Annotated[int, typer.Option(min=1, help="Number of processors of the database.")] = 8,
+    costs: Annotated[Path | None, typer.Option(help="File of measured costs; default: that of this version.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compute what an amount of clips needs of workers, servers and database, and which part saturates first.
+
+    The numbers are computed from measured costs of a job, a clip and a byte; nothing is measured now. They hold for
+    machines like that of the measurement, and leave out pauses, failures and networks.
+    """
+    from marey_client import embedded
+
+    found = embedded.compute_capacity(
+        costs=costs, clips=clips, jobs_per_clip=jobs_per_clip, clip_bytes=clip_bytes, days=days, workers=workers,
+        servers=servers, database_processors=database_processors,
+    )  # fmt: skip
+    if as_json:
+        return print_json(found)
+    print_table(
+        ("part", "needed hours", "available hours", "used"),
+        [
+            (
+                part["name"],
+                f"{part['needed_s'] / 3600:,.1f}",
+                f"{part['available_s'] / 3600:,.1f}",
+                _percent(part["share"]),
+            )
+            for part in found["parts"]
+        ],
+        right=("needed hours", "available hours", "used"),
+    )
+    print_pairs(
+        [
+            ("saturates first", f"{found['first']}, at {found['clips_per_day']:,.0f} clips per day"),
+            ("blobs", f"{found['blob_bytes'] / 1e12:,.2f} TB"),
+            ("rows of jobs", f"{found['database_bytes'] / 1e9:,.1f} GB"),
+        ]
+    )
+    measured = found["measured"]
+    print_message(f"costs measured on {measured['date']}: {measured['machine']}; {measured['load']}")
+    return None
+
+
+@bench.command("costs")
+def measure_costs(
+    database_url: Annotated[
+        str | None, typer.Option(help="URL of an empty Postgres database; default: an SQLite file.")
+    ] = None,
+    workers: Annotated[str, typer.Option(help="Numbers of workers to predict and to measure.")] = CHECKED,
+    rounds: Annotated[int, typer.Option(min=1, max=20, help="Number of rounds; medians of the rounds are used.")] = 3,
+    work_ms: WorkMs = 0.0,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the costs of a job on a new server, predict jobs per second from them, and compare with measurements.
+
+    The costs come from runs with one worker and with sixteen. A simulation of the queue predicts the jobs per second of
+    other numbers of workers, which are measured in the same rounds. The server is removed at the end.
+    """
+    counts = _counts(workers)
+    from marey_client import embedded
+    from marey_client.load.calibrating import calibrate
+    from marey_client.load.own_server import own_server
+
+    if database_url is not None:
+        embedded.database("require_empty", data=None, database_url=database_url)
+    with ended_politely(), own_server(database_url) as marey, progress() as advance:
+        found = calibrate(
+            marey, counts, rounds=rounds, work_s=work_ms / 1000, on_drain=lambda what: advance(what, 0, None)
+        )
+    predicted = embedded.predict_jobs(_job_costs(found), (*counts, 32), found.work_s, seed)
+    if as_json:
+        print_json({"job": _job_costs(found), "measured": found.checked, "predicted": predicted})
+    else:
+        _print(found, predicted)
+
+
+def _counts(text: str) -> tuple[int, ...]:
+    """Return numbers of workers. Raises `WrongUsage` if one is not valid."""
+    try:
+        counts = tuple(int(one) for one in text.split(","))
+    except ValueError:
+        counts = ()
+    if not counts or not all(1 < count <= MOST_CHECKED and count != 16 for count in counts):
+        raise WrongUsage(
+            f"--workers {text}: give numbers from 2 to {MOST_CHECKED} with commas between them, such as {CHECKED}; not "
+            "16, from which the costs are measured"
+        )
+    return counts
+
+
+def _job_costs(found: Calibration) -> dict[str, float]:
+    return {
+        "claim_s": found.claim_s,
+        "complete_s": found.complete_s,
+        "busy_s": found.busy_s,
+        "database_s": 0.0,
+        "database_bytes": max(0.0, found.database_bytes),
+    }
+
+
+def _print(found: Calibration, predicted: dict[int, float]) -> None:
+    from statistics import median
+
+    rows: list[tuple[Any, ...]] = []
+    for count, expected in predicted.items():
+        runs = found.checked.get(count)
+        measured = median(runs) if runs else None
+        ratio = "" if measured is None else f"{expected / measured - 1:+.1%}"
+        rows.append((count, f"{expected:.1f}", "" if measured is None else f"{measured:.1f}", ratio))
+    columns = ("workers", "predicted jobs/s", "measured jobs/s", "difference")
+    print_table(columns, rows, right=columns)
+    print_pairs(
+        [
+            ("claim", f"{1e3 * found.claim_s:.2f} ms"),
+            ("completion", f"{1e3 * found.complete_s:.2f} ms"),
+            ("server occupied", f"{1e3 * found.busy_s:.2f} ms per job"),
+            ("processor time", f"{1e3 * found.processor_s:.2f} ms per job"),
+            ("database", f"{max(0.0, found.database_bytes):,.0f} bytes per job"),
+        ]
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:,.1f} %"
