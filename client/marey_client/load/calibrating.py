@@ -35,21 +35,32 @@ class Drain:
 
 
 @dataclass(frozen=True)
-class Calibration:
-    """Costs of a job on one server.
+class Round:
+    """Costs of a job on one server, and the jobs per second of the checked numbers of workers, measured in turn.
 
-    `claim_s` and `complete_s` are the durations of the requests of a worker that is alone. `busy_s` is the time for
-    which a job occupies the server when many workers compete: the reciprocal of the greatest jobs per second. Each
-    number is the median of the rounds. `checked` contains the drains of the checked numbers of workers.
+    `claim_s` and `complete_s` are the mean durations of the requests of a worker that is alone, so that its jobs per
+    second follow from them. `busy_s` is the time for which a job occupies the server when many workers compete: the
+    reciprocal of the greatest jobs per second.
     """
 
     claim_s: float
     complete_s: float
     busy_s: float
+    checked: dict[int, float]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """All rounds, and what the server used per job in all of them."""
+
+    rounds: tuple[Round, ...]
+    work_s: float
     processor_s: float
     database_bytes: float
-    work_s: float
-    checked: dict[int, list[float]]
+
+    def median(self, cost: Callable[[Round], float]) -> float:
+        """Return the median of a number over the rounds."""
+        return statistics.median(map(cost, self.rounds))
 
 
 def drain(scratch: Scratch, workers: int, work_s: float) -> Drain:
@@ -58,7 +69,7 @@ def drain(scratch: Scratch, workers: int, work_s: float) -> Drain:
     The jobs per second are counted from the first completion to the last one.
     """
     load = OfferedLoad(scratch, own_workers=True)
-    load.submit_backlog(max(FEWEST_JOBS, workers * JOBS_OF_A_WORKER))
+    load.submit_backlog(backlog_of(workers))
     begun = time.monotonic()
     with load.workers(workers, work_s):
         load.await_end(LONGEST_DRAIN_S, begun, lambda _: None)
@@ -75,28 +86,38 @@ def drain(scratch: Scratch, workers: int, work_s: float) -> Drain:
 
 
 def calibrate(marey: Marey, checked: Sequence[int], *, rounds: int, work_s: float, on_drain: OnDrain) -> Calibration:
-    """Measure the costs of a job, and the drains of other numbers of workers, in turn, several times.
+    """Measure the costs of a job, and the drains of other numbers of workers, in several rounds.
 
-    Measuring in turn lets a change of the machine's speed affect all numbers of workers.
+    The numbers of a round are compared with each other only, since the speed of the machine may change meanwhile.
     """
-    found: dict[int, list[Drain]] = {count: [] for count in (ALONE, CROWDED, *checked)}
+    counts = (ALONE, CROWDED, *checked)
+    measured, jobs = [], 0
     with scratch_project(marey) as scratch:
         drain(scratch, ALONE, 0.0)
-        use, jobs = ServerUse(marey.transport), 0
+        use = ServerUse(marey.transport)
         for number in range(rounds):
-            for count in found:
+            found = {}
+            for count in counts:
                 on_drain(f"round {number + 1} of {rounds}, {count} workers")
-                # Alone and crowded workers do nothing but requests, so that only the server limits them.
-                found[count].append(drain(scratch, count, work_s if count in checked else 0.0))
-                jobs += max(FEWEST_JOBS, count * JOBS_OF_A_WORKER)
+                # Crowded workers send nothing but requests, so that only the server limits them.
+                found[count] = drain(scratch, count, 0.0 if count == CROWDED else work_s)
+                jobs += backlog_of(count)
+            measured.append(_round(found, checked, work_s))
         used = use.figures(jobs)
-    alone = found[ALONE]
     return Calibration(
-        claim_s=statistics.median(one.claim_s for one in alone),
-        complete_s=statistics.median(one.complete_s for one in alone),
-        busy_s=statistics.median(1 / one.per_s for one in found[CROWDED]),
-        processor_s=used["processor_ms_per_job"] / 1e3,
-        database_bytes=used["database_bytes_per_job"],
-        work_s=work_s,
-        checked={count: [one.per_s for one in found[count]] for count in checked},
+        tuple(measured), work_s, used["processor_ms_per_job"] / 1e3, max(0.0, used["database_bytes_per_job"])
     )
+
+
+def _round(found: dict[int, Drain], checked: Sequence[int], work_s: float) -> Round:
+    alone = found[ALONE]
+    requests_s = 1 / alone.per_s - work_s
+    claim_s = requests_s * alone.claim_s / (alone.claim_s + alone.complete_s)
+    return Round(
+        claim_s, requests_s - claim_s, 1 / found[CROWDED].per_s, {count: found[count].per_s for count in checked}
+    )
+
+
+def backlog_of(workers: int) -> int:
+    """Return the number of jobs that a drain by this number of workers submits."""
+    return max(FEWEST_JOBS, workers * JOBS_OF_A_WORKER)

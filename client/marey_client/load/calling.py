@@ -68,6 +68,10 @@ class LoadConnection:
             return LoadAnswer(0, NO_ANSWER, {})
         return LoadAnswer(answer.status, *_read(answer.status, body))
 
+    def send_only(self, path: str, document: Mapping[str, Any]) -> None:
+        """Send a JSON document by POST and do not read the answer; the caller closes the connection."""
+        self._connection.request("POST", self._path + path, orjson.dumps(document), self._headers)
+
 
 def _read(status: int, body: bytes) -> tuple[str, dict[str, Any]]:
     """Return the code and the document of an answer's body; an answer that is not JSON has a code of its status."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,10 +13,12 @@ from marey_client.cli.terminal.invocation import AsJson
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table, progress
 
 if TYPE_CHECKING:
-    from marey_client.load.calibrating import Calibration
+    from marey_client.load.calibrating import Calibration, Round
 
 CHECKED = "2,8"
 MOST_CHECKED = 64
+FURTHER = 32
+"""Number of workers for which jobs per second are predicted and not measured."""
 
 
 def add_to(app: typer.Typer) -> None:
@@ -90,6 +92,8 @@ def measure_costs(
     other numbers of workers, which are measured in the same rounds. The server is removed at the end.
     """
     counts = _counts(workers)
+    from dataclasses import asdict
+
     from marey_client import embedded
     from marey_client.load.calibrating import calibrate
     from marey_client.load.own_server import own_server
@@ -100,9 +104,9 @@ def measure_costs(
         found = calibrate(
             marey, counts, rounds=rounds, work_s=work_ms / 1000, on_drain=lambda what: advance(what, 0, None)
         )
-    predicted = embedded.predict_jobs(_job_costs(found), (*counts, 32), found.work_s, seed)
+    predicted = [embedded.predict_jobs(_job_costs(one), (*counts, FURTHER), found.work_s, seed) for one in found.rounds]
     if as_json:
-        print_json({"job": _job_costs(found), "measured": found.checked, "predicted": predicted})
+        print_json({**asdict(found), "predicted": predicted, "difference": _differences(found, predicted)})
     else:
         _print(found, predicted)
 
@@ -121,34 +125,46 @@ def _counts(text: str) -> tuple[int, ...]:
     return counts
 
 
-def _job_costs(found: Calibration) -> dict[str, float]:
+def _job_costs(one: Round) -> dict[str, float]:
+    """Return the costs of a round, without those of the database, which a simulation of the queue does not need."""
     return {
-        "claim_s": found.claim_s,
-        "complete_s": found.complete_s,
-        "busy_s": found.busy_s,
-        "database_s": 0.0,
-        "database_bytes": max(0.0, found.database_bytes),
+        "claim_s": one.claim_s, "complete_s": one.complete_s, "busy_s": one.busy_s,
+        "database_s": 0.0, "database_bytes": 0.0,
+    }  # fmt: skip
+
+
+def _differences(found: Calibration, predicted: list[dict[int, float]]) -> dict[int, float]:
+    """Return the median over the rounds of predicted over measured jobs per second, minus 1, by number of workers."""
+    from statistics import median
+
+    rounds = list(zip(found.rounds, predicted, strict=True))
+    return {
+        count: median(two[count] / one.checked[count] for one, two in rounds) - 1 for count in found.rounds[0].checked
     }
 
 
-def _print(found: Calibration, predicted: dict[int, float]) -> None:
+def _print(found: Calibration, predicted: list[dict[int, float]]) -> None:
     from statistics import median
 
-    rows: list[tuple[Any, ...]] = []
-    for count, expected in predicted.items():
-        runs = found.checked.get(count)
-        measured = median(runs) if runs else None
-        ratio = "" if measured is None else f"{expected / measured - 1:+.1%}"
-        rows.append((count, f"{expected:.1f}", "" if measured is None else f"{measured:.1f}", ratio))
+    differences = _differences(found, predicted)
+    rows = [
+        (
+            count,
+            f"{median(one[count] for one in predicted):.1f}",
+            f"{found.median(lambda one, count=count: one.checked[count]):.1f}" if count in differences else "",
+            f"{100 * differences[count]:+.1f} %" if count in differences else "",
+        )
+        for count in predicted[0]
+    ]
     columns = ("workers", "predicted jobs/s", "measured jobs/s", "difference")
     print_table(columns, rows, right=columns)
     print_pairs(
         [
-            ("claim", f"{1e3 * found.claim_s:.2f} ms"),
-            ("completion", f"{1e3 * found.complete_s:.2f} ms"),
-            ("server occupied", f"{1e3 * found.busy_s:.2f} ms per job"),
+            ("claim", f"{1e3 * found.median(lambda one: one.claim_s):.2f} ms"),
+            ("completion", f"{1e3 * found.median(lambda one: one.complete_s):.2f} ms"),
+            ("server occupied", f"{1e3 * found.median(lambda one: one.busy_s):.2f} ms per job"),
             ("processor time", f"{1e3 * found.processor_s:.2f} ms per job"),
-            ("database", f"{max(0.0, found.database_bytes):,.0f} bytes per job"),
+            ("database", f"{found.database_bytes:,.0f} bytes per job"),
         ]
     )
 
