@@ -7,12 +7,13 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from marey_client.chaos.hostile_attempts import HOSTILE_CASES, RESULT, HostileAttempt
+from marey_client.chaos.hostile_attempts import HOSTILE_CASES, HostileAttempt
 from marey_client.chaos.worker_processes import WORKER_FAULTS, WorkerProcesses, worker_processes
 from marey_client.errors import MareyError, WaitedTooLong
 from marey_client.load.offering import connection
-from marey_client.load.scratch import CLIP_NAME, Scratch, scratch_project
+from marey_client.load.scratch import Scratch, scratch_project
 from marey_client.marey import Marey
+from marey_schemas.kinds import Kind
 from marey_schemas.queue.jobs import Job, JobState
 
 HEALTHY_WORKERS = 2
@@ -49,14 +50,14 @@ def run_chaos(marey: Marey, seed: int, faults: int, on_step: OnStep) -> Iterator
     hostile = _drawn(list(HOSTILE_CASES), faults, draw)
     killed = _drawn(list(WORKER_FAULTS), faults, draw)
     with scratch_project(marey) as scratch, worker_processes(scratch) as processes:
-        expected: dict[str, str] = {}
+        expected: dict[str, Kind] = {}
         for number, name in enumerate(hostile):
             on_step(name, number, len(hostile))
             job = _submit(scratch, f"hostile-{number}")
-            expected[job] = RESULT
+            expected[job] = Kind.SKELETON
             yield _attempt(scratch, job, name, draw)
         jobs = [_submit(scratch, f"imported-{number}") for number in range(len(killed) + HEALTHY_WORKERS)]
-        expected |= dict.fromkeys(jobs, CLIP_NAME.partition(".")[0])
+        expected |= dict.fromkeys(jobs, Kind.CLIP)
         paused = []
         for number, fault in enumerate(killed):
             on_step(str(fault), number, len(killed))
@@ -68,7 +69,7 @@ def run_chaos(marey: Marey, seed: int, faults: int, on_step: OnStep) -> Iterator
         for worker in paused:
             worker.resume()
         time.sleep(LATE_S)
-        yield from (_check(scratch, job, name) for job, name in expected.items())
+        yield from (_check(scratch, job, kind) for job, kind in expected.items())
 
 
 def _drawn(cases: Sequence[object], faults: int, draw: random.Random) -> list[object]:
@@ -112,26 +113,25 @@ def _await_results(
             yield ChaosFinding(f"job {job}", str(error), "")
 
 
-def _check(scratch: Scratch, job_id: str, name: str) -> ChaosFinding:
+def _check(scratch: Scratch, job_id: str, kind: Kind) -> ChaosFinding:
     """Check that a job has succeeded in exactly one attempt, and that its result is visible exactly once."""
     job = scratch.marey.jobs.get(job_id)
-    wrong = list(_faults_of(scratch, job, name))
+    wrong = list(_faults_of(scratch, job, kind))
     attempts = len(list(scratch.marey.jobs.attempts(job_id)))
     return ChaosFinding(f"job in {job.into}", "; ".join(wrong), f"one visible result after {attempts} attempts")
 
 
-def _faults_of(scratch: Scratch, job: Job, name: str) -> Iterator[str]:
+def _faults_of(scratch: Scratch, job: Job, kind: Kind) -> Iterator[str]:
     if job.state is not JobState.SUCCEEDED:
         yield f"the job is {job.state}" + (f": {job.failure.detail}" if job.failure else "")
     ended = [one.outcome for one in scratch.marey.jobs.attempts(job.id)]
     if ended.count("succeeded") != 1:
         yield f"{ended.count('succeeded')} attempts succeeded"
-    outputs = [one for one in scratch.marey.jobs.outputs(job.id) if one.name.endswith(name) or name in one.name]
     project = scratch.project
-    listing = project.skeletons if name == RESULT else project.clips
-    visible = [one.item for one in listing.list(collection=job.into)]
+    listed = (project.skeletons if kind is Kind.SKELETON else project.clips).list(collection=job.into)
+    visible = [one.item for one in listed]
     if len(visible) != 1 or visible[0].revision != 1:
         shown = ", ".join(f"{one.path}@{one.revision}" for one in visible) or "nothing"
         yield f"the folder {job.into} has {shown} instead of one item with one revision"
-    if not outputs:
-        yield "the job lists no output"
+    if not any(one.kind is kind for one in scratch.marey.jobs.outputs(job.id)):
+        yield f"the job lists no {kind} as its output"

@@ -28,8 +28,8 @@ class WorkerFault(NamedTuple):
     action: str
 
     def __str__(self) -> str:
-        verb = {"kill": "killed", "stop": "paused until its lease is lost"}[self.action]
-        return f"worker {verb} at {self.point.removeprefix('worker.').replace('_', ' ')}"
+        verb = {"kill": "killed", "stop": "paused"}[self.action]
+        return f"worker {verb} {self.point.removeprefix('worker.').replace('_', ' ')}"
 
 
 WORKER_FAULTS = (

@@ -16,9 +16,9 @@ from marey_client.marey import Marey
 ALONE, CROWDED = 1, 16
 """Numbers of workers of the calibration: one that never waits for others, and enough to saturate the server."""
 LONGEST_DRAIN_S = 300.0
-JOBS_OF_A_WORKER = 20
+JOBS_OF_A_WORKER = 10
 """Number of jobs in the backlog per worker; at least `FEWEST_JOBS`."""
-FEWEST_JOBS = 100
+FEWEST_JOBS = 60
 
 OnDrain = Callable[[str], None]
 """Function called with the present activity."""
