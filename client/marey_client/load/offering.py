@@ -26,7 +26,7 @@ PAUSE_AFTER_ERROR_S = 0.1
 DRAIN_S = 30.0
 """Longest time for which a run waits for its jobs to end after the last submission."""
 TICK_EVERY_S = 0.2
-BATCH = 200
+JOBS_PER_BATCH = 200
 
 Tick = Callable[[float], None]
 """Function that is called several times a second with the seconds since the start of the run."""
@@ -61,7 +61,7 @@ class OfferedLoad:
         left = count
         with connection(self._scratch.url, self._scratch.token) as caller:
             while left:
-                portion = min(left, BATCH)
+                portion = min(left, JOBS_PER_BATCH)
                 reply = caller.post(f"{self._path}/batch", {"jobs": [self._job] * portion})
                 if reply.code:
                     raise MareyError(f"the server refused a batch of jobs: {reply.document.get('detail', reply.code)}")

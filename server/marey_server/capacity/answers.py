@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from marey_schemas.wording import without_prefix
 from marey_server.capacity.costs import MEASURED, JobCosts, MeasuredCosts, UnusableCosts
-from marey_server.capacity.needs import Demand, compute_needs
+from marey_server.capacity.needs import PlannedWork, compute_needs
 from marey_server.capacity.simulation import SimulatedJob, simulate
 
 JOBS_PER_WORKER = 100
@@ -27,7 +27,7 @@ def capacity(*, costs: Path | None = None, **demand: Any) -> dict[str, Any]:
     """
     try:
         measured = MeasuredCosts.read(costs or MEASURED)
-        needs = compute_needs(measured, wanted := Demand(**demand))
+        needs = compute_needs(measured, wanted := PlannedWork(**demand))
     except (UnusableCosts, ValueError) as error:
         raise NotComputable(str(error)) from error
     return {

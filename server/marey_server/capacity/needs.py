@@ -1,4 +1,4 @@
-"""What an amount of clips needs of workers, servers and database, and which of these parts saturates first."""
+"""Needs of an amount of clips: seconds of workers, servers and database, and the part that saturates first."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from marey_server.capacity.costs import MeasuredCosts
 from marey_server.store.jobs.policy import DEFAULT_POLICY, QueuePolicy
 
-SECONDS_PER_DAY = 86_400
+DAY_S = 86_400
 HEARTBEAT_SHARE = 0.5
 """Share of the server's occupied time of a job that a heartbeat takes: one write of the two of a job."""
 
 
 @dataclass(frozen=True)
-class Demand:
+class PlannedWork:
     """Work and machines: clips to import and process within a number of days, and what is there for it.
 
     Each worker runs one job at a time. Servers share one Postgres database.
@@ -34,7 +34,7 @@ class Demand:
 
 
 @dataclass(frozen=True)
-class Part:
+class InstalledPart:
     """Part of an installation: seconds of work that it needs, and the seconds that it has; both of one processor."""
 
     name: str
@@ -51,23 +51,23 @@ class Part:
 class Needs:
     """Computed needs: the parts, the busiest one first, and the bytes to store."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[InstalledPart, ...]
     blob_bytes: float
     database_bytes: float
     clips_per_day: float
 
     @property
-    def first(self) -> Part:
+    def first(self) -> InstalledPart:
         """The part that saturates first."""
         return self.parts[0]
 
 
-def compute_needs(costs: MeasuredCosts, demand: Demand, policy: QueuePolicy = DEFAULT_POLICY) -> Needs:
+def compute_needs(costs: MeasuredCosts, demand: PlannedWork, policy: QueuePolicy = DEFAULT_POLICY) -> Needs:
     """Compute what `demand` needs. All work is assumed to be spread evenly over the days.
 
     `clips_per_day` is the number at which the first part is saturated; heartbeats are counted for working workers only.
     """
-    period_s = demand.days * SECONDS_PER_DAY
+    period_s = demand.days * DAY_S
     jobs = demand.clips * demand.jobs_per_clip
     work_s = jobs * costs.clip.worker_s
     heartbeats = work_s / policy.heartbeat_s
@@ -76,9 +76,9 @@ def compute_needs(costs: MeasuredCosts, demand: Demand, policy: QueuePolicy = DE
     waits_s = jobs * (costs.job.claim_s + costs.job.complete_s)
     database_s = (jobs + heartbeats * HEARTBEAT_SHARE + demand.clips) * costs.job.database_s
     parts = (
-        Part("workers", work_s + waits_s, demand.workers * period_s),
-        Part("servers", busy_s + upload_s, demand.servers * period_s),
-        Part("database", database_s, demand.database_processors * period_s),
+        InstalledPart("workers", work_s + waits_s, demand.workers * period_s),
+        InstalledPart("servers", busy_s + upload_s, demand.servers * period_s),
+        InstalledPart("database", database_s, demand.database_processors * period_s),
     )
     ordered = tuple(sorted(parts, key=lambda part: part.share, reverse=True))
     return Needs(

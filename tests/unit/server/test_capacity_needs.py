@@ -9,7 +9,7 @@ from tests.support.command_line import run_here
 
 from marey_server.capacity.answers import NotComputable, capacity, predict
 from marey_server.capacity.costs import MEASURED, JobCosts, MeasuredCosts
-from marey_server.capacity.needs import Demand, compute_needs
+from marey_server.capacity.needs import PlannedWork, compute_needs
 from marey_server.store.jobs.policy import DEFAULT_POLICY
 
 COSTS = MeasuredCosts.model_validate(
@@ -20,7 +20,7 @@ COSTS = MeasuredCosts.model_validate(
         "byte": {"upload_s": 1e-6},
     }
 )  # fmt: skip
-DAY = Demand(clips=1000, clip_bytes=1000, days=1, workers=2, servers=3, database_processors=4)
+DAY = PlannedWork(clips=1000, clip_bytes=1000, days=1, workers=2, servers=3, database_processors=4)
 
 
 def test_needs_are_those_of_a_computation_by_hand() -> None:
