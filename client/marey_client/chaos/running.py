@@ -6,6 +6,7 @@ import random
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 from marey_client.chaos.hostile_attempts import HOSTILE_CASES, HostileAttempt
 from marey_client.chaos.worker_processes import WORKER_FAULTS, WorkerProcesses, worker_processes
@@ -15,6 +16,8 @@ from marey_client.load.scratch import Scratch, scratch_project
 from marey_client.marey import Marey
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.jobs import Job, JobState
+
+T = TypeVar("T")
 
 HEALTHY_WORKERS = 2
 FAULT_S = 120.0
@@ -72,7 +75,7 @@ def run_chaos(marey: Marey, seed: int, faults: int, on_step: OnStep) -> Iterator
         yield from (_check(scratch, job, kind) for job, kind in expected.items())
 
 
-def _drawn(cases: Sequence[object], faults: int, draw: random.Random) -> list[object]:
+def _drawn(cases: Sequence[T], faults: int, draw: random.Random) -> list[T]:
     """Return all cases and further drawn ones, shuffled; half of all faults are of each sort of cases."""
     further = max(0, faults // 2 - len(cases))
     chosen = [*cases, *(draw.choice(cases) for _ in range(further))]
@@ -89,13 +92,13 @@ def _submit(scratch: Scratch, folder: str) -> str:
     return str(answer.document["id"])
 
 
-def _attempt(scratch: Scratch, job: str, name: object, draw: random.Random) -> ChaosFinding:
+def _attempt(scratch: Scratch, job: str, name: str, draw: random.Random) -> ChaosFinding:
     with connection(scratch.url, scratch.token) as caller:
         try:
-            HOSTILE_CASES[str(name)](HostileAttempt(scratch, caller, job, draw))
+            HOSTILE_CASES[name](HostileAttempt(scratch, caller, job, draw))
         except MareyError as error:
-            return ChaosFinding(str(name), str(error), "")
-    return ChaosFinding(str(name), "", "answered as it must be")
+            return ChaosFinding(name, str(error), "")
+    return ChaosFinding(name, "", "answered as it must be")
 
 
 def _await_results(

@@ -18,7 +18,7 @@ from marey_client.embedded import NotInstalled
 from marey_client.load.scratch import KIND, LABEL, Scratch
 from marey_schemas.queue.worker_protocol import FAULT_VARIABLE
 
-WATCH_EVERY_S = 0.1
+STATE_EVERY_S = 0.1
 
 
 class WorkerFault(NamedTuple):
@@ -66,7 +66,7 @@ class WorkerProcess:
         while time.monotonic() < deadline:
             if self._process.poll() is not None or self._is_stopped():
                 return True
-            time.sleep(WATCH_EVERY_S)
+            time.sleep(STATE_EVERY_S)
         return False
 
     def resume(self) -> None:

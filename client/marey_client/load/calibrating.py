@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -26,41 +27,31 @@ OnDrain = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Drain:
-    """Measured drain of a backlog: jobs per second, and median durations of the requests in seconds."""
+    """Measured drain of a backlog: jobs per second, and the durations of the requests in seconds."""
 
-    workers: int
     per_s: float
-    claim_s: float
-    complete_s: float
-
-
-@dataclass(frozen=True)
-class Round:
-    """Costs of a job on one server, and the jobs per second of the checked numbers of workers, measured in turn.
-
-    `claim_s` and `complete_s` are the mean durations of the requests of a worker that is alone, so that its jobs per
-    second follow from them. `busy_s` is the time for which a job occupies the server when many workers compete: the
-    reciprocal of the greatest jobs per second.
-    """
-
-    claim_s: float
-    complete_s: float
-    busy_s: float
-    checked: dict[int, float]
+    claims_s: tuple[float, ...]
+    completions_s: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """All rounds, and what the server used per job in all of them."""
+    """Costs of a job on one server, and the jobs per second of the checked numbers of workers.
 
-    rounds: tuple[Round, ...]
+    `claim_s` and `complete_s` are the mean durations of the requests of a worker that is alone; `variation` is their
+    standard deviation over their mean. `busy_s` is the time per job when `CROWDED` workers compete. `work_s` is the
+    time from the answer to a claim to the completion, and from there to the next claim, with a worker that is alone;
+    it is longer than planned on a busy machine. All rounds count together: the times of their jobs are added up.
+    """
+
+    claim_s: float
+    complete_s: float
+    variation: float
+    busy_s: float
     work_s: float
     processor_s: float
     database_bytes: float
-
-    def median(self, cost: Callable[[Round], float]) -> float:
-        """Return the median of a number over the rounds."""
-        return statistics.median(map(cost, self.rounds))
+    checked: dict[int, float]
 
 
 def drain(scratch: Scratch, workers: int, work_s: float) -> Drain:
@@ -76,46 +67,46 @@ def drain(scratch: Scratch, workers: int, work_s: float) -> Drain:
     if load.errors or len(load.completed) < len(load.planned):
         raise MareyError(f"the backlog was not drained without errors: {dict(load.errors) or 'too slow'}")
     ends = sorted(load.completed.values())
-    claims = sorted(load.durations_s["claim"])
-    return Drain(
-        workers,
-        (len(ends) - 1) / (ends[-1] - ends[0]),
-        statistics.median(claims[: len(ends)]),
-        statistics.median(load.durations_s["complete"]),
-    )
+    claims = sorted(load.durations_s["claim"])[: len(ends)]  # the longest are those that waited in vain at the end
+    return Drain((len(ends) - 1) / (ends[-1] - ends[0]), tuple(claims), tuple(load.durations_s["complete"]))
 
 
 def calibrate(marey: Marey, checked: Sequence[int], *, rounds: int, work_s: float, on_drain: OnDrain) -> Calibration:
     """Measure the costs of a job, and the drains of other numbers of workers, in several rounds.
 
-    The numbers of a round are compared with each other only, since the speed of the machine may change meanwhile.
+    Measuring in turn lets a change of the machine's speed affect all numbers of workers.
     """
     counts = (ALONE, CROWDED, *checked)
-    measured, jobs = [], 0
+    found: dict[int, list[Drain]] = {count: [] for count in counts}
     with scratch_project(marey) as scratch:
         drain(scratch, ALONE, 0.0)
         use = ServerUse(marey.transport)
         for number in range(rounds):
-            found = {}
             for count in counts:
                 on_drain(f"round {number + 1} of {rounds}, {count} workers")
                 # Crowded workers send nothing but requests, so that only the server limits them.
-                found[count] = drain(scratch, count, 0.0 if count == CROWDED else work_s)
-                jobs += backlog_of(count)
-            measured.append(_round(found, checked, work_s))
-        used = use.figures(jobs)
+                found[count].append(drain(scratch, count, 0.0 if count == CROWDED else work_s))
+        used = use.figures(rounds * sum(map(backlog_of, counts)))
+    requests_s = [
+        list(itertools.chain.from_iterable(parts))
+        for parts in ([one.claims_s for one in found[ALONE]], [one.completions_s for one in found[ALONE]])
+    ]
+    claim_s, complete_s = map(statistics.fmean, requests_s)
     return Calibration(
-        tuple(measured), work_s, used["processor_ms_per_job"] / 1e3, max(0.0, used["database_bytes_per_job"])
+        claim_s=claim_s,
+        complete_s=complete_s,
+        variation=statistics.fmean(statistics.pstdev(one) / statistics.fmean(one) for one in requests_s),
+        busy_s=1 / _together(found[CROWDED]),
+        work_s=max(0.0, 1 / _together(found[ALONE]) - claim_s - complete_s),
+        processor_s=used["processor_ms_per_job"] / 1e3,
+        database_bytes=max(0.0, used["database_bytes_per_job"]),
+        checked={count: _together(found[count]) for count in checked},
     )
 
 
-def _round(found: dict[int, Drain], checked: Sequence[int], work_s: float) -> Round:
-    alone = found[ALONE]
-    requests_s = 1 / alone.per_s - work_s
-    claim_s = requests_s * alone.claim_s / (alone.claim_s + alone.complete_s)
-    return Round(
-        claim_s, requests_s - claim_s, 1 / found[CROWDED].per_s, {count: found[count].per_s for count in checked}
-    )
+def _together(drains: Sequence[Drain]) -> float:
+    """Return the jobs per second of several drains of equally many jobs, whose times are added up."""
+    return statistics.harmonic_mean([one.per_s for one in drains])
 
 
 def backlog_of(workers: int) -> int:

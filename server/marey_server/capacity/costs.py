@@ -28,26 +28,34 @@ class _Table(BaseModel):
 class JobCosts(_Table):
     """Costs of one job without its computation.
 
-    `busy_s` is the time for which a job occupies a server process that many workers use; `claim_s` and `complete_s` are
-    the durations of the two requests of a worker that is alone.
+    `claim_s` and `complete_s` are the durations of the two requests of a worker that is alone. `busy_s` is the time per
+    job with so many workers (`crowded`) that the server is always occupied. It is shorter than the two requests of a
+    worker that is alone, because the server commits writes together that arrive at the same time.
     """
 
     claim_s: float = Field(gt=0)
     complete_s: float = Field(gt=0)
     busy_s: float = Field(gt=0)
+    crowded: int = Field(16, ge=2)
+    variation: float = Field(0.0, ge=0, le=10, description="Standard deviation of requests, divided by their mean.")
     database_s: float = Field(ge=0, description="Processor time of a Postgres database for one job, in seconds.")
     database_bytes: float = Field(ge=0)
 
     def in_queue(self) -> QueueCosts:
-        """Return the costs for a simulation: the occupied time is divided in proportion to the durations."""
-        whole_s = self.claim_s + self.complete_s
-        busy_s = min(self.busy_s, whole_s)
+        """Return the costs for a simulation: those of each request, and those of each common commit.
 
-        def request(duration_s: float) -> RequestCosts:
-            part_s = busy_s * duration_s / whole_s
-            return RequestCosts(part_s, duration_s - part_s)
-
-        return QueueCosts(request(self.claim_s), request(self.complete_s))
+        They follow from two equations. Alone, a job takes the times of two requests and two commits; crowded, all
+        workers share each commit.
+        """
+        alone_s = self.claim_s + self.complete_s
+        commits_s = min(max(0.0, (alone_s - self.busy_s) / (1 - 1 / self.crowded)), alone_s)
+        requests_s = max(self.busy_s - commits_s / self.crowded, 0.0)
+        return QueueCosts(
+            RequestCosts(requests_s * self.claim_s / alone_s),
+            RequestCosts(requests_s * self.complete_s / alone_s),
+            batch_s=commits_s / 2,
+            variation=self.variation,
+        )
 
 
 class ClipCosts(_Table):

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from marey_server.capacity.costs import MeasuredCosts
 from marey_server.store.jobs.policy import DEFAULT_POLICY, QueuePolicy
 
-DAY_S = 86_400
 HEARTBEAT_SHARE = 0.5
 """Share of the server's occupied time of a job that a heartbeat takes: one write of the two of a job."""
 
@@ -67,7 +66,7 @@ def compute_needs(costs: MeasuredCosts, demand: PlannedWork, policy: QueuePolicy
 
     `clips_per_day` is the number at which the first part is saturated; heartbeats are counted for working workers only.
     """
-    period_s = demand.days * DAY_S
+    period_s = demand.days * 24 * 3600
     jobs = demand.clips * demand.jobs_per_clip
     work_s = jobs * costs.clip.worker_s
     heartbeats = work_s / policy.heartbeat_s

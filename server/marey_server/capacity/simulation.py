@@ -2,8 +2,8 @@
 
 The order of claims, the lock by concurrency keys, labels, leases, lost attempts, and retries after failures follow
 `marey_server.store.jobs`; durations and limits are those of its `QueuePolicy`. The server is a number of equal stations
-with one waiting line: each request occupies a station for a fixed time, and takes the worker some further time. Time is
-in seconds from the start of the simulation.
+with one waiting line: each request occupies a station for some time, and takes the worker some further time. Time is in
+seconds from the start of the simulation.
 """
 
 from __future__ import annotations
@@ -34,12 +34,19 @@ FREE = RequestCosts()
 
 @dataclass(frozen=True)
 class QueueCosts:
-    """Costs of the requests of workers, and the number of stations of the server."""
+    """Costs of the requests of workers, and the number of stations of the server.
+
+    A station takes all waiting requests together if `batch_s` is not 0: they take `batch_s` once, and the occupied time
+    of each, as writes that are committed together. `variation` is the coefficient of variation (standard deviation over
+    mean) of all times of requests, which have a gamma distribution; 0: they are constant.
+    """
 
     claim: RequestCosts = FREE
     complete: RequestCosts = FREE
     heartbeat: RequestCosts = FREE
     stations: int = 1
+    batch_s: float = 0.0
+    variation: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -161,16 +168,26 @@ class _Simulation:
 
     def _serve(self) -> None:
         while self._free_stations and self._line:
-            costs, answered = self._line.popleft()
+            together = len(self._line) if self._costs.batch_s else 1
+            taken = [self._line.popleft() for _ in range(together)]
             self._free_stations -= 1
-            self._busy_s += costs.busy_s
+            busy_s = self._drawn(self._costs.batch_s + sum(costs.busy_s for costs, _ in taken))
+            self._busy_s += busy_s
 
-            def done(answered: Callable[[], None] = answered) -> None:
+            def done(taken: list[tuple[RequestCosts, Callable[[], None]]] = taken) -> None:
                 self._free_stations += 1
-                answered()
+                for _, answered in taken:
+                    answered()
                 self._serve()
 
-            self._at(self._now_s + costs.busy_s, done)
+            self._at(self._now_s + busy_s, done)
+
+    def _drawn(self, mean_s: float) -> float:
+        """Draw the time of a request with the given mean."""
+        if not mean_s or not self._costs.variation:
+            return mean_s
+        shape = self._costs.variation**-2
+        return self._draw.gammavariate(shape, mean_s / shape)
 
     # -- the queue --
 
@@ -205,7 +222,7 @@ class _Simulation:
         if key is not None:
             self._keys.add(key)
         expires_s = self._now_s + self._policy.lease_ttl_s
-        self._at(self._now_s + self._costs.claim.idle_s, lambda: self._start(worker, number, expires_s))
+        self._at(self._now_s + self._drawn(self._costs.claim.idle_s), lambda: self._start(worker, number, expires_s))
 
     def _pick(self, labels: frozenset[str]) -> int | None:
         """Remove and return the first queued job that a worker with these labels may run now, or None."""
@@ -244,7 +261,7 @@ class _Simulation:
 
         def answered() -> None:
             self._end(number, failed=failed)
-            self._at(self._now_s + self._costs.complete.idle_s, lambda: self._ask(worker))
+            self._at(self._now_s + self._drawn(self._costs.complete.idle_s), lambda: self._ask(worker))
 
         self._request(self._costs.complete, answered)
 

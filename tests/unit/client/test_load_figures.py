@@ -22,6 +22,7 @@ def test_an_interval_is_that_of_student_and_one_value_has_none() -> None:
     values = [10.0, 12.0, 17.0]
     low, high = scipy.stats.t.interval(0.95, 2, statistics.fmean(values), scipy.stats.sem(values))
     found = Estimate.of(values)
+    assert found.margin is not None
     assert (found.value - found.margin, found.value + found.margin) == pytest.approx((low, high), rel=1e-3)
     assert Estimate.of([3.0]) == Estimate(3.0, None)
 

@@ -56,18 +56,20 @@ def test_the_installed_costs_are_valid_and_name_their_machine() -> None:
     assert "2 cores" in costs.machine
 
 
-def test_the_occupied_time_of_a_job_is_divided_between_its_requests() -> None:
+def test_costs_of_requests_and_commits_follow_from_few_and_many_workers() -> None:
     queue = COSTS.job.in_queue()
-    assert queue.claim.busy_s + queue.complete.busy_s == pytest.approx(0.004)
-    assert queue.claim.busy_s + queue.claim.idle_s == pytest.approx(0.002)
+    requests_s = queue.claim.busy_s + queue.complete.busy_s
+    assert requests_s + 2 * queue.batch_s == pytest.approx(0.005)
+    assert requests_s + 2 * queue.batch_s / 16 == pytest.approx(0.004)
     slow = JobCosts(claim_s=0.002, complete_s=0.003, busy_s=1.0, database_s=0, database_bytes=0).in_queue()
-    assert slow.claim.idle_s == slow.complete.idle_s == 0.0
+    assert (slow.batch_s, slow.claim.busy_s + slow.complete.busy_s) == (0.0, pytest.approx(1.0))
 
 
 def test_predictions_grow_with_the_workers_until_the_server_is_saturated() -> None:
-    found = predict(COSTS.job.model_dump(), (2, 8, 32), 0.0)
-    assert found[8] == pytest.approx(1 / 0.004, rel=0.01)
-    assert found[32] == pytest.approx(1 / 0.004, rel=0.01)
+    found = predict(COSTS.job.model_dump(), (1, 2, 16, 32), 0.0)
+    assert found[1] == pytest.approx(1 / 0.005, rel=0.01)
+    assert found[16] == pytest.approx(1 / 0.004, rel=0.02)
+    assert found[1] < found[2] < found[16] < found[32] < 1.03 / 0.004
     slow = predict(COSTS.job.model_dump(), (2, 8), 0.1)
     assert slow[2] == pytest.approx(2 / 0.105, rel=0.03)
     assert slow[8] == pytest.approx(8 / 0.105, rel=0.03)

@@ -25,12 +25,12 @@ NO_COSTS = QueueCosts()
 REPLICATES, JOBS = 20, 4000
 
 
-def poisson_jobs(rate: float, mean_work_s: float, seed: int, **fields: int) -> list[SimulatedJob]:
+def poisson_jobs(rate: float, mean_work_s: float, seed: int) -> list[SimulatedJob]:
     draw = random.Random(seed)
     now_s, jobs = 0.0, []
     for _ in range(JOBS):
         now_s += draw.expovariate(rate)
-        jobs.append(SimulatedJob(now_s, draw.expovariate(1 / mean_work_s), **fields))
+        jobs.append(SimulatedJob(now_s, draw.expovariate(1 / mean_work_s)))
     return jobs
 
 

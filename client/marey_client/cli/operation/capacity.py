@@ -13,7 +13,7 @@ from marey_client.cli.terminal.invocation import AsJson
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table, progress
 
 if TYPE_CHECKING:
-    from marey_client.load.calibrating import Calibration, Round
+    from marey_client.load.calibrating import Calibration
 
 CHECKED = "2,8"
 MOST_CHECKED = 64
@@ -81,7 +81,7 @@ def measure_costs(
         str | None, typer.Option(help="URL of an empty Postgres database; default: an SQLite file.")
     ] = None,
     workers: Annotated[str, typer.Option(help="Numbers of workers to predict and to measure.")] = CHECKED,
-    rounds: Annotated[int, typer.Option(min=1, max=20, help="Number of rounds; medians of the rounds are used.")] = 3,
+    rounds: Annotated[int, typer.Option(min=1, max=20, help="Number of rounds; in each, all numbers take turns.")] = 5,
     work_ms: WorkMs = 0.0,
     seed: Seed = 0,
     as_json: AsJson = False,
@@ -104,7 +104,7 @@ def measure_costs(
         found = calibrate(
             marey, counts, rounds=rounds, work_s=work_ms / 1000, on_drain=lambda what: advance(what, 0, None)
         )
-    predicted = [embedded.predict_jobs(_job_costs(one), (*counts, FURTHER), found.work_s, seed) for one in found.rounds]
+    predicted = embedded.predict_jobs(_job_costs(found), (*counts, FURTHER), found.work_s, seed)
     if as_json:
         print_json({**asdict(found), "predicted": predicted, "difference": _differences(found, predicted)})
     else:
@@ -125,44 +125,39 @@ def _counts(text: str) -> tuple[int, ...]:
     return counts
 
 
-def _job_costs(one: Round) -> dict[str, float]:
-    """Return the costs of a round, without those of the database, which a simulation of the queue does not need."""
+def _job_costs(found: Calibration) -> dict[str, float]:
+    """Return the costs of a job, without those of the database, which a simulation of the queue does not need."""
     return {
-        "claim_s": one.claim_s, "complete_s": one.complete_s, "busy_s": one.busy_s,
-        "database_s": 0.0, "database_bytes": 0.0,
+        "claim_s": found.claim_s, "complete_s": found.complete_s, "busy_s": found.busy_s,
+        "variation": found.variation, "database_s": 0.0, "database_bytes": 0.0,
     }  # fmt: skip
 
 
-def _differences(found: Calibration, predicted: list[dict[int, float]]) -> dict[int, float]:
-    """Return the median over the rounds of predicted over measured jobs per second, minus 1, by number of workers."""
-    from statistics import median
-
-    rounds = list(zip(found.rounds, predicted, strict=True))
-    return {
-        count: median(two[count] / one.checked[count] for one, two in rounds) - 1 for count in found.rounds[0].checked
-    }
+def _differences(found: Calibration, predicted: dict[int, float]) -> dict[int, float]:
+    """Return predicted over measured jobs per second, minus 1, by number of workers."""
+    return {count: predicted[count] / measured - 1 for count, measured in found.checked.items()}
 
 
-def _print(found: Calibration, predicted: list[dict[int, float]]) -> None:
-    from statistics import median
-
+def _print(found: Calibration, predicted: dict[int, float]) -> None:
     differences = _differences(found, predicted)
     rows = [
         (
             count,
-            f"{median(one[count] for one in predicted):.1f}",
-            f"{found.median(lambda one, count=count: one.checked[count]):.1f}" if count in differences else "",
+            f"{expected:.1f}",
+            f"{found.checked[count]:.1f}" if count in differences else "",
             f"{100 * differences[count]:+.1f} %" if count in differences else "",
         )
-        for count in predicted[0]
+        for count, expected in predicted.items()
     ]
     columns = ("workers", "predicted jobs/s", "measured jobs/s", "difference")
     print_table(columns, rows, right=columns)
     print_pairs(
         [
-            ("claim", f"{1e3 * found.median(lambda one: one.claim_s):.2f} ms"),
-            ("completion", f"{1e3 * found.median(lambda one: one.complete_s):.2f} ms"),
-            ("server occupied", f"{1e3 * found.median(lambda one: one.busy_s):.2f} ms per job"),
+            ("claim", f"{1e3 * found.claim_s:.2f} ms"),
+            ("completion", f"{1e3 * found.complete_s:.2f} ms"),
+            ("variation of requests", f"{found.variation:.2f}"),
+            ("work", f"{1e3 * found.work_s:.2f} ms"),
+            ("server occupied", f"{1e3 * found.busy_s:.2f} ms per job"),
             ("processor time", f"{1e3 * found.processor_s:.2f} ms per job"),
             ("database", f"{found.database_bytes:,.0f} bytes per job"),
         ]
