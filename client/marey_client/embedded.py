@@ -56,11 +56,17 @@ def compute_capacity(**amounts: Any) -> dict[str, Any]:
     return found
 
 
-def predict_jobs(job: dict[str, float], workers: tuple[int, ...], work_s: float, seed: int) -> dict[int, float]:
-    """Return the jobs per second that a simulation of the queue predicts for each number of workers."""
+def predict_jobs(
+    job: dict[str, float], known: tuple[int, float], workers: tuple[int, ...], work_s: float, seed: int
+) -> dict[int, float]:
+    """Return the jobs per second that a simulation of the queue predicts for each number of workers.
+
+    `known` is one other number of workers and its measured jobs per second.
+    """
     answers = room("marey_server.capacity.answers", "server")
     try:
-        found: dict[int, float] = answers.predict(job, workers, work_s, seed)
+        fitted = answers.fit_idle(job, *known, work_s, seed)
+        found: dict[int, float] = answers.predict(fitted, workers, work_s, seed)
     except answers.NotComputable as error:
         raise MareyError(str(error)) from error
     return found

@@ -14,8 +14,8 @@ from marey_client.load.offering import OfferedLoad
 from marey_client.load.scratch import Scratch, scratch_project
 from marey_client.marey import Marey
 
-ALONE, CROWDED = 1, 16
-"""Numbers of workers of the calibration: one that never waits for others, and enough to saturate the server."""
+ALONE, SOME, CROWDED = 1, 4, 16
+"""Numbers of workers of the calibration: one that never waits for others, some, and enough to saturate the server."""
 LONGEST_DRAIN_S = 300.0
 JOBS_OF_A_WORKER = 10
 """Number of jobs in the backlog per worker; at least `FEWEST_JOBS`."""
@@ -39,9 +39,9 @@ class Calibration:
     """Costs of a job on one server, and the jobs per second of the checked numbers of workers.
 
     `claim_s` and `complete_s` are the mean durations of the requests of a worker that is alone; `variation` is their
-    standard deviation over their mean. `busy_s` is the time per job when `CROWDED` workers compete. `work_s` is the
-    time from the answer to a claim to the completion, and from there to the next claim, with a worker that is alone;
-    it is longer than planned on a busy machine. All rounds count together: the times of their jobs are added up.
+    standard deviation over their mean. `busy_s` is the time per job when `CROWDED` workers compete, and `some_per_s`
+    the jobs per second of `SOME` workers. `work_s` is the time of a worker that is alone outside its two requests; it is
+    longer than planned on a busy machine. All rounds count together: the times of their jobs are added up.
     """
 
     claim_s: float
@@ -51,6 +51,7 @@ class Calibration:
     work_s: float
     processor_s: float
     database_bytes: float
+    some_per_s: float
     checked: dict[int, float]
 
 
@@ -76,7 +77,7 @@ def calibrate(marey: Marey, checked: Sequence[int], *, rounds: int, work_s: floa
 
     Measuring in turn lets a change of the machine's speed affect all numbers of workers.
     """
-    counts = (ALONE, CROWDED, *checked)
+    counts = (ALONE, SOME, CROWDED, *checked)
     found: dict[int, list[Drain]] = {count: [] for count in counts}
     with scratch_project(marey) as scratch:
         drain(scratch, ALONE, 0.0)
@@ -100,6 +101,7 @@ def calibrate(marey: Marey, checked: Sequence[int], *, rounds: int, work_s: floa
         work_s=max(0.0, 1 / _together(found[ALONE]) - claim_s - complete_s),
         processor_s=used["processor_ms_per_job"] / 1e3,
         database_bytes=max(0.0, used["database_bytes_per_job"]),
+        some_per_s=_together(found[SOME]),
         checked={count: _together(found[count]) for count in checked},
     )
 

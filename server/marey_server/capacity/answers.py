@@ -12,6 +12,7 @@ from marey_server.capacity.costs import MEASURED, JobCosts, MeasuredCosts, Unusa
 from marey_server.capacity.needs import PlannedWork, compute_needs
 from marey_server.capacity.simulation import SimulatedJob, simulate
 
+IDLE_STEPS = 20
 JOBS_PER_WORKER = 100
 """Number of simulated jobs per worker of a prediction, so that start and end hardly count."""
 
@@ -40,6 +41,15 @@ def capacity(*, costs: Path | None = None, **demand: Any) -> dict[str, Any]:
         "measured": {"date": measured.date, "machine": measured.machine, "load": measured.load},
         "predicted_jobs_per_s": predict(measured.job.model_dump(), (2, 8, 32), 0.0),
     }
+
+
+def fit_idle(job: dict[str, float], workers: int, per_s: float, work_s: float, seed: int = 0) -> dict[str, float]:
+    """Return the costs of a job with the share `idle` for which the prediction is nearest to measured jobs per second.
+
+    `workers` is the number of workers of this measurement. Raises `NotComputable` if the costs are not valid.
+    """
+    candidates = [job | {"idle": step / IDLE_STEPS} for step in range(IDLE_STEPS)]
+    return min(candidates, key=lambda costs: abs(predict(costs, (workers,), work_s, seed)[workers] - per_s))
 
 
 def predict(job: dict[str, float], workers: tuple[int, ...], work_s: float, seed: int = 0) -> dict[int, float]:

@@ -36,7 +36,8 @@ class JobCosts(_Table):
     claim_s: float = Field(gt=0)
     complete_s: float = Field(gt=0)
     busy_s: float = Field(gt=0)
-    crowded: int = Field(16, ge=2)
+    crowded: int = Field(16, ge=3)
+    idle: float = Field(0.0, ge=0, lt=1, description="Share of a request of a worker alone, without use of the server.")
     variation: float = Field(0.0, ge=0, le=10, description="Standard deviation of requests, divided by their mean.")
     database_s: float = Field(ge=0, description="Processor time of a Postgres database for one job, in seconds.")
     database_bytes: float = Field(ge=0)
@@ -44,15 +45,16 @@ class JobCosts(_Table):
     def in_queue(self) -> QueueCosts:
         """Return the costs for a simulation: those of each request, and those of each common commit.
 
-        They follow from two equations. Alone, a job takes the times of two requests and two commits; crowded, all
-        workers share each commit.
+        They follow from two equations. Alone, a job takes the times of two requests and two commits. Crowded, half of
+        the workers wait for the next commit while the other half shares one.
         """
         alone_s = self.claim_s + self.complete_s
-        commits_s = min(max(0.0, (alone_s - self.busy_s) / (1 - 1 / self.crowded)), alone_s)
-        requests_s = max(self.busy_s - commits_s / self.crowded, 0.0)
+        used_s, shared = alone_s * (1 - self.idle), 2 / self.crowded
+        commits_s = min(max(0.0, (used_s - self.busy_s) / (1 - shared)), used_s)
+        requests_s = max(self.busy_s - commits_s * shared, 0.0)
         return QueueCosts(
-            RequestCosts(requests_s * self.claim_s / alone_s),
-            RequestCosts(requests_s * self.complete_s / alone_s),
+            RequestCosts(requests_s * self.claim_s / alone_s, self.claim_s * self.idle),
+            RequestCosts(requests_s * self.complete_s / alone_s, self.complete_s * self.idle),
             batch_s=commits_s / 2,
             variation=self.variation,
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from tests.support.command_line import run_here
 
-from marey_server.capacity.answers import NotComputable, capacity, predict
+from marey_server.capacity.answers import NotComputable, capacity, fit_idle, predict
 from marey_server.capacity.costs import MEASURED, JobCosts, MeasuredCosts
 from marey_server.capacity.needs import PlannedWork, compute_needs
 from marey_server.store.jobs.policy import DEFAULT_POLICY
@@ -60,16 +60,17 @@ def test_costs_of_requests_and_commits_follow_from_few_and_many_workers() -> Non
     queue = COSTS.job.in_queue()
     requests_s = queue.claim.busy_s + queue.complete.busy_s
     assert requests_s + 2 * queue.batch_s == pytest.approx(0.005)
-    assert requests_s + 2 * queue.batch_s / 16 == pytest.approx(0.004)
+    assert requests_s + 2 * queue.batch_s * 2 / 16 == pytest.approx(0.004)
     slow = JobCosts(claim_s=0.002, complete_s=0.003, busy_s=1.0, database_s=0, database_bytes=0).in_queue()
-    assert (slow.batch_s, slow.claim.busy_s + slow.complete.busy_s) == (0.0, pytest.approx(1.0))
+    assert slow.batch_s == 0.0
+    assert slow.claim.busy_s + slow.complete.busy_s == pytest.approx(1.0)
 
 
 def test_predictions_grow_with_the_workers_until_the_server_is_saturated() -> None:
-    found = predict(COSTS.job.model_dump(), (1, 2, 16, 32), 0.0)
+    found = predict(COSTS.job.model_dump(), (1, 8, 16, 32), 0.0)
     assert found[1] == pytest.approx(1 / 0.005, rel=0.01)
     assert found[16] == pytest.approx(1 / 0.004, rel=0.02)
-    assert found[1] < found[2] < found[16] < found[32] < 1.03 / 0.004
+    assert found[1] < found[8] < found[16] < found[32] < 1.05 / 0.004
     slow = predict(COSTS.job.model_dump(), (2, 8), 0.1)
     assert slow[2] == pytest.approx(2 / 0.105, rel=0.03)
     assert slow[8] == pytest.approx(8 / 0.105, rel=0.03)
@@ -88,6 +89,12 @@ def test_a_wrong_file_of_costs_is_refused_with_the_place(tmp_path: Path, text: s
     assert str(path) in str(caught.value)
     with pytest.raises(NotComputable, match="none"):
         capacity(costs=tmp_path / "none.toml")
+
+
+def test_the_idle_share_is_found_from_a_third_number_of_workers() -> None:
+    true = COSTS.job.model_dump() | {"idle": 0.4, "busy_s": 0.002}
+    found = fit_idle(true | {"idle": 0.0}, 4, predict(true, (4,), 0.0)[4], 0.0)
+    assert found["idle"] == pytest.approx(0.4, abs=0.05)
 
 
 def test_wrong_costs_of_a_prediction_are_refused() -> None:

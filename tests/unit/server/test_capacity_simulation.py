@@ -137,3 +137,19 @@ def test_heartbeats_occupy_the_server() -> None:
     costs = QueueCosts(FREE, FREE, heartbeat=RequestCosts(0.5))
     run = simulate([SimulatedJob(0.0, 40.0)], [ANY], costs)
     assert run.busy_share * run.seconds == pytest.approx(0.5 * 3)
+
+
+def test_requests_that_wait_together_share_one_commit() -> None:
+    costs = QueueCosts(RequestCosts(0.001), RequestCosts(0.001), batch_s=0.004)
+    jobs = [SimulatedJob(0.0, 0.0)] * 2000
+    for workers in (2, 8, 16):  # while one half shares a commit, the other half waits for the next
+        per_job_s = 2 * 0.001 + 2 * 0.004 * 2 / workers
+        assert simulate(jobs, [ANY] * workers, costs).per_s == pytest.approx(1 / per_job_s, rel=0.02)
+
+
+def test_varying_times_keep_their_mean_and_slow_down_workers_who_wait_for_each_other() -> None:
+    even = QueueCosts(RequestCosts(0.002, 0.002), RequestCosts(0.002, 0.002))
+    jobs = [SimulatedJob(0.0, 0.0)] * 4000
+    uneven = replace(even, variation=1.0)
+    assert simulate(jobs, [ANY], uneven).per_s == pytest.approx(1 / 0.008, rel=0.05)
+    assert simulate(jobs, [ANY] * 2, uneven).per_s < 0.85 * simulate(jobs, [ANY] * 2, even).per_s

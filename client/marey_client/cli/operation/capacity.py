@@ -88,39 +88,40 @@ def measure_costs(
 ) -> None:
     """Measure the costs of a job on a new server, predict jobs per second from them, and compare with measurements.
 
-    The costs come from runs with one worker and with sixteen. A simulation of the queue predicts the jobs per second of
+    The costs come from runs with 1, 4 and 16 workers. A simulation of the queue predicts the jobs per second of
     other numbers of workers, which are measured in the same rounds. The server is removed at the end.
     """
-    counts = _counts(workers)
     from dataclasses import asdict
 
     from marey_client import embedded
-    from marey_client.load.calibrating import calibrate
+    from marey_client.load.calibrating import ALONE, CROWDED, SOME, calibrate
     from marey_client.load.own_server import own_server
 
+    counts = _counts(workers, (ALONE, SOME, CROWDED))
     if database_url is not None:
         embedded.database("require_empty", data=None, database_url=database_url)
     with ended_politely(), own_server(database_url) as marey, progress() as advance:
         found = calibrate(
             marey, counts, rounds=rounds, work_s=work_ms / 1000, on_drain=lambda what: advance(what, 0, None)
         )
-    predicted = embedded.predict_jobs(_job_costs(found), (*counts, FURTHER), found.work_s, seed)
+    known = (SOME, found.some_per_s)
+    predicted = embedded.predict_jobs(_job_costs(found), known, (*counts, FURTHER), found.work_s, seed)
     if as_json:
         print_json({**asdict(found), "predicted": predicted, "difference": _differences(found, predicted)})
     else:
         _print(found, predicted)
 
 
-def _counts(text: str) -> tuple[int, ...]:
-    """Return numbers of workers. Raises `WrongUsage` if one is not valid."""
+def _counts(text: str, used: tuple[int, ...]) -> tuple[int, ...]:
+    """Return numbers of workers. Raises `WrongUsage` if one is not valid, or used to measure the costs."""
     try:
         counts = tuple(int(one) for one in text.split(","))
     except ValueError:
         counts = ()
-    if not counts or not all(1 < count <= MOST_CHECKED and count != 16 for count in counts):
+    if not counts or not all(1 < count <= MOST_CHECKED and count not in used for count in counts):
         raise WrongUsage(
             f"--workers {text}: give numbers from 2 to {MOST_CHECKED} with commas between them, such as {CHECKED}; not "
-            "16, from which the costs are measured"
+            f"{', '.join(map(str, used))}, from which the costs are measured"
         )
     return counts
 
