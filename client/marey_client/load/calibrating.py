@@ -40,7 +40,7 @@ class Calibration:
 
     `claim_s` and `complete_s` are the mean durations of the requests of a worker that is alone; `variation` is their
     standard deviation over their mean. `busy_s` is the time per job when `CROWDED` workers compete, and `some_per_s`
-    the jobs per second of `SOME` workers. `work_s` is the time of a worker that is alone outside its two requests; it is
+    the jobs per second of `SOME` workers. `work_s` is the time of a worker alone outside its requests; it is
     longer than planned on a busy machine. All rounds count together: the times of their jobs are added up.
     """
 
