@@ -46,6 +46,7 @@ class WorkerProcess:
 
     def __init__(self, scratch: Scratch, folder: Path, fault: WorkerFault | None) -> None:
         environment = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
+        environment["TMPDIR"] = str(folder)  # a killed worker cannot remove its temporary folders
         if fault is not None:
             environment[FAULT_VARIABLE] = f"{fault.point}:{fault.action}"
         label = f"{LABEL}={scratch.project.name}"
