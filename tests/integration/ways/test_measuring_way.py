@@ -45,6 +45,7 @@ def test_a_new_server_is_measured_and_removed(run: CommandLine) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_each_fault_happens_and_each_job_has_one_visible_result(tmp_path: Path) -> None:
     server = ServerProcess(tmp_path, **QUICK_LEASES).start()
     try:
