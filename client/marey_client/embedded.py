@@ -1,4 +1,4 @@
-"""Access to the server, worker and motion packages for the commands `serve`, `worker`, `demo`, `db` and `doctor`.
+"""Access to the server, worker and motion packages for the commands that need them, such as `serve` and `worker`.
 
 Only this module imports these packages, and only when such a command runs, so that the client can be installed alone.
 """
@@ -43,6 +43,32 @@ def examine(*, data: Path | None, database_url: str | None) -> list[tuple[str, s
     """Check a server's machine; return for each check its name, its state (ok, warning or fault) and a detail."""
     commands = room("marey_server.commands", "server")
     found: list[tuple[str, str, str]] = commands.examine(**_given({"data": data, "database_url": database_url}))
+    return found
+
+
+def compute_capacity(**amounts: Any) -> dict[str, Any]:
+    """Return what an amount of work needs, and the measured costs from which this is computed."""
+    answers = room("marey_server.capacity.answers", "server")
+    try:
+        found: dict[str, Any] = answers.capacity(**amounts)
+    except answers.NotComputable as error:
+        raise MareyError(str(error)) from error
+    return found
+
+
+def predict_jobs(
+    job: dict[str, float], known: tuple[int, float], workers: tuple[int, ...], work_s: float, seed: int
+) -> dict[int, float]:
+    """Return the jobs per second that a simulation of the queue predicts for each number of workers.
+
+    `known` is one other number of workers and its measured jobs per second.
+    """
+    answers = room("marey_server.capacity.answers", "server")
+    try:
+        fitted = answers.fit_idle(job, *known, work_s, seed)
+        found: dict[int, float] = answers.predict(fitted, workers, work_s, seed)
+    except answers.NotComputable as error:
+        raise MareyError(str(error)) from error
     return found
 
 

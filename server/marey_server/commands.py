@@ -132,6 +132,22 @@ def upgrade(*, while_serving: bool = False, finish: bool = False, **settings: An
         _say("when all servers have this version, run `marey db upgrade --finish`")
 
 
+def require_empty(**settings: Any) -> None:
+    """Raise `CommandFailed` if the database has tables; nothing is changed."""
+    from marey_server.access.principal import SYSTEM
+    from marey_server.app import connect_database
+    from marey_server.store.database.schema import list_tables
+
+    chosen = read_settings(**settings)
+    with _database_of(chosen), closing(connect_database(chosen)) as database:
+        tables = database.read(SYSTEM, lambda tx: list_tables(tx.connection))
+    if tables:
+        raise CommandFailed(
+            f"the database is not empty ({counted(len(tables), 'table')}, such as {tables[0]}); create another one for "
+            "the test, for example with `createdb`"
+        )
+
+
 def backup(*, target: Path, **settings: Any) -> None:
     """Copy an SQLite database in a consistent state, even while a server is writing to it."""
     source = _sqlite_file(read_settings(**settings), must_exist=True)

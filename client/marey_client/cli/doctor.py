@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from marey_client.cli.processes import DatabaseUrl, DataFolder
-from marey_client.cli.terminal.invocation import AsJson, credential_of
-from marey_client.cli.terminal.output import print_json
+from marey_client.cli.terminal.invocation import AsJson, connect, credential_of
+from marey_client.cli.terminal.output import print_json, print_message, progress
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -33,6 +33,19 @@ def doctor(
         bool, typer.Option("--local/--no-local", help="Check the data folder and the database on this machine.")
     ] = True,
     remote: Annotated[bool, typer.Option("--remote/--no-remote", help="Check the running server.")] = True,
+    chaos: Annotated[
+        bool,
+        typer.Option(
+            "--chaos",
+            help="Test the running server by faults instead: in a scratch project, which is removed at the end.",
+        ),
+    ] = False,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of --chaos; default: a random seed, which is printed.")
+    ] = None,
+    faults: Annotated[
+        int, typer.Option(min=1, max=100, help="Number of faults of --chaos; each kind happens at least once.")
+    ] = 8,
     as_json: AsJson = False,
 ) -> None:
     """Check settings, clock, disk, data folder, database, kernels, the running server, and its workers.
@@ -40,8 +53,14 @@ def doctor(
     Prints one line for each check: ok, warning or fault, and what to do. The exit status is 1 if there are faults. On a
     machine without a server's data folder, use --no-local; while the server is stopped, use --no-remote. Only the token
     of an administrator shows workers and the reason why a server is not ready.
+
+    With --chaos, the command creates a project, of which you are the owner, starts workers for this project only, kills
+    and pauses them, loses answers, and repeats requests with wrong times. Then it checks that each job has exactly one
+    visible result, and removes the project. On a server with the usual leases of a minute, it takes a few minutes.
     """
     findings: list[Finding] = []
+    if chaos:
+        return _print(_test_by_faults(context, seed, faults), as_json)
     if local:
         from marey_client import embedded
 
@@ -53,6 +72,10 @@ def doctor(
         credential = credential_of(context)
         with Marey(credential.url, credential.bearer, retries=ONCE, timeout_s=10.0) as marey:
             findings += check_server(marey)
+    return _print(findings, as_json)
+
+
+def _print(findings: list[Finding], as_json: bool) -> None:
     if as_json:
         print_json([{"check": check, "state": state, "detail": detail} for check, state, detail in findings])
     else:
@@ -60,6 +83,20 @@ def doctor(
             typer.echo(f"{state:<7}  {check}: {detail}")
     if any(state == "fault" for _, state, _ in findings):
         raise typer.Exit(1)
+
+
+def _test_by_faults(context: typer.Context, seed: int | None, faults: int) -> list[Finding]:
+    """Test the running server by faults; the seed is printed first, so that it is known after a crash, too."""
+    import secrets
+
+    from marey_client.chaos.running import run_chaos
+    from marey_client.cli.operation.bench import ended_politely
+
+    chosen = secrets.randbelow(2**31) if seed is None else seed
+    print_message(f"seed {chosen}")
+    with connect(context) as marey, ended_politely(), progress() as advance:
+        found = list(run_chaos(marey, chosen, faults, advance))
+    return [(one.check, "fault" if one.fault else "ok", one.fault or one.detail) for one in found]
 
 
 def check_server(marey: Marey) -> Iterator[Finding]:

@@ -23,7 +23,7 @@ from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Connection
+from sqlalchemy import Connection, inspect
 
 from marey_server.access.principal import SYSTEM
 from marey_server.store.credentials.server_key import make_server_key
@@ -117,6 +117,11 @@ def _is_served(connection: Connection) -> bool:
 def _current(connection: Connection) -> str | None:
     heads = MigrationContext.configure(connection).get_current_heads()
     return heads[0] if heads else None
+
+
+def list_tables(connection: Connection) -> list[str]:
+    """Return the names of all tables in the database's default schema, whichever program has created them."""
+    return sorted(inspect(connection).get_table_names())
 
 
 @lru_cache

@@ -1,0 +1,169 @@
+"""Commands `capacity`, which computes what an amount of work needs, and `bench costs`, which measures and predicts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from marey_client.cli.operation.bench import Seed, WorkMs, bench, ended_politely
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.invocation import AsJson
+from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table, progress
+
+if TYPE_CHECKING:
+    from marey_client.load.calibrating import Calibration
+
+CHECKED = "2,8"
+MOST_CHECKED = 64
+FURTHER = 32
+"""Number of workers for which jobs per second are predicted and not measured."""
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module; `bench costs` is registered with the group `bench`."""
+    app.command()(capacity)
+
+
+def capacity(
+    clips: Annotated[int, typer.Option(min=1, help="Number of clips to import and process.")] = 10_000_000,
+    jobs_per_clip: Annotated[float, typer.Option(min=0, help="Number of jobs for each clip.")] = 1.0,
+    clip_bytes: Annotated[float, typer.Option(min=1, help="Size of an uploaded file, in bytes.")] = 500_000.0,
+    days: Annotated[float, typer.Option(min=0.001, help="Number of days in which all work is done.")] = 30.0,
+    workers: Annotated[int, typer.Option(min=1, help="Number of workers, each with one slot.")] = 1000,
+    servers: Annotated[int, typer.Option(min=1, help="Number of server processes that share a database.")] = 100,
+    database_processors: Annotated[int, typer.Option(min=1, help="Number of processors of the database.")] = 8,
+    costs: Annotated[Path | None, typer.Option(help="File of measured costs; default: that of this version.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compute what an amount of clips needs of workers, servers and database, and which part saturates first.
+
+    The numbers are computed from measured costs of a job, a clip and a byte; nothing is measured now. They hold for
+    machines like that of the measurement, and leave out pauses, failures and networks.
+    """
+    from marey_client import embedded
+
+    found = embedded.compute_capacity(
+        costs=costs, clips=clips, jobs_per_clip=jobs_per_clip, clip_bytes=clip_bytes, days=days, workers=workers,
+        servers=servers, database_processors=database_processors,
+    )  # fmt: skip
+    if as_json:
+        return print_json(found)
+    print_table(
+        ("part", "needed hours", "available hours", "used"),
+        [
+            (
+                part["name"],
+                f"{part['needed_s'] / 3600:,.1f}",
+                f"{part['available_s'] / 3600:,.1f}",
+                _percent(part["share"]),
+            )
+            for part in found["parts"]
+        ],
+        right=("needed hours", "available hours", "used"),
+    )
+    print_pairs(
+        [
+            ("saturates first", f"{found['first']}, at {found['clips_per_day']:,.0f} clips per day"),
+            ("blobs", f"{found['blob_bytes'] / 1e12:,.2f} TB"),
+            ("rows of jobs", f"{found['database_bytes'] / 1e9:,.1f} GB"),
+        ]
+    )
+    measured = found["measured"]
+    print_message(f"costs measured on {measured['date']}: {measured['machine']}; {measured['load']}")
+    return None
+
+
+@bench.command("costs")
+def measure_costs(
+    database_url: Annotated[
+        str | None, typer.Option(help="URL of an empty Postgres database; default: an SQLite file.")
+    ] = None,
+    workers: Annotated[str, typer.Option(help="Numbers of workers to predict and to measure.")] = CHECKED,
+    rounds: Annotated[int, typer.Option(min=1, max=20, help="Number of rounds; in each, all numbers take turns.")] = 5,
+    work_ms: WorkMs = 0.0,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the costs of a job on a new server, predict jobs per second from them, and compare with measurements.
+
+    The costs come from runs with 1, 4 and 16 workers. A simulation of the queue predicts the jobs per second of
+    other numbers of workers, which are measured in the same rounds. The server is removed at the end.
+    """
+    from dataclasses import asdict
+
+    from marey_client import embedded
+    from marey_client.load.calibrating import ALONE, CROWDED, SOME, calibrate
+    from marey_client.load.own_server import own_server
+
+    counts = _counts(workers, (ALONE, SOME, CROWDED))
+    if database_url is not None:
+        embedded.database("require_empty", data=None, database_url=database_url)
+    with ended_politely(), own_server(database_url) as marey, progress() as advance:
+        found = calibrate(
+            marey, counts, rounds=rounds, work_s=work_ms / 1000, on_drain=lambda what: advance(what, 0, None)
+        )
+    known = (SOME, found.some_per_s)
+    predicted = embedded.predict_jobs(_job_costs(found), known, (*counts, FURTHER), found.work_s, seed)
+    if as_json:
+        print_json({**asdict(found), "predicted": predicted, "difference": _differences(found, predicted)})
+    else:
+        _print(found, predicted)
+
+
+def _counts(text: str, used: tuple[int, ...]) -> tuple[int, ...]:
+    """Return numbers of workers. Raises `WrongUsage` if one is not valid, or used to measure the costs."""
+    try:
+        counts = tuple(int(one) for one in text.split(","))
+    except ValueError:
+        counts = ()
+    if not counts or not all(1 < count <= MOST_CHECKED and count not in used for count in counts):
+        raise WrongUsage(
+            f"--workers {text}: give numbers from 2 to {MOST_CHECKED} with commas between them, such as {CHECKED}; not "
+            f"{', '.join(map(str, used))}, from which the costs are measured"
+        )
+    return counts
+
+
+def _job_costs(found: Calibration) -> dict[str, float]:
+    """Return the costs of a job, without those of the database, which a simulation of the queue does not need."""
+    return {
+        "claim_s": found.claim_s, "complete_s": found.complete_s, "busy_s": found.busy_s,
+        "variation": found.variation, "database_s": 0.0, "database_bytes": 0.0,
+    }  # fmt: skip
+
+
+def _differences(found: Calibration, predicted: dict[int, float]) -> dict[int, float]:
+    """Return predicted over measured jobs per second, minus 1, by number of workers."""
+    return {count: predicted[count] / measured - 1 for count, measured in found.checked.items()}
+
+
+def _print(found: Calibration, predicted: dict[int, float]) -> None:
+    differences = _differences(found, predicted)
+    rows = [
+        (
+            count,
+            f"{expected:.1f}",
+            f"{found.checked[count]:.1f}" if count in differences else "",
+            f"{100 * differences[count]:+.1f} %" if count in differences else "",
+        )
+        for count, expected in predicted.items()
+    ]
+    columns = ("workers", "predicted jobs/s", "measured jobs/s", "difference")
+    print_table(columns, rows, right=columns)
+    print_pairs(
+        [
+            ("claim", f"{1e3 * found.claim_s:.2f} ms"),
+            ("completion", f"{1e3 * found.complete_s:.2f} ms"),
+            ("variation of requests", f"{found.variation:.2f}"),
+            ("work", f"{1e3 * found.work_s:.2f} ms"),
+            ("server occupied", f"{1e3 * found.busy_s:.2f} ms per job"),
+            ("processor time", f"{1e3 * found.processor_s:.2f} ms per job"),
+            ("database", f"{found.database_bytes:,.0f} bytes per job"),
+        ]
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:,.1f} %"

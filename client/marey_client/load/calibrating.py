@@ -1,0 +1,116 @@
+"""Measurement of the costs of a job in the queue: a backlog of jobs is drained by few and by many simulated workers."""
+
+from __future__ import annotations
+
+import itertools
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from marey_client.errors import MareyError
+from marey_client.load.figures import ServerUse
+from marey_client.load.offering import OfferedLoad
+from marey_client.load.scratch import Scratch, scratch_project
+from marey_client.marey import Marey
+
+ALONE, SOME, CROWDED = 1, 4, 16
+"""Numbers of workers of the calibration: one that never waits for others, some, and enough to saturate the server."""
+LONGEST_DRAIN_S = 300.0
+JOBS_OF_A_WORKER = 10
+"""Number of jobs in the backlog per worker; at least `FEWEST_JOBS`."""
+FEWEST_JOBS = 60
+
+OnDrain = Callable[[str], None]
+"""Function called with the present activity."""
+
+
+@dataclass(frozen=True)
+class Drain:
+    """Measured drain of a backlog: jobs per second, and the durations of the requests in seconds."""
+
+    per_s: float
+    claims_s: tuple[float, ...]
+    completions_s: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Costs of a job on one server, and the jobs per second of the checked numbers of workers.
+
+    `claim_s` and `complete_s` are the mean durations of the requests of a worker that is alone; `variation` is their
+    standard deviation over their mean. `busy_s` is the time per job when `CROWDED` workers compete, and `some_per_s`
+    the jobs per second of `SOME` workers. `work_s` is the time of a worker alone outside its requests; it is
+    longer than planned on a busy machine. All rounds count together: the times of their jobs are added up.
+    """
+
+    claim_s: float
+    complete_s: float
+    variation: float
+    busy_s: float
+    work_s: float
+    processor_s: float
+    database_bytes: float
+    some_per_s: float
+    checked: dict[int, float]
+
+
+def drain(scratch: Scratch, workers: int, work_s: float) -> Drain:
+    """Submit a backlog of jobs, then let simulated workers run it. Raises `MareyError` if a request fails.
+
+    The jobs per second are counted from the first completion to the last one.
+    """
+    load = OfferedLoad(scratch, own_workers=True)
+    load.submit_backlog(backlog_of(workers))
+    begun = time.monotonic()
+    with load.workers(workers, work_s):
+        load.await_end(LONGEST_DRAIN_S, begun, lambda _: None)
+    if load.errors or len(load.completed) < len(load.planned):
+        raise MareyError(f"the backlog was not drained without errors: {dict(load.errors) or 'too slow'}")
+    ends = sorted(load.completed.values())
+    claims = sorted(load.durations_s["claim"])[: len(ends)]  # the longest are those that waited in vain at the end
+    return Drain((len(ends) - 1) / (ends[-1] - ends[0]), tuple(claims), tuple(load.durations_s["complete"]))
+
+
+def calibrate(marey: Marey, checked: Sequence[int], *, rounds: int, work_s: float, on_drain: OnDrain) -> Calibration:
+    """Measure the costs of a job, and the drains of other numbers of workers, in several rounds.
+
+    Measuring in turn lets a change of the machine's speed affect all numbers of workers.
+    """
+    counts = (ALONE, SOME, CROWDED, *checked)
+    found: dict[int, list[Drain]] = {count: [] for count in counts}
+    with scratch_project(marey) as scratch:
+        drain(scratch, ALONE, 0.0)
+        use = ServerUse(marey.transport)
+        for number in range(rounds):
+            for count in counts:
+                on_drain(f"round {number + 1} of {rounds}, {count} workers")
+                # Crowded workers send nothing but requests, so that only the server limits them.
+                found[count].append(drain(scratch, count, 0.0 if count == CROWDED else work_s))
+        used = use.figures(rounds * sum(map(backlog_of, counts)))
+    requests_s = [
+        list(itertools.chain.from_iterable(parts))
+        for parts in ([one.claims_s for one in found[ALONE]], [one.completions_s for one in found[ALONE]])
+    ]
+    claim_s, complete_s = map(statistics.fmean, requests_s)
+    return Calibration(
+        claim_s=claim_s,
+        complete_s=complete_s,
+        variation=statistics.fmean(statistics.pstdev(one) / statistics.fmean(one) for one in requests_s),
+        busy_s=1 / _together(found[CROWDED]),
+        work_s=max(0.0, 1 / _together(found[ALONE]) - claim_s - complete_s),
+        processor_s=used["processor_ms_per_job"] / 1e3,
+        database_bytes=max(0.0, used["database_bytes_per_job"]),
+        some_per_s=_together(found[SOME]),
+        checked={count: _together(found[count]) for count in checked},
+    )
+
+
+def _together(drains: Sequence[Drain]) -> float:
+    """Return the jobs per second of several drains of equally many jobs, whose times are added up."""
+    return statistics.harmonic_mean([one.per_s for one in drains])
+
+
+def backlog_of(workers: int) -> int:
+    """Return the number of jobs that a drain by this number of workers submits."""
+    return max(FEWEST_JOBS, workers * JOBS_OF_A_WORKER)

@@ -1,0 +1,70 @@
+"""Answers for the command line, as plain values: computed needs, predicted jobs per second, and a file of costs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from marey_schemas.wording import without_prefix
+from marey_server.capacity.costs import MEASURED, JobCosts, MeasuredCosts, UnusableCosts
+from marey_server.capacity.needs import PlannedWork, compute_needs
+from marey_server.capacity.simulation import SimulatedJob, simulate
+
+IDLE_STEPS = 20
+JOBS_PER_WORKER = 100
+"""Number of simulated jobs per worker of a prediction, so that start and end hardly count."""
+
+
+class NotComputable(Exception):
+    """Costs or amounts are not valid; the text gives the reason."""
+
+
+def capacity(*, costs: Path | None = None, **demand: Any) -> dict[str, Any]:
+    """Return the needs of an amount of work, and the costs from which they were computed.
+
+    Raises `NotComputable` if the file of costs or an amount is not valid.
+    """
+    try:
+        measured = MeasuredCosts.read(costs or MEASURED)
+        needs = compute_needs(measured, wanted := PlannedWork(**demand))
+    except (UnusableCosts, ValueError) as error:
+        raise NotComputable(str(error)) from error
+    return {
+        "demand": vars(wanted),
+        "parts": [vars(part) | {"share": part.share} for part in needs.parts],
+        "first": needs.first.name,
+        "clips_per_day": needs.clips_per_day,
+        "blob_bytes": needs.blob_bytes,
+        "database_bytes": needs.database_bytes,
+        "measured": {"date": measured.date, "machine": measured.machine, "load": measured.load},
+        "predicted_jobs_per_s": predict(measured.job.model_dump(), (2, 8, 32), 0.0),
+    }
+
+
+def fit_idle(job: dict[str, float], workers: int, per_s: float, work_s: float, seed: int = 0) -> dict[str, float]:
+    """Return the costs of a job with the share `idle` for which the prediction is nearest to measured jobs per second.
+
+    `workers` is the number of workers of this measurement. Raises `NotComputable` if the costs are not valid.
+    """
+    candidates = [job | {"idle": step / IDLE_STEPS} for step in range(IDLE_STEPS)]
+    return min(candidates, key=lambda costs: abs(predict(costs, (workers,), work_s, seed)[workers] - per_s))
+
+
+def predict(job: dict[str, float], workers: tuple[int, ...], work_s: float, seed: int = 0) -> dict[int, float]:
+    """Return the jobs per second that a simulation predicts for each number of workers that drain a backlog.
+
+    `job` contains the fields of `JobCosts`. Raises `NotComputable` if they are not valid.
+    """
+    try:
+        costs = JobCosts.model_validate(job).in_queue()
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise NotComputable(f"{'.'.join(map(str, first['loc']))}: {without_prefix(first['msg'])}") from error
+    return {
+        count: simulate(
+            [SimulatedJob(0.0, work_s)] * (JOBS_PER_WORKER * count), [frozenset()] * count, costs, seed=seed
+        ).per_s
+        for count in workers
+    }

@@ -1,0 +1,98 @@
+"""Measured costs per job, clip and byte, with the date and the machine of the measurement.
+
+`measured_costs.toml` in this folder is the only place of these numbers. `marey bench costs` measures those of jobs.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from marey_schemas.wording import without_prefix
+from marey_server.capacity.simulation import QueueCosts, RequestCosts
+
+MEASURED = Path(__file__).with_name("measured_costs.toml")
+
+
+class UnusableCosts(Exception):
+    """A file of costs cannot be read; the text gives the place and the reason."""
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class JobCosts(_Table):
+    """Costs of one job without its computation.
+
+    `claim_s` and `complete_s` are the durations of the two requests of a worker that is alone. `busy_s` is the time per
+    job with so many workers (`crowded`) that the server is always occupied. It is shorter than the two requests of a
+    worker that is alone, because the server commits writes together that arrive at the same time.
+    """
+
+    claim_s: float = Field(gt=0)
+    complete_s: float = Field(gt=0)
+    busy_s: float = Field(gt=0)
+    crowded: int = Field(16, ge=3)
+    idle: float = Field(0.0, ge=0, lt=1, description="Share of a request of a worker alone, without use of the server.")
+    variation: float = Field(0.0, ge=0, le=10, description="Standard deviation of requests, divided by their mean.")
+    database_s: float = Field(ge=0, description="Processor time of a Postgres database for one job, in seconds.")
+    database_bytes: float = Field(ge=0)
+
+    def in_queue(self) -> QueueCosts:
+        """Return the costs for a simulation: those of each request, and those of each common commit.
+
+        They follow from two equations. Alone, a job takes the times of two requests and two commits. Crowded, half of
+        the workers wait for the next commit while the other half shares one.
+        """
+        alone_s = self.claim_s + self.complete_s
+        used_s, shared = alone_s * (1 - self.idle), 2 / self.crowded
+        commits_s = min(max(0.0, (used_s - self.busy_s) / (1 - shared)), used_s)
+        requests_s = max(self.busy_s - commits_s * shared, 0.0)
+        return QueueCosts(
+            RequestCosts(requests_s * self.claim_s / alone_s, self.claim_s * self.idle),
+            RequestCosts(requests_s * self.complete_s / alone_s, self.complete_s * self.idle),
+            batch_s=commits_s / 2,
+            variation=self.variation,
+        )
+
+
+class ClipCosts(_Table):
+    """Costs of one clip: its length, its stored bytes, and seconds of processor time of server and worker."""
+
+    frames: int = Field(gt=0)
+    stored_bytes: float = Field(gt=0)
+    import_s: float = Field(gt=0)
+    worker_s: float = Field(gt=0)
+
+
+class ByteCosts(_Table):
+    """Costs of one byte that a client uploads: processor time of the server."""
+
+    upload_s: float = Field(ge=0)
+
+
+class MeasuredCosts(_Table):
+    """All measured costs, and where they were measured."""
+
+    date: str
+    machine: str
+    load: str = Field(description="How busy the machine was with other programs.")
+    job: JobCosts
+    clip: ClipCosts
+    byte: ByteCosts
+
+    @classmethod
+    def read(cls, path: Path = MEASURED) -> Self:
+        """Read a file of costs. Raises `UnusableCosts`, with the place of the fault."""
+        try:
+            return cls.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where = ".".join(map(str, first["loc"]))
+            raise UnusableCosts(f"{path}: {where}: {without_prefix(first['msg'])}") from error
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise UnusableCosts(f"{path}: {error}") from error

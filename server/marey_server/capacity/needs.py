@@ -1,0 +1,88 @@
+"""Needs of an amount of clips: seconds of workers, servers and database, and the part that saturates first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from marey_server.capacity.costs import MeasuredCosts
+from marey_server.store.jobs.policy import DEFAULT_POLICY, QueuePolicy
+
+HEARTBEAT_SHARE = 0.5
+"""Share of the server's occupied time of a job that a heartbeat takes: one write of the two of a job."""
+
+
+@dataclass(frozen=True)
+class PlannedWork:
+    """Work and machines: clips to import and process within a number of days, and what is there for it.
+
+    Each worker runs one job at a time. Servers share one Postgres database.
+    """
+
+    clips: int = 10_000_000
+    jobs_per_clip: float = 1.0
+    clip_bytes: float = 500_000.0
+    days: float = 30.0
+    workers: int = 1000
+    servers: int = 100
+    database_processors: int = 8
+
+    def __post_init__(self) -> None:
+        amounts = (self.clips, self.clip_bytes, self.days, self.workers, self.servers, self.database_processors)
+        if min(amounts) <= 0 or self.jobs_per_clip < 0:
+            raise ValueError("all amounts must be greater than 0; only the jobs per clip may be 0")
+
+
+@dataclass(frozen=True)
+class InstalledPart:
+    """Part of an installation: seconds of work that it needs, and the seconds that it has; both of one processor."""
+
+    name: str
+    needed_s: float
+    available_s: float
+
+    @property
+    def share(self) -> float:
+        """The share of the available time that is needed; above 1, the part is saturated."""
+        return self.needed_s / self.available_s
+
+
+@dataclass(frozen=True)
+class Needs:
+    """Computed needs: the parts, the busiest one first, and the bytes to store."""
+
+    parts: tuple[InstalledPart, ...]
+    blob_bytes: float
+    database_bytes: float
+    clips_per_day: float
+
+    @property
+    def first(self) -> InstalledPart:
+        """The part that saturates first."""
+        return self.parts[0]
+
+
+def compute_needs(costs: MeasuredCosts, demand: PlannedWork, policy: QueuePolicy = DEFAULT_POLICY) -> Needs:
+    """Compute what `demand` needs. All work is assumed to be spread evenly over the days.
+
+    `clips_per_day` is the number at which the first part is saturated; heartbeats are counted for working workers only.
+    """
+    period_s = demand.days * 24 * 3600
+    jobs = demand.clips * demand.jobs_per_clip
+    work_s = jobs * costs.clip.worker_s
+    heartbeats = work_s / policy.heartbeat_s
+    busy_s = jobs * costs.job.busy_s + heartbeats * HEARTBEAT_SHARE * costs.job.busy_s
+    upload_s = demand.clips * (costs.clip.import_s + demand.clip_bytes * costs.byte.upload_s)
+    waits_s = jobs * (costs.job.claim_s + costs.job.complete_s)
+    database_s = (jobs + heartbeats * HEARTBEAT_SHARE + demand.clips) * costs.job.database_s
+    parts = (
+        InstalledPart("workers", work_s + waits_s, demand.workers * period_s),
+        InstalledPart("servers", busy_s + upload_s, demand.servers * period_s),
+        InstalledPart("database", database_s, demand.database_processors * period_s),
+    )
+    ordered = tuple(sorted(parts, key=lambda part: part.share, reverse=True))
+    return Needs(
+        ordered,
+        blob_bytes=demand.clips * (costs.clip.stored_bytes * (1 + demand.jobs_per_clip) + demand.clip_bytes),
+        database_bytes=jobs * costs.job.database_bytes,
+        clips_per_day=demand.clips / demand.days / ordered[0].share,
+    )
