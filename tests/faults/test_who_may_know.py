@@ -63,7 +63,7 @@ def _everybody_is_an_administrator(_principal: Any) -> bool:
 
 
 def _every_project_has_guests(principal: Any, row: Any) -> Any:
-    return AS_SEEN(principal, row) or projects._row(row, Role.READER, guest=True)
+    return AS_SEEN(principal, row) or projects._row(row, Role.READER, None, guest=True)
 
 
 HOLES: dict[str, tuple[Any, str, Callable[..., Any]]] = {

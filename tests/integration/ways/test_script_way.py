@@ -50,7 +50,7 @@ def test_the_commands_and_the_python_of_the_page_work_in_their_order(
     *commands, removal = [line for block in blocks("sh") for line in block.splitlines()]
     printed = [run(*shlex.split(line)[1:]).stdout for line in commands]
     first, second, table = printed[-3:]
-    lengths = [float(re.search(r"path\s+(\S+)", text)[1]) for text in (first, second)]  # type: ignore[index]
+    lengths = [float(re.search(r"path\s+(\S+)", text)[1]) for text in (first, second)]
     assert lengths[1] == pytest.approx(2.5 * lengths[0])
     assert lengths[0] > 100, "centimetres of a walk of three seconds"
     factors = [line.split()[1] for line in table.splitlines() if "job_" in line]
