@@ -112,6 +112,14 @@ def test_closing_without_waiting_cancels_what_is_queued(release: threading.Event
     assert running.result(PATIENCE_S)
 
 
+def test_a_closed_lane_says_that_the_server_is_stopping() -> None:
+    lane = Lane("test", 1)
+    lane.close()
+    with pytest.raises(UnavailableProblem) as refused:
+        lane.submit(ANNA, print)
+    assert refused.value.error_code == "draining"
+
+
 class Tree:
     """Decoded body of a request."""
 

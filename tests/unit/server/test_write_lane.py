@@ -9,7 +9,7 @@ import pytest
 import sqlalchemy
 
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import ConflictProblem
+from marey_server.errors import ConflictProblem, UnavailableProblem
 from marey_server.store.database.connections import Database
 from marey_server.store.tables import user
 from marey_server.store.transaction import Transaction
@@ -131,3 +131,15 @@ def test_a_write_that_was_cancelled_while_it_waited_does_not_happen(database: Da
     with pytest.raises(CancelledError):
         cancelled.result(0)
     assert user_names(database) == ["kept"]
+
+
+def test_a_closed_lane_says_that_the_server_is_stopping_and_writes_nothing(
+    database: Database, database_url: str
+) -> None:
+    database.close()
+    with pytest.raises(UnavailableProblem) as refused:
+        database.submit_write(SYSTEM, adding("late"))
+    assert refused.value.error_code == "draining"
+    other = Database(database_url)
+    assert "late" not in user_names(other)
+    other.close()

@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 
 from marey_server.errors import UnavailableProblem
 from marey_server.store.blob_backings import BlobBacking
-from marey_server.store.database.lanes import Client, Lane
+from marey_server.store.database.lanes import Client, Lane, stopping
 from marey_server.store.object_storage.awaiting import BytesAwaited, Carried
 from marey_server.store.object_storage.backing import ObjectBlobs
 from marey_server.store.transaction import Transaction
@@ -89,17 +89,11 @@ class MovingCall(Generic[T]):
     def _then(self, submit: Callable[[], Future[U]], go_on: Callable[[Future[U]], None]) -> None:
         try:
             submitted = submit()
-        except UnavailableProblem as error:  # the queue is full
+        except UnavailableProblem as error:  # the queue is full, or the server is stopping
             self._result.set_exception(error)
-        except RuntimeError:  # of threads that were stopped
-            self._result.set_exception(_stopping())
         else:
             submitted.add_done_callback(go_on)
 
 
 def _error_of(ended: Future[Any]) -> BaseException | None:
-    return _stopping() if ended.cancelled() else ended.exception()
-
-
-def _stopping() -> UnavailableProblem:
-    return UnavailableProblem("The server is stopping and accepts no more work.", code="draining")
+    return stopping() if ended.cancelled() else ended.exception()

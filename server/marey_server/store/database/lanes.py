@@ -48,6 +48,23 @@ SERVER = Client("server")
 """Client that stands for the server itself, in calls such as housekeeping."""
 
 
+def stopping() -> UnavailableProblem:
+    """Return the problem of a call for which the server has no threads any more."""
+    return UnavailableProblem("The server is stopping and accepts no more work.", code="draining")
+
+
+def begin(pool: ThreadPoolExecutor, run: Callable[[], None], future: Future[Any]) -> None:
+    """Run a function in a thread, which finishes `future` among others.
+
+    Raises `UnavailableProblem` if the threads were stopped and nobody else has begun to compute the future.
+    """
+    try:
+        pool.submit(run)
+    except RuntimeError:  # so says a pool whose threads were stopped
+        if future.cancel():
+            raise stopping() from None
+
+
 @dataclass(frozen=True, slots=True)
 class _QueuedCall:
     """Queued call of a function for a client, and the future of its result."""
@@ -152,14 +169,14 @@ class Lane:
         return len(self._line)
 
     def submit(self, client: Client, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Queue a call for a client. Raises `UnavailableProblem` if the queue is full."""
+        """Queue a call for a client. Raises `UnavailableProblem` if the queue is full or the lane is closed."""
         future: Future[T] = Future()
         with self._lock:
             self._line.put(client, _QueuedCall(client, partial(function, *args, **kwargs), future))
             start = self._idle > 0
             self._idle -= start
         if start:
-            self._pool.submit(self._run_waiting)
+            begin(self._pool, self._run_waiting, future)
         return future
 
     def close(self, *, wait: bool = True) -> None:

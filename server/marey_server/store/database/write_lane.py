@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ApiProblem
-from marey_server.store.database.lanes import Client, FairLine, finish
+from marey_server.store.database.lanes import Client, FairLine, begin, finish
 from marey_server.store.database.prepared import run_text
 from marey_server.store.object_storage.awaiting import BytesAwaited
 from marey_server.store.transaction import Transaction
@@ -58,12 +58,12 @@ class WriteLane:
     ) -> Future[T]:
         """Queue `function(tx)`; once the transaction is committed, the future holds what the function returned.
 
-        Raises `UnavailableProblem` if too many writes are waiting.
+        Raises `UnavailableProblem` if too many writes are waiting, or the lane is closed.
         """
         one = _Write(principal, function, Future())
         with self._lock:
             (self._reserved if reserved else self._ordinary).put(client, one)
-        self._thread.submit(self._write_waiting)
+        begin(self._thread, self._write_waiting, one.future)
         return one.future
 
     def close(self) -> None:
