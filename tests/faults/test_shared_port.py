@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import Self
 
 import httpx
 import psutil
@@ -151,7 +152,10 @@ def test_sign_ins_are_limited_at_all_processes_together(pair: Pair) -> None:
 
 
 class Load:
-    """Threads that create collections, some over one connection, some over a new connection for each request."""
+    """Threads that create collections during a `with` block, some over a new connection for each request.
+
+    After the block, everything that was accepted is stored, and if the load is not forgiving, no request has failed.
+    """
 
     def __init__(self, server: SharingServer, name: str, *, forgiving: bool) -> None:
         self.server, self.name, self.forgiving = server, name, forgiving
@@ -184,12 +188,16 @@ class Load:
             time.sleep(0.01)  # leave the processor to the processes that start
         client.close()
 
-    def stop(self) -> None:
-        """Stop, and check that everything that was accepted is stored."""
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, failed: type[BaseException] | None, _error: object, _at: object) -> None:
         self._stop.set()
+        self._pool.shutdown()
+        if failed is not None:
+            return
         for one in self._running:
             one.result()
-        self._pool.shutdown()
         with self.server.client() as marey:
             stored = {one.path for one in marey.project("lab").collections.list()}
         assert stored >= set(self.accepted)
@@ -203,13 +211,12 @@ def test_a_process_that_is_killed_is_replaced_and_no_accepted_write_is_lost(serv
     victim = worker.parent()
     assert victim is not None
     (survivor,) = [one for one in server.modules(PROGRAM) if one != victim]
-    load = Load(server, "killed", forgiving=True)
-    time.sleep(1)
-    victim.kill()
-    time.sleep(0.2)
-    went_on = len(load.accepted)
-    server.wait_for("the process is replaced", lambda: len(set(server.modules(PROGRAM)) - {victim}) == 2)
-    load.stop()
+    with Load(server, "killed", forgiving=True) as load:
+        time.sleep(1)
+        victim.kill()
+        time.sleep(0.2)
+        went_on = len(load.accepted)
+        server.wait_for("the process is replaced", lambda: len(set(server.modules(PROGRAM)) - {victim}) == 2)
     assert survivor.is_running()
     assert len(load.accepted) > went_on
     assert len(load.failures) <= 2 * 4, "each writer may lose the requests that the process was answering"
@@ -226,11 +233,10 @@ def keepers_of_workers(server: SharingServer) -> list[psutil.Process | None]:
 def test_processes_are_replaced_without_a_failed_request(server: SharingServer) -> None:
     before = {one.pid for one in server.modules(PROGRAM)}
     replaced = server.logged("all server processes are replaced")
-    load = Load(server, "replaced", forgiving=False)
-    time.sleep(0.5)
-    server.send(signal.SIGHUP)
-    server.wait_for("all are replaced", lambda: server.logged("all server processes are replaced") > replaced)
-    load.stop()
+    with Load(server, "replaced", forgiving=False):
+        time.sleep(0.5)
+        server.send(signal.SIGHUP)
+        server.wait_for("all are replaced", lambda: server.logged("all server processes are replaced") > replaced)
     after = {one.pid for one in server.modules(PROGRAM)}
     assert len(after) == 2
     assert not after & before
