@@ -320,6 +320,20 @@ def test_a_repository_that_cannot_be_read_is_tried_again(repository: Repository)
         script.run(repository.project, ScriptParams(script="test", declaration=declared))
 
 
+def test_files_that_a_killed_git_has_left_in_the_cache_do_not_stop_later_runs(
+    repository: Repository, tmp_path: Path
+) -> None:
+    repository.run(WRITE_FIELDS)
+    (cached,) = (tmp_path / "cache").rglob("*.git")
+    left = [cached / "config.lock", cached / "refs" / "heads" / "main.lock", cached / "objects" / "pack" / "tmp_pack_x"]
+    for file in left:
+        file.touch()
+    repository.project.scratch = tmp_path / "second"
+    repository.project.scratch.mkdir()
+    assert repository.run(WRITE_FIELDS + "# again\n")["fields"]["answer"] == 42
+    assert not [file for file in left if file.exists()]
+
+
 def test_hooks_and_links_of_the_commit_do_nothing(repository: Repository) -> None:
     (repository.folder / "leading_out").symlink_to("/etc/passwd")
     assert refusal(repository, WRITE_FIELDS).code == "unsafe-commit"
