@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import platform
-import shutil
 import signal
 import tempfile
 import threading
@@ -47,7 +46,7 @@ from marey_schemas.queue.worker_protocol import (
 from marey_schemas.sizes import MIB
 from marey_worker import faults, signatures
 from marey_worker.attempt_api import AttemptApi
-from marey_worker.attempt_limits import LogUploader, Stop, Watch
+from marey_worker.attempt_limits import LogUploader, Stop, Watch, remove_folder
 from marey_worker.heartbeats import LeaseKeeper
 from marey_worker.job_io.input_cache import InputCache
 from marey_worker.messages import (
@@ -164,7 +163,10 @@ class RunningAttempt:
         self._keeper.stop()
         for threads in (self._transfers, self._log_sender):
             threads.shutdown(wait=False, cancel_futures=True)
-        shutil.rmtree(self._scratch, ignore_errors=True)
+        try:
+            remove_folder(self._scratch)
+        except OSError as error:
+            log.warning("%s: the folder %s cannot be removed: %s", self._lease.job, self._scratch, error)
 
     def _order(self) -> Run:
         lease = self._lease

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import secrets
 import threading
 import time
 from dataclasses import dataclass
@@ -105,3 +107,29 @@ class Watch:
             Stop.MEMORY: f"the job needs more memory than its limit of {resources.memory_limit_mb} MiB",
             Stop.LOG: f"the job's log grew beyond its limit of {LOG_LIMIT_BYTES // MIB} MiB",
         }[stop]
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder with all that is in it; links are removed, not followed.
+
+    Nothing may write to the folder any more. Folders are moved to the top before they are emptied, because a script can
+    nest them deeper than a path can be long. Does nothing if there is no folder. Raises `OSError`.
+    """
+    prefix = secrets.token_hex(8)
+    waiting, count = [folder] if folder.is_dir() else [], 0
+    while waiting:
+        emptied = waiting.pop()
+        emptied.chmod(0o700)
+        with os.scandir(emptied) as entries:
+            for entry in list(entries):
+                if not entry.is_dir(follow_symlinks=False):
+                    os.unlink(entry.path)
+                    continue
+                os.chmod(entry.path, 0o700)
+                count += 1
+                waiting.append(folder / f"{prefix}-{count}")
+                os.rename(entry.path, waiting[-1])
+        if emptied != folder:
+            emptied.rmdir()
+    if folder.is_dir():
+        folder.rmdir()

@@ -51,7 +51,7 @@ Repository = Annotated[
 Value = bool | int | float | str
 """Value of a parameter or a logged field."""
 
-_PLACEHOLDER = re.compile(r"^\{(input|output|parameter):([A-Za-z][A-Za-z0-9_]{0,62})\}$")
+_PLACEHOLDER = re.compile(r"\{(input|output|parameter):([A-Za-z][A-Za-z0-9_]{0,62})\}")
 _MOTION_ENDINGS = {row.name: row.endings[0] for row in FORMATS if row.name in WHOLE_FORMATS}
 """Formats of clips that a script can write, with the endings of their files."""
 
@@ -72,6 +72,10 @@ class ScriptParameter(Request):
             raise ValueError(f"minimum and maximum need a parameter of the type number or integer, not {self.type}")
         if self.choices and self.type != "text":
             raise ValueError(f"choices need a parameter of the type text, not {self.type}")
+        if any("\x00" in choice for choice in self.choices):
+            raise ValueError("choices: a text contains a zero character")
+        if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
+            raise ValueError("minimum is greater than maximum")
         if self.default is not None and (fault := self.fault_of(self.default)) is not None:
             raise ValueError(f"default: {fault}")
         return self
@@ -190,7 +194,7 @@ class ScriptDeclaration(Request):
         self._check_program()
         used = set()
         for place, word in enumerate(self.argv):
-            match = _PLACEHOLDER.match(word)
+            match = _PLACEHOLDER.fullmatch(word)
             if match is not None:
                 used.add(match.groups())
             elif re.search(r"\{(input|output|parameter):", word):
@@ -213,7 +217,7 @@ class ScriptDeclaration(Request):
         file = (self.argv[1] if len(self.argv) > 1 else "") if program == PYTHON else program.removeprefix("./")
         if program != PYTHON and not program.startswith("./"):
             raise ValueError(f"argv.0: the first word must be {PYTHON}, or a file of the commit such as ./measure")
-        if not re.match(r"^[\w][\w./+-]*$", file) or ".." in file.split("/"):
+        if not re.fullmatch(r"[\w][\w./+-]*", file) or ".." in file.split("/"):
             raise ValueError(f"argv: {file!r} is not the path of a file in the commit")
 
     @property
@@ -224,7 +228,7 @@ class ScriptDeclaration(Request):
     def words(self, paths: Mapping[tuple[str, str], str], values: Mapping[str, Value]) -> Iterator[str]:
         """Yield the words of the command; `paths` contains the path of each (input or output, name)."""
         for word in self.argv:
-            match = _PLACEHOLDER.match(word)
+            match = _PLACEHOLDER.fullmatch(word)
             if match is None:
                 yield word
             elif match[1] == "parameter":

@@ -79,6 +79,17 @@ def test_runs_are_listed_by_their_values_and_logged_fields(desk: Desk) -> None:
             listed(desk, sort)
 
 
+def test_a_result_that_a_worker_made_up_does_not_break_the_list(desk: Desk) -> None:
+    register(desk)
+    for result in ({"fields": {"a": [1], "b": 2}}, {"fields": [1]}, {"fields": None}, {}):
+        run(desk, size=1)
+        desk.complete(desk.claim(kinds=("script",)), result=result)
+    assert [one.fields for one in listed(desk, "fields.b")] == [{"b": 2}, {}, {}, {}]
+    for sort in ("fields.b\n", "created_at\n"):
+        with pytest.raises(BadRequestProblem, match="cannot be sorted"):
+            listed(desk, sort)
+
+
 WRONG_VALUES = [
     ({}, "needs the parameter 'size'"),
     ({"size": 0}, "at least 1"),
@@ -161,6 +172,10 @@ WRONG_DECLARATIONS = [
     ({"argv": ["python", "../evil.py"]}, "not the path"),
     ({"argv": ["./../evil"]}, "not the path"),
     ({"argv": ["python"]}, "not the path"),
+    ({"argv": ["python", "a.py\n"]}, "not the path"),
+    ({"argv": ["python", "a.py", "{output:fields}\n"]}, "word of its own"),
+    ({"parameters": {"size": {"type": "text", "choices": ["a\0b"]}}}, "zero character"),
+    ({"parameters": {"size": {"minimum": 5, "maximum": 1}}}, "greater than"),
     ({"argv": ["python", "a.py", "--size={parameter:size}"]}, "word of its own"),
     ({"argv": ["python", "a.py", "{input:clip}"]}, "not declared"),
     ({"argv": ["python", "a.py"]}, "no word is"),

@@ -21,12 +21,14 @@ from marey_motion.gait import generate_gait
 from marey_schemas.consents import CONSENT_EXPIRED
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.scripts import REPOSITORIES_VARIABLE, ScriptDeclaration, ScriptParams
+from marey_worker.attempt_limits import remove_folder
 from marey_worker.context import JobRefused
 from marey_worker.kinds import script
+from marey_worker.scripts import guard
 from marey_worker.scripts.checkout import FetchFailed
 from marey_worker.scripts.confinement import landlock_version
 from marey_worker.scripts.files import OUTPUTS, collect, read_fields
-from marey_worker.scripts.guard import LOG_BYTES
+from marey_worker.scripts.guard import LOG_BYTES, fault_of_files
 
 pytestmark = pytest.mark.skipif(landlock_version() == 0, reason="scripts need Linux with Landlock")
 
@@ -149,6 +151,19 @@ HOSTILE = {
         "n = 0\nwhile True:\n n += 1\n open(f'file{n}', 'wb').write(b'x' * 1000000)",
         "its files took more than 8 MiB",
     ),
+    "files without a name": (
+        "import os, time\nopened = []\nfor _ in range(4):\n opened.append(open('x', 'wb', 0))\n"
+        " opened[-1].write(bytes(4_000_000))\n os.unlink('x')\ntime.sleep(30)",
+        "its files took more than 8 MiB",
+    ),
+    "files in memory": (
+        "import os, time\nfor _ in range(4): os.write(os.memfd_create('x'), bytes(4_000_000))\ntime.sleep(30)",
+        "its files took more than 8 MiB",
+    ),
+    "deep folders": (
+        "import os, time\nfor _ in range(1500): os.mkdir('d'); os.chdir('d')\ntime.sleep(30)",
+        "nested deeper than",
+    ),
     "much memory": (
         "import os\nfor _ in range(4):\n if os.fork() == 0: break\nx = bytearray(b'x') * 200_000_000\n"
         "import time; time.sleep(30)",
@@ -162,6 +177,30 @@ def test_a_script_that_exceeds_a_limit_is_killed_with_all_its_processes(reposito
     text, reason = HOSTILE[what]
     error = refusal(repository, text)
     assert (error.code, reason in error.detail) == ("script-limit", True), error.detail
+    remove_folder(repository.project.scratch)
+
+
+def test_folders_count_as_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number in range(3):
+        (tmp_path / str(number)).mkdir()
+    assert fault_of_files(tmp_path, 0, 1) is None
+    monkeypatch.setattr(guard, "MOST_FILES", 2)
+    assert "more than 2" in (fault_of_files(tmp_path, 0, 1) or "")
+
+
+def test_folders_without_rights_and_links_are_removed(tmp_path: Path) -> None:
+    kept = tmp_path / "kept"
+    kept.mkdir(mode=0o755)
+    (kept / "file").touch()
+    scratch = tmp_path / "scratch"
+    (scratch / "a" / "b").mkdir(parents=True)
+    (scratch / "a" / "link").symlink_to(kept)
+    (scratch / "a" / "b").chmod(0)
+    (scratch / "a").chmod(0)
+    remove_folder(scratch)
+    assert not scratch.exists()
+    assert (kept / "file").exists()
+    remove_folder(scratch)
 
 
 def test_a_script_that_sleeps_past_its_limit_is_killed(repository: Repository) -> None:
@@ -184,13 +223,18 @@ DENIED = {
     "one huge file": "open('huge', 'wb').write(bytes(9_000_000))",
     "one huge allocation": "bytearray(1_000_000_000)",
     "network": "__import__('socket').create_connection(('127.0.0.1', {port}), 5)",
+    "Unix socket": "__import__('socket').socket(1).connect('{outside}/socket')",
+    "mode": "__import__('os').chmod('{outside}/secret', 0o777)",
+    "times": "__import__('os').utime('{outside}/secret')",
     "signal": "__import__('os').kill({parent}, 0)",
 }
 
 
 def test_a_script_cannot_reach_outside(repository: Repository, tmp_path: Path) -> None:
     (tmp_path / "secret").write_text("secret")
-    with socket.create_server(("127.0.0.1", 0)) as listening:
+    with socket.create_server(("127.0.0.1", 0)) as listening, socket.socket(socket.AF_UNIX) as unix:
+        unix.bind(str(tmp_path / "socket"))
+        unix.listen()
         port = listening.getsockname()[1]
         tries = {name: text.format(outside=tmp_path, parent=os.getpid(), port=port) for name, text in DENIED.items()}
         text = (
@@ -198,11 +242,12 @@ def test_a_script_cannot_reach_outside(repository: Repository, tmp_path: Path) -
             "def succeeds(code):\n"
             "    try:\n        eval(code)\n    except BaseException:\n        return False\n    return True\n"
             f"found = {{name.replace(' ', '_'): succeeds(code) for name, code in {tries!r}.items()}}\n"
-            "found['inside'] = succeeds(\"open('inside', 'w')\")\n"
+            "found['inside'] = succeeds(\"open('inside', 'w'), __import__('os').chmod('inside', 0o755)\")\n"
+            "found['pair'] = succeeds(\"__import__('socket').socketpair()\")\n"
             "json.dump(found, open(sys.argv[-1], 'w'))\n"
         )
         fields = repository.run(text)["fields"]
-    assert fields == {name.replace(" ", "_"): False for name in DENIED} | {"inside": True}
+    assert fields == {name.replace(" ", "_"): False for name in DENIED} | {"inside": True, "pair": True}
     assert not (tmp_path / "evil").exists()
 
 
@@ -273,6 +318,20 @@ def test_a_repository_that_cannot_be_read_is_tried_again(repository: Repository)
     declared = repository.declare(commit, repository=f"file://{repository.folder.parent}/missing")
     with pytest.raises(FetchFailed, match=r"git fetch of .*missing failed"):
         script.run(repository.project, ScriptParams(script="test", declaration=declared))
+
+
+def test_files_that_a_killed_git_has_left_in_the_cache_do_not_stop_later_runs(
+    repository: Repository, tmp_path: Path
+) -> None:
+    repository.run(WRITE_FIELDS)
+    (cached,) = (tmp_path / "cache").rglob("*.git")
+    left = [cached / "config.lock", cached / "refs" / "heads" / "main.lock", cached / "objects" / "pack" / "tmp_pack_x"]
+    for file in left:
+        file.touch()
+    repository.project.scratch = tmp_path / "second"
+    repository.project.scratch.mkdir()
+    assert repository.run(WRITE_FIELDS + "# again\n")["fields"]["answer"] == 42
+    assert not [file for file in left if file.exists()]
 
 
 def test_hooks_and_links_of_the_commit_do_nothing(repository: Repository) -> None:

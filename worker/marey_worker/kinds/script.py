@@ -32,6 +32,10 @@ from marey_worker.scripts.guard import CommandEnd, GuardedCommand
 CODE = "code"
 """Folder of the commit, below the folder of a run."""
 LAST_LINES = 10
+NOT_ISOLATED = (
+    "this system allows no namespaces with mounts, so that the script could change modes and times of files of the "
+    "worker's user"
+)
 GUARD_MODULE = "marey_worker.scripts.guard"
 
 
@@ -111,7 +115,7 @@ def _run_guarded(order: GuardedCommand) -> CommandEnd:
 
 def _words_of(end: CommandEnd) -> str:
     how = f"exit status {end.status}" if end.stopped is None else f"stopped: {end.stopped}"
-    missing = "" if end.isolated else "; this system allows no namespaces, so only Landlock confined the script"
+    missing = "" if end.isolated else f"; {NOT_ISOLATED}"
     return f"{how}{missing}"
 
 

@@ -99,6 +99,8 @@ class _Git:
     def fetch(self) -> None:
         """Fetch all branches and tags. Raises `FetchFailed`."""
         self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        for left in (*self._folder.rglob("*.lock"), *self._folder.glob("objects/**/tmp_*")):
+            left.unlink()  # of a Git command that was killed; no other one runs, because this worker holds the lock
         self._run("init", "--quiet", "--bare", str(self._folder))
         refs = ("+refs/heads/*:refs/heads/*", "+refs/tags/*:refs/tags/*")
         options = ("--quiet", "--prune", "--no-tags", "--no-recurse-submodules", "--no-write-fetch-head")

@@ -14,7 +14,11 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-CLONE_NEWIPC, CLONE_NEWUSER, CLONE_NEWPID, CLONE_NEWNET = 0x08000000, 0x10000000, 0x20000000, 0x40000000
+CLONE_NEWNS, CLONE_NEWIPC, CLONE_NEWUSER = 0x00020000, 0x08000000, 0x10000000
+CLONE_NEWPID, CLONE_NEWNET = 0x20000000, 0x40000000
+MS_BIND, MS_REC, MS_PRIVATE = 1 << 12, 1 << 14, 1 << 18
+_MOUNT_SETATTR = 442
+_AT_FDCWD, _AT_RECURSIVE, _MOUNT_READ_ONLY = -100, 0x8000, 1
 PR_SET_CHILD_SUBREAPER, PR_SET_NO_NEW_PRIVS = 36, 38
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # the same numbers on all architectures
 _PATH_BENEATH = 1
@@ -45,18 +49,22 @@ def landlock_version() -> int:
     return max(0, int(_libc().syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), 1)))
 
 
-def separate(*, network: bool) -> bool:
+def separate(writable: Path, *, network: bool) -> bool:
     """Move the next child of this process to namespaces of its own; return whether the system allowed it.
 
     This process must have only one thread. Its next child sees no other processes and, unless `network` is true, no
-    network.
+    network. Both see all files outside `writable` as read-only.
     """
     user, group = os.geteuid(), os.getegid()
-    flags = CLONE_NEWUSER | CLONE_NEWPID | CLONE_NEWIPC | (0 if network else CLONE_NEWNET)
+    flags = CLONE_NEWUSER | CLONE_NEWNS | CLONE_NEWPID | CLONE_NEWIPC | (0 if network else CLONE_NEWNET)
     if _libc().unshare(flags) != 0:
         return False
     for file, text in (("setgroups", "deny"), ("uid_map", f"1000 {user} 1"), ("gid_map", f"1000 {group} 1")):
         Path(f"/proc/self/{file}").write_text(text)
+    try:
+        _make_read_only(writable)
+    except NotConfinedError:  # some containers allow namespaces, but no mounts
+        return False
     return True
 
 
@@ -89,6 +97,25 @@ def confine(writable: Path, *, network: bool) -> None:
     os.close(ruleset)
 
 
+def _make_read_only(writable: Path) -> None:
+    """Make all files read-only for the namespace of this process, except those below `writable`.
+
+    Landlock does not limit changes of modes, owners and times, which this process may make to all files of its user.
+    Raises `NotConfinedError`.
+    """
+    libc, folder = _libc(), os.fsencode(writable)
+    _check(libc.mount(None, b"/", None, ctypes.c_ulong(MS_REC | MS_PRIVATE), None))
+    _set_read_only(b"/", read_only=True, flags=_AT_RECURSIVE)
+    _check(libc.mount(folder, folder, None, ctypes.c_ulong(MS_BIND), None))
+    _set_read_only(folder, read_only=False, flags=0)
+
+
+def _set_read_only(path: bytes, *, read_only: bool, flags: int) -> None:
+    attributes = struct.pack("=QQQQ", _MOUNT_READ_ONLY * read_only, _MOUNT_READ_ONLY * (not read_only), 0, 0)
+    size = ctypes.c_size_t(len(attributes))
+    _check(_libc().syscall(_MOUNT_SETATTR, _AT_FDCWD, path, ctypes.c_uint(flags), attributes, size))
+
+
 def _rights_of(version: int) -> int:
     """Return all rights to files that a version of Landlock knows."""
     newest = {1: 12, 2: 13, 3: 14, 4: 14}.get(version, 15)
@@ -109,7 +136,7 @@ def _allow(ruleset: int, paths: Iterable[str], rights: int) -> None:
 
 def _check(answer: int) -> int:
     if answer < 0:
-        raise NotConfinedError(f"Landlock cannot be used: {os.strerror(ctypes.get_errno())}")
+        raise NotConfinedError(f"this system cannot confine it: {os.strerror(ctypes.get_errno())}")
     return answer
 
 

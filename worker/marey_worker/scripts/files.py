@@ -88,7 +88,10 @@ def collect(declared: ScriptDeclaration, folder: Path, target: Path) -> dict[str
     Raises `JobRefused` if a required output is missing, or an output is too large, a link, or not an ordinary file.
     Only the names below `folder` are trusted: the script may have replaced any file or folder by a link.
     """
-    run = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        run = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise JobRefused("unsafe-output", "the script has made its folder unreadable") from error
     try:
         try:
             outputs = os.open(OUTPUTS, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=run)

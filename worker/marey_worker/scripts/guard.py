@@ -17,7 +17,7 @@ import signal
 import stat
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -27,12 +27,16 @@ import psutil
 from marey_schemas.processes.limits import PR_SET_PDEATHSIG, die_with_parent
 from marey_schemas.sizes import MIB
 from marey_worker.scripts.confinement import NotConfinedError, adopt_orphans, confine, separate
+from marey_worker.scripts.system_calls import filter_system_calls
 
 LOOK_EVERY_S = 0.05
 MEASURE_EVERY_S = 0.5
 LOG_BYTES = 8 * MIB
 TAIL_BYTES = 2000
 MOST_FILES = 100_000
+"""Greatest number of files and folders below the folder of a run."""
+MOST_NESTED = 100
+BLOCK_BYTES = 512
 OPEN_FILES = 1024
 THREADS_PER_PROCESS = 8
 NO_PROGRAM_STATUS = 127
@@ -71,7 +75,7 @@ def main() -> None:
     die_with_parent()
     _take_precedence()
     adopt_orphans()
-    isolated = separate(network=order.network)
+    isolated = separate(Path(order.folder), network=order.network)
     read_end, write_end = os.pipe()
     held = os.fork()
     if held == 0:
@@ -99,6 +103,7 @@ def _hold(order: GuardedCommand, output: int, *, isolated: bool) -> NoReturn:
     try:
         _limit(order, isolated=isolated)
         confine(Path(order.folder), network=order.network)
+        filter_system_calls()
         command = os.fork()
         if command == 0:
             _die_with_parent()
@@ -207,10 +212,10 @@ class _Watch:
         if sum(map(_resident, family)) > order.memory_mb * MIB:
             return f"it used more than {order.memory_mb} MiB of memory"
         if time.monotonic() > self._measure_at:
-            written = _bytes_below(Path(order.folder), order.written_mb * MIB)
+            fault = fault_of_files(Path(order.folder), _nameless_files(family), order.written_mb)
             self._measure_at = time.monotonic() + MEASURE_EVERY_S
-            if written:
-                return f"its files took more than {order.written_mb} MiB, or there were more than {MOST_FILES:,}"
+            if fault is not None:
+                return fault
         return self._too_much_output()
 
     def _end_all(self) -> None:
@@ -253,20 +258,52 @@ def _resident(one: psutil.Process) -> int:
         return 0
 
 
-def _bytes_below(folder: Path, limit: int) -> bool:
-    """Return whether the files below a folder take more than `limit` bytes, or are too many; links are not followed."""
-    total = count = 0
-    for parent, _, names in os.walk(folder):
-        for name in names:
+def _nameless_files(family: Iterable[psutil.Process]) -> int:
+    """Return how many bytes the open files take that have no name any more, or never had one (memory files)."""
+    sizes: dict[tuple[int, int], int] = {}
+    for one in family:
+        try:
+            descriptors = os.listdir(f"/proc/{one.pid}/fd")
+        except OSError:
+            continue  # it has ended
+        for number in descriptors:
+            try:
+                found = os.stat(f"/proc/{one.pid}/fd/{number}")
+            except OSError:
+                continue  # it is closed
+            if stat.S_ISREG(found.st_mode) and found.st_nlink == 0:
+                sizes[found.st_dev, found.st_ino] = found.st_blocks * BLOCK_BYTES
+    return sum(sizes.values())
+
+
+def fault_of_files(folder: Path, nameless_bytes: int, written_mb: int) -> str | None:
+    """Return why the files below a folder are too large, too many or out of sight, or None; links are not followed.
+
+    `nameless_bytes` is what files without a name take in addition.
+    """
+    total, count, waiting = nameless_bytes, 0, [(str(folder), 0)]
+    while waiting:
+        path, depth = waiting.pop()
+        try:
+            entries = list(os.scandir(path))
+        except PermissionError:
+            return "it has made a folder unreadable"
+        except OSError:
+            continue  # it has been removed or moved
+        for entry in entries:
             count += 1
             try:
-                found = os.lstat(os.path.join(parent, name))
+                found = entry.stat(follow_symlinks=False)
             except OSError:
                 continue
-            total += found.st_blocks * 512 if stat.S_ISREG(found.st_mode) else 0
-            if total > limit or count > MOST_FILES:
-                return True
-    return False
+            total += found.st_blocks * BLOCK_BYTES if stat.S_ISREG(found.st_mode) else 0
+            if stat.S_ISDIR(found.st_mode):
+                waiting.append((entry.path, depth + 1))
+        if depth > MOST_NESTED:
+            return f"its folders were nested deeper than {MOST_NESTED}"
+        if total > written_mb * MIB or count > MOST_FILES:
+            return f"its files took more than {written_mb} MiB, or there were more than {MOST_FILES:,}"
+    return None
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from sqlalchemy import ColumnElement, Row, func, select
 
 from marey_schemas.items import Page
 from marey_schemas.queue.jobs import Job, JobCreate
-from marey_schemas.queue.scripts import SCRIPT, ScriptRun, ScriptRunCreate
+from marey_schemas.queue.scripts import SCRIPT, ScriptRun, ScriptRunCreate, Value
 from marey_server.errors import BadRequestProblem
 from marey_server.store import projects
 from marey_server.store.database.clock import datetime_of
@@ -18,7 +18,7 @@ from marey_server.store.scripts.registry import find_script
 from marey_server.store.tables import job, script_run, user
 from marey_server.store.transaction import Transaction
 
-_SORT = re.compile(r"^(-?)(created_at|(?:(fields|values)\.([A-Za-z][A-Za-z0-9_]{0,62})))$")
+_SORT = re.compile(r"(-?)(created_at|(?:(fields|values)\.([A-Za-z][A-Za-z0-9_]{0,62})))")
 
 
 def run_script(tx: Transaction, project: str, name: str, request: ScriptRunCreate) -> Job:
@@ -57,7 +57,7 @@ def list_runs(tx: Transaction, project: str, name: str, *, sort: str, limit: int
 
 
 def _order(tx: Transaction, sort: str) -> list[ColumnElement[Any]]:
-    match = _SORT.match(sort)
+    match = _SORT.fullmatch(sort)
     if match is None:
         raise BadRequestProblem(
             f"The runs cannot be sorted by {sort!r}; sort them by created_at, fields.<name> or values.<name>.",
@@ -79,10 +79,18 @@ def _shown(row: Row[Any]) -> ScriptRun:
         job=row.id,
         state=row.state,
         values=row.params["values"],
-        fields=(row.result or {}).get("fields", {}),
+        fields=_fields_of(row.result),
         commit=row.params["declaration"]["commit"],
         seed=row.seed,
         author=row.author,
         created_at=datetime_of(row.created_us),
         finished_at=None if row.finished_us is None else datetime_of(row.finished_us),
     )
+
+
+def _fields_of(result: Any) -> dict[str, Value]:
+    """Return the logged fields in the result of a run; a worker can write anything else there, which is left out."""
+    fields = result.get("fields") if isinstance(result, dict) else None
+    if not isinstance(fields, dict):
+        return {}
+    return {name: value for name, value in fields.items() if isinstance(value, bool | int | float | str)}
