@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 from typing import NoReturn
 
@@ -188,7 +189,7 @@ class _Watch:
         order = self._order
         if time.monotonic() > self._deadline:
             return f"it ran longer than its limit of {order.seconds} s"
-        family = list(_descendants())
+        family = list(islice(_descendants(), order.processes + 2))
         if len(family) > order.processes + 1:  # one process waits for the command
             return f"it had more than {order.processes} processes at the same time"
         if sum(map(_resident, family)) > order.memory_mb * MIB:
@@ -201,7 +202,13 @@ class _Watch:
         return self._too_much_output()
 
     def _end_all(self) -> None:
-        """Kill all processes of the command, until none is left."""
+        """Kill all processes of the command, until none is left.
+
+        The first process is killed first: if it has a namespace of its own, the kernel then kills all others at once,
+        even those that fork faster than they can be listed.
+        """
+        if self.status is None:
+            os.kill(self._held, signal.SIGKILL)
         while family := list(_descendants()):
             for one in family:
                 try:
