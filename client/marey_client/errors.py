@@ -147,6 +147,8 @@ class RequestFailed(MareyError):
         self.anonymous = anonymous
 
     def __str__(self) -> str:
+        if len(self.errors) == 1 and self.errors[0].detail == self.detail:
+            return ": ".join(text for text in (self.errors[0].pointer, self.detail) if text)
         whole = self.detail
         for text in (f"{field.pointer}: {field.detail}" for field in self.errors):
             if text not in self.detail:

@@ -85,6 +85,11 @@ def _why_queued(
             f"queued: the next attempt starts in {wait_s:.0f} s at the earliest, after attempt {job.attempt} of "
             f"{job.max_attempts}."
         )
+    if limit is not None and limit.allowed == 0:
+        return (
+            "queued: no job of the project can start, because its limit of running jobs is 0. An administrator can "
+            "change the limit (`marey project quota`)."
+        )
     if limit is not None and limit.allowed is not None and limit.used >= limit.allowed:
         return (
             f"queued: the project runs {limit.used} jobs, and its limit is {limit.allowed}; the job can start when "

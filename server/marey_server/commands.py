@@ -124,6 +124,8 @@ def upgrade(*, while_serving: bool = False, finish: bool = False, **settings: An
         _say("a newer version of Marey has added to the tables; this version can serve them")
         return
     _say("the database's schema is up to date")
+    if done.created:
+        return
     if done.applied and done.additive:
         _say("servers of the earlier version can go on, because the upgrade has only added to the tables")
     elif done.applied:

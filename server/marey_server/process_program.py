@@ -33,9 +33,9 @@ with loading_modules():
     from marey_server.launchers.launcher import LauncherUnusable
     from marey_server.launchers.pools import find_launcher, keeping_workers
     from marey_server.process.settings import Settings
-    from marey_server.shared_port.orders import KEEP_WORKERS, READY, StartOrder
+    from marey_server.shared_port.orders import KEEP_WORKERS, PROGRAM, READY, StartOrder
 
-log = logging.getLogger(__name__)
+log = logging.getLogger(PROGRAM)  # `__name__` is `__main__`, since this module is run as a program
 
 LINGER_S = 1.0
 """Seconds in which a process that will end still answers requests on open connections, so that none is lost."""

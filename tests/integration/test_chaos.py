@@ -84,8 +84,8 @@ def test_only_the_scratch_project_can_be_reached_with_the_token_of_the_test(scra
 
 def test_each_case_happens_and_equal_seeds_draw_equal_orders() -> None:
     cases = ["a", "b", "c"]
-    assert sorted(running._drawn(cases, 1, random.Random(1))) == cases
-    many = [running._drawn(cases, 40, random.Random(seed)) for seed in (1, 1, 2)]
+    assert sorted(running._drawn(cases, 0, random.Random(1))) == cases
+    many = [running._drawn(cases, 17, random.Random(seed)) for seed in (1, 1, 2)]
     assert many[0] == many[1] != many[2]
     assert len(many[0]) == 20
     assert set(many[0]) == set(cases)

@@ -16,6 +16,7 @@ from marey_client.load.scratch import Scratch, scratch_project
 from marey_client.marey import Marey
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.jobs import Job, JobState
+from marey_schemas.wording import counted
 
 T = TypeVar("T")
 
@@ -45,13 +46,15 @@ class ChaosFinding:
 def run_chaos(marey: Marey, seed: int, faults: int, on_step: OnStep) -> Iterator[ChaosFinding]:
     """Run each fault at least once in a scratch project, and yield a finding for each fault and for the results.
 
-    `faults` is the total number of faults; those beyond one of each are drawn. Equal seeds draw the same faults in the
+    `faults` is the total number of faults, but each happens at least once; half of those beyond one of each are drawn
+    from each group. Equal seeds draw the same faults in the
     same order; the moments at which requests meet still differ. The scratch project and all processes of the test are
     removed at the end, also after an error or Ctrl-C.
     """
     draw = random.Random(seed)  # noqa: S311 - faults of a test, not secrets
-    hostile = _drawn(list(HOSTILE_CASES), faults, draw)
-    killed = _drawn(list(WORKER_FAULTS), faults, draw)
+    further = max(0, faults - len(HOSTILE_CASES) - len(WORKER_FAULTS))
+    hostile = _drawn(list(HOSTILE_CASES), further // 2, draw)
+    killed = _drawn(list(WORKER_FAULTS), further - further // 2, draw)
     with scratch_project(marey) as scratch, worker_processes(scratch) as processes:
         expected: dict[str, Kind] = {}
         for number, name in enumerate(hostile):
@@ -75,9 +78,8 @@ def run_chaos(marey: Marey, seed: int, faults: int, on_step: OnStep) -> Iterator
         yield from (_check(scratch, job, kind) for job, kind in expected.items())
 
 
-def _drawn(cases: Sequence[T], faults: int, draw: random.Random) -> list[T]:
-    """Return all cases and further drawn ones, shuffled; half of all faults are of each sort of cases."""
-    further = max(0, faults // 2 - len(cases))
+def _drawn(cases: Sequence[T], further: int, draw: random.Random) -> list[T]:
+    """Return all cases and `further` drawn ones, shuffled."""
     chosen = [*cases, *(draw.choice(cases) for _ in range(further))]
     draw.shuffle(chosen)
     return chosen
@@ -121,7 +123,9 @@ def _check(scratch: Scratch, job_id: str, kind: Kind) -> ChaosFinding:
     job = scratch.marey.jobs.get(job_id)
     wrong = list(_faults_of(scratch, job, kind))
     attempts = len(list(scratch.marey.jobs.attempts(job_id)))
-    return ChaosFinding(f"job in {job.into}", "; ".join(wrong), f"one visible result after {attempts} attempts")
+    return ChaosFinding(
+        f"job in {job.into}", "; ".join(wrong), f"one visible result after {counted(attempts, 'attempt')}"
+    )
 
 
 def _faults_of(scratch: Scratch, job: Job, kind: Kind) -> Iterator[str]:

@@ -51,7 +51,7 @@ class LoadPlan:
         if not 1 <= self.replicates <= MOST_REPLICATES:
             raise ValueError(f"the number of replicates must be between 1 and {MOST_REPLICATES}")
         if not 0 <= self.workers <= MOST_WORKERS:
-            raise ValueError(f"the number of workers must be between 0 and {MOST_WORKERS}")
+            raise ValueError(f"the number of workers must be at most {MOST_WORKERS}")
 
 
 def load_test(marey: Marey, plan: LoadPlan, on_run: OnRun) -> Iterator[RateFigures]:

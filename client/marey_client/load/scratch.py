@@ -95,7 +95,7 @@ def scratch_project(marey: Marey) -> Iterator[Scratch]:
     Its jobs that have not ended are cancelled, its token is revoked, and the project is deleted. Raises
     `MareyError` if the caller may not create projects, or may not create a token with the scope `work`.
     """
-    project = marey.create_project(ProjectCreate(name=f"{PREFIX}{secrets.token_hex(6)}", title="Load test"))
+    project = marey.create_project(ProjectCreate(name=f"{PREFIX}{secrets.token_hex(6)}", title="Test of the server"))
     token: str | None = None
     try:
         made = _make_token(marey, project.name)

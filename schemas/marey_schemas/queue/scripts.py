@@ -52,6 +52,7 @@ Value = bool | int | float | str
 """Value of a parameter or a logged field."""
 
 _PLACEHOLDER = re.compile(r"\{(input|output|parameter):([A-Za-z][A-Za-z0-9_]{0,62})\}")
+_COMMIT = re.compile(r"^[0-9a-f]{40}$")
 _MOTION_ENDINGS = {row.name: row.endings[0] for row in FORMATS if row.name in WHOLE_FORMATS}
 """Formats of clips that a script can write, with the endings of their files."""
 
@@ -167,7 +168,7 @@ class ScriptDeclaration(Request):
     """Code and command of a script, its parameters, inputs and outputs, and its limits."""
 
     repository: Repository = Field(description="Address of the Git repository; the server must allow it.")
-    commit: str = Field(pattern=r"^[0-9a-f]{40}$", description="Full name of the commit, 40 hexadecimal digits.")
+    commit: str = Field(pattern=_COMMIT.pattern, description="Full name of the commit, 40 hexadecimal digits.")
     argv: tuple[Annotated[str, StringConstraints(min_length=1, max_length=1000)], ...] = Field(
         min_length=1,
         max_length=MOST_WORDS,
@@ -179,6 +180,13 @@ class ScriptDeclaration(Request):
     inputs: dict[FieldName, ScriptInput] = Field(default_factory=dict, max_length=MOST_DECLARED)
     outputs: dict[FieldName, ScriptOutput] = Field(min_length=1, max_length=MOST_DECLARED)
     limits: ScriptLimits = ScriptLimits()
+
+    @field_validator("commit", mode="before")
+    @classmethod
+    def _check_commit(cls, commit: object) -> object:
+        if isinstance(commit, str) and not _COMMIT.fullmatch(commit):
+            raise ValueError("give the full name of a commit, 40 hexadecimal digits, as `git rev-parse` prints it")
+        return commit
 
     @field_validator("repository")
     @classmethod

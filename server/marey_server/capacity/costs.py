@@ -94,5 +94,7 @@ class MeasuredCosts(_Table):
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"]))
             raise UnusableCosts(f"{path}: {where}: {without_prefix(first['msg'])}") from error
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        except OSError as error:
+            raise UnusableCosts(f"{path}: {error.strerror}") from error
+        except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
             raise UnusableCosts(f"{path}: {error}") from error

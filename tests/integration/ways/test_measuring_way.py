@@ -55,6 +55,6 @@ def test_each_fault_happens_and_each_job_has_one_visible_result(tmp_path: Path) 
     finally:
         server.stop()
     assert shown.stderr.startswith("seed 7\n")
-    assert shown.stdout.count("one visible result after") == 11
+    assert shown.stdout.count("one visible result after") == 10
     for fault in ("killed after claim", "killed before complete", "paused before complete", "stale fence"):
         assert fault in shown.stdout

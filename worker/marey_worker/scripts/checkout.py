@@ -60,7 +60,8 @@ def check_out(declared: ScriptDeclaration, folder: Path, environment: Mapping[st
             if not git.contains(declared.commit):
                 raise JobRefused(
                     "no-commit",
-                    f"no branch or tag of {declared.repository} contains the commit {declared.commit}",
+                    f"no branch or tag of {declared.repository} contains the commit {declared.commit}; push the "
+                    "commit, or register the script with another one",
                 )
         git.extract(declared.commit, folder)
         os.utime(repository)

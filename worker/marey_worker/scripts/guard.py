@@ -19,6 +19,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 from typing import NoReturn
 
@@ -206,7 +207,7 @@ class _Watch:
         order = self._order
         if time.monotonic() > self._deadline:
             return f"it ran longer than its limit of {order.seconds} s"
-        family = list(_descendants())
+        family = list(islice(_descendants(), order.processes + 2))
         if len(family) > order.processes + 1:  # one process waits for the command
             return f"it had more than {order.processes} processes at the same time"
         if sum(map(_resident, family)) > order.memory_mb * MIB:
@@ -221,7 +222,8 @@ class _Watch:
     def _end_all(self) -> None:
         """Kill all processes of the command, until none is left.
 
-        In a process namespace of its own, the first process takes all others with it.
+        The first process is killed first: if it has a namespace of its own, the kernel then kills all others at once,
+        even those that fork faster than they can be listed.
         """
         if self.status is None:
             os.kill(self._held, signal.SIGKILL)

@@ -155,7 +155,7 @@ def _use(one: RateFigures) -> str:
     use = one.server
     return (
         f"at {one.rate:g}/s, the server process used {use['processor_ms_per_job']:.2f} ms of processor time and "
-        f"{use['database_bytes_per_job']:,.0f} bytes of database per job; at most "
-        f"{use['most_database_connections']:.0f} connections to the database were in use, and "
-        f"{use['most_waiting_calls']:.0f} calls waited for it"
+        f"{use['database_bytes_per_job']:,.0f} bytes of database per job; greatest numbers at one time: "
+        f"{use['most_database_connections']:.0f} connections to the database, {use['most_waiting_calls']:.0f} waiting "
+        "calls"
     )

@@ -166,4 +166,4 @@ def _print(found: Calibration, predicted: dict[int, float]) -> None:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:,.1f} %"
+    return f"{100 * share:,.{1 if share >= 0.001 else 2}f} %"

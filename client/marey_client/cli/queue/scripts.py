@@ -38,7 +38,8 @@ def register(
     name: Name,
     file: Annotated[Path, typer.Option("--file", help="JSON file that describes the script; - reads standard input.")],
     commit: Annotated[
-        str | None, typer.Option(help="Full name of the commit, instead of the commit in the file.")
+        str | None,
+        typer.Option(help="Full name of the commit (`git rev-parse HEAD`), instead of the commit in the file."),
     ] = None,
     repository: Annotated[
         str | None, typer.Option(help="Address of the repository, instead of the address in the file.")
@@ -87,7 +88,8 @@ def show(context: typer.Context, project: ProjectName, name: Name, as_json: AsJs
         [
             ("name", found.name), ("description", found.description), ("repository", declared.repository),
             ("commit", declared.commit), ("command", " ".join(declared.argv)), ("author", found.author),
-            *((f"limit {limit}", value) for limit, value in declared.limits),
+            *((f"limit {limit}", value) for limit, value in declared.limits if limit != "network"),
+            ("network", "allowed" if declared.limits.network else "not allowed"),
         ]
     )  # fmt: skip
     rows: list[tuple[object, ...]] = [

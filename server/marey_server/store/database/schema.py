@@ -51,6 +51,8 @@ class SchemaUpgrade:
     """Whether servers of the earlier version can go on serving."""
     known: bool = True
     """Whether this version knows the schema; if not, a newer version has only added to it."""
+    created: bool = False
+    """Whether the database was new, so that no server of an earlier version has used it."""
 
 
 def upgrade_schema(url: str, *, while_serving: bool = False, finish: bool = False) -> SchemaUpgrade:
@@ -75,7 +77,10 @@ def _upgrade(tx: Transaction, while_serving: bool, finish: bool, one_server: boo
     pending = [name for name in steps if current is None or current < name]
     applied = [name for name in pending if name <= last]
     if finish and while_serving:
-        raise DatabaseUnusable("the last steps of an upgrade run when no server of an earlier version runs")
+        raise DatabaseUnusable(
+            "the last steps of an upgrade run when no server of an earlier version runs, so not with --while-serving; "
+            "run `marey db upgrade --while-serving`, replace all servers, then run `marey db upgrade --finish`"
+        )
     additive = current is None or all(steps[name] == "before" for name in applied)
     if while_serving and not additive:
         raise DatabaseUnusable(
@@ -87,7 +92,8 @@ def _upgrade(tx: Transaction, while_serving: bool, finish: bool, one_server: boo
         command.upgrade(config, last)
     _record_served(tx, max(current or "", last))
     make_server_key(tx)
-    return SchemaUpgrade(tuple(applied), tuple(name for name in pending if name > last), additive)
+    waiting = tuple(name for name in pending if name > last)
+    return SchemaUpgrade(tuple(applied), waiting, additive, created=current is None)
 
 
 def schema_fits(connection: Connection) -> bool:

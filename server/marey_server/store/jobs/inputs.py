@@ -125,7 +125,10 @@ def _misnamed(kind: KindDeclaration, request: JobCreate, at: str) -> list[FieldE
     ]
     lacking = [
         _error(
-            f"{at}/inputs", "missing-input", f"Jobs of the kind {kind.name} need the input {name!r}: {spec.description}"
+            f"{at}/inputs",
+            "missing-input",
+            f"Jobs of the kind {kind.name} need the input {name!r}"
+            + (f": {spec.description}" if spec.description else "."),
         )
         for name, spec in kind.inputs.items()
         if spec.required and name not in request.inputs
