@@ -20,6 +20,7 @@ WARM_UP_S = 1.0
 MOST_RATE = 10_000.0
 MOST_WORKERS = 256
 LONGEST_S = 3600.0
+LONGEST_WORK_S = 600.0
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,8 @@ class LoadPlan:
             raise ValueError(f"the number of replicates must be between 1 and {MOST_REPLICATES}")
         if not 0 <= self.workers <= MOST_WORKERS:
             raise ValueError(f"the number of workers must be at most {MOST_WORKERS}")
+        if not 0 <= self.work_s <= LONGEST_WORK_S:
+            raise ValueError(f"the work of a job must last between 0 and {LONGEST_WORK_S:,.0f} s")
 
 
 def load_test(marey: Marey, plan: LoadPlan, on_run: OnRun) -> Iterator[RateFigures]:

@@ -11,6 +11,7 @@ from marey_client.cli.operation.bench import _plan
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.errors import MareyError
 from marey_client.load.figures import T_975, Estimate, RateFigures, Replicate, percentile, read_samples
+from marey_client.load.measuring import LoadPlan
 from marey_client.load.offering import arrival_times
 
 
@@ -74,3 +75,9 @@ def test_metrics_are_read_with_their_labels_and_other_texts_are_refused() -> Non
 def test_wrong_options_are_refused_with_the_reason(options: tuple[str, float, int, int, float, int], said: str) -> None:
     with pytest.raises(WrongUsage, match=said):
         _plan(*options)
+
+
+@pytest.mark.parametrize("work_s", [math.inf, math.nan, -1.0, 1e9])
+def test_work_without_end_is_refused(work_s: float) -> None:
+    with pytest.raises(ValueError, match="work of a job"):
+        LoadPlan((5.0,), work_s=work_s)

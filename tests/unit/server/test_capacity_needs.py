@@ -110,3 +110,11 @@ def test_the_command_prints_the_part_that_saturates_first() -> None:
     found = json.loads(run_here(["capacity", "--workers", "1", "--json"]).stdout)
     assert found["first"] == "workers"
     assert set(found["predicted_jobs_per_s"]) == {"2", "8", "32"}
+
+
+@pytest.mark.parametrize(
+    "option", ["--days=inf", "--clip-bytes=inf", "--jobs-per-clip=1e308", "--workers=1" + "0" * 400]
+)
+def test_amounts_without_end_are_refused(option: str) -> None:
+    shown = run_here(["capacity", option])
+    assert (shown.returncode, "Invalid value" in shown.stderr) == (2, True), shown.stderr

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 CHECKED = "2,8"
 MOST_CHECKED = 64
+MOST = 10**15
+"""Greatest amount of anything; infinity and numbers near the end of the range of floats have no sensible answer."""
 FURTHER = 32
 """Number of workers for which jobs per second are predicted and not measured."""
 
@@ -27,13 +29,17 @@ def add_to(app: typer.Typer) -> None:
 
 
 def capacity(
-    clips: Annotated[int, typer.Option(min=1, help="Number of clips to import and process.")] = 10_000_000,
-    jobs_per_clip: Annotated[float, typer.Option(min=0, help="Number of jobs for each clip.")] = 1.0,
-    clip_bytes: Annotated[float, typer.Option(min=1, help="Size of an uploaded file, in bytes.")] = 500_000.0,
-    days: Annotated[float, typer.Option(min=0.001, help="Number of days in which all work is done.")] = 30.0,
-    workers: Annotated[int, typer.Option(min=1, help="Number of workers, each with one slot.")] = 1000,
-    servers: Annotated[int, typer.Option(min=1, help="Number of server processes that share a database.")] = 100,
-    database_processors: Annotated[int, typer.Option(min=1, help="Number of processors of the database.")] = 8,
+    clips: Annotated[int, typer.Option(min=1, max=MOST, help="Number of clips to import and process.")] = 10_000_000,
+    jobs_per_clip: Annotated[float, typer.Option(min=0, max=MOST, help="Number of jobs for each clip.")] = 1.0,
+    clip_bytes: Annotated[float, typer.Option(min=1, max=MOST, help="Size of an uploaded file, in bytes.")] = 500_000.0,
+    days: Annotated[float, typer.Option(min=0.001, max=MOST, help="Number of days in which all work is done.")] = 30.0,
+    workers: Annotated[int, typer.Option(min=1, max=MOST, help="Number of workers, each with one slot.")] = 1000,
+    servers: Annotated[
+        int, typer.Option(min=1, max=MOST, help="Number of server processes that share a database.")
+    ] = 100,
+    database_processors: Annotated[
+        int, typer.Option(min=1, max=MOST, help="Number of processors of the database.")
+    ] = 8,
     costs: Annotated[Path | None, typer.Option(help="File of measured costs; default: that of this version.")] = None,
     as_json: AsJson = False,
 ) -> None:
