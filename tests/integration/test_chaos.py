@@ -9,8 +9,7 @@ from tests.support.rest_server import ALL_SCOPES, Server
 from marey_client.chaos import running
 from marey_client.chaos.hostile_attempts import HOSTILE_CASES, HostileAttempt
 from marey_client.errors import MareyError
-from marey_client.load.calling import LoadAnswer
-from marey_client.load.offering import connection
+from marey_client.load.calling import LoadAnswer, connection
 from marey_client.load.scratch import Scratch, scratch_project
 from marey_client.marey import Marey
 from marey_schemas.kinds import Kind

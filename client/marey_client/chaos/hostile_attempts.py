@@ -10,8 +10,7 @@ from email.utils import format_datetime
 from typing import Any
 
 from marey_client.errors import MareyError
-from marey_client.load.calling import LoadAnswer, LoadConnection
-from marey_client.load.offering import connection
+from marey_client.load.calling import LoadAnswer, LoadConnection, connection
 from marey_client.load.scratch import KIND, Scratch
 
 RESULT = "result"

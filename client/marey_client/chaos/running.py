@@ -11,7 +11,7 @@ from typing import TypeVar
 from marey_client.chaos.hostile_attempts import HOSTILE_CASES, HostileAttempt
 from marey_client.chaos.worker_processes import WORKER_FAULTS, WorkerProcesses, worker_processes
 from marey_client.errors import MareyError, WaitedTooLong
-from marey_client.load.offering import connection
+from marey_client.load.calling import connection
 from marey_client.load.scratch import Scratch, scratch_project
 from marey_client.marey import Marey
 from marey_schemas.kinds import Kind

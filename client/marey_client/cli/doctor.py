@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from marey_client.cli.processes import DatabaseUrl, DataFolder
+from marey_client.cli.terminal.failures import interrupted_by_sigterm
 from marey_client.cli.terminal.invocation import AsJson, connect, credential_of
 from marey_client.cli.terminal.output import print_json, print_message, progress
 
@@ -90,11 +91,10 @@ def _test_by_faults(context: typer.Context, seed: int | None, faults: int) -> li
     import secrets
 
     from marey_client.chaos.running import run_chaos
-    from marey_client.cli.operation.bench import ended_politely
 
     chosen = secrets.randbelow(2**31) if seed is None else seed
     print_message(f"seed {chosen}")
-    with connect(context) as marey, ended_politely(), progress() as advance:
+    with connect(context) as marey, interrupted_by_sigterm(), progress() as advance:
         found = list(run_chaos(marey, chosen, faults, advance))
     return [(one.check, "fault" if one.fault else "ok", one.fault or one.detail) for one in found]
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import http.client
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from types import MappingProxyType
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
@@ -71,6 +72,16 @@ class LoadConnection:
     def send_only(self, path: str, document: Mapping[str, Any]) -> None:
         """Send a JSON document by POST and do not read the answer; the caller closes the connection."""
         self._connection.request("POST", self._path + path, orjson.dumps(document), self._headers)
+
+
+@contextmanager
+def connection(url: str, token: str) -> Iterator[LoadConnection]:
+    """Open a connection, and close it at the end of the `with` block."""
+    caller = LoadConnection(url, token)
+    try:
+        yield caller
+    finally:
+        caller.close()
 
 
 def _read(status: int, body: bytes) -> tuple[str, dict[str, Any]]:

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from marey_client.errors import MareyError
-from marey_client.load.calling import NO_ANSWER, LoadAnswer, LoadConnection
+from marey_client.load.calling import NO_ANSWER, LoadAnswer, LoadConnection, connection
 from marey_client.load.figures import Replicate
 from marey_client.load.scratch import KIND, Scratch
 
@@ -170,16 +170,6 @@ class OfferedLoad:
                 end_s = None if job.finished_at is None else (job.finished_at - job.created_at).total_seconds()
                 found[job.id] = (job.started_at - job.created_at).total_seconds(), end_s
         return found
-
-
-@contextmanager
-def connection(url: str, token: str) -> Iterator[LoadConnection]:
-    """Open a connection, and close it at the end of the `with` block."""
-    caller = LoadConnection(url, token)
-    try:
-        yield caller
-    finally:
-        caller.close()
 
 
 def arrival_times(rate: float, seconds: float, seed: int) -> list[float]:

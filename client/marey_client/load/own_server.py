@@ -15,7 +15,6 @@ from marey_client.credentials import ADMIN_TOKEN, read_secret
 from marey_client.errors import MareyError
 from marey_client.marey import Marey
 from marey_client.retries import ONCE
-from marey_schemas.queue.worker_protocol import FAULT_VARIABLE
 
 START_S = 60.0
 STOP_S = 40.0
@@ -36,7 +35,6 @@ def own_server(database_url: str | None = None, **settings: str) -> Iterator[Mar
         folder = Path(name)
         environment = {key: text for key, text in os.environ.items() if not key.startswith("MAREY_")}
         environment |= {"MAREY_DATA": str(folder / "data"), "MAREY_WARM_UP": "false", **settings}
-        environment.pop(FAULT_VARIABLE, None)
         if database_url is not None:  # in the environment, since other users can read command lines
             environment["MAREY_DATABASE_URL"] = database_url
         command = [sys.executable, "-m", "marey_client.cli", "serve", "--workers", "0", "--port", "0"]

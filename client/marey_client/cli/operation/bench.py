@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.failures import WrongUsage, interrupted_by_sigterm
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_table, progress
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from marey_client.load.figures import RateFigures
     from marey_client.load.measuring import LoadPlan
     from marey_client.marey import Marey
@@ -60,7 +57,7 @@ def load(
     from other users. Stop it with Ctrl-C. For administrators, the output shows what the server used.
     """
     plan = _plan(rates, seconds, replicates, 0 if other_workers else workers, work_ms, seed)
-    with connect(context) as marey, ended_politely():
+    with connect(context) as marey, interrupted_by_sigterm():
         _measure(marey, plan, as_json)
 
 
@@ -92,7 +89,7 @@ def serve(
         from marey_client import embedded
 
         embedded.database("require_empty", data=None, database_url=database_url)
-    with ended_politely(), own_server(database_url) as marey:
+    with interrupted_by_sigterm(), own_server(database_url) as marey:
         _measure(marey, plan, as_json)
 
 
@@ -108,21 +105,6 @@ def _plan(rates: str, seconds: float, replicates: int, workers: int, work_ms: fl
         return LoadPlan(numbers, seconds, replicates, workers, work_ms / 1000, seed)
     except ValueError as error:
         raise WrongUsage(str(error)) from error
-
-
-@contextmanager
-def ended_politely() -> Iterator[None]:
-    """Treat SIGTERM like Ctrl-C while the `with` block runs, so that the scratch project is removed."""
-    import signal
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    earlier = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, earlier)
 
 
 def _measure(marey: Marey, plan: LoadPlan, as_json: bool) -> None:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.operation.bench import Seed, WorkMs, bench, ended_politely
-from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.operation.bench import Seed, WorkMs, bench
+from marey_client.cli.terminal.failures import WrongUsage, interrupted_by_sigterm
 from marey_client.cli.terminal.invocation import AsJson
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table, progress
 
@@ -106,7 +106,7 @@ def measure_costs(
     counts = _counts(workers, (ALONE, SOME, CROWDED))
     if database_url is not None:
         embedded.database("require_empty", data=None, database_url=database_url)
-    with ended_politely(), own_server(database_url) as marey, progress() as advance:
+    with interrupted_by_sigterm(), own_server(database_url) as marey, progress() as advance:
         found = calibrate(
             marey, counts, rounds=rounds, work_s=work_ms / 1000, on_drain=lambda what: advance(what, 0, None)
         )

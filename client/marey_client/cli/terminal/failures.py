@@ -58,6 +58,21 @@ def reported(*, verbose: bool) -> Iterator[None]:
         raise
 
 
+@contextmanager
+def interrupted_by_sigterm() -> Iterator[None]:
+    """Treat SIGTERM like Ctrl-C while the `with` block runs, so that the command removes what it has created."""
+    import signal
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    earlier = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, earlier)
+
+
 def sentence(error: BaseException) -> str:
     """Return an error in one line, with its code, request id and notes if it has them."""
     from marey_client.errors import NotFound, RequestFailed
