@@ -234,4 +234,4 @@ def test_a_kind_that_exports_takes_the_permission_among_its_parameters() -> None
         replace(RETARGET, exports="clips")
     with pytest.raises(ValueError, match="exports must name inputs"):
         replace(EXPORT, exports="takes")
-    assert [kind.name for kind in KINDS.values() if kind.exports] == ["export"]
+    assert [kind.name for kind in KINDS.values() if kind.exports] == ["export", "script"]
