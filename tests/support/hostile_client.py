@@ -11,6 +11,7 @@ import bz2
 import contextlib
 import gzip
 import io
+import json
 import random
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -22,14 +23,19 @@ import bson
 import msgpack
 import numpy as np
 from tests.support.furnished_house import ROUTES, House, Planned
+from tests.support.rest_server import SCRIPTS_AT
 from tests.support.who_may import PEOPLE, verdict
 
 from marey_schemas.encoding import blocks
+from marey_schemas.queue.scripts import REPOSITORIES_VARIABLE
 from marey_server.http.routes import Route
 
 SMALL_BYTES = 10_000
 """Largest size in bytes of a request whose cost is limited by the tests."""
-ATTACKED = {"MAREY_LEASE_TTL_S": "3600", "MAREY_BODY_TIMEOUT_S": "5", "MAREY_HEADER_TIMEOUT_S": "5"}
+ATTACKED = {
+    "MAREY_LEASE_TTL_S": "3600", "MAREY_BODY_TIMEOUT_S": "5", "MAREY_HEADER_TIMEOUT_S": "5",
+    REPOSITORIES_VARIABLE: json.dumps([SCRIPTS_AT]),
+}  # fmt: skip
 """Environment of a server under attack: short timeouts, so that refused connections soon end, and long leases."""
 HANGS_S = 120.0
 """Time without an answer after which a test says that the server hangs; much longer than any busy machine takes."""
