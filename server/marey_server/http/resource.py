@@ -180,7 +180,8 @@ class Resource(CallingExchange):
         if delay_s := brake.delay_s(key, at_once=at_once, waiting=waiting):
             self.services.metrics.delayed.inc()
             self._release_memory()
-            await self.pause(delay_s)
+            with brake.delaying():
+                await self.pause(delay_s)
 
     def _release_memory(self) -> None:
         if hasattr(self, "operation"):  # otherwise the path or the method is unknown, and nothing was received

@@ -9,20 +9,26 @@ treated as a client without a known token, so that its requests begin after the 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
+from collections.abc import Iterator
 
 from marey_schemas.backoff import spread
 from marey_schemas.lru import LruCache
 
 EVERY_S = 0.05
 """Time in seconds between two measurements of the lateness of the event loop."""
-KEPT_SHARE = 0.9
+KEPT_SHARE = 0.98
 """Smallest ratio of a measured lateness to the previous one, so that the lateness decreases slowly."""
 TOLERATED_S = 0.1
 """Lateness in seconds up to which no refusal is delayed, unless the client is one of a crowd."""
 DELAY_PER_LATENESS = 10.0
 CROWD = 32
-"""Number of requests that wait for their turn from which on clients with many requests at once are a crowd."""
+"""Number of requests that wait, for their turn or for a delayed refusal, above which there is a crowd.
+
+In a crowd, refusals of clients with many requests at once are delayed earlier and for longer. Delayed refusals count,
+because otherwise the delays would end the crowd and bring it back at once.
+"""
 FEW_AT_ONCE = 3
 """Number of requests of a client under way up to which the client is not counted to the crowd.
 
@@ -52,6 +58,8 @@ class RefusalBrake:
 
     def __init__(self) -> None:
         self.late_s = 0.0
+        self._delayed = 0
+        """Number of refusals that are being delayed."""
         self._due_s = 0.0
         self._last_refusal_s = 0.0
         self._timer: asyncio.TimerHandle | None = None
@@ -69,11 +77,20 @@ class RefusalBrake:
             self._measure_later(now_s)
         count = self._count(client, now_s) + 1
         self._refusals.put(client, (count, now_s))
-        crowd = waiting > CROWD and at_once > FEW_AT_ONCE
+        crowd = waiting + self._delayed > CROWD and at_once > FEW_AT_ONCE
         if self.late_s <= (TOLERATED_OF_CROWD_S if crowd else TOLERATED_S) or count <= FREE_REFUSALS:
             return 0.0
         delay_s = (DELAY_PER_LATENESS_OF_CROWD if crowd else DELAY_PER_LATENESS) * self.late_s
         return spread(min(LONGEST_S, delay_s), 0.5)  # delays that end at once bring all back at once
+
+    @contextlib.contextmanager
+    def delaying(self) -> Iterator[None]:
+        """Count a refusal as delayed during the `with` block."""
+        self._delayed += 1
+        try:
+            yield
+        finally:
+            self._delayed -= 1
 
     def is_often_refused(self, client: str) -> bool:
         """Return whether more than `FREE_REFUSALS` refusals of a client count."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Awaitable, Callable
 
@@ -72,6 +73,19 @@ async def test_a_client_with_many_requests_at_once_waits_earlier_and_longer_if_a
     brake.late_s = 1.2 * TOLERATED_S
     alone = brake.delay_s("a", at_once=FEW_AT_ONCE, waiting=CROWD + 1)
     assert 0 < alone < brake.delay_s("a", at_once=FEW_AT_ONCE + 1, waiting=CROWD + 1)
+
+
+@in_a_loop
+async def test_delayed_refusals_belong_to_the_crowd() -> None:
+    brake = RefusalBrake()
+    refused(brake, "a", FREE_REFUSALS)
+    brake.late_s = 1.5 * TOLERATED_OF_CROWD_S
+    with contextlib.ExitStack() as delays:
+        for _ in range(CROWD + 1):
+            delays.enter_context(brake.delaying())
+        assert brake.delay_s("a", at_once=FEW_AT_ONCE + 1) > 0
+        assert brake.delay_s("a", at_once=FEW_AT_ONCE) == 0
+    assert brake.delay_s("a", at_once=FEW_AT_ONCE + 1) == 0
 
 
 @in_a_loop
