@@ -23,10 +23,10 @@ FLOORS = {
     "marey_server": 88,
     "marey_worker": 44,
 }
-"""Minimum coverage in percent, by package: 2 to 3 percentage points below the coverage of a whole run of `make test`.
+"""Minimum coverage in percent, by package: 2 to 3 percentage points below the coverage of a whole run of `make check`.
 
-The launcher `slurm` (1 % of the branches of the server) is measured only where Slurm is installed. The worker, and the
-limits and the fork server in `marey_schemas.processes`, mostly run in child processes, which are not measured.
+The worker, and the limits and the fork server in `marey_schemas.processes`, mostly run in child processes, which are not
+measured.
 """
 
 
