@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 from marey_schemas.tracing.context import TraceContext
 from marey_schemas.tracing.declared import CALL, COMMAND
-from marey_schemas.tracing.export import closing, open_optional_tracer
 from marey_schemas.tracing.spans import ProcessScope, SpanScope, current_scope, trace_headers
 
 SERVICE = "marey"
@@ -67,6 +66,8 @@ def tracing_command(name: str) -> Iterator[None]:
 
     The trace is that in the variable `TRACEPARENT`. Without it, a new trace begins if a collector is configured.
     """
+    from marey_schemas.tracing.export import closing, open_optional_tracer
+
     given = TraceContext.parse(os.environ.get(PARENT_VARIABLE))
     with closing(open_optional_tracer(SERVICE, os.environ)) as tracer:
         place = given if tracer is None or given is not None else tracer.new_root()

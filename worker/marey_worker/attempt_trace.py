@@ -9,9 +9,9 @@ from contextlib import contextmanager
 
 from marey_schemas.queue.worker_protocol import Lease
 from marey_schemas.tracing.context import TraceContext
-from marey_schemas.tracing.declared import ATTEMPT, INPUTS, OUTPUTS, QUEUED, SpanDeclaration
+from marey_schemas.tracing.declared import ATTEMPT, COMPUTE, INPUTS, OUTPUTS, QUEUED, SpanDeclaration
 from marey_schemas.tracing.export import Tracer
-from marey_schemas.tracing.spans import AttributeValue, SpanScope, Span, entering
+from marey_schemas.tracing.spans import AttributeValue, Span, SpanScope, entering
 from marey_worker.attempt_limits import Stop
 from marey_worker.messages import Done, Failed, PutFile, Request, Stage
 
@@ -23,9 +23,9 @@ class AttemptTrace:
     """Spans of one attempt; nothing is recorded if the job belongs to no trace, or if the worker sends no traces."""
 
     def __init__(self, lease: Lease, tracer: Tracer | None) -> None:
-        self._lease = lease
         self._span: Span | None = None
-        self._scope = self._stage = None if tracer is None else self._begin(lease, tracer)
+        self._scope = None if tracer is None else self._begin(lease, tracer)
+        self._computing: SpanScope | None = None
         self._transfers = 0
         self._lock = threading.Lock()
 
@@ -48,22 +48,23 @@ class AttemptTrace:
 
     @contextmanager
     def stage(self, declaration: SpanDeclaration) -> Iterator[None]:
-        """Record a stage of the attempt while the `with` block runs; transfers belong to the stage."""
+        """Record a stage of the attempt while the `with` block runs.
+
+        Transfers belong to the stage `COMPUTE`, even if they begin later: the child does not wait for uploads.
+        """
         if self._scope is None:
             yield
             return
         with self._scope.child(declaration) as stage:
-            self._stage = stage
-            try:
-                yield
-            finally:
-                self._stage = self._scope
+            if declaration is COMPUTE:
+                self._computing = stage
+            yield
 
     @contextmanager
     def transfer(self, request: Request) -> Iterator[None]:
         """Record a request of the child process while the `with` block runs, in any thread."""
-        stage = self._stage
-        if stage is None:
+        computing = self._computing
+        if computing is None:
             yield
             return
         with self._lock:
@@ -73,7 +74,7 @@ class AttemptTrace:
             with entering(None):
                 yield
             return
-        with stage.child(OUTPUTS if isinstance(request, PutFile | Stage) else INPUTS):
+        with computing.child(OUTPUTS if isinstance(request, PutFile | Stage) else INPUTS):
             yield
 
     def end(self, end: Done | Failed | Stop) -> None:

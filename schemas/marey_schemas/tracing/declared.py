@@ -43,7 +43,11 @@ class SpanDeclaration(NamedTuple):
 _OF_JOB = ("marey.job.id", "marey.job.kind", "marey.job.attempt")
 
 COMMAND = SpanDeclaration(
-    "marey COMMAND", "client", "internal", "A command of `marey`, from the reading of its options to its end."
+    "marey COMMAND",
+    "client",
+    "internal",
+    "A command of `marey`, from the reading of its options to its end.",
+    ("error.type",),
 )
 CALL = SpanDeclaration(
     "METHOD", "client", "client", "A request of a client or worker, with its repetitions.",
@@ -72,13 +76,20 @@ ATTEMPT = SpanDeclaration(
     (*_OF_JOB, "marey.job.outcome", "error.type", "marey.spans_dropped"),
 )  # fmt: skip
 COMPUTE = SpanDeclaration(
-    "job compute", "worker", "internal", "Work of the child process, until it has sent its result."
+    "job compute",
+    "worker",
+    "internal",
+    "Work of the child process, until it has sent its result. The spans of uploads below it may end later.",
 )
-INPUTS = SpanDeclaration("job inputs", "worker", "internal", "Download of inputs, or their lookup in the cache.")
-OUTPUTS = SpanDeclaration("job outputs", "worker", "internal", "Upload of results, which stay invisible for now.")
+INPUTS = SpanDeclaration(
+    "job inputs", "worker", "internal", "Download of inputs, or their lookup in the cache.", ("error.type",)
+)
+OUTPUTS = SpanDeclaration(
+    "job outputs", "worker", "internal", "Upload of results, which stay invisible for now.", ("error.type",)
+)
 COMPLETE = SpanDeclaration(
     "job complete", "worker", "internal", "Wait for the uploads, then the report of the attempt's end; after a "
-    "success, the server publishes the results.",
+    "success, the server publishes the results.", ("error.type",),
 )  # fmt: skip
 
 SPANS = (

@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Mapping
 from contextlib import contextmanager
-from importlib.metadata import version
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
@@ -156,6 +155,8 @@ def _fraction(name: str, text: str) -> float:
 
 
 def _opened(service: str, environment: Mapping[str, str], endpoint: str | None, share: float) -> Tracer:
+    from importlib.metadata import version  # slow to load, and needed only here
+
     try:
         from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
         from opentelemetry.sdk.resources import Resource

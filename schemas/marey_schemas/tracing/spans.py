@@ -5,6 +5,7 @@ This module needs no package of the extra `traces`, so that programs without it 
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from marey_schemas.tracing.context import HEADER, TraceContext, new_span_id
 from marey_schemas.tracing.declared import SpanDeclaration
 
 AttributeValue = str | int | float
+_ERROR_TYPE = re.compile("[A-Za-z_][A-Za-z0-9_.-]{0,63}")
 
 
 @dataclass(slots=True)
@@ -31,8 +33,8 @@ class Span:
     ended_ns: int = 0
 
     def fail(self, error_type: str) -> None:
-        """Mark the span as failed, with the code of a refusal or the class of an error."""
-        self.attributes["error.type"] = error_type
+        """Mark the span as failed, with the code of a refusal or the class of an error; other texts are not kept."""
+        self.attributes["error.type"] = error_type if _ERROR_TYPE.fullmatch(error_type) else "other"
 
 
 Emit = Callable[[TraceContext, Span], None]
@@ -64,7 +66,8 @@ class SpanScope:
             with entering(scope):
                 yield scope
         except BaseException as error:
-            span.fail(getattr(error, "code", None) or type(error).__name__)
+            code = getattr(error, "code", None) if isinstance(error, Exception) else None
+            span.fail(code if isinstance(code, str) else type(error).__name__)
             raise
         finally:
             span.ended_ns = time.time_ns()
