@@ -31,7 +31,7 @@ $(VENV)/.installed-all: pyproject.toml pins/build.txt pins/all.txt | $(BIN)/pyth
 	$(BIN)/python -m marey_motion.warm_up --processes 2
 	@touch $@
 
-$(VENV)/.installed-dev: pyproject.toml pins/build.txt pins/all.txt pins/kubernetes.txt pins/dev.txt | $(BIN)/python
+$(VENV)/.installed-dev: pyproject.toml pins/build.txt pins/all.txt pins/traces.txt pins/kubernetes.txt pins/dev.txt | $(BIN)/python
 	$(PINNED) pins/dev.txt
 	$(MAREY)
 	$(BIN)/python -m marey_motion.warm_up --processes 2

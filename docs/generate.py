@@ -22,6 +22,7 @@ from marey_schemas.documents.evaluations import HEADLINE_METRICS
 from marey_schemas.queries.fields import FACET_PREFIX, FIELDS, OPERATORS, declared_facets
 from marey_schemas.queries.grammar import MOST_CHARACTERS, MOST_COMPARED_VALUES, MOST_CONDITIONS
 from marey_schemas.queue.job_kinds import job_kinds
+from marey_schemas.tracing.declared import ATTRIBUTES, SPANS
 from marey_server import errors
 from marey_server.launchers.kubernetes.manifests import Pool, pool_deployment
 from marey_server.launchers.kubernetes.options import ClusterOptions
@@ -48,6 +49,7 @@ def pages() -> dict[str, str]:
         "queries.md": queries_page(),
         "errors.md": errors_page(),
         "metrics.md": metrics_page(),
+        "traces.md": traces_page(),
         "motion-library.md": NOTE + library_page(),
     }
 
@@ -151,6 +153,25 @@ attacks](../how-to/see-attacks.md) describes which metrics show an attack.
 
 """
     return NOTE + text + _table(("metric", "type", "labels", "meaning"), rows)
+
+
+def traces_page() -> str:
+    """Return the page of the spans of traces, and of their attributes."""
+    text = """# Traces
+
+With the extra `traces`, Marey sends these spans to a collector; see [Trace requests and
+jobs](../how-to/trace-requests.md). Names of spans contain methods, patterns of addresses and names of commands. Neither
+they nor attributes contain names of projects, items, files or users, tokens, or parameters of SQL statements. Only
+`marey.request_id` may be a text from the client: the id that it has chosen for the request.
+
+"""
+    spans = [
+        (f"`{one.name}`", one.maker, one.kind, one.meaning, ", ".join(f"`{name}`" for name in one.attributes))
+        for one in SPANS
+    ]
+    text += _table(("span", "made by", "kind", "meaning", "attributes"), spans)
+    attributes = [(f"`{name}`", meaning) for name, meaning in ATTRIBUTES.items()]
+    return NOTE + text + "## Attributes\n\n" + _table(("attribute", "meaning"), attributes).rstrip() + "\n"
 
 
 def settings_page() -> str:

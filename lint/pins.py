@@ -17,7 +17,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 FOLDER = "pins"
-BELOW = {"build": None, "all": "build", "kubernetes": "all", "dev": "kubernetes", "bench": "dev", "audit": "dev"}
+BELOW = {
+    "build": None, "all": "build", "traces": "all", "kubernetes": "traces", "dev": "kubernetes", "bench": "dev",
+    "audit": "dev",
+}  # fmt: skip
 """Layers of packages, each with the layer that it extends.
 
 `build` is the build backend; the other layers are extras of `pyproject.toml`.

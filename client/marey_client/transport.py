@@ -19,6 +19,7 @@ from pydantic import BaseModel, ValidationError
 from marey_client.credentials import TokenFile, as_token, require_address
 from marey_client.errors import RequestFailed, UnexpectedAnswer, Unreachable, error_of
 from marey_client.retries import BUSY_STATUSES, NEVER_ARRIVED, Retries, retry_after_s
+from marey_client.tracing import TracedRequest, calling
 from marey_schemas.address import API
 from marey_schemas.encoding.codecs import JSON, CodecError, decode_tree, encode_tree
 from marey_schemas.problems import MEDIA_TYPE as PROBLEM
@@ -159,7 +160,26 @@ class Transport:
 
         Raises `RequestFailed` if the server answers with an error, `Unreachable` if there is no answer.
         """
-        sent_headers = {"Accept": JSON, **(headers or {})}
+        with calling(method) as call:
+            return self._send(
+                call, method, path, params=params, content=content, media_type=media_type, headers=headers,
+                repeatable=repeatable, timeout_s=timeout_s,
+            )  # fmt: skip
+
+    def _send(
+        self,
+        call: TracedRequest,
+        method: str,
+        path: str,
+        *,
+        params: Params | None,
+        content: bytes | Callable[[], Iterable[bytes]] | None,
+        media_type: str,
+        headers: Mapping[str, str] | None,
+        repeatable: bool | None,
+        timeout_s: float | None,
+    ) -> httpx.Response:
+        sent_headers = {"Accept": JSON, **call.headers, **(headers or {})}
         if content is not None:
             sent_headers.setdefault("Content-Type", media_type)
         if repeatable is None:
@@ -168,6 +188,7 @@ class Transport:
                 sent_headers.setdefault("Idempotency-Key", uuid.uuid4().hex)
 
         def once() -> httpx.Response:
+            call.note_try()
             response = self._client.request(
                 method,
                 _quoted(path),
@@ -177,6 +198,7 @@ class Transport:
                 auth=self._auth,
                 timeout=httpx.Timeout(timeout_s, connect=10.0) if timeout_s else httpx.USE_CLIENT_DEFAULT,
             )
+            call.note_answer(response.status_code)
             raise_for_problem(response)
             return response
 
@@ -233,15 +255,18 @@ class Transport:
 
         If the server refers to its object storage, the bytes are read there. Then httpx does not send the token.
         """
-        sent_headers = {"Accept": "*/*", **(headers or {})}
-        with self._client.stream(
-            "GET",
-            _quoted(path),
-            params=_present(params),
-            headers=sent_headers,
-            auth=self._auth,
-            follow_redirects=True,
-        ) as response:
+        with (
+            calling("GET") as call,
+            self._client.stream(
+                "GET",
+                _quoted(path),
+                params=_present(params),
+                headers={"Accept": "*/*", **call.headers, **(headers or {})},
+                auth=self._auth,
+                follow_redirects=True,
+            ) as response,
+        ):
+            call.note_answer(response.status_code)
             if response.status_code >= 400:
                 response.read()
             raise_for_problem(response)

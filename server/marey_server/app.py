@@ -28,6 +28,7 @@ from tornado.web import RequestHandler
 from marey_schemas.processes.environment import clean_environment
 from marey_schemas.processes.memory import keep_freed_memory
 from marey_schemas.sizes import KIB, MIB
+from marey_schemas.tracing.spans import AttributeValue
 from marey_server.access.principal import SYSTEM
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.handlers.health import RESOURCES as MONITORING
@@ -91,6 +92,13 @@ class Application(TornadoApplication):
         self.services.metrics.count_request(method, route, status, duration_s, handler.received_bytes)
         if handler.problem_code is not None:
             self.services.metrics.refusals.labels(handler.problem_code, route).inc()
+        if handler.trace is not None:
+            handler.trace.finish(
+                f"{method} {route}",
+                handler.principal,
+                uneventful=handler.uneventful and status < 400,
+                attributes=_span_attributes(handler, method, route, status),
+            )
         level = logging.ERROR if status >= 500 else logging.INFO
         if handler.uneventful and status < 400:
             level = logging.DEBUG
@@ -98,9 +106,20 @@ class Application(TornadoApplication):
             access_log.log(level, "%s %s %d", method, route, status, extra=_fields(handler, route, status, duration_s))
 
 
+def _span_attributes(handler: Resource, method: str, route: str, status: int) -> dict[str, AttributeValue]:
+    attributes: dict[str, AttributeValue] = {
+        "http.request.method": method,
+        "http.route": route,
+        "http.response.status_code": status,
+        "marey.request_id": handler.request_id,
+    }
+    return attributes if status < 500 else {**attributes, "error.type": handler.problem_code or str(status)}
+
+
 def _fields(handler: Resource, route: str, status: int, duration_s: float) -> dict[str, Any]:
     return {
         "request_id": handler.request_id,
+        "trace_id": handler.trace_id,
         "principal": handler.principal.actor if handler.principal is not None else None,
         "method": handler.request.method,
         "route": route,

@@ -64,6 +64,7 @@ def _serve_in_processes(given: dict[str, Any]) -> None:
 def run_server(server: Coroutine[Any, Any, None]) -> None:
     """Run the coroutine of a server until it ends. Raises `CommandFailed` with the reason if it cannot start."""
     with loading_modules():
+        from marey_schemas.tracing.export import TracesUnusable
         from marey_server.http.accepting import CannotListen
         from marey_server.launchers.launcher import LauncherUnusable
         from marey_server.process.computing import leave
@@ -79,7 +80,7 @@ def run_server(server: Coroutine[Any, Any, None]) -> None:
         raise CommandFailed(
             f"{error}; choose another address with --host, or another port with --port (0: any free port)"
         ) from error
-    except LauncherUnusable as error:
+    except (LauncherUnusable, TracesUnusable) as error:
         raise CommandFailed(f"invalid setting: {error}") from error
     leave()
 

@@ -44,9 +44,12 @@ from marey_schemas.queue.worker_protocol import (
     Lease,
 )
 from marey_schemas.sizes import MIB
+from marey_schemas.tracing.declared import COMPLETE, COMPUTE
+from marey_schemas.tracing.export import Tracer
 from marey_worker import faults, signatures
 from marey_worker.attempt_api import AttemptApi
 from marey_worker.attempt_limits import LogUploader, Stop, Watch, remove_folder
+from marey_worker.attempt_trace import AttemptTrace
 from marey_worker.heartbeats import LeaseKeeper
 from marey_worker.job_io.input_cache import InputCache
 from marey_worker.messages import (
@@ -110,12 +113,14 @@ class RunningAttempt:
         stopping: threading.Event,
         *,
         threads: int,
+        tracer: Tracer | None = None,
     ) -> None:
         self._api = api
         self._lease = lease
         self._cache = cache
         self._server = server
         self._threads = threads
+        self._trace = AttemptTrace(lease, tracer)
         self._scratch = Path(tempfile.mkdtemp(prefix="marey-job-"))
         self._job_log = LogUploader(api, self._scratch / "log")
         self._keeper = LeaseKeeper(api, lease)
@@ -132,8 +137,9 @@ class RunningAttempt:
         Afterwards, the child is idle or has ended, and the caller must call `finish`.
         """
         try:
-            child.send(pack(self._order()))
-            end = self._attend(child)
+            with self._trace.stage(COMPUTE):
+                child.send(pack(self._order()))
+                end = self._attend(child)
             if isinstance(end, Stop):
                 child.kill()
         except BaseException:
@@ -148,14 +154,16 @@ class RunningAttempt:
         failure or a stop is reported instead of a success. Returns the end of the job, even if it cannot be reported.
         """
         try:
-            if isinstance(end, Done):
-                end = self._when_staged(end)
-            end = self._report(end)
+            with self._trace.stage(COMPLETE):
+                if isinstance(end, Done):
+                    end = self._when_staged(end)
+                end = self._report(end)
         except LeaseLost as error:
             log.warning("%s: attempt abandoned: %s", self._lease.job, error)
         except MareyError as error:
             log.error("%s: the end of the attempt could not be reported: %s", self._lease.job, error)
         finally:
+            self._trace.end(end)
             self._close()
         return end
 
@@ -223,7 +231,8 @@ class RunningAttempt:
     def _reply_to(self, request: Request) -> ChildReply | None:
         """Carry out one request of the child; return the reply, or None if the lease was lost."""
         try:
-            return ChildReply(request.request, self._carried_out(request))
+            with self._trace.transfer(request):
+                return ChildReply(request.request, self._carried_out(request))
         except LeaseLost:
             self._keeper.lost.set()
             return None

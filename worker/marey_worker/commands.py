@@ -21,8 +21,11 @@ from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
 from marey_schemas.queue.log_lines import LogForm, log_to_standard_error, usual_form
 from marey_schemas.queue.scripts import REPOSITORIES_VARIABLE, SCRIPT
 from marey_schemas.sizes import MIB
+from marey_schemas.tracing.export import closing, open_optional_tracer
 from marey_worker.supervisor import Supervisor, WorkerOptions, default_cache, runnable_kinds
 
+SERVICE = "marey-worker"
+"""Name under which collectors show a worker, unless a variable of OpenTelemetry names another."""
 BRIEF = Retries(tries=6)
 """Retries of an attempt's requests, limited so that a stopping worker does not wait long for an unreachable server."""
 
@@ -58,12 +61,14 @@ def work(
         slots=slots, kinds=_known_kinds(kinds), labels=labels,
         cache=cache or default_cache(os.environ), **given,
     )  # fmt: skip
-    supervisor = Supervisor(Transport(credential.url, credential.bearer, retries=BRIEF), options)
+    tracer = open_optional_tracer(SERVICE, os.environ)
+    supervisor = Supervisor(Transport(credential.url, credential.bearer, retries=BRIEF), options, tracer)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: threading.Thread(target=supervisor.stop).start())
     if attached:
         threading.Thread(target=_stop_at_end_of_input, args=(supervisor,), name="attached", daemon=True).start()
-    status = supervisor.run()
+    with closing(tracer):
+        status = supervisor.run()
     logging.shutdown()
     os._exit(status)  # threads that wait for work hold nothing
 

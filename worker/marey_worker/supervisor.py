@@ -23,6 +23,7 @@ from marey_schemas.processes.child_process import ChildBroken, ChildProcess
 from marey_schemas.queue.job_kinds import job_kinds
 from marey_schemas.queue.scripts import SCRIPT, read_repositories
 from marey_schemas.queue.worker_protocol import INTERRUPTED_STATUS, ClaimRequest, Lease
+from marey_schemas.tracing.export import Tracer
 from marey_worker import faults
 from marey_worker.attempt import RunningAttempt
 from marey_worker.attempt_api import AttemptApi, claim
@@ -81,8 +82,9 @@ class Supervisor:
     The supervisor continues if a child process crashes.
     """
 
-    def __init__(self, transport: Transport, options: WorkerOptions) -> None:
+    def __init__(self, transport: Transport, options: WorkerOptions, tracer: Tracer | None = None) -> None:
         self._transport = transport
+        self._tracer = tracer
         self._claims = transport.with_retries(ONCE)
         self._options = options
         self._cache = InputCache(options.cache, options.cache_bytes)
@@ -189,8 +191,9 @@ class Supervisor:
             log.info("%s: %s, attempt %d", lease.job, lease.kind, lease.attempt)
             api = AttemptApi(self._transport, lease)
             attempt = RunningAttempt(
-                api, lease, self._cache, self._transport.url, self._stopping, threads=self._options.threads_of_a_slot
-            )
+                api, lease, self._cache, self._transport.url, self._stopping,
+                threads=self._options.threads_of_a_slot, tracer=self._tracer,
+            )  # fmt: skip
             end = attempt.run(child)
         except BaseException:
             self._running.discard(place)

@@ -45,6 +45,10 @@ app = typer.Typer(
 )
 
 
+UNTRACED = ("serve", "worker")
+"""Commands that run for long; the server and the worker record their requests and jobs themselves."""
+
+
 def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
@@ -70,6 +74,10 @@ def marey(
 ) -> None:
     """Store, check, retarget, edit and evaluate motion data on a Marey server."""
     context.obj = Invocation(server, token_file, verbose)
+    if context.invoked_subcommand not in (None, *UNTRACED):
+        from marey_client.tracing import tracing_command
+
+        context.with_resource(tracing_command(str(context.invoked_subcommand)))
 
 
 for register in (

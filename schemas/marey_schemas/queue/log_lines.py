@@ -11,7 +11,8 @@ from typing import Literal
 LogForm = Literal["json", "text"]
 
 _FIELDS = (
-    "request_id", "principal", "method", "route", "status", "duration_ms", "bytes_in", "bytes_out", "remote", "job",
+    "request_id", "trace_id", "principal", "method", "route", "status", "duration_ms", "bytes_in", "bytes_out",
+    "remote", "job",
 )  # fmt: skip
 
 
@@ -39,10 +40,10 @@ class TextFormatter(logging.Formatter):
         super().__init__("%(asctime)s %(levelname)-7s %(name)s: %(message)s", datefmt="%H:%M:%S")
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return a log record as text, followed by the id of its request if there is one."""
+        """Return a log record as text, followed by the ids of its request and of its trace if there are any."""
         line = super().format(record)
-        given = getattr(record, "request_id", None)
-        return f"{line} [{given}]" if given else line
+        given = [one for name in ("request_id", "trace_id") if (one := getattr(record, name, None))]
+        return f"{line} [{' '.join(given)}]" if given else line
 
 
 def usual_form() -> LogForm:

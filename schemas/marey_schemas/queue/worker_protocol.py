@@ -95,6 +95,15 @@ class PinnedInput(Answer):
         return ItemInput(item=self.item, revision=self.revision)
 
 
+class JobTrace(Answer):
+    """Trace to which a job belongs, because the request that submitted the job was recorded."""
+
+    traceparent: str = Field(
+        description="Span of the request that submitted the job, in the form of W3C Trace Context."
+    )
+    waited_s: float = Field(description="Seconds for which the job could have run before it was claimed.")
+
+
 class Lease(Answer):
     """Right to work on a job until the lease ends."""
 
@@ -118,6 +127,7 @@ class Lease(Answer):
     attempt_token: str
     lease_ttl_s: float
     heartbeat_s: float
+    trace: JobTrace | None = Field(None, description="Trace to which the job belongs; null without one.")
 
 
 class LeaseList(Answer):

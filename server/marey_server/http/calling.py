@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
+from concurrent.futures import Future
 from contextlib import asynccontextmanager, suppress
 from functools import cached_property, partial
 from typing import Any, Concatenate, ParamSpec, TypeVar
@@ -12,7 +13,7 @@ from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.errors import ClientGoneProblem, LeaseLostProblem, UnauthenticatedProblem
 from marey_server.http.calls import Caller, run_plain
 from marey_server.http.declarations import Operation
-from marey_server.http.exchange import Exchange
+from marey_server.http.exchange import Exchange, log_fault
 from marey_server.http.negotiation import bearer_token
 from marey_server.process.children import ChildTask
 from marey_server.process.memory import UNKNOWN_CLIENTS, Holding
@@ -45,6 +46,11 @@ class CallingExchange(Exchange):
         caller: Caller | None = getattr(self, "caller", None)  # absent where the request was refused before
         return caller.principal if caller is not None else None
 
+    @property
+    def trace_id(self) -> str | None:
+        """The id of the trace to which the request belongs; None if the server sends no traces."""
+        return None if self.trace is None else self.trace.place(self.principal).shown_trace
+
     async def look_up(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run `function(tx, ...)` on behalf of the caller in a read-only transaction and return its result."""
         return await self._read(partial(run_plain, self.caller, lambda tx: function(tx, *args, **kwargs)))
@@ -54,12 +60,20 @@ class CallingExchange(Exchange):
         return await self._write(partial(run_plain, self.caller, lambda tx: function(tx, *args, **kwargs)))
 
     async def _read(self, function: Callable[[Transaction], T]) -> T:
-        queue = self.services.database.queue_read
-        return await asyncio.wrap_future(queue(self.client, ANONYMOUS, function, reserved=self.operation.reserved))
+        return await asyncio.wrap_future(self._queued(self.services.database.queue_read, function, writes=False))
 
     async def _write(self, function: Callable[[Transaction], T]) -> T:
-        queue = self.services.database.queue_write
-        return await asyncio.wrap_future(queue(self.client, ANONYMOUS, function, reserved=self.operation.reserved))
+        return await asyncio.wrap_future(self._queued(self.services.database.queue_write, function, writes=True))
+
+    def _queued(
+        self, queue: Callable[..., Future[T]], function: Callable[[Transaction], T], *, writes: bool
+    ) -> Future[T]:
+        reserved = self.operation.reserved
+        if self.trace is None:
+            return queue(self.client, ANONYMOUS, function, reserved=reserved)
+        system = "sqlite" if self.services.database.is_sqlite else "postgresql"
+        call = self.trace.transaction(function, system, writes=writes)
+        return call.recorded(queue(self.client, ANONYMOUS, call, reserved=reserved))
 
     @cached_property
     def holding(self) -> Holding:
@@ -78,6 +92,10 @@ class CallingExchange(Exchange):
         if token is not None and (key := self.services.client_key(token)) is not None:
             return Client(key, known=not self.services.refusal_brake.is_often_refused(key), is_gone=self.departure)
         return Client(limited_address(self.client_address), known=False, is_gone=self.departure)
+
+    def log_exception(self, _type: Any, value: Any, _traceback: Any) -> None:
+        """Log internal errors with their traceback; refusals are not logged as errors."""
+        log_fault(value, self.request_id, self.request.method or "", self.template(), trace_id=self.trace_id)
 
     def _write_problem(self, error: BaseException) -> None:
         super()._write_problem(error)
@@ -112,6 +130,8 @@ class CallingExchange(Exchange):
         count_stop = self.services.metrics.count_stopped_child
         task = self.services.children.submit(self._child_user, function, make, read, count_stop)
         self._in_children.add(task)
+        if self.trace is not None:
+            self.trace.record_child(function, task.future)
         try:
             return await asyncio.wrap_future(task.future)
         except asyncio.CancelledError:

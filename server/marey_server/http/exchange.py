@@ -16,6 +16,7 @@ from tornado.web import HTTPError, RequestHandler
 from marey_schemas.address import API
 from marey_schemas.problems import MEDIA_TYPE, Problem
 from marey_schemas.sizes import KIB, MIB
+from marey_schemas.tracing.context import HEADER
 from marey_server.errors import (
     ApiProblem,
     DamagedProblem,
@@ -27,6 +28,7 @@ from marey_server.http.caching import NOT_STORED
 from marey_server.http.declarations import Declared, Operation
 from marey_server.http.etags import entity_tag
 from marey_server.http.reply import Rendered
+from marey_server.http.tracing import RequestTrace
 from marey_server.process.observe import request_id
 from marey_server.process.services import Services
 from marey_versions.tree.chunks import DamagedChunk
@@ -72,10 +74,17 @@ class Exchange(RequestHandler):
         """Set up the state of one request."""
         self.request_id = request_id(self.request.headers.get("X-Request-Id"))
         self.set_header("X-Request-Id", self.request_id)
+        self.trace = self._begin_trace()
         self.received_bytes = 0
         self.problem_code: str | None = None
         self.refused = self.performing = False
         self.departure = Departure()
+
+    def _begin_trace(self) -> RequestTrace | None:
+        tracer = self.services.tracer
+        if tracer is None:
+            return None
+        return RequestTrace(tracer, self.services.settings.traces_callers, self.request.headers.get(HEADER))
 
     @classmethod
     def template(cls) -> str:
@@ -234,10 +243,6 @@ class Exchange(RequestHandler):
         """Whether the answer may name what the caller has not named; see `ApiProblem`."""
         return True
 
-    def log_exception(self, _type: Any, value: Any, _traceback: Any) -> None:
-        """Log internal errors with their traceback; refusals are not logged as errors."""
-        log_fault(value, self.request_id, self.request.method or "", self.template())
-
     def on_finish(self) -> None:
         """Remove the request from the requests in progress after its answer was written."""
         self.services.in_flight.discard(self)
@@ -310,8 +315,8 @@ def _problem(status: int, code: str, title: str, detail: str, request_id: str) -
     )
 
 
-def log_fault(error: BaseException, request_id: str, method: str, path: str) -> None:
+def log_fault(error: BaseException, request_id: str, method: str, path: str, *, trace_id: str | None = None) -> None:
     """Log an internal error with its traceback."""
     if isinstance(error, ApiProblem | HTTPError | StreamClosedError | UnauthenticatedProblem):
         return
-    log.error("%s %s failed", method, path, exc_info=error, extra={"request_id": request_id})
+    log.error("%s %s failed", method, path, exc_info=error, extra={"request_id": request_id, "trace_id": trace_id})

@@ -61,6 +61,7 @@ class LaunchContext:
     log_form, log_level : form and level of the logs of workers
     options : settings `launcher_options`, replaced by the `options` of the pool where both have a value
     labels : labels of the workers of the pool
+    variables : further environment variables of workers on this machine; they may contain the password of a collector
     """
 
     pool: str
@@ -71,6 +72,7 @@ class LaunchContext:
     log_level: str
     options: Mapping[str, Any] = field(default_factory=dict)
     labels: Mapping[str, str] = field(default_factory=dict)
+    variables: Mapping[str, str] = field(default_factory=dict, repr=False)
 
     @property
     def token_file(self) -> Path:

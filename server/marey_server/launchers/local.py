@@ -92,7 +92,8 @@ class _LocalWorker:
         self.end: WorkerEnd | None = None
         self._labels: Mapping[str, str] = request.labels
         self._token = context.token
-        self._environment = {"MAREY_LOG_FORM": context.log_form, "MAREY_LOG_LEVEL": context.log_level}
+        log = {"MAREY_LOG_FORM": context.log_form, "MAREY_LOG_LEVEL": context.log_level}
+        self._environment = {**context.variables, **log}
         self._command = [
             sys.executable, *worker_arguments(request, context.url), "--attached", "--name", name,
             "--cache", str(context.data / WORKER_CACHE),

@@ -57,7 +57,10 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
     if settings.local_workers:
         token = make_worker_token(services.database, settings)
         data = settings.data.absolute()
-        fixed = LocalLauncher(LaunchContext(FIXED_POOL, address, token, data, settings.log_form, settings.log_level))
+        variables = settings.worker_trace_variables
+        fixed = LocalLauncher(
+            LaunchContext(FIXED_POOL, address, token, data, settings.log_form, settings.log_level, variables=variables)
+        )
         await fixed.start(WorkerRequest(), settings.local_workers, key=FIXED_KEY)
     if settings.pools and settings.worker_url is None and settings.launcher != "local":
         log.info("workers in pools reach this server at %s; the setting worker_url names another address", address)
@@ -102,5 +105,6 @@ def _launcher_of(pool: WorkerPool, services: Services, address: str) -> Launcher
             settings.log_level,
             {**settings.launcher_options, **pool.options},
             pool.labels,
+            settings.worker_trace_variables,
         )
     )

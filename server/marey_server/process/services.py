@@ -14,6 +14,7 @@ from importlib.metadata import version
 from typing import Any
 
 from marey_schemas.lru import LruCache
+from marey_schemas.tracing.export import Tracer
 from marey_server.access import scopes
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.access.secret_tokens import is_sealed, token_hash
@@ -68,6 +69,8 @@ class Services:
 
     parting = False
     """Whether the process accepts no more connections; then its answers ask clients to close theirs."""
+    tracer: Tracer | None
+    """Sender of the spans of requests; None if no collector is configured."""
 
     def __init__(
         self,
@@ -79,6 +82,7 @@ class Services:
         self.settings = settings
         self.database = database
         self.description = description
+        self.tracer = settings.open_tracer()
         self.metrics = Metrics()
         self.answers: LruCache[tuple[str, str], bytes] = LruCache(
             max_bytes=settings.answer_cache_bytes,
@@ -208,3 +212,5 @@ class Services:
         self.password_lane.close()
         self.unknown_lane.close()
         self.database.close()
+        if self.tracer is not None:
+            self.tracer.close()

@@ -75,6 +75,10 @@ class Observer:
         """Record for how many seconds each job of a claim could have run before."""
 
 
+def _untraced(_principal: Principal) -> None:
+    """Return that jobs belong to no trace."""
+
+
 IGNORED = Observer()
 """Observer that ignores everything."""
 
@@ -108,6 +112,8 @@ class Transaction:
         """Number of outputs that this transaction has published from the cache; many facets count as outputs, too."""
         self.new_document_bytes = 0
         """Number of bytes of new documents and arrays that this transaction has stored."""
+        self.trace_of_jobs: Callable[[Principal], str | None] = _untraced
+        """Returns the place in a trace, as a header, of the jobs that this transaction submits for its principal."""
         self._clock = clock
         self._now_us = now_us
         self._after_commit: list[Callable[[], None]] = []
@@ -125,6 +131,7 @@ class Transaction:
         """Return a transaction for another `principal` on the same connection; the two are committed together."""
         other = Transaction(self.connection, principal, self._clock, self.blobs, self.quotas, self.observer)
         other.before_statement = self.before_statement
+        other.trace_of_jobs = self.trace_of_jobs
         return other
 
     @property

@@ -7,9 +7,12 @@ from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import motion_tree, skeleton_tree
 
 from marey_schemas.kinds import Kind
+from marey_schemas.queue.jobs import JobCreate
 from marey_server.errors import InvalidProblem
 from marey_server.store import blobs, items
 from marey_server.store.items.drafts import Draft
+from marey_server.store.jobs import submission
+from marey_server.store.transaction import Transaction
 
 TRIM: dict[str, Any] = {"commands": [{"command": "trim", "stop": 3}]}
 
@@ -43,6 +46,28 @@ def refused(desk: Desk, kind: str, inputs: dict[str, Any], params: dict[str, Any
 def shares(desk: Desk, *job: Any, **fields: Any) -> bool:
     """Submit a job; return whether it gets the result of another job that was completed before."""
     return desk.job(submit(desk, *job, **fields)).cached_from is not None
+
+
+def test_a_job_has_a_place_in_a_trace_until_its_end_and_still_shares_results(desk: Desk) -> None:
+    def traced(span: str) -> str:
+        def submit_traced(tx: Transaction) -> str:
+            tx.trace_of_jobs = lambda _principal: f"00-{'a' * 32}-{span * 16}-01"
+            return submission.submit(tx, "lab", [JobCreate(kind="sum")])[0].id
+
+        return desk.database.write(desk.user, submit_traced)
+
+    first = traced("b")
+    desk.clock.advance(5)
+    lease = desk.claim()
+    assert lease.trace is not None
+    assert lease.trace.traceparent == f"00-{'a' * 32}-{'b' * 16}-01"
+    assert 5 <= lease.trace.waited_s < 60
+    desk.complete(lease)
+    assert desk.job(traced("c")).cached_from == first
+    assert desk.job(desk.submit("sum")).cached_from == first
+    assert desk.claim_many() == []
+    desk.submit("errand")
+    assert desk.claim().trace is None
 
 
 def test_results_that_went_elsewhere_do_not_serve_where_they_would_replace_something(desk: Desk) -> None:

@@ -112,3 +112,15 @@ def test_a_misspelt_variable_is_told_with_the_one_that_was_meant() -> None:
         "MAREY_PROT": "MAREY_PORT",
         "MAREY_DATA_DIR": "MAREY_DATA",
     }
+
+
+def test_workers_on_this_machine_send_traces_to_the_same_collector(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_HEADERS", "key=1")
+    monkeypatch.setenv("OTEL_SERVICE_NAME", "the-server")
+    given = Settings(traces_endpoint="http://collector:4318", traces_share=0.5).worker_trace_variables
+    own = {name: text for name, text in given.items() if name.startswith("MAREY_")}
+    assert own == {"MAREY_TRACES_ENDPOINT": "http://collector:4318/v1/traces", "MAREY_TRACES_SHARE": "0.5"}
+    assert given["OTEL_EXPORTER_OTLP_HEADERS"] == "key=1"
+    assert "OTEL_SERVICE_NAME" not in given
+    with pytest.raises(ValidationError, match="not an address of a collector"):
+        Settings(traces_endpoint="collector:4318")

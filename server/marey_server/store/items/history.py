@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from sqlalchemy import Row, Select, and_, select, tuple_
 
 from marey_schemas.items import Lineage, LineageEdge, Page, Revision, Staleness
 from marey_schemas.kinds import Kind
+from marey_schemas.tracing.context import HEADER
 from marey_server.errors import NotFoundProblem
 from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
@@ -87,8 +88,13 @@ def read_lineage(
     return Lineage(
         item=item_id, revision=number, inputs=inputs, outputs=outputs,
         job_kind=how.kind if how else None, params=how.params if how else None, seed=how.seed if how else None,
-        code_version=how.code_version if how else None, environment=(how.environment or {}) if how else {},
+        code_version=how.code_version if how else None, environment=_versions(how.environment) if how else {},
     )  # fmt: skip
+
+
+def _versions(environment: Mapping[str, str] | None) -> dict[str, str]:
+    """Return the versions of libraries in the environment of a job, without its place in a trace."""
+    return {name: text for name, text in (environment or {}).items() if name != HEADER}
 
 
 def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[LineageEdge, ...]:

@@ -20,6 +20,7 @@ from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.queue.jobs import JobCreate, Resources, commits_of
 from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_schemas.sizes import batched
+from marey_schemas.tracing.context import HEADER
 from marey_server.store.ids import new_id
 from marey_server.store.jobs import result_cache
 from marey_server.store.jobs.commits import Target
@@ -201,10 +202,22 @@ def new_row(tx: Transaction, one: NewJob) -> dict[str, Any]:
         "retry_of": submission.retry_of if one.parent_id is None else None,
         "author_id": submission.author_id,
         "message": request.message,
+        "environment": place_in_trace(tx),
         "created_us": tx.now_us,
         "finished_us": tx.now_us if one.state in ("failed", "cancelled") else None,
         **layout_columns(tx, one),
     }
+
+
+def place_in_trace(tx: Transaction) -> dict[str, str] | None:
+    """Return what a new job stores in place of its environment, until a worker reports the latter."""
+    header = tx.trace_of_jobs(tx.principal)
+    return None if header is None else {HEADER: header}
+
+
+def trace_header(environment: Mapping[str, str] | None) -> str | None:
+    """Return the place in a trace of a job that has not ended, as a header."""
+    return (environment or {}).get(HEADER)
 
 
 def layout_columns(tx: Transaction, one: NewJob) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from marey_schemas.queue.worker_protocol import (
     ClaimRequest,
     Heartbeat,
     HeartbeatAnswer,
+    JobTrace,
     Lease,
     PinnedInput,
 )
@@ -65,6 +66,7 @@ from marey_server.store.jobs.fencing import (
     lease_lost,
     require_attempt,
 )
+from marey_server.store.jobs.layout import trace_header
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.tables import attempt, job, project
 from marey_server.store.transaction import Transaction
@@ -108,7 +110,7 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
         ],
     )
     emit_job_events(tx, "job.started", [(row.project_id, row.id, {"fence": row.fence}) for row in rows])
-    delays_s = [max(0, tx.now_us - row.run_at_us) / SECOND_US for row in rows]
+    delays_s = [_delay_s(tx, row) for row in rows]
     tx.after_commit(lambda: tx.observer.observe_claims(delays_s))
     tx.after_commit(lambda: faults.point("claim.after_commit"))
     return _leases(tx, rows, tokens, policy)
@@ -212,6 +214,7 @@ _LEASE_COLUMNS = (
     (job.c.attempt + UNCOUNTED).label("attempt"),
     job.c.priority,
     job.c.run_at_us,
+    job.c.environment,
 )
 
 
@@ -359,6 +362,7 @@ def _leases(
             sizes.get(row.parent_id, row.size),
             sealed(token, seal_key),
             policy,
+            _trace(tx, row),
         )
         for row, token in zip(rows, tokens, strict=True)
     ]
@@ -372,7 +376,24 @@ def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
     return {one.id: one.size for one in tx.execute(select(job.c.id, job.c.size).where(job.c.id.in_(parents)))}
 
 
-def _lease(row: Row[Any], inputs: Mapping[str, Any], size: int | None, token: str, policy: QueuePolicy) -> Lease:
+def _trace(tx: Transaction, row: Row[Any]) -> JobTrace | None:
+    """Return the trace to which the job belongs, with the time for which the job could have run before."""
+    header = trace_header(row.environment)
+    return None if header is None else JobTrace(traceparent=header, waited_s=_delay_s(tx, row))
+
+
+def _delay_s(tx: Transaction, row: Row[Any]) -> float:
+    return max(0, tx.now_us - row.run_at_us) / SECOND_US  # type: ignore[no-any-return]
+
+
+def _lease(
+    row: Row[Any],
+    inputs: Mapping[str, Any],
+    size: int | None,
+    token: str,
+    policy: QueuePolicy,
+    trace: JobTrace | None,
+) -> Lease:
     return Lease(
         job=row.id,
         project=row.project_name,
@@ -389,4 +410,5 @@ def _lease(row: Row[Any], inputs: Mapping[str, Any], size: int | None, token: st
         attempt_token=token,
         lease_ttl_s=policy.lease_ttl_s,
         heartbeat_s=policy.heartbeat_s,
+        trace=trace,
     )

@@ -73,7 +73,7 @@ job = Table(
     Column("cached_from", ID),  # the job whose result this one shares, or waits to share
     Column("retry_of", ID),
     Column("code_version", String(255)),
-    Column("environment", Document),
+    Column("environment", Document),  # versions of libraries at its end; before, {"traceparent": ...} or null
     Column("author_id", ID, ForeignKey("user.id")),
     Column("message", Text, nullable=False, default=""),
     Column("created_us", Micros, nullable=False),

@@ -1,0 +1,82 @@
+"""Traces of a client: requests pass on the trace of the program, and a command of `marey` may begin one.
+
+A program that uses OpenTelemetry needs to do nothing: requests belong to its active span.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from marey_schemas.tracing.context import TraceContext
+from marey_schemas.tracing.declared import CALL, COMMAND
+from marey_schemas.tracing.spans import ProcessScope, SpanScope, current_scope, trace_headers
+
+SERVICE = "marey"
+"""Name under which collectors show commands, unless a variable of OpenTelemetry names another."""
+PARENT_VARIABLE = "TRACEPARENT"
+"""Variable by which the program that starts a command passes on its trace, in the form of the header."""
+
+
+@dataclass(slots=True)
+class TracedRequest:
+    """Request, which is perhaps sent several times."""
+
+    scope: SpanScope | None
+    tries: int = 0
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """The headers that pass the trace on."""
+        return trace_headers(self.scope)
+
+    def note_try(self) -> None:
+        """Record that the request is sent, perhaps again."""
+        if self.tries:
+            self._note("http.request.resend_count", self.tries)
+        self.tries += 1
+
+    def note_answer(self, status: int) -> None:
+        """Record the status of an answer."""
+        self._note("http.response.status_code", status)
+
+    def _note(self, attribute: str, value: int) -> None:
+        if self.scope is not None and self.scope.span is not None:
+            self.scope.span.attributes[attribute] = value
+
+
+@contextmanager
+def calling(method: str) -> Iterator[TracedRequest]:
+    """Record a request while the `with` block runs, if this process records the current trace."""
+    scope = current_scope()
+    if scope is None or scope.emit is None:
+        yield TracedRequest(scope)
+        return
+    with scope.child(CALL, method) as call:
+        if call.span is not None:
+            call.span.attributes["http.request.method"] = method
+        yield TracedRequest(call)
+
+
+@contextmanager
+def tracing_command(name: str) -> Iterator[None]:
+    """Let all requests of this process belong to one trace while the `with` block runs.
+
+    The trace is that in the variable `TRACEPARENT`. Without it, a new trace begins if a collector is configured.
+    """
+    from marey_schemas.tracing.export import closing, open_optional_tracer
+
+    given = TraceContext.parse(os.environ.get(PARENT_VARIABLE))
+    with closing(open_optional_tracer(SERVICE, os.environ)) as tracer:
+        place = given if tracer is None or given is not None else tracer.new_root()
+        if place is None or not (place.sampled or given):
+            yield
+            return
+        with SpanScope(place, None if tracer is None else tracer.emit).child(COMMAND, f"marey {name}") as scope:
+            ProcessScope.scope = scope
+            try:
+                yield
+            finally:
+                ProcessScope.scope = None
