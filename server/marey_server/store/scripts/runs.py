@@ -50,13 +50,14 @@ def list_runs(tx: Transaction, project: str, name: str, *, sort: str, limit: int
             script_run.join(job, job.c.id == script_run.c.job_id).outerjoin(user, user.c.id == job.c.author_id)
         )
         .where(script_run.c.project_id == row.id, script_run.c.script == name)
-        .order_by(*_order(tx, sort), job.c.id.desc())
+        .order_by(*order_of_runs(tx, sort), job.c.id.desc())
         .limit(limit)
     )
     return Page(items=tuple(map(_shown, tx.execute(statement))))
 
 
-def _order(tx: Transaction, sort: str) -> list[ColumnElement[Any]]:
+def order_of_runs(tx: Transaction, sort: str) -> list[ColumnElement[Any]]:
+    """Return the columns by which a list of runs is sorted. Raises `BadRequestProblem` for an unknown order."""
     match = _SORT.fullmatch(sort)
     if match is None:
         raise BadRequestProblem(
@@ -79,7 +80,7 @@ def _shown(row: Row[Any]) -> ScriptRun:
         job=row.id,
         state=row.state,
         values=row.params["values"],
-        fields=_fields_of(row.result),
+        fields=fields_of(row.result),
         commit=row.params["declaration"]["commit"],
         seed=row.seed,
         author=row.author,
@@ -88,7 +89,7 @@ def _shown(row: Row[Any]) -> ScriptRun:
     )
 
 
-def _fields_of(result: Any) -> dict[str, Value]:
+def fields_of(result: Any) -> dict[str, Value]:
     """Return the logged fields in the result of a run; a worker can write anything else there, which is left out."""
     fields = result.get("fields") if isinstance(result, dict) else None
     if not isinstance(fields, dict):
