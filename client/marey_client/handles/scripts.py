@@ -92,7 +92,9 @@ class ScriptHandle:
         The result contains `curves` of at most 6 fields if they are requested. Raises `BadRequest` for a field that no
         run has logged.
         """
-        named = {goal: ",".join(name for name, own in (goals or {}).items() if own == goal) for goal in GOALS}
+        named: dict[str, str] = {
+            goal: ",".join(name for name, own in (goals or {}).items() if own == goal) for goal in GOALS
+        }
         wanted: dict[str, Any] = {"sort": sort, "limit": limit, "fields": ",".join(fields), **named}
         if curves:
             wanted["curves"] = True

@@ -51,21 +51,37 @@ def compare_runs(tx: Transaction, project: str, name: str, wanted: Compared) -> 
     Raises `BadRequestProblem` for an unknown order, and for a field that no run has logged.
     """
     found, complete = comparing.find_runs(tx, project, name, sort=wanted.sort, limit=wanted.limit)
+    curves = comparing.read_curves(tx, [run.curves_blob for run in found if run.curves_blob]) if wanted.curves else {}
+    return compare_read(name, found, curves, wanted, complete=complete)
+
+
+def compare_read(
+    name: str,
+    found: Sequence[RunToCompare],
+    curves: Mapping[str, Mapping[str, Curve]],
+    wanted: Compared,
+    *,
+    complete: bool,
+) -> Comparison:
+    """Compare runs that were read, with their curves by the digest of the file. Raises `BadRequestProblem`."""
     goals = _goals(wanted)
     logged = dict.fromkeys(field for run in found for field in run.fields)
     if found and (unknown := [field for field in (*wanted.fields, *goals) if field not in logged]):
         detail = f"No compared run logged the field {unknown[0]!r}; the fields are {', '.join(logged) or 'none'}."
         raise BadRequestProblem(detail, code="no-field")
-    drawn, curves = _curves(tx, found, wanted) if wanted.curves else ((), {})
+    drawn = _drawn(found, curves, wanted)
     fields = wanted.fields or tuple(logged)
     settings = {key: place for place, key in enumerate(dict.fromkeys(run.setting for run in found))}
     counted = _counted(found)
-    runs = [_shown(run, fields, settings, run.job in counted, curves.get(run.curves_blob or "", {})) for run in found]
+    runs = []
+    for run in found:
+        own = curves.get(run.curves_blob or "", {})
+        kept = {field: own[field] for field in drawn if field in own}
+        runs.append(_shown(run, fields, settings[run.setting], counted=run.job in counted, curves=kept))
     summaries = tuple(_summary(runs, place) for place in settings.values())
-    columns = tuple(_columns(runs, fields))
     return Comparison(
         subject=name,
-        columns=tuple(_with_best(column, goals, runs, summaries) for column in columns),
+        columns=tuple(_with_best(column, goals, runs, summaries) for column in _columns(runs, fields)),
         runs=tuple(runs),
         settings=summaries,
         curves=drawn,
@@ -82,15 +98,13 @@ def _goals(wanted: Compared) -> dict[str, Goal]:
     return goals | dict(wanted.goals or {})
 
 
-def _curves(
-    tx: Transaction, found: Sequence[RunToCompare], wanted: Compared
-) -> tuple[tuple[str, ...], dict[str, dict[str, Curve]]]:
-    """Return the fields whose curves are compared, and these curves by the digest of their file."""
-    read = comparing.read_curves(tx, [run.curves_blob for run in found if run.curves_blob])
-    counts = Counter(field for run in found for field in read.get(run.curves_blob or "", {}))
-    fields = [field for field in wanted.fields or [field for field, _ in counts.most_common()] if field in counts]
-    drawn = tuple(fields[:MOST_DRAWN])
-    return drawn, {digest: {field: own[field] for field in drawn if field in own} for digest, own in read.items()}
+def _drawn(
+    found: Sequence[RunToCompare], curves: Mapping[str, Mapping[str, Curve]], wanted: Compared
+) -> tuple[str, ...]:
+    """Return the fields whose curves are compared."""
+    counts = Counter(field for run in found for field in curves.get(run.curves_blob or "", {}))
+    fields = wanted.fields or [field for field, _ in counts.most_common()]
+    return tuple(field for field in fields if field in counts)[:MOST_DRAWN]
 
 
 def _counted(found: Sequence[RunToCompare]) -> set[str]:
@@ -104,7 +118,7 @@ def _counted(found: Sequence[RunToCompare]) -> set[str]:
 
 
 def _shown(
-    run: RunToCompare, fields: Sequence[str], settings: Mapping[str, int], counted: bool, curves: dict[str, Curve]
+    run: RunToCompare, fields: Sequence[str], setting: int, *, counted: bool, curves: dict[str, Curve]
 ) -> ComparedRun:
     return ComparedRun(
         job=run.job,
@@ -114,7 +128,7 @@ def _shown(
         inputs=run.inputs,
         values=run.values,
         fields={field: run.fields[field] for field in fields if field in run.fields},
-        setting=settings[run.setting],
+        setting=setting,
         counted=counted,
         curves=curves,
     )

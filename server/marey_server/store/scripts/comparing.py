@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Iterable, Mapping
 from datetime import datetime
 from itertools import islice
@@ -19,7 +18,7 @@ from marey_schemas.queue.scripts import LONGEST_NAME, LONGEST_TEXT, MOST_FIELDS,
 from marey_schemas.wording import counted
 from marey_server.store import blobs, projects
 from marey_server.store.database.clock import datetime_of
-from marey_server.store.scripts.runs import fields_of, order_of_runs
+from marey_server.store.scripts.runs import fields_of, order_of_runs, sound_values
 from marey_server.store.tables import job, script_run
 from marey_server.store.transaction import Transaction
 
@@ -92,8 +91,8 @@ def _run_of(row: Row[Any]) -> RunToCompare:
         created_at=datetime_of(row.created_us),
         setting=hashlib.sha256(text).hexdigest(),
         inputs={name: _words_of(_listed(given)) for name, given in row.inputs.items()},
-        values=values,
-        fields=dict(islice(filter(_is_sound, fields_of(row.result).items()), MOST_FIELDS)),
+        values=sound_values(values),
+        fields=dict(islice(filter(_is_short, fields_of(row.result).items()), MOST_FIELDS)),
         curves_blob=blob if isinstance(blob, str) and is_digest(blob) else None,
     )
 
@@ -112,9 +111,7 @@ def _words_of(pins: list[Mapping[str, Any]]) -> str:
     return f"{path or pin['item']}@{pin['revision']}"
 
 
-def _is_sound(field: tuple[str, Value]) -> bool:
-    """Return whether `marey_worker` would accept a field: another worker can write any JSON into a result."""
+def _is_short(field: tuple[str, Value]) -> bool:
+    """Return whether name and text of a field have an accepted length: a worker can write any JSON into a result."""
     name, value = field
-    if len(name) > LONGEST_NAME or (isinstance(value, str) and len(value) > LONGEST_TEXT):
-        return False
-    return isinstance(value, str) or (abs(value) < 2**63 if isinstance(value, int) else math.isfinite(value))
+    return len(name) <= LONGEST_NAME and not (isinstance(value, str) and len(value) > LONGEST_TEXT)

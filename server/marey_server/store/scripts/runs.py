@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from sqlalchemy import ColumnElement, Row, func, select
@@ -92,6 +95,19 @@ def _shown(row: Row[Any]) -> ScriptRun:
 def fields_of(result: Any) -> dict[str, Value]:
     """Return the logged fields in the result of a run; a worker can write anything else there, which is left out."""
     fields = result.get("fields") if isinstance(result, dict) else None
-    if not isinstance(fields, dict):
-        return {}
-    return {name: value for name, value in fields.items() if isinstance(value, bool | int | float | str)}
+    return sound_values(fields) if isinstance(fields, dict) else {}
+
+
+def sound_values(values: Mapping[str, Any]) -> dict[str, Value]:
+    """Return the texts, truth values and finite numbers of a document.
+
+    Postgres returns a large float such as 1e20 as an integer; it becomes a float again, as integers are 64 bits wide.
+    """
+    found: dict[str, Value] = {}
+    for name, value in values.items():
+        if isinstance(value, int) and not -(2**63) <= value < 2**63:
+            with suppress(OverflowError):
+                found[name] = float(value)
+        elif isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value)):
+            found[name] = value
+    return found

@@ -1,0 +1,176 @@
+"""Chart of a field over a parameter: each run as a dot, and means of replicates with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from marey_reports.comparisons.axes import add_chart, axis_title, set_logarithmic, spread
+from marey_reports.comparisons.subjects import (
+    LARGEST,
+    SMALLEST,
+    ComparedSubject,
+    Point,
+    missing_words,
+    written,
+)
+from marey_reports.drawing.drawn import Sketch, Tables
+from marey_reports.drawing.paper import COLOURS, MARKERS, QUIET, Place, add_keys, new_figure, plain
+from marey_schemas.queue.comparisons import ComparedColumn, number_of
+from marey_schemas.wording import counted
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+WIDE = 100.0
+"""Ratio of the largest to the smallest value of a parameter from which its axis is logarithmic."""
+MOST_NAMES = 12
+"""Greatest number of different texts on the horizontal axis."""
+MOST_NUMBERED = 24
+"""Greatest number of means beside which the number of runs is written."""
+_APART, _BESIDE = 9.0, 6.0
+"""Distances of groups, and of runs from their mean, in points of 1/72 inch."""
+_MOST_SIGNS = 60
+"""Number of characters from which texts along the axis are turned."""
+
+
+class _Across(NamedTuple):
+    """Place of each setting on the horizontal axis; `names` are the texts at 0, 1, ..., empty for numbers."""
+
+    places: dict[int, float]
+    names: tuple[str, ...]
+    log: bool
+
+
+def draw_scatter(subject: ComparedSubject, column: ComparedColumn, parameter: ComparedColumn) -> Sketch | None:
+    """Draw a field over a parameter; return None if there are no numbers, or too many different texts.
+
+    Means are not joined by lines, because nothing is known of the values between them. If one further setting differs,
+    it has colours.
+    """
+    across = _across(subject, parameter)
+    points = [one for one in subject.points(column.name) if across is not None and one.setting in across.places]
+    if across is None or not points:
+        return None
+    numbers = [number for one in points for number in one.numbers]
+    log = subject.is_log(numbers)
+    figure = new_figure(9.6, 4.0)
+    further = _further(subject, parameter, points)
+    width = 5.9 if len(further) > 1 else 8.2
+    panel = add_chart(figure, Place(0.95, 0.85, width, 2.65), title=f"{axis_title(column.name)} by {parameter.name}",
+                      x=axis_title(parameter.name, log=across.log),
+                      y=axis_title(column.name, log=log))  # fmt: skip
+    ends = [end for one in points for end in (one.summary.low, one.summary.high) if end is not None]
+    low, high = min(numbers), max(numbers)
+    reach = 0.4 * (high - low)
+    if not log:
+        low, high = max(min([low, *ends]), low - reach), min(max([high, *ends]), high + reach)
+    panel.set_ylim(*spread(low, high, log=log))
+    _set_across(panel, across)
+    if log:
+        set_logarithmic(panel.yaxis)
+    for number, (name, some) in enumerate(further.items()):
+        _draw_points(panel, some, across, number, name, shift=(number - (len(further) - 1) / 2.0) * _APART)
+    if len(further) > 1:
+        add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.03))
+    return Sketch(figure, _tables(subject, points, across), _caption(subject, column, parameter, points))
+
+
+def _across(subject: ComparedSubject, parameter: ComparedColumn) -> _Across | None:
+    cells = {place: subject.first_run(place).cell(parameter) for place in range(len(subject.comparison.settings))}
+    if parameter.numeric:
+        numbers = {place: number_of(cell) for place, cell in cells.items()}
+        places = {place: one for place, one in numbers.items() if one is not None and abs(one) <= LARGEST}
+        known = places.values()
+        log = bool(places) and min(known) >= SMALLEST and max(known) / min(known) >= WIDE
+        return _Across(places, (), log) if places else None
+    names = [written(parameter, subject.first_run(place)) for place in cells]
+    order = list(dict.fromkeys(names))
+    if len(order) > MOST_NAMES:
+        return None
+    return _Across({place: float(order.index(name)) for place, name in zip(cells, names, strict=True)},
+                   tuple(order), log=False)  # fmt: skip
+
+
+def _set_across(panel: Axes, across: _Across) -> None:
+    known = across.places.values()
+    if across.names:
+        panel.set_xlim(-0.6, len(across.names) - 0.4)
+        many = sum(map(len, across.names)) > _MOST_SIGNS
+        panel.set_xticks(range(len(across.names)), [plain(name) for name in across.names], parse_math=False,
+                         rotation=20 if many else 0, ha="right" if many else "center")  # fmt: skip
+        return
+    panel.set_xlim(*spread(min(known), max(known), log=across.log))
+    if across.log:
+        set_logarithmic(panel.xaxis)
+
+
+def _further(subject: ComparedSubject, parameter: ComparedColumn, points: Sequence[Point]) -> dict[str, list[Point]]:
+    """Return the settings by the one further value that differs; all in one group if there are none, or several."""
+    others = [column for column in subject.varied if column != parameter]
+    groups: dict[str, list[Point]] = {}
+    if len(others) == 1:
+        for one in sorted(points, key=lambda one: number_of(subject.first_run(one.setting).cell(others[0])) or 0.0):
+            name = f"{others[0].name} = {written(others[0], subject.first_run(one.setting))}"
+            groups.setdefault(name, []).append(one)
+    return groups if 1 < len(groups) <= len(COLOURS) else {"": list(points)}
+
+
+def _draw_points(panel: Axes, points: list[Point], across: _Across, number: int, name: str, *, shift: float) -> None:
+    """Draw settings; `shift` moves them to the right, in points of 1/72 inch, so that groups lie side by side."""
+    from matplotlib.transforms import ScaledTranslation
+
+    scale = panel.get_figure(root=True).dpi_scale_trans
+    at, beside = (panel.transData + ScaledTranslation(x / 72.0, 0.0, scale) for x in (shift, shift - _BESIDE))
+    colour, marker = COLOURS[number], MARKERS[number]
+    limits = panel.get_xlim(), panel.get_ylim()
+    counts = _span([one.summary.n for one in points])
+    for place, point in enumerate(points):
+        x, summary = across.places[point.setting], point.summary
+        if summary.n > 1:
+            panel.plot(np.full(summary.n, x), point.numbers, ls="", marker="o", ms=3.4, mew=0, color=colour, alpha=0.5,
+                       transform=beside)  # fmt: skip
+        if summary.low is not None and summary.high is not None:
+            panel.plot([x, x], [summary.low, summary.high], color=colour, lw=1.4, transform=at)
+        panel.plot([x], [summary.mean], ls="", marker=marker, ms=6.5, color=colour, zorder=3, transform=at,
+                   label=f"{plain(name)} (n = {counts})" if place == 0 and name else None)  # fmt: skip
+        if not name and len(points) <= MOST_NUMBERED:
+            panel.annotate(f"n = {summary.n}", (x, summary.mean), xytext=(7, 0), textcoords="offset points", fontsize=7,
+                           color=QUIET, va="center")  # fmt: skip
+    panel.set(xlim=limits[0], ylim=limits[1])
+
+
+def _span(counts: Sequence[int]) -> str:
+    return f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
+
+
+def _caption(
+    subject: ComparedSubject, column: ComparedColumn, parameter: ComparedColumn, points: Sequence[Point]
+) -> str:
+    parts = [f"{column.name} by {parameter.name}"]
+    if any(one.summary.n > 1 for one in points):
+        parts.append("small dots are runs with different seeds, and large marks are the means of n runs")
+    if any(one.summary.low is not None for one in points):
+        parts.append("vertical lines are 95 % confidence intervals of the means (from n = 3)")
+    others = [one.name for one in subject.varied if one != parameter]
+    if len(others) > 1:
+        parts.append(f"{counted(len(others), 'other value')} differ, too: {', '.join(others[:5])}")
+    if len(points) > MOST_NUMBERED:
+        parts.append(f"n is {_span([one.summary.n for one in points])}")
+    return f"{'; '.join([*parts, *missing_words(subject.left_out(column.name))])}."
+
+
+def _tables(subject: ComparedSubject, points: Sequence[Point], across: _Across) -> Tables:
+    rows = [(one, number) for one in points for number in one.numbers]
+    return {
+        "runs": {
+            "setting": [subject.labels[one.setting] for one, _ in rows],
+            "parameter": [
+                across.names[int(across.places[one.setting])] if across.names else across.places[one.setting]
+                for one, _ in rows
+            ],
+            "field": [number for _, number in rows],
+        }
+    }
