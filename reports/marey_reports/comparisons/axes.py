@@ -19,9 +19,6 @@ UNITS = {
 """Units that the last part of a name can be, such as `path_m`."""
 
 
-_LONGEST_TITLE = 40
-
-
 def add_chart(figure: Figure, place: Place, *, title: str, x: str, y: str = "") -> Axes:
     """Add a panel like `add_panel`; names in its texts are written literally."""
     panel = add_panel(figure, place, title=title, x=plain(x), y=plain(y))
@@ -34,7 +31,7 @@ def axis_title(name: str, *, log: bool = False) -> str:
     """Return the title of an axis: `path_m` becomes `path (m)`."""
     stem, _, unit = name.rpartition("_")
     known = UNITS.get(unit.lower()) if stem else None
-    title = shortened(name if known is None else f"{re.sub('_+', ' ', stem)} ({known})", _LONGEST_TITLE)
+    title = shortened(name if known is None else f"{re.sub('_+', ' ', stem)} ({known})")
     return f"{title}, logarithmic" if log else title
 
 

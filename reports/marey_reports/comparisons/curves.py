@@ -20,6 +20,7 @@ from marey_reports.drawing.paper import (
     add_keys,
     new_figure,
     plain,
+    tick_whole_numbers,
 )
 from marey_schemas.queue.comparisons import Curve
 from marey_schemas.wording import counted
@@ -51,15 +52,19 @@ def draw_curves(subject: ComparedSubject, field: str) -> Sketch | None:
     groups = _groups(subject, field)
     if not groups:
         return None
-    numbers = np.concatenate([_values(curve) for curves in groups.values() for curve in curves])
+    coloured = list(groups.items())[: len(COLOURS)]
+    others = [curve for curves in list(groups.values())[len(COLOURS) :] for curve in curves]
+    drawn = [*(curve for _, curves in coloured for curve in curves), *others[:MOST_OTHERS]]
+    numbers = np.concatenate([_values(curve) for curve in drawn])
     numbers = numbers[np.isfinite(numbers)]
     log = subject.is_log(numbers.tolist())
     figure = new_figure(9.6, 4.0)
     panel = add_chart(figure, Place(0.95, 0.6, 5.0, 2.95), title=axis_title(field), x="step",
                       y=axis_title(field, log=log))  # fmt: skip
-    _draw_others(panel, list(groups.values())[len(COLOURS) :])
+    tick_whole_numbers(panel.xaxis)
+    _draw_others(panel, others[:MOST_OTHERS])
     means = {}
-    for number, (setting, curves) in enumerate(list(groups.items())[: len(COLOURS)]):
+    for number, (setting, curves) in enumerate(coloured):
         means[setting] = _mean_of(curves)
         _draw_setting(panel, number, subject.labels[setting], curves, means[setting])
     if len(numbers):
@@ -95,10 +100,9 @@ def _mean_of(curves: list[Curve]) -> _MeanCurve:
     return _MeanCurve(np.array(steps, dtype=np.float64), *columns)
 
 
-def _draw_others(panel: Axes, others: list[list[Curve]]) -> None:
-    curves = [curve for group in others for curve in group][:MOST_OTHERS]
-    for place, curve in enumerate(curves):
-        label = f"{counted(len(others), 'other setting')}" if place == 0 else None
+def _draw_others(panel: Axes, others: list[Curve]) -> None:
+    for place, curve in enumerate(others):
+        label = f"{counted(len(others), 'run')} of other settings" if place == 0 else None
         panel.plot(curve.steps, _values(curve), color=REFERENCE, lw=0.7, alpha=0.45, label=label)
         _mark_break(panel, curve)
 
@@ -155,7 +159,9 @@ def _caption(field: str, groups: dict[int, list[Curve]], means: dict[int, _MeanC
         most = max(curve.logged for curve in curves)
         parts.append(f"{counted(thinned, 'run')} logged more values than are drawn, at most {most:,}")
     if len(groups) > len(COLOURS):
-        parts.append(f"only the first {len(COLOURS)} of {len(groups)} settings have colours")
+        others = sum(numbers[len(COLOURS) :])
+        cut = f", and the first {MOST_OTHERS} of {others:,} other runs are drawn" if others > MOST_OTHERS else ""
+        parts.append(f"the first {len(COLOURS)} of {len(groups)} settings have colours{cut}")
     return f"{'; '.join(parts)}."
 
 

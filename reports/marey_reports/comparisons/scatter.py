@@ -59,9 +59,13 @@ def draw_scatter(subject: ComparedSubject, column: ComparedColumn, parameter: Co
     figure = new_figure(9.6, 4.0)
     further = _further(subject, parameter, points)
     width = 5.9 if len(further) > 1 else 8.2
-    panel = add_chart(figure, Place(0.95, 0.85, width, 2.65), title=f"{axis_title(column.name)} by {parameter.name}",
-                      x=axis_title(parameter.name, log=across.log),
-                      y=axis_title(column.name, log=log))  # fmt: skip
+    panel = add_chart(
+        figure,
+        Place(0.95, 0.85, width, 2.65),
+        title=f"{axis_title(column.name)} by {axis_title(parameter.name)}",
+        x=axis_title(parameter.name, log=across.log),
+        y=axis_title(column.name, log=log),
+    )
     ends = [end for one in points for end in (one.summary.low, one.summary.high) if end is not None]
     low, high = min(numbers), max(numbers)
     reach = 0.4 * (high - low)
@@ -124,21 +128,25 @@ def _draw_points(panel: Axes, points: list[Point], across: _Across, number: int,
 
     scale = panel.get_figure(root=True).dpi_scale_trans
     at, beside = (panel.transData + ScaledTranslation(x / 72.0, 0.0, scale) for x in (shift, shift - _BESIDE))
-    colour, marker = COLOURS[number], MARKERS[number]
-    limits = panel.get_xlim(), panel.get_ylim()
-    counts = _span([one.summary.n for one in points])
-    for place, point in enumerate(points):
-        x, summary = across.places[point.setting], point.summary
-        if summary.n > 1:
-            panel.plot(np.full(summary.n, x), point.numbers, ls="", marker="o", ms=3.4, mew=0, color=colour, alpha=0.5,
-                       transform=beside)  # fmt: skip
-        if summary.low is not None and summary.high is not None:
-            panel.plot([x, x], [summary.low, summary.high], color=colour, lw=1.4, transform=at)
-        panel.plot([x], [summary.mean], ls="", marker=marker, ms=6.5, color=colour, zorder=3, transform=at,
-                   label=f"{plain(name)} (n = {counts})" if place == 0 and name else None)  # fmt: skip
-        if not name and len(points) <= MOST_NUMBERED:
-            panel.annotate(f"n = {summary.n}", (x, summary.mean), xytext=(7, 0), textcoords="offset points", fontsize=7,
-                           color=QUIET, va="center")  # fmt: skip
+    colour, limits = COLOURS[number], (panel.get_xlim(), panel.get_ylim())
+    runs = [(across.places[one.setting], value) for one in points if one.summary.n > 1 for value in one.numbers]
+    if runs:
+        panel.plot(
+            *zip(*runs, strict=True), ls="", marker="o", ms=3.4, mew=0, color=colour, alpha=0.5, transform=beside
+        )
+    xs, means = [across.places[one.setting] for one in points], [one.summary.mean for one in points]
+    ends = [
+        (x, one.summary.low, one.summary.high) for x, one in zip(xs, points, strict=True) if one.summary.low is not None
+    ]
+    if ends:
+        panel.vlines(*zip(*ends, strict=True), color=colour, lw=1.4, transform=at)
+    size = 6.5 if len(points) <= MOST_NUMBERED else 4.5
+    label = f"{plain(name)} (n = {_span([one.summary.n for one in points])})" if name else None
+    panel.plot(xs, means, ls="", marker=MARKERS[number], ms=size, color=colour, zorder=3, transform=at, label=label)
+    if not name and len(points) <= MOST_NUMBERED:
+        for x, one in zip(xs, points, strict=True):
+            panel.annotate(f"n = {one.summary.n}", (x, one.summary.mean), xytext=(7, 0), textcoords="offset points",
+                           fontsize=7, color=QUIET, va="center")  # fmt: skip
     panel.set(xlim=limits[0], ylim=limits[1])
 
 
