@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
+    from matplotlib.transforms import Transform
 
 UNITS = {
     "m": "m", "cm": "cm", "mm": "mm", "km": "km", "s": "s", "ms": "ms", "min": "min", "h": "h", "hz": "Hz", "kg": "kg",
@@ -55,3 +56,13 @@ def spread(low: float, high: float, *, log: bool) -> tuple[float, float]:
         return low / factor, high * factor
     margin = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
     return low - margin, high + margin
+
+
+def beside(axes: Axes, transform: Transform, inches: float) -> Transform:
+    """Return a transform of places on axes that moves them to the right by a distance in inches."""
+    from matplotlib.transforms import ScaledTranslation
+
+    figure = axes.get_figure(root=True)
+    if figure is None:
+        raise ValueError("the axes are on no page")
+    return transform + ScaledTranslation(inches, 0.0, figure.dpi_scale_trans)

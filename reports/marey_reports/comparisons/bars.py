@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from marey_reports.comparisons.axes import add_chart, axis_title, set_logarithmic, spread
+from marey_reports.comparisons.axes import add_chart, axis_title, beside, set_logarithmic, spread
 from marey_reports.comparisons.subjects import (
     ComparedSubject,
     Point,
@@ -90,14 +90,10 @@ def _name_rows(panel: Axes, subject: ComparedSubject, shown: list[Point], column
 
 def _write_columns(panel: Axes, shown: list[Point], column: ComparedColumn) -> None:
     """Write mean and number of runs at the right of the panel, in columns with fixed distances in inches."""
-    from matplotlib.transforms import ScaledTranslation, blended_transform_factory
+    from matplotlib.transforms import blended_transform_factory
 
-    def column_at(inches: float) -> Any:
-        return blended_transform_factory(panel.transAxes, panel.transData) + ScaledTranslation(
-            inches, 0.0, panel.get_figure(root=True).dpi_scale_trans
-        )
-
-    means, counts, marks = column_at(0.7), column_at(1.0), column_at(1.08)
+    across = blended_transform_factory(panel.transAxes, panel.transData)
+    means, counts, marks = (beside(panel, across, inches) for inches in (0.7, 1.0, 1.08))
     head = "mean" if any(one.summary.n > 1 for one in shown) else "value"
     for transform, text in ((means, head), (counts, "n")):
         write(panel, (1.0, -1.0), text, transform=transform, ha="right", color=QUIET)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -114,7 +114,12 @@ def _draw_setting(panel: Axes, number: int, label: str, curves: list[Curve], mea
         if len(curves) > 1:
             panel.plot(curve.steps, values, color=colour, lw=0.8, alpha=0.35, zorder=2)
         _mark_break(panel, curve)
-    look = {"color": colour, "marker": marker, "zorder": 3, "label": f"{plain(label)}\nn = {len(curves)}"}
+    look: dict[str, Any] = {
+        "color": colour,
+        "marker": marker,
+        "zorder": 3,
+        "label": f"{plain(label)}\nn = {len(curves)}",
+    }
     if len(curves) > 1 and np.isfinite(mean.low).any():
         panel.fill_between(mean.steps, mean.low, mean.high, color=colour, alpha=0.16, lw=0)
     steps, values = (mean.steps, mean.mean) if len(curves) > 1 else (curves[0].steps, _values(curves[0]))

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-
-from marey_reports.comparisons.axes import add_chart, axis_title, set_logarithmic, spread
+from marey_reports.comparisons.axes import add_chart, axis_title, beside, set_logarithmic, spread
 from marey_reports.comparisons.subjects import (
     LARGEST,
     SMALLEST,
@@ -30,8 +28,8 @@ MOST_NAMES = 12
 """Greatest number of different texts on the horizontal axis."""
 MOST_NUMBERED = 24
 """Greatest number of means beside which the number of runs is written."""
-_APART, _BESIDE = 9.0, 6.0
-"""Distances of groups, and of runs from their mean, in points of 1/72 inch."""
+_APART, _BESIDE = 0.125, 0.083
+"""Distances of groups, and of runs from their mean, in inches."""
 _MOST_SIGNS = 60
 """Number of characters from which texts along the axis are turned."""
 
@@ -42,6 +40,11 @@ class _Across(NamedTuple):
     places: dict[int, float]
     names: tuple[str, ...]
     log: bool
+
+    @property
+    def turned(self) -> bool:
+        """Whether the texts are turned, because they are long."""
+        return sum(map(len, self.names)) > _MOST_SIGNS
 
 
 def draw_scatter(subject: ComparedSubject, column: ComparedColumn, parameter: ComparedColumn) -> Sketch | None:
@@ -59,9 +62,10 @@ def draw_scatter(subject: ComparedSubject, column: ComparedColumn, parameter: Co
     figure = new_figure(9.6, 4.0)
     further = _further(subject, parameter, points)
     width = 5.9 if len(further) > 1 else 8.2
+    bottom = 1.25 if across.turned else 0.65
     panel = add_chart(
         figure,
-        Place(0.95, 0.85, width, 2.65),
+        Place(0.95, bottom, width, 3.5 - bottom),
         title=f"{axis_title(column.name)} by {axis_title(parameter.name)}",
         x=axis_title(parameter.name, log=across.log),
         y=axis_title(column.name, log=log),
@@ -102,9 +106,8 @@ def _set_across(panel: Axes, across: _Across) -> None:
     known = across.places.values()
     if across.names:
         panel.set_xlim(-0.6, len(across.names) - 0.4)
-        many = sum(map(len, across.names)) > _MOST_SIGNS
         panel.set_xticks(range(len(across.names)), [plain(name) for name in across.names], parse_math=False,
-                         rotation=20 if many else 0, ha="right" if many else "center")  # fmt: skip
+                         rotation=20 if across.turned else 0, ha="right" if across.turned else "center")  # fmt: skip
         return
     panel.set_xlim(*spread(min(known), max(known), log=across.log))
     if across.log:
@@ -123,17 +126,12 @@ def _further(subject: ComparedSubject, parameter: ComparedColumn, points: Sequen
 
 
 def _draw_points(panel: Axes, points: list[Point], across: _Across, number: int, name: str, *, shift: float) -> None:
-    """Draw settings; `shift` moves them to the right, in points of 1/72 inch, so that groups lie side by side."""
-    from matplotlib.transforms import ScaledTranslation
-
-    scale = panel.get_figure(root=True).dpi_scale_trans
-    at, beside = (panel.transData + ScaledTranslation(x / 72.0, 0.0, scale) for x in (shift, shift - _BESIDE))
+    """Draw settings; `shift` moves them to the right, in inches, so that groups lie side by side."""
+    at, aside = (beside(panel, panel.transData, inches) for inches in (shift, shift - _BESIDE))
     colour, limits = COLOURS[number], (panel.get_xlim(), panel.get_ylim())
     runs = [(across.places[one.setting], value) for one in points if one.summary.n > 1 for value in one.numbers]
     if runs:
-        panel.plot(
-            *zip(*runs, strict=True), ls="", marker="o", ms=3.4, mew=0, color=colour, alpha=0.5, transform=beside
-        )
+        panel.plot(*zip(*runs, strict=True), ls="", marker="o", ms=3.4, mew=0, color=colour, alpha=0.5, transform=aside)
     xs, means = [across.places[one.setting] for one in points], [one.summary.mean for one in points]
     ends = [
         (x, one.summary.low, one.summary.high) for x, one in zip(xs, points, strict=True) if one.summary.low is not None
