@@ -19,7 +19,7 @@ from marey_client.credentials import Credential
 from marey_client.errors import MareyError
 from marey_schemas.documents.differences import Difference
 from marey_schemas.lineage import LineageGraph
-from marey_schemas.queue.comparisons import Comparison
+from marey_schemas.queue.comparisons import RunComparison
 
 
 class NotInstalled(MareyError):
@@ -96,7 +96,7 @@ def draw_lineage(graph: LineageGraph, file_type: str) -> bytes:
     return picture
 
 
-def draw_comparison(comparison: Comparison, **options: Any) -> bytes:
+def draw_comparison(comparison: RunComparison, **options: Any) -> bytes:
     """Return a page or a picture of a comparison of runs; `options` are those of `marey_reports.comparisons.charts`.
 
     Raises `MareyError` if the runs have no values for the wanted chart.

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
+from marey_schemas.documents.evaluations import CONFIDENCE
+
 LEAST_REPLICATES = 3
 """Least number of measurements for an interval; that of two would be 12.7 times as wide as their distance."""
-CONFIDENCE = 0.95
 
 
 class MeanInterval(NamedTuple):
@@ -58,6 +59,16 @@ def mean_interval(values: Sequence[float]) -> MeanInterval:
 def student_quantile(degrees: int) -> float:
     """Compute the distance from 0 within which Student's t with a number of degrees of freedom lies in 95 % of cases.
 
+    Parameters
+    ----------
+    degrees : int    degrees of freedom, at least 1
+
+    Returns
+    -------
+    float    the distance, without a unit
+
+    Notes
+    -----
     The distribution is that of Abramowitz and Stegun (1964), equations 26.7.3 and 26.7.4; it is inverted by bisection.
     """
     low, high = 1.9, 13.0

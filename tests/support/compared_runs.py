@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from marey_schemas.queue.comparisons import Comparison, Curve
+from marey_schemas.queue.comparisons import Curve, RunComparison
 from marey_server.motions.run_comparison import Compared, compare_read
 from marey_server.store.scripts.comparing import RunToCompare
 
@@ -38,7 +38,7 @@ def a_run(
 
 def compared_of(
     runs: Iterable[RunToCompare], curves: Mapping[int, Mapping[str, Curve]] | None = None, **wanted: Any
-) -> Comparison:
+) -> RunComparison:
     """Return the comparison of runs; `curves` has the curves of runs by their number."""
     order = Compared(**{"sort": "created_at", "limit": 100, "curves": True, **wanted})
     files = {f"curves-{number}": own for number, own in (curves or {}).items()}

@@ -8,7 +8,7 @@ from typing import Any
 
 from marey_client.paging import pages
 from marey_client.transport import Transport
-from marey_schemas.queue.comparisons import GOALS, MOST_COMPARED, Comparison, Goal
+from marey_schemas.queue.comparisons import GOALS, MOST_COMPARED, Goal, RunComparison
 from marey_schemas.queue.jobs import Job, JobInput
 from marey_schemas.queue.scripts import Script, ScriptCreate, ScriptRun, ScriptRunCreate, Value
 
@@ -85,7 +85,7 @@ class ScriptHandle:
         fields: Sequence[str] = (),
         goals: Mapping[str, Goal] | None = None,
         curves: bool = False,
-    ) -> Comparison:
+    ) -> RunComparison:
         """Compare the succeeded runs, the first `limit` in an order: their settings, logged fields and curves.
 
         `fields` are the logged fields to compare, by default all, and `goals` say which value of a field is the best.
@@ -99,7 +99,7 @@ class ScriptHandle:
         if curves:
             wanted["curves"] = True
         given = {name: value for name, value in wanted.items() if value != ""}
-        return self.transport.get(Comparison, f"{self.url}/comparison", given)
+        return self.transport.get(RunComparison, f"{self.url}/comparison", given)
 
     def delete(self) -> None:
         """Delete the script; its runs remain."""

@@ -20,10 +20,10 @@ from marey_schemas.queue.comparisons import ComparedColumn
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MOST_ROWS = 30
+MOST_BARS_DRAWN = 30
 NARROW = 0.7
 """Share of the greatest value from which all values are so near to each other that bars from 0 would look equal."""
-_ROW, _ABOVE, _BELOW, _RIGHT, _PAGE = 0.27, 0.62, 0.6, 1.65, 9.6
+_ROW, _ABOVE, _UNDER, _RIGHT, _PAGE = 0.27, 0.62, 0.6, 1.65, 9.6
 _SIGN = 0.068
 """Width of a character in inches."""
 
@@ -37,14 +37,14 @@ def draw_bars(subject: ComparedSubject, column: ComparedColumn) -> Sketch | None
     points = subject.points(column.name)
     if not points:
         return None
-    shown = points[:MOST_ROWS]
+    shown = points[:MOST_BARS_DRAWN]
     low, high = min(one.ends[0] for one in shown), max(one.ends[1] for one in shown)
     log = subject.is_log([low])
     bars = not log and not (min(abs(low), abs(high)) > NARROW * max(abs(low), abs(high)) and low * high > 0.0)
     height = _ROW * max(len(shown), 2)
-    figure = new_figure(_PAGE, height + _ABOVE + _BELOW)
+    figure = new_figure(_PAGE, height + _ABOVE + _UNDER)
     left_in = 0.35 + _SIGN * max(len(subject.labels[one.setting]) for one in shown)
-    panel = add_chart(figure, Place(left_in, _BELOW, _PAGE - _RIGHT - left_in, height), title=axis_title(column.name),
+    panel = add_chart(figure, Place(left_in, _UNDER, _PAGE - _RIGHT - left_in, height), title=axis_title(column.name),
                       x=axis_title(column.name, log=log))  # fmt: skip
     panel.grid(visible=False, axis="y")
     ends = [end for one in shown for end in (one.summary.low, one.summary.high) if end is not None]

@@ -17,7 +17,7 @@ from marey_reports.drawing.markup import Content, element
 from marey_reports.drawing.page import Section, page, shown
 from marey_reports.drawing.paper import QUIET, SMALL, plain
 from marey_reports.drawing.tables import Cell, Number, facts, table
-from marey_schemas.queue.comparisons import MOST_DRAWN, ComparedColumn, ComparedRun, Comparison, number_of
+from marey_schemas.queue.comparisons import MOST_DRAWN, ComparedColumn, ComparedRun, RunComparison, number_of
 from marey_schemas.wording import counted
 
 FileType = Literal["html", "svg", "png"]
@@ -32,7 +32,7 @@ MOST_PARAMETERS = 3
 
 
 def draw_comparison(
-    comparison: Comparison,
+    comparison: RunComparison,
     file_type: FileType,
     *,
     plot: Plot | None = None,
@@ -171,7 +171,7 @@ def _verdict(subject: ComparedSubject) -> str:
     return text if apart else f"{text} Its 95 % interval overlaps that of another setting."
 
 
-def _headline(comparison: Comparison) -> Content:
+def _headline(comparison: RunComparison) -> Content:
     counts = [len(setting.runs) for setting in comparison.settings]
     repeats = sum(setting.repeats for setting in comparison.settings)
     seeds = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
@@ -185,7 +185,7 @@ def _headline(comparison: Comparison) -> Content:
     )
 
 
-def _runs(comparison: Comparison) -> Content:
+def _runs(comparison: RunComparison) -> Content:
     columns = [column for column in comparison.columns if column.differs or len(comparison.runs) < 2]
     kept = columns[:MOST_COLUMNS]
     heads = ("job", "seed", *comparison.titles(kept))

@@ -1,4 +1,4 @@
-"""What the charts of a comparison show: names of settings, axes with units, and numbers of fields."""
+"""Content of the charts of a comparison: names of settings, and the numbers of fields."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from marey_reports.drawing.paper import shortened
-from marey_schemas.queue.comparisons import ComparedColumn, ComparedRun, Comparison, FieldSummary, number_of
+from marey_schemas.queue.comparisons import ComparedColumn, ComparedRun, FieldSummary, RunComparison, number_of
 
 LONGEST_LABEL, LONGEST_VALUE = 46, 24
 COMMIT_SIGNS = 8
@@ -42,7 +42,7 @@ class ComparedSubject:
     log : whether axes of fields with positive values are logarithmic
     """
 
-    comparison: Comparison
+    comparison: RunComparison
     log: bool
 
     @cached_property

@@ -99,7 +99,7 @@ class ComparedSetting(Answer):
     fields: dict[str, FieldSummary] = Field(description="Summary of each numeric field that a counted run logged.")
 
 
-class Comparison(Answer):
+class RunComparison(Answer):
     """Comparison of the succeeded runs of a script."""
 
     subject: str = Field(description="Name of the script.")

@@ -12,10 +12,10 @@ from marey_schemas.queue.comparisons import (
     ComparedColumn,
     ComparedRun,
     ComparedSetting,
-    Comparison,
     Curve,
     FieldSummary,
     Goal,
+    RunComparison,
     Source,
     number_of,
 )
@@ -27,7 +27,7 @@ from marey_server.store.transaction import Transaction
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """What to compare.
+    """Runs, fields and goals of a wanted comparison.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class Compared:
     curves: bool = False
 
 
-def compare_runs(tx: Transaction, project: str, name: str, wanted: Compared) -> Comparison:
+def compare_runs(tx: Transaction, project: str, name: str, wanted: Compared) -> RunComparison:
     """Compare the succeeded runs of a script.
 
     Raises `BadRequestProblem` for an unknown order, and for a field that no run has logged.
@@ -62,7 +62,7 @@ def compare_read(
     wanted: Compared,
     *,
     complete: bool,
-) -> Comparison:
+) -> RunComparison:
     """Compare runs that were read, with their curves by the digest of the file. Raises `BadRequestProblem`."""
     goals = _goals(wanted)
     logged = dict.fromkeys(field for run in found for field in run.fields)
@@ -79,7 +79,7 @@ def compare_read(
         kept = {field: own[field] for field in drawn if field in own}
         runs.append(_shown(run, fields, settings[run.setting], counted=run.job in counted, curves=kept))
     summaries = tuple(_summary(runs, place) for place in settings.values())
-    return Comparison(
+    return RunComparison(
         subject=name,
         columns=tuple(_with_best(column, goals, runs, summaries) for column in _columns(runs, fields)),
         runs=tuple(runs),

@@ -12,10 +12,10 @@ from tests.support.compared_runs import a_run, compared_of
 from tests.support.scripted_server import ScriptedServer
 
 from marey_client.cli.queue.compared_tables import shown_columns, table_of_means, table_of_runs, texts_of_means
-from marey_schemas.queue.comparisons import Comparison
+from marey_schemas.queue.comparisons import RunComparison
 
 
-def replicated() -> Comparison:
+def replicated() -> RunComparison:
     runs = [
         a_run(3 * group + seed, {"size": group, "mode": "fast"}, {"loss": 1.0 / 3 + group + seed, "ok": seed == 1},
               seed=seed)

@@ -18,12 +18,12 @@ from marey_reports.comparisons import page
 from marey_reports.comparisons.axes import axis_title
 from marey_reports.comparisons.page import draw_comparison
 from marey_reports.comparisons.subjects import ComparedSubject
-from marey_schemas.queue.comparisons import Comparison, Curve
+from marey_schemas.queue.comparisons import Curve, RunComparison
 
 EVIL = "<script>alert('$x_1$')</script>&\u202e\x1b[31m\n\x00 名前 \U0001f3c3"
 
 
-def trained() -> Comparison:
+def trained() -> RunComparison:
     """Two learning rates with three seeds, of which one diverges at the higher rate; a third one with one seed."""
     runs, curves = [], {}
     given: list[tuple[float, int, float | str]] = [
@@ -36,7 +36,7 @@ def trained() -> Comparison:
     return compared_of(runs, curves, goals={"loss": "lowest"})
 
 
-def numbers(runs: list[dict[str, Any]]) -> Comparison:
+def numbers(runs: list[dict[str, Any]]) -> RunComparison:
     """Return a comparison of runs whose only parameter is their number."""
     return compared_of(
         [a_run(number, {"number": number}, fields) for number, fields in enumerate(runs)],
@@ -44,7 +44,7 @@ def numbers(runs: list[dict[str, Any]]) -> Comparison:
     )
 
 
-def evil() -> Comparison:
+def evil() -> RunComparison:
     runs = [
         a_run(number, {EVIL: f"{number}{EVIL}", "b": True}, {EVIL: 1.0 + number, "<b>": EVIL}, inputs={EVIL: EVIL * 9},
               commit=f"{number}" * 40)
@@ -54,7 +54,7 @@ def evil() -> Comparison:
     return compared_of(runs, curves, goals={EVIL: "highest"})
 
 
-COMPARISONS: dict[str, Comparison] = {
+COMPARISONS: dict[str, RunComparison] = {
     "trained": trained(),
     "evil": evil(),
     "one run": numbers([{"a": 0.5}]),

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import t
 from tests.support.queue_desk import Desk
 
-from marey_schemas.queue.comparisons import MOST_CURVE_BYTES, Comparison, Curve, Curves
+from marey_schemas.queue.comparisons import MOST_CURVE_BYTES, Curve, Curves, RunComparison
 from marey_schemas.queue.scripts import ScriptCreate, ScriptRunCreate
 from marey_server.errors import BadRequestProblem
 from marey_server.motions.run_comparison import Compared, compare_runs
@@ -43,12 +43,12 @@ def run(desk: Desk, size: int, seed: int, result: dict[str, Any], *, curves: byt
     return job
 
 
-def compared(desk: Desk, sort: str = "created_at", limit: int = 100, **wanted: Any) -> Comparison:
+def compared(desk: Desk, sort: str = "created_at", limit: int = 100, **wanted: Any) -> RunComparison:
     order = Compared(sort, limit, **wanted)
     return desk.database.read(desk.user, lambda tx: compare_runs(tx, "lab", "train", order))
 
 
-def places(comparison: Comparison) -> list[Sequence[int]]:
+def places(comparison: RunComparison) -> list[Sequence[int]]:
     return [setting.runs for setting in comparison.settings]
 
 
@@ -104,4 +104,4 @@ def test_results_that_a_worker_made_up_give_a_comparison_of_what_is_sound(traine
     found = compared(trained)
     assert found.runs[0].fields == {"largest": 1.7e308, "b": True, "<b>": "<script>"}
     assert found.settings[0].fields["largest"].mean == 1.7e308
-    assert Comparison.model_validate_json(found.model_dump_json()) == found
+    assert RunComparison.model_validate_json(found.model_dump_json()) == found

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from marey_schemas.queue.comparisons import ComparedColumn, Comparison
+    from marey_schemas.queue.comparisons import ComparedColumn, RunComparison
     from marey_schemas.queue.scripts import Value
 
 BEST = " *"
@@ -41,13 +41,13 @@ class RunTable(NamedTuple):
         return buffer.getvalue()
 
 
-def shown_columns(comparison: Comparison, *, every: bool) -> tuple[ComparedColumn, ...]:
+def shown_columns(comparison: RunComparison, *, every: bool) -> tuple[ComparedColumn, ...]:
     """Return the columns that differ between the runs, or all; a single run has all."""
     every = every or len(comparison.runs) < 2
     return tuple(column for column in comparison.columns if every or column.differs)
 
 
-def table_of_runs(comparison: Comparison, columns: Sequence[ComparedColumn]) -> RunTable:
+def table_of_runs(comparison: RunComparison, columns: Sequence[ComparedColumn]) -> RunTable:
     """Return a table with one row for each run: its job, its seed if the seeds differ, and the columns."""
     seeds = len({run.seed for run in comparison.runs}) > 1
     rows = [[run.job, *([run.seed] * seeds), *(run.cell(column) for column in columns)] for run in comparison.runs]
@@ -62,7 +62,7 @@ def table_of_runs(comparison: Comparison, columns: Sequence[ComparedColumn]) -> 
     return RunTable(heads, rows, _numeric(heads[first:], columns) | {"seed"}, frozenset(best))
 
 
-def table_of_means(comparison: Comparison, columns: Sequence[ComparedColumn]) -> RunTable:
+def table_of_means(comparison: RunComparison, columns: Sequence[ComparedColumn]) -> RunTable:
     """Return a table with one row for each setting: its number of runs, and each field's mean with its interval."""
     fixed = [column for column in columns if column.of != "field"]
     fields = [column for column in columns if column.of == "field" and column.numeric]
@@ -84,7 +84,7 @@ def table_of_means(comparison: Comparison, columns: Sequence[ComparedColumn]) ->
     return RunTable(heads, rows, _numeric(heads, fixed) | set(heads[len(fixed) :]), frozenset(best))
 
 
-def texts_of_means(comparison: Comparison, columns: Sequence[ComparedColumn]) -> RunTable:
+def texts_of_means(comparison: RunComparison, columns: Sequence[ComparedColumn]) -> RunTable:
     """Return the table of means with each mean and its interval in one cell, such as `0.52 (0.4 to 0.64)`."""
     table = table_of_means(comparison, columns)
     fixed = sum(column.of != "field" for column in columns) + 1

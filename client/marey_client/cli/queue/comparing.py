@@ -20,7 +20,7 @@ from marey_client.cli.terminal.invocation import AsJson, ProjectName, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 
 if TYPE_CHECKING:
-    from marey_schemas.queue.comparisons import ComparedColumn, Comparison
+    from marey_schemas.queue.comparisons import ComparedColumn, RunComparison
 
 CHARTS = ("html", "svg", "png")
 MOST_COLUMNS = 16
@@ -110,7 +110,7 @@ def _ending_of(chart: Path | None) -> str:
     return ending
 
 
-def _draw(found: Comparison, chart: Path, options: dict[str, Any]) -> None:
+def _draw(found: RunComparison, chart: Path, options: dict[str, Any]) -> None:
     from marey_client import embedded
 
     if not found.runs:
@@ -119,7 +119,7 @@ def _draw(found: Comparison, chart: Path, options: dict[str, Any]) -> None:
     return print_message(f"wrote {chart}")
 
 
-def _print(found: Comparison, columns: Sequence[ComparedColumn], *, means: bool) -> None:
+def _print(found: RunComparison, columns: Sequence[ComparedColumn], *, means: bool) -> None:
     left_out = columns[MOST_COLUMNS:]
     shown = columns[:MOST_COLUMNS]
     table: RunTable = texts_of_means(found, shown) if means else table_of_runs(found, shown)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_schemas.queue.comparisons import GOALS, MOST_COMPARED, MOST_DRAWN, Comparison, Goal
+from marey_schemas.queue.comparisons import GOALS, MOST_COMPARED, MOST_DRAWN, Goal, RunComparison
 from marey_schemas.queue.jobs import Job
 from marey_schemas.queue.scripts import FieldName, Script, ScriptCreate, ScriptRun, ScriptRunCreate
 from marey_schemas.sizes import KIB
@@ -134,7 +134,7 @@ class ScriptComparison(Resource):
     path = "/projects/{project}/scripts/{script}/comparison"
     tag = "Jobs"
 
-    @reads(access=Access.READER, query=ComparisonQuery, answer=Comparison, public=False)
+    @reads(access=Access.READER, query=ComparisonQuery, answer=RunComparison, public=False)
     async def get(self, project: str, script: str, query: ComparisonQuery) -> Rendered:
         """Compare the succeeded runs of a script: their settings, logged fields and curves.
 
