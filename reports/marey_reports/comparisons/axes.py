@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from marey_reports.drawing.paper import HAIRLINE, Place, add_panel, plain, shortened
+from marey_schemas.queue.comparisons import FieldSummary
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,6 +20,10 @@ UNITS = {
     "deg": "°", "rad": "rad", "percent": "%", "mb": "MB", "gb": "GB", "bytes": "bytes", "mps": "m/s", "fps": "frames/s",
 }  # fmt: skip
 """Units that the last part of a name can be, such as `path_m`."""
+
+
+_REACH = 0.4
+"""Share of an axis by which intervals lengthen it at most."""
 
 
 def add_chart(figure: Figure, place: Place, *, title: str, x: str, y: str = "") -> Axes:
@@ -56,6 +62,13 @@ def spread(low: float, high: float, *, log: bool) -> tuple[float, float]:
         return low / factor, high * factor
     margin = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
     return low - margin, high + margin
+
+
+def widened(low: float, high: float, summaries: Sequence[FieldSummary]) -> tuple[float, float]:
+    """Widen the ends of an axis so that it contains the intervals of means, but not so far that runs look alike."""
+    ends = [end for one in summaries for end in (one.low, one.high) if end is not None]
+    reach = _REACH * (high - low)
+    return max(min([low, *ends]), low - reach), min(max([high, *ends]), high + reach)
 
 
 def beside(axes: Axes, transform: Transform, inches: float) -> Transform:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from marey_reports.comparisons.axes import add_chart, axis_title, beside, set_logarithmic, spread
+from marey_reports.comparisons.axes import add_chart, axis_title, beside, set_logarithmic, spread, widened
 from marey_reports.comparisons.subjects import (
     ComparedSubject,
     Point,
@@ -47,12 +47,10 @@ def draw_bars(subject: ComparedSubject, column: ComparedColumn) -> Sketch | None
     panel = add_chart(figure, Place(left_in, _UNDER, _PAGE - _RIGHT - left_in, height), title=axis_title(column.name),
                       x=axis_title(column.name, log=log))  # fmt: skip
     panel.grid(visible=False, axis="y")
-    ends = [end for one in shown for end in (one.summary.low, one.summary.high) if end is not None]
-    reach = 0.4 * (high - low)
     if bars:
-        low, high, reach = min(low, 0.0), max(high, 0.0), 0.4 * (max(high, 0.0) - min(low, 0.0))
+        low, high = min(low, 0.0), max(high, 0.0)
     if not log:
-        low, high = max(min([low, *ends]), low - reach), min(max([high, *ends]), high + reach)
+        low, high = widened(low, high, [one.summary for one in shown])
     left, right = spread(low, high, log=log)
     if bars and low < high:
         left, right = (left if low < 0.0 else 0.0), (right if high > 0.0 else 0.0)

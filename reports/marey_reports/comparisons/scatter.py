@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from marey_reports.comparisons.axes import add_chart, axis_title, beside, set_logarithmic, spread
+from marey_reports.comparisons.axes import add_chart, axis_title, beside, set_logarithmic, spread, widened
 from marey_reports.comparisons.subjects import (
     LARGEST,
     SMALLEST,
@@ -59,22 +59,20 @@ def draw_scatter(subject: ComparedSubject, column: ComparedColumn, parameter: Co
         return None
     numbers = [number for one in points for number in one.numbers]
     log = subject.is_log(numbers)
-    figure = new_figure(9.6, 4.0)
     further = _further(subject, parameter, points)
     width = 5.9 if len(further) > 1 else 8.2
     bottom = 1.25 if across.turned else 0.65
+    figure = new_figure(9.6, bottom + 3.35)
     panel = add_chart(
         figure,
-        Place(0.95, bottom, width, 3.5 - bottom),
+        Place(0.95, bottom, width, 2.85),
         title=f"{axis_title(column.name)} by {axis_title(parameter.name)}",
         x=axis_title(parameter.name, log=across.log),
         y=axis_title(column.name, log=log),
     )
-    ends = [end for one in points for end in (one.summary.low, one.summary.high) if end is not None]
     low, high = min(numbers), max(numbers)
-    reach = 0.4 * (high - low)
     if not log:
-        low, high = max(min([low, *ends]), low - reach), min(max([high, *ends]), high + reach)
+        low, high = widened(low, high, [one.summary for one in points])
     panel.set_ylim(*spread(low, high, log=log))
     _set_across(panel, across)
     if log:

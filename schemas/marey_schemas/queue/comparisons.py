@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import datetime
-from typing import Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from marey_schemas.base import Answer
 from marey_schemas.queue.scripts import Value
@@ -20,6 +20,8 @@ MOST_POINTS = 256
 """Greatest number of points of a curve; longer curves are thinned."""
 MOST_CURVE_BYTES = 512 * KIB
 """Greatest size of the file with the curves of a run."""
+LAST_STEP = 2**53
+"""Greatest step, because JSON numbers of other programs are exact up to here."""
 MOST_DRAWN = 6
 """Greatest number of fields whose curves a comparison contains."""
 
@@ -31,11 +33,19 @@ Source = Literal["input", "value", "field", "commit"]
 class Curve(Answer):
     """Values of a field over the steps of a run."""
 
-    steps: tuple[int, ...] = Field(max_length=MOST_POINTS, description="Steps in ascending order.")
+    steps: tuple[Annotated[int, Field(ge=-LAST_STEP, le=LAST_STEP)], ...] = Field(
+        max_length=MOST_POINTS, description="Steps in ascending order."
+    )
     values: tuple[float | None, ...] = Field(
         max_length=MOST_POINTS, description="The value at each step; null where it is not a finite number."
     )
     logged: int = Field(description="Number of values that the script logged; the curve contains some of them.")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self.steps) != len(self.values):
+            raise ValueError("a curve has one value for each step")
+        return self
 
 
 class Curves(Answer):

@@ -84,7 +84,9 @@ def test_a_setting_has_no_mean_if_a_replicate_gave_no_number(trained: Desk) -> N
 def test_curves_are_read_only_if_they_are_curves(trained: Desk) -> None:
     curve = Curve(steps=(0, 1), values=(1.5, None), logged=2)
     content = Curves(curves={"loss": curve, "other": curve}).model_dump_json().encode()
-    for seed, file in enumerate((content, b"{}", b" " * MOST_CURVE_BYTES + content)):
+    for seed, file in enumerate(
+        (content, b'{"curves": {"loss": {"steps": [1], "values": [], "logged": 1}}}', b" " * MOST_CURVE_BYTES + content)
+    ):
         run(trained, 1, seed, {"fields": {"loss": 1}}, curves=file)
     for made_up in ({"size_bytes": 1}, [1], "text", {"blob": 7}):
         run(trained, 1, 9, {"fields": {"loss": 1}, "curves": made_up})

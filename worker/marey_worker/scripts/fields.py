@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from pydantic import TypeAdapter, ValidationError
 
-from marey_schemas.queue.comparisons import MOST_CURVES, MOST_POINTS, Curve
+from marey_schemas.queue.comparisons import LAST_STEP, MOST_CURVES, MOST_POINTS, Curve
 from marey_schemas.queue.scripts import LONGEST_TEXT, MOST_FIELDS, STEPWISE, FieldName, ScriptOutput, Value
 from marey_schemas.sizes import KIB, MIB
 from marey_worker.context import JobRefused
@@ -19,8 +19,6 @@ MOST_FIELD_BYTES = MIB
 MOST_LINE_BYTES = 64 * KIB
 STEP = "step"
 """Member of a line that contains the step of its values."""
-LAST_STEP = 2**53
-"""Greatest step, because JSON numbers of other programs are exact up to here."""
 
 _FIELD_NAME: TypeAdapter[str] = TypeAdapter(FieldName)
 
