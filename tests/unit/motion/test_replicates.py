@@ -24,7 +24,8 @@ def test_the_interval_is_that_of_the_t_test_at_any_scale() -> None:
             values = scale * rng.normal(2.0, 1.0, count)
             found = mean_interval(values.tolist())
             known = ttest_1samp(values / scale, 0.0).confidence_interval(0.95)
-            assert (found.n, found.mean) == (count, pytest.approx(values.mean(), rel=1e-12))
+            assert found.n == count
+            assert found.mean == pytest.approx(values.mean(), rel=1e-12)
             assert np.array([found.low, found.high]) / scale == pytest.approx([known.low, known.high], rel=1e-9)
 
 
@@ -33,4 +34,6 @@ def test_few_equal_and_huge_values_have_no_interval_that_is_not_finite() -> None
     assert mean_interval([1.0, 2.0]) == (2, 1.5, None, None)
     assert mean_interval([0.0] * 3) == (3, 0.0, 0.0, 0.0)
     assert mean_interval([0.1] * 5).mean == pytest.approx(0.1)
-    assert mean_interval([1.7e308, -1.7e308, 1.7e308]) == (3, pytest.approx(1.7e308 / 3), None, None)
+    huge = mean_interval([1.7e308, -1.7e308, 1.7e308])
+    assert huge.mean == pytest.approx(1.7e308 / 3)
+    assert (huge.low, huge.high) == (None, None)
