@@ -51,7 +51,7 @@ def test_the_commands_and_the_python_of_the_page_work_in_their_order(
     printed = {line: run(*shlex.split(line)[1:]).stdout for line in commands}
     first, second = (text for line, text in printed.items() if "run lab measure" in line)
     table = next(text for line, text in printed.items() if "runs lab measure" in line)
-    lengths = [float(re.search(r"path\s+(\S+)", text)[1]) for text in (first, second)]
+    lengths = [float(re.findall(r"path\s+(\S+)", text)[0]) for text in (first, second)]
     assert lengths[1] == pytest.approx(2.5 * lengths[0])
     assert lengths[0] > 100, "centimetres of a walk of three seconds"
     factors = [line.split()[1] for line in table.splitlines() if "job_" in line]
