@@ -19,6 +19,7 @@ from marey_client.credentials import Credential
 from marey_client.errors import MareyError
 from marey_schemas.documents.differences import Difference
 from marey_schemas.lineage import LineageGraph
+from marey_schemas.queue.comparisons import RunComparison
 
 
 class NotInstalled(MareyError):
@@ -93,6 +94,18 @@ def draw_lineage(graph: LineageGraph, file_type: str) -> bytes:
     except ValueError as error:
         raise MareyError(str(error)) from error
     return picture
+
+
+def draw_comparison(comparison: RunComparison, **options: Any) -> bytes:
+    """Return a page or a picture of a comparison of runs; `options` are those of `marey_reports.comparisons.charts`.
+
+    Raises `MareyError` if the runs have no values for the wanted chart.
+    """
+    try:
+        chart: bytes = room("marey_reports.comparisons.page", "figures").draw_comparison(comparison, **options)
+    except ValueError as error:
+        raise MareyError(str(error)) from error
+    return chart
 
 
 @contextmanager

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from marey_client.paging import pages
 from marey_client.transport import Transport
+from marey_schemas.queue.comparisons import GOALS, MOST_COMPARED, Goal, RunComparison
 from marey_schemas.queue.jobs import Job, JobInput
 from marey_schemas.queue.scripts import Script, ScriptCreate, ScriptRun, ScriptRunCreate, Value
 
@@ -74,6 +76,30 @@ class ScriptHandle:
         """Return the first runs in an order: `created_at`, `fields.<name>` or `values.<name>`; `-` reverses it."""
         found = pages(self.transport, ScriptRun, f"{self.url}/runs", {"sort": sort, "limit": limit})
         return tuple(found)
+
+    def compare(
+        self,
+        *,
+        sort: str = "-created_at",
+        limit: int = MOST_COMPARED,
+        fields: Sequence[str] = (),
+        goals: Mapping[str, Goal] | None = None,
+        curves: bool = False,
+    ) -> RunComparison:
+        """Compare the succeeded runs, the first `limit` in an order: their settings, logged fields and curves.
+
+        `fields` are the logged fields to compare, by default all, and `goals` say which value of a field is the best.
+        The result contains `curves` of at most 6 fields if they are requested. Raises `BadRequest` for a field that no
+        run has logged.
+        """
+        named: dict[str, str] = {
+            goal: ",".join(name for name, own in (goals or {}).items() if own == goal) for goal in GOALS
+        }
+        wanted: dict[str, Any] = {"sort": sort, "limit": limit, "fields": ",".join(fields), **named}
+        if curves:
+            wanted["curves"] = True
+        given = {name: value for name, value in wanted.items() if value != ""}
+        return self.transport.get(RunComparison, f"{self.url}/comparison", given)
 
     def delete(self) -> None:
         """Delete the script; its runs remain."""

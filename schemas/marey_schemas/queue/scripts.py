@@ -24,6 +24,9 @@ SCRIPT = "script"
 REPOSITORIES_VARIABLE = "MAREY_SCRIPT_REPOSITORIES"
 """Environment variable with the allowed repositories as a JSON list; the setting of the server has the same name."""
 
+STEPWISE = "jsonl"
+"""Format of files with logged fields: JSON lines, each with the values of one step."""
+
 PYTHON = "python"
 """First word of commands that the Python interpreter of the worker runs."""
 
@@ -32,6 +35,8 @@ MOST_DECLARED = 50
 MOST_FIELDS = 100
 LONGEST_TEXT = 500
 """Greatest number of characters of a text parameter, and of a logged text."""
+LONGEST_NAME = 63
+"""Greatest number of characters in the name of a parameter or a field."""
 
 WORKER_S, WORKER_MB = 1800, 2048
 """Seconds and MiB that a worker may use beside the script, for example to fetch the commit."""
@@ -129,7 +134,12 @@ class ScriptOutput(Request):
     """File that a script writes: a clip, which is imported, a JSON object of logged fields, or any other file."""
 
     kind: Literal["clip", "fields", "file"]
-    format: str | None = Field(None, max_length=16, description="Format of a clip, such as bvh.")
+    format: str | None = Field(
+        None,
+        max_length=16,
+        description="Format of a clip, such as bvh. For logged fields: jsonl, if each line is a JSON object of values "
+        "of one step; absent: the file is one JSON object.",
+    )
     max_bytes: int = Field(64 * MIB, ge=1, le=GIB, description="Greatest size of the file.")
     required: bool = Field(True, description="Whether a run without this file fails.")
     description: Message = ""
@@ -138,14 +148,18 @@ class ScriptOutput(Request):
     def _check_format(self) -> Self:
         if self.kind == "clip" and self.format not in _MOTION_ENDINGS:
             raise ValueError(f"format: a clip needs one of the formats {', '.join(_MOTION_ENDINGS)}")
-        if self.kind != "clip" and self.format is not None:
-            raise ValueError("format: leave it out, because only a clip has a format")
+        if self.kind == "fields" and self.format not in (None, STEPWISE):
+            raise ValueError(f"format: fields have the format {STEPWISE}, or none for a file with one JSON object")
+        if self.kind == "file" and self.format is not None:
+            raise ValueError("format: leave it out, because only clips and fields have a format")
         return self
 
     @property
     def ending(self) -> str:
         """The ending of the file's name."""
-        return _MOTION_ENDINGS[self.format or ""] if self.kind == "clip" else ".json" * (self.kind == "fields")
+        if self.kind == "clip":
+            return _MOTION_ENDINGS[self.format or ""]
+        return f".{self.format or 'json'}" if self.kind == "fields" else ""
 
 
 class ScriptLimits(Request):

@@ -43,25 +43,47 @@ def lab(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandle:
 def test_the_commands_and_the_python_of_the_page_work_in_their_order(
     marey: Marey, lab: ProjectHandle, run: CommandLine, script_repositories: Path, tmp_path: Path
 ) -> None:
-    script, python = blocks("python")
-    declared = json.loads(blocks("json")[0])
-    declared["repository"], declared["commit"] = committed(script_repositories / "page", {"measure.py": script})
-    (tmp_path / "measure.json").write_text(json.dumps(declared))
+    measure, python, fit, comparison = blocks("python")
+    address, commit = committed(script_repositories / "page", {"measure.py": measure, "fit.py": fit})
+    for name, declared in zip(("measure", "fit"), map(json.loads, blocks("json")), strict=True):
+        (tmp_path / f"{name}.json").write_text(json.dumps(declared | {"repository": address, "commit": commit}))
     *commands, removal = [line for block in blocks("sh") for line in block.splitlines()]
-    printed = [run(*shlex.split(line)[1:]).stdout for line in commands]
-    first, second, table = printed[-3:]
-    lengths = [float(re.search(r"path\s+(\S+)", text)[1]) for text in (first, second)]
+    printed = {line: run(*shlex.split(line)[1:]).stdout for line in commands}
+    first, second = (text for line, text in printed.items() if "run lab measure" in line)
+    table = next(text for line, text in printed.items() if "runs lab measure" in line)
+    lengths = [float(re.findall(r"path\s+(\S+)", text)[0]) for text in (first, second)]
     assert lengths[1] == pytest.approx(2.5 * lengths[0])
     assert lengths[0] > 100, "centimetres of a walk of three seconds"
     factors = [line.split()[1] for line in table.splitlines() if "job_" in line]
     assert factors == ["2.5", "1"], table
     copies = list(lab.clips.list(collection="measured"))
     assert [copy.name for copy in copies] == ["measure-copy"]
+    check_comparisons({line: text for line, text in printed.items() if " compare " in line}, tmp_path)
     space: dict[str, Any] = {"project": lab, "marey": marey, "ItemInput": ItemInput}
     exec(compile(python, "run-your-own-scripts.md", "exec"), space)
     assert space["best"].values == {"factor": 4.0}
+    exec(compile(comparison, "run-your-own-scripts.md", "exec"), space)
+    found = space["found"]
+    assert (found.curves, [len(setting.runs) for setting in found.settings]) == (("loss",), [1, 3])
+    assert found.settings[1].fields["loss"].high > found.settings[1].fields["loss"].mean
+    assert found.runs[0].curves["loss"].steps == tuple(range(50))
     run(*shlex.split(removal)[1:])
-    assert list(lab.scripts.list()) == []
+    assert [one.name for one in lab.scripts.list()] == ["fit"]
+
+
+def check_comparisons(printed: dict[str, str], folder: Path) -> None:
+    """Check the tables and the files of the commands that compare the runs of `fit`."""
+    table, means, exact, _, _ = printed.values()
+    marked = [line.split() for line in table.splitlines() if "*" in line]
+    assert [row[2] for row in marked] == ["0.05"], table
+    assert [line.split()[:2] for line in means.splitlines() if "0.0" in line] == [["0.05", "1"], ["0.02", "3"]], means
+    assert means.count(" to ") == 1, "only three seeds have an interval"
+    head, *rows = exact.splitlines()
+    assert (head, len(rows)) == ("job,seed,rate,loss", 4)
+    text = (folder / "runs.html").read_text()
+    assert "The lowest loss has rate=0.05" in text
+    assert "thin lines are runs with different seeds" in text
+    assert (folder / "loss.png").read_bytes().startswith(b"\x89PNG")
 
 
 SLOW = """import sys, time

@@ -27,7 +27,8 @@ from marey_worker.kinds import script
 from marey_worker.scripts import guard
 from marey_worker.scripts.checkout import FetchFailed
 from marey_worker.scripts.confinement import landlock_version
-from marey_worker.scripts.files import OUTPUTS, collect, read_fields
+from marey_worker.scripts.fields import read_fields
+from marey_worker.scripts.files import OUTPUTS, collect
 from marey_worker.scripts.guard import LOG_BYTES, fault_of_files
 
 pytestmark = pytest.mark.skipif(landlock_version() == 0, reason="scripts need Linux with Landlock")
@@ -292,7 +293,7 @@ def test_an_output_that_is_not_as_declared_fails_the_job(repository: Repository,
     (run / OUTPUTS).mkdir(parents=True)
     write(run / OUTPUTS / "fields.json")
     with pytest.raises(JobRefused) as refused:
-        read_fields("fields", collect(declared, run, tmp_path / "collected")["fields"])
+        read_fields("fields", declared.outputs["fields"], collect(declared, run, tmp_path / "collected")["fields"])
     assert refused.value.code == code, refused.value.detail
 
 

@@ -20,13 +20,15 @@ from marey_schemas.formats import DEFAULT_UNIT
 from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
 from marey_schemas.processes.environment import clean_environment, thread_limits
+from marey_schemas.queue.comparisons import Curves
 from marey_schemas.queue.scripts import PYTHON, ScriptDeclaration, ScriptParams
 from marey_schemas.queue.worker_protocol import StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.staged_results import StagedResults
 from marey_worker.scripts.checkout import check_out
 from marey_worker.scripts.confinement import landlock_version
-from marey_worker.scripts.files import OUTPUTS, collect, output_path, read_fields, write_inputs
+from marey_worker.scripts.fields import LoggedFields, read_fields
+from marey_worker.scripts.files import OUTPUTS, collect, output_path, write_inputs
 from marey_worker.scripts.guard import CommandEnd, GuardedCommand
 
 CODE = "code"
@@ -131,20 +133,29 @@ def _failure(end: CommandEnd) -> str:
 def _publish(context: Context, params: ScriptParams, declared: ScriptDeclaration, folder: Path) -> dict[str, Any]:
     """Store the outputs of a script that has ended; return the logged fields, the files and the number of clips."""
     files: dict[str, Any] = {}
-    fields: dict[str, Any] = {}
+    logged = LoggedFields({}, {})
     results = StagedResults(context)
     for name, path in collect(declared, folder, context.scratch / "collected").items():
         kind = declared.outputs[name].kind
         if kind == "fields":
-            fields = read_fields(name, path)
+            logged = read_fields(name, declared.outputs[name], path)
         if kind == "clip":
             _stage_clip(context, params, results, name, path)
         else:
-            stored = StoredFile(blob=context.put_file(path), size_bytes=path.stat().st_size)
-            files[name] = stored.model_dump(mode="json")
+            files[name] = _stored(context, path)
     results.flush()
     values = declared.values_of(params.values)
-    return {"values": values, "fields": fields, "files": files, "commit": declared.commit, "items": results.count}
+    result = {"values": values, "fields": logged.fields, "files": files}
+    if logged.curves:
+        path = context.scratch / "curves.json"
+        path.write_text(Curves(curves=logged.curves).model_dump_json())
+        result["curves"] = _stored(context, path)
+    return {**result, "commit": declared.commit, "items": results.count}
+
+
+def _stored(context: Context, path: Path) -> dict[str, Any]:
+    stored = StoredFile(blob=context.put_file(path), size_bytes=path.stat().st_size)
+    return stored.model_dump(mode="json")
 
 
 def _stage_clip(context: Context, params: ScriptParams, results: StagedResults, name: str, path: Path) -> None:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import shutil
 import stat
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +14,12 @@ from marey_schemas.consents import CONSENT_EXPIRED, CONSENT_REMEDY
 from marey_schemas.item_files import ItemToExport, item_as_json
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.queue.job_params import ExportParams
-from marey_schemas.queue.scripts import LONGEST_TEXT, MOST_FIELDS, FieldName, ScriptDeclaration, ScriptOutput, Value
+from marey_schemas.queue.scripts import ScriptDeclaration, ScriptOutput
 from marey_schemas.queue.worker_protocol import PinnedInput
-from marey_schemas.sizes import MIB
 from marey_worker.context import Context, JobRefused
 from marey_worker.kinds.export import ClipFiles
 
 INPUTS, OUTPUTS = "inputs", "outputs"
-MOST_FIELD_BYTES = MIB
 
 
 def write_inputs(
@@ -130,43 +126,3 @@ def _collect_one(name: str, declared: ScriptOutput, outputs: int, target: Path) 
         with target.open("xb") as copy:
             shutil.copyfileobj(source, copy)
     return target
-
-
-def read_fields(name: str, file: Path) -> dict[str, Value]:
-    """Return the logged fields of a run from its JSON file. Raises `JobRefused` if the file has another form."""
-    if file.stat().st_size > MOST_FIELD_BYTES:
-        raise JobRefused("bad-fields", f"the output {name!r} must have at most {MOST_FIELD_BYTES:,} bytes")
-    try:
-        document = json.loads(file.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise JobRefused("bad-fields", f"the output {name!r} is not a JSON document: {error}") from error
-    if not isinstance(document, Mapping) or len(document) > MOST_FIELDS:
-        detail = f"the output {name!r} must be a JSON object of at most {MOST_FIELDS} fields"
-        raise JobRefused("bad-fields", detail)
-    for field, value in document.items():
-        if (fault := _fault_of(field, value)) is not None:
-            raise JobRefused("bad-fields", f"the field {field!r:.100} of the output {name!r}: {fault}")
-    return dict(document)
-
-
-def _fault_of(field: str, value: Any) -> str | None:
-    if not _is_name(field):
-        return "a name consists of letters, digits and _, and begins with a letter"
-    if isinstance(value, str):
-        return None if len(value) <= LONGEST_TEXT else f"a text may have at most {LONGEST_TEXT} characters"
-    if isinstance(value, bool):
-        return None
-    if isinstance(value, int | float):
-        small = abs(value) < 2**63 if isinstance(value, int) else math.isfinite(value)
-        return None if small else "a number must be finite, and an integer must fit into 64 bits"
-    return "a value must be a number, a text, true or false"
-
-
-def _is_name(field: str) -> bool:
-    from pydantic import TypeAdapter, ValidationError
-
-    try:
-        TypeAdapter(FieldName).validate_python(field)
-    except ValidationError:
-        return False
-    return True

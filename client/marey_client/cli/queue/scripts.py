@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address
+from marey_client.cli.queue.comparing import ScriptName, compare
 from marey_client.cli.queue.jobs import input_of_kind
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import Into, Wait, follow
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from marey_schemas.queue.scripts import ScriptRun
 
 script = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Run commands of Git commits, and compare runs.")
-
-Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the script.")]
 
 OWN_COLUMNS = ("job", "state", "commit", "seed", "author", "created_at", "finished_at")
 """Columns of runs that are neither values nor fields."""
@@ -35,7 +34,7 @@ def add_to(app: typer.Typer) -> None:
 def register(
     context: typer.Context,
     project: ProjectName,
-    name: Name,
+    name: ScriptName,
     file: Annotated[Path, typer.Option("--file", help="JSON file that describes the script; - reads standard input.")],
     commit: Annotated[
         str | None,
@@ -77,7 +76,7 @@ def list_scripts(context: typer.Context, project: ProjectName, as_json: AsJson =
 
 
 @script.command("show")
-def show(context: typer.Context, project: ProjectName, name: Name, as_json: AsJson = False) -> None:
+def show(context: typer.Context, project: ProjectName, name: ScriptName, as_json: AsJson = False) -> None:
     """Show a script: its command, parameters, inputs, outputs and limits."""
     with connect(context) as marey:
         found = marey.project(project).scripts.at(name).read()
@@ -106,7 +105,7 @@ def show(context: typer.Context, project: ProjectName, name: Name, as_json: AsJs
 def run(
     context: typer.Context,
     project: ProjectName,
-    name: Name,
+    name: ScriptName,
     values: Annotated[
         list[str] | None, typer.Option("--value", help="Value of a parameter as name=value; may be repeated.")
     ] = None,
@@ -152,7 +151,7 @@ def run(
 def list_runs(
     context: typer.Context,
     project: ProjectName,
-    name: Name,
+    name: ScriptName,
     columns: Annotated[
         list[str] | None,
         typer.Option(
@@ -170,7 +169,7 @@ def list_runs(
     limit: Annotated[int, typer.Option(min=1, max=1000, help="Greatest number of runs.")] = 50,
     as_json: AsJson = False,
 ) -> None:
-    """Compare the runs of a script: a table of their parameters and logged fields."""
+    """List the runs of a script: a table of their parameters and logged fields."""
     with connect(context) as marey:
         found = marey.project(project).scripts.at(name).runs(sort=sort, limit=limit)
     if as_json:
@@ -189,8 +188,11 @@ def _cell(one: ScriptRun, column: str) -> object:
     return one.fields.get(column, one.values.get(column))
 
 
+script.command("compare")(compare)
+
+
 @script.command("rm")
-def remove(context: typer.Context, project: ProjectName, name: Name) -> None:
+def remove(context: typer.Context, project: ProjectName, name: ScriptName) -> None:
     """Delete a script; its runs remain."""
     with connect(context) as marey:
         marey.project(project).scripts.at(name).delete()

@@ -5,14 +5,16 @@ from __future__ import annotations
 from pydantic import Field
 
 from marey_schemas.base import Request
+from marey_schemas.queue.comparisons import GOALS, MOST_COMPARED, MOST_DRAWN, Goal, RunComparison
 from marey_schemas.queue.jobs import Job
-from marey_schemas.queue.scripts import Script, ScriptCreate, ScriptRun, ScriptRunCreate
+from marey_schemas.queue.scripts import FieldName, Script, ScriptCreate, ScriptRun, ScriptRunCreate
 from marey_schemas.sizes import KIB
 from marey_server.handlers.queue.jobs import MAX_SUBMISSION_BYTES, accepted
 from marey_server.http.declarations import Access, RequestBody, reads, writes
-from marey_server.http.queries import PageQuery
+from marey_server.http.queries import CommaSeparatedOf, PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
+from marey_server.motions.run_comparison import Compared, compare_runs
 from marey_server.store.listing import DEFAULT_LIMIT, MAX_LIMIT
 from marey_server.store.scripts import registry, runs
 
@@ -70,8 +72,8 @@ class ScriptResource(Resource):
         return await self.answer(registry.delete_script, project, script)
 
 
-class RunsQuery(Request):
-    """Query parameters of a list of runs: their order and number."""
+class OrderQuery(Request):
+    """Query parameter with the order of runs."""
 
     sort: str = Field(
         "-created_at",
@@ -79,6 +81,11 @@ class RunsQuery(Request):
         description="Order: created_at, fields.<name> or values.<name>; a leading - sorts in descending order. Runs "
         "without the field come last.",
     )
+
+
+class RunsQuery(OrderQuery):
+    """Query parameters of a list of runs: their order and number."""
+
     limit: int = Field(DEFAULT_LIMIT, ge=1, le=MAX_LIMIT, description="Greatest number of runs.")
 
 
@@ -107,4 +114,35 @@ class ScriptRuns(Resource):
         return await self.answer_with(accepted, runs.run_script, project, script, body)
 
 
-RESOURCES: tuple[type[Resource], ...] = (ProjectScripts, ScriptResource, ScriptRuns)
+class ComparisonQuery(OrderQuery):
+    """Query parameters of a comparison of runs."""
+
+    limit: int = Field(MOST_COMPARED, ge=1, le=MOST_COMPARED, description="Greatest number of runs.")
+    fields: CommaSeparatedOf[FieldName] = Field((), description="Logged fields to compare; absent: all.")
+    highest: CommaSeparatedOf[FieldName] = Field((), description="Fields whose highest value is the best.")
+    lowest: CommaSeparatedOf[FieldName] = Field((), description="Fields whose lowest value is the best.")
+    curves: bool = Field(
+        False,
+        description=f"Return the curves of at most {MOST_DRAWN} fields: of the given fields, otherwise of the fields "
+        "that most runs logged over steps.",
+    )
+
+
+class ScriptComparison(Resource):
+    """Comparison of the runs of a script."""
+
+    path = "/projects/{project}/scripts/{script}/comparison"
+    tag = "Jobs"
+
+    @reads(access=Access.READER, query=ComparisonQuery, answer=RunComparison, public=False)
+    async def get(self, project: str, script: str, query: ComparisonQuery) -> Rendered:
+        """Compare the succeeded runs of a script: their settings, logged fields and curves.
+
+        Runs that differ only by their seeds form a setting, with means and 95 % confidence intervals.
+        """
+        goals: dict[str, Goal] = {field: goal for goal in GOALS for field in getattr(query, goal)}
+        wanted = Compared(query.sort, query.limit, query.fields, goals, query.curves)
+        return await self.answer(compare_runs, project, script, wanted)
+
+
+RESOURCES: tuple[type[Resource], ...] = (ProjectScripts, ScriptResource, ScriptRuns, ScriptComparison)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from sqlalchemy import ColumnElement, Row, func, select
@@ -50,13 +53,14 @@ def list_runs(tx: Transaction, project: str, name: str, *, sort: str, limit: int
             script_run.join(job, job.c.id == script_run.c.job_id).outerjoin(user, user.c.id == job.c.author_id)
         )
         .where(script_run.c.project_id == row.id, script_run.c.script == name)
-        .order_by(*_order(tx, sort), job.c.id.desc())
+        .order_by(*order_of_runs(tx, sort), job.c.id.desc())
         .limit(limit)
     )
     return Page(items=tuple(map(_shown, tx.execute(statement))))
 
 
-def _order(tx: Transaction, sort: str) -> list[ColumnElement[Any]]:
+def order_of_runs(tx: Transaction, sort: str) -> list[ColumnElement[Any]]:
+    """Return the columns by which a list of runs is sorted. Raises `BadRequestProblem` for an unknown order."""
     match = _SORT.fullmatch(sort)
     if match is None:
         raise BadRequestProblem(
@@ -79,7 +83,7 @@ def _shown(row: Row[Any]) -> ScriptRun:
         job=row.id,
         state=row.state,
         values=row.params["values"],
-        fields=_fields_of(row.result),
+        fields=fields_of(row.result),
         commit=row.params["declaration"]["commit"],
         seed=row.seed,
         author=row.author,
@@ -88,9 +92,22 @@ def _shown(row: Row[Any]) -> ScriptRun:
     )
 
 
-def _fields_of(result: Any) -> dict[str, Value]:
+def fields_of(result: Any) -> dict[str, Value]:
     """Return the logged fields in the result of a run; a worker can write anything else there, which is left out."""
     fields = result.get("fields") if isinstance(result, dict) else None
-    if not isinstance(fields, dict):
-        return {}
-    return {name: value for name, value in fields.items() if isinstance(value, bool | int | float | str)}
+    return sound_values(fields) if isinstance(fields, dict) else {}
+
+
+def sound_values(values: Mapping[str, Any]) -> dict[str, Value]:
+    """Return the texts, truth values and finite numbers of a document.
+
+    Postgres returns a large float such as 1e20 as an integer; it becomes a float again, as integers are 64 bits wide.
+    """
+    found: dict[str, Value] = {}
+    for name, value in values.items():
+        if isinstance(value, int) and not -(2**63) <= value < 2**63:
+            with suppress(OverflowError):
+                found[name] = float(value)
+        elif isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value)):
+            found[name] = value
+    return found

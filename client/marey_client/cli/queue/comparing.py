@@ -1,0 +1,134 @@
+"""Command `script compare`: runs of a script as a table or a chart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from marey_client.cli.queue.compared_tables import (
+    RunTable,
+    shown_columns,
+    table_of_means,
+    table_of_runs,
+    texts_of_means,
+)
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.invocation import AsJson, ProjectName, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_table
+
+if TYPE_CHECKING:
+    from marey_schemas.queue.comparisons import ComparedColumn, RunComparison
+
+CHARTS = ("html", "svg", "png")
+MOST_COLUMNS = 16
+"""Greatest number of columns of a table for people."""
+
+Names = list[str] | None
+ScriptName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the script.")]
+
+
+def compare(
+    context: typer.Context,
+    project: ProjectName,
+    name: ScriptName,
+    fields: Annotated[
+        Names, typer.Option("--field", help="Logged field to compare; may be repeated. Default: all.")
+    ] = None,
+    highest: Annotated[
+        Names, typer.Option(help="Field whose highest value is marked as the best; may be repeated.")
+    ] = None,
+    lowest: Annotated[
+        Names, typer.Option(help="Field whose lowest value is marked as the best; may be repeated.")
+    ] = None,
+    sort: Annotated[
+        str,
+        typer.Option(
+            metavar="ORDER",
+            help="created_at, fields.NAME or values.NAME; a leading - sorts in descending order. The first value of "
+            "a field in this order is the best, unless another option says which.",
+        ),
+    ] = "-created_at",
+    limit: Annotated[int, typer.Option(min=1, max=100, help="Greatest number of runs.")] = 100,
+    means: Annotated[
+        bool, typer.Option("--means", help="One row for each setting, with the means of runs with different seeds.")
+    ] = False,
+    every_column: Annotated[bool, typer.Option("--all-columns", help="Show columns with equal values, too.")] = False,
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV with exact numbers.")] = False,
+    chart: Annotated[
+        Path | None,
+        typer.Option(
+            help="Draw to this file: .html contains a page with all charts and tables, .svg or .png one chart."
+        ),
+    ] = None,
+    plot: Annotated[
+        Literal["lines", "scatter", "bars"] | None,
+        typer.Option(
+            help="Chart in a .svg or .png: lines over steps, a field over a parameter, or bars. Default: the first of "
+            "these that the runs have values for."
+        ),
+    ] = None,
+    parameter: Annotated[
+        str | None, typer.Option(help="Parameter on the horizontal axis. Default: the first that differs.")
+    ] = None,
+    log: Annotated[bool, typer.Option("--log", help="Logarithmic scale for fields with positive values.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Compare the succeeded runs of a script: a table of what differs, or charts.
+
+    Runs that differ only by their seeds are replicates of one setting. Charts show their mean with its 95 % confidence
+    interval, if there are at least 3, and their number n.
+    """
+    ending = _ending_of(chart)
+    if as_csv and as_json:
+        raise WrongUsage("choose one of --csv and --json")
+    if chart is None and (plot or parameter or log):
+        raise WrongUsage("--plot, --parameter and --log need --chart")
+    goals: dict[str, Any] = dict.fromkeys(highest or (), "highest")
+    if both := sorted(goals.keys() & set(lowest or ())):
+        raise WrongUsage(f"{both[0]} can be in only one of --highest and --lowest")
+    goals |= dict.fromkeys(lowest or (), "lowest")
+    with connect(context) as marey:
+        script = marey.project(project).scripts.at(name)
+        found = script.compare(sort=sort, limit=limit, fields=fields or (), goals=goals, curves=chart is not None)
+    if chart is not None:
+        _draw(found, chart, {"file_type": ending, "plot": plot, "parameter": parameter, "log": log})
+    if as_json:
+        return print_json(found)
+    columns = shown_columns(found, every=every_column)
+    if as_csv:
+        return typer.echo((table_of_means if means else table_of_runs)(found, columns).csv(), nl=False)
+    return _print(found, columns, means=means)
+
+
+def _ending_of(chart: Path | None) -> str:
+    ending = "" if chart is None else chart.suffix.lower().lstrip(".")
+    if chart is not None and ending not in CHARTS:
+        raise WrongUsage(f"{chart} must end in .html, .svg or .png")
+    return ending
+
+
+def _draw(found: RunComparison, chart: Path, options: dict[str, Any]) -> None:
+    from marey_client import embedded
+
+    if not found.runs:
+        return print_message("there is nothing to draw; no run has succeeded")
+    chart.write_bytes(embedded.draw_comparison(found, **options))
+    return print_message(f"wrote {chart}")
+
+
+def _print(found: RunComparison, columns: Sequence[ComparedColumn], *, means: bool) -> None:
+    left_out = columns[MOST_COLUMNS:]
+    shown = columns[:MOST_COLUMNS]
+    table: RunTable = texts_of_means(found, shown) if means else table_of_runs(found, shown)
+    print_table(table.heads, table.texts(), right=sorted(table.numeric))
+    if goals := [f"{column.goal} {column.name}" for column in shown if column.goal is not None]:
+        print_message(f"* best: {', '.join(goals)}")
+    if left_out:
+        print_message(f"{len(left_out)} more columns; choose with --field, or use --csv")
+    if not found.complete:
+        print_message(f"only the first {len(found.runs)} runs are compared")
+    if repeats := sum(setting.repeats for setting in found.settings) if means else 0:
+        print_message(f"{repeats} repetitions with a seed that was compared already are not counted")
