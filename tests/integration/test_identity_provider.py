@@ -24,6 +24,8 @@ from marey_server.store.credentials import browser_sign_ins
 from marey_server.store.database.connections import Database
 from marey_server.store.tables import browser_sign_in
 
+ON_SQLITE = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+"""Mark of tests to which the kind of database makes no difference."""
 ADMIN_SCOPES = ("read", "write", "admin")
 
 
@@ -131,6 +133,7 @@ def test_a_linked_person_signs_in_and_gets_an_ordinary_token(house: Server) -> N
     assert Person(house).finish().status_code == 403
 
 
+@ON_SQLITE
 def test_a_program_on_the_same_machine_gets_the_code_from_the_browser(house: Server) -> None:
     link(house)
     person = Person(house, port=40123)
@@ -217,6 +220,7 @@ def test_nobody_is_let_in_by_a_name_or_as_a_disabled_user(house: Server, provide
     assert Person(house).finish().status_code == 403
 
 
+@ON_SQLITE
 def test_only_administrators_link_people(house: Server) -> None:
     link(house)
     ben = house.client(house.make_user("ben"))
@@ -243,6 +247,7 @@ def test_unknown_people_become_users_only_if_the_operator_wants_it(
         assert "No user name can be made" in Person(server).finish().text
 
 
+@ON_SQLITE
 def test_new_keys_of_the_provider_are_read_once(
     house: Server, provider: FakeProvider, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -260,11 +265,12 @@ def test_new_keys_of_the_provider_are_read_once(
     assert provider.requests.count("/.well-known/openid-configuration") == 1
 
 
+@ON_SQLITE
 @pytest.mark.parametrize("fault", ["status", "redirect", "huge", "slow", "text", "list", "issuer", "down"])
 def test_a_faulty_provider_gives_a_clear_error_and_keeps_nobody_else_waiting(
     house: Server, provider: FakeProvider, fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(identity_provider, "TIMEOUT_S", 1.0)
+    monkeypatch.setattr(identity_provider, "PROVIDER_TIMEOUT_S", 1.0)
     provider.fault = fault
     if fault == "down":
         with socket.create_server(("127.0.0.1", 0)) as closed:
@@ -284,12 +290,13 @@ def test_a_faulty_provider_gives_a_clear_error_and_keeps_nobody_else_waiting(
     assert house.client().get("/me").status_code == 401
 
 
+@ON_SQLITE
 @pytest.mark.parametrize("fault", ["status", "slow", "text"])
 def test_a_provider_that_fails_later_ends_the_sign_in(
     house: Server, provider: FakeProvider, fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     link(house)
-    monkeypatch.setattr(identity_provider, "TIMEOUT_S", 1.0)
+    monkeypatch.setattr(identity_provider, "PROVIDER_TIMEOUT_S", 1.0)
     person = Person(house)
     back = person.sign_in()
     provider.fault = fault
@@ -305,6 +312,7 @@ def test_a_provider_that_fails_later_ends_the_sign_in(
     assert "its claim aud is not the expected one" in Person(house).finish().text
 
 
+@ON_SQLITE
 def test_without_a_provider_there_is_nothing_to_begin(database: Database, tmp_path: Path) -> None:
     with running(database, tmp_path) as server:
         answer = server.client().post("/sign-ins", json={"challenge": "0" * 64})

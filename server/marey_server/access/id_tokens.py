@@ -21,6 +21,7 @@ from marey_schemas.sizes import KIB
 ALGORITHMS = ("RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES384", "ES512")
 """Accepted algorithms of signatures."""
 MOST_TOKEN_BYTES = 32 * KIB
+MOST_HEADER_BYTES = 4 * KIB
 MOST_KEYS = 64
 RSA_BITS = range(2048, 8193)
 MOST_EXPONENT_DIGITS = 8
@@ -102,7 +103,7 @@ def _read_key(data: Any) -> SigningKey | None:
         return None
     try:
         key = _import_key(members)
-    except (JoseError, ValueError, TypeError):
+    except (JoseError, ValueError, TypeError, KeyError):  # the last one for an unknown curve
         return None
     return None if key is None else SigningKey(key, key_id, algorithm)
 
@@ -126,7 +127,7 @@ def verify(token: str, keys: Sequence[SigningKey], expected: Expectation, now_s:
         raise InvalidIdToken(f"it is longer than {MOST_TOKEN_BYTES} bytes")
     # Unknown members of the header are ignored (RFC 7515, section 4), but those that it declares critical are not.
     registry = jws.JWSRegistry(algorithms=ALGORITHMS, strict_check_header=False)
-    registry.max_payload_length = MOST_TOKEN_BYTES
+    registry.max_header_length, registry.max_payload_length = MOST_HEADER_BYTES, MOST_TOKEN_BYTES
     try:
         key = _key_of(token, keys, registry)
         claims = jwt.decode(token, key, ALGORITHMS, registry).claims
@@ -139,6 +140,8 @@ def verify(token: str, keys: Sequence[SigningKey], expected: Expectation, now_s:
 def _key_of(token: str, keys: Sequence[SigningKey], registry: jws.JWSRegistry) -> RSAKey | ECKey:
     """Return the one key that fits the header of a token."""
     header = jws.extract_compact(token.encode("ascii"), registry=registry).headers()
+    if not isinstance(header, dict):
+        raise InvalidIdToken("its header is no JSON object")
     algorithm, key_id = header.get("alg"), header.get("kid")
     if algorithm not in ALGORITHMS:
         raise InvalidIdToken("it is not signed with an accepted algorithm")

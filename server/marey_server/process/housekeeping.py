@@ -202,7 +202,7 @@ async def _forget_tries(services: Services, holder: str) -> None:
     if await _write(services, _leads, holder):
         while await _write(services, rate_limits.forget_ended) == rate_limits.FORGOTTEN_AT_ONCE:
             pass
-        while await _write(services, browser_sign_ins.delete_expired) == browser_sign_ins.DELETED_AT_ONCE:
+        while await _write(services, browser_sign_ins.delete_expired) == rate_limits.FORGOTTEN_AT_ONCE:
             pass
 
 

@@ -12,6 +12,7 @@ import base64
 import hashlib
 import json
 import logging
+import ssl
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
@@ -38,7 +39,7 @@ from marey_server.errors import ForbiddenProblem, UnauthenticatedProblem, Unavai
 from marey_server.process.identity_settings import IdentitySettings
 from marey_server.process.secret_files import read_secret
 
-TIMEOUT_S = 10.0
+PROVIDER_TIMEOUT_S = 10.0
 MOST_ANSWER_BYTES = 256 * KIB
 KEPT_S = 3600.0
 REFETCH_S = 30.0
@@ -227,9 +228,9 @@ class IdentityProvider:
         return token
 
     @cached_property
-    def _http(self) -> Any:
-        """The trusted certificates: those of the variables SSL_CERT_FILE and SSL_CERT_DIR, or the usual ones."""
-        return httpx.create_ssl_context()
+    def _certificates(self) -> ssl.SSLContext:
+        """The trusted certificates: those of the system, or of the variables SSL_CERT_FILE and SSL_CERT_DIR."""
+        return ssl.create_default_context()
 
     async def _fetch(
         self, what: str, method: str, url: str, headers: Mapping[str, str] | None = None, form: Any = None
@@ -238,13 +239,13 @@ class IdentityProvider:
         sent = {"Accept": "application/json", "Accept-Encoding": "identity", **(headers or {})}
         try:
             async with (
-                asyncio.timeout(TIMEOUT_S),
-                httpx.AsyncClient(verify=self._http, timeout=TIMEOUT_S) as client,
+                asyncio.timeout(PROVIDER_TIMEOUT_S),
+                httpx.AsyncClient(verify=self._certificates, timeout=PROVIDER_TIMEOUT_S, trust_env=False) as client,
                 client.stream(method, url, headers=sent, data=form) as answer,
             ):
                 body = await _read(what, answer)
         except (TimeoutError, httpx.TimeoutException):
-            _fail(what, f"it did not come within {TIMEOUT_S:g} s")
+            _fail(what, f"it did not come within {PROVIDER_TIMEOUT_S:g} s")
         except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:
             log.warning("the %s of the identity provider at %s cannot be read: %r", what, url, error)
             _fail(what, "the provider cannot be reached")

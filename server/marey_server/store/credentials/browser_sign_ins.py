@@ -24,7 +24,7 @@ from marey_server.access.secret_tokens import hash_secret
 from marey_server.errors import ForbiddenProblem, NotFoundProblem, TooManyRequestsProblem, UnavailableProblem
 from marey_server.store import rate_limits, users
 from marey_server.store.credentials import identities, sign_ins, tokens
-from marey_server.store.credentials.sign_ins import SignInTry
+from marey_server.store.credentials.sign_ins import MINUTE_US, SignInTry
 from marey_server.store.ids import new_id
 from marey_server.store.rate_limits import RateLimit, key_of
 from marey_server.store.tables import browser_sign_in, identity
@@ -34,8 +34,6 @@ LIFETIME_US = 600 * 1_000_000
 """Time in which a person must sign in."""
 MOST_WAITING = 10_000
 """Greatest number of sign-ins that are not complete."""
-DELETED_AT_ONCE = 1000
-_MINUTE_US = 60_000_000
 _USER_NAME = re.compile(UserName.__metadata__[0].pattern)  # type: ignore[attr-defined]
 
 
@@ -44,7 +42,7 @@ def begin(tx: Transaction, request: BrowserSignInCreate, address: str, per_minut
 
     Raises `TooManyRequestsProblem`, and `UnavailableProblem` if too many sign-ins of all addresses are not complete.
     """
-    if wait_s := rate_limits.count(tx, RateLimit(key_of("browser", address), per_minute, _MINUTE_US // per_minute)):
+    if wait_s := rate_limits.count(tx, RateLimit(key_of("browser", address), per_minute, MINUTE_US // per_minute)):
         raise TooManyRequestsProblem(
             f"Too many sign-ins were begun from your address; wait {wait_s} s.",
             code="too-many-sign-ins",
@@ -159,7 +157,11 @@ def redeem(tx: Transaction, sign_in_id: str, request: BrowserSignInCode, attempt
 
 def delete_expired(tx: Transaction) -> int:
     """Delete some of the sign-ins that were not completed in time; return their number."""
-    expired = select(browser_sign_in.c.id).where(browser_sign_in.c.expires_us <= tx.now_us).limit(DELETED_AT_ONCE)
+    expired = (
+        select(browser_sign_in.c.id)
+        .where(browser_sign_in.c.expires_us <= tx.now_us)
+        .limit(rate_limits.FORGOTTEN_AT_ONCE)
+    )
     if tx.is_postgres:
         expired = expired.with_for_update(skip_locked=True)
     return tx.execute(delete(browser_sign_in).where(browser_sign_in.c.id.in_(expired))).rowcount
