@@ -196,7 +196,8 @@ class IdentityProvider:
         methods = document.get("token_endpoint_auth_methods_supported", ["client_secret_basic"])
         in_body = isinstance(methods, list) and "client_secret_basic" not in methods
         names_issuer = document.get("authorization_response_iss_parameter_supported") is True
-        return Endpoints(*map(str, urls), secret_in_body=in_body, names_issuer=names_issuer)
+        authorization, token, keys = map(str, urls)
+        return Endpoints(authorization, token, keys, in_body, names_issuer)
 
     async def _fetch_keys(self) -> tuple[SigningKey, ...]:
         document = await self._fetch("key set", "GET", (await self._endpoints.get()).keys)

@@ -187,7 +187,8 @@ def test_only_usable_public_keys_are_taken_from_the_list() -> None:
     ]
     kept = read_keys({"keys": [*unusable, RSA.as_dict(private=True)]})
     assert [(one.key_id, one.key.is_private) for one in kept] == [("first", False)]
-    for wrong in ({}, {"keys": {}}, {"keys": unusable}, {"keys": [public] * 65}):
+    wrongs: list[dict[str, Any]] = [{}, {"keys": {}}, {"keys": unusable}, {"keys": [public] * 65}]
+    for wrong in wrongs:
         with pytest.raises(ValueError, match="it has no"):
             read_keys(wrong)
 
