@@ -14,9 +14,10 @@ from marey_schemas.access import EndTokens
 from marey_schemas.items import Page
 from marey_schemas.problems import FieldError
 from marey_schemas.sign_ins import Identity
+from marey_server.access import scopes
 from marey_server.access.id_tokens import Person
 from marey_server.access.roles import require_administrator
-from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem, QuotaExceededProblem
+from marey_server.errors import ConflictProblem, ForbiddenProblem, InvalidProblem, NotFoundProblem, QuotaExceededProblem
 from marey_server.store import listing, users
 from marey_server.store.credentials import tokens
 from marey_server.store.database.clock import datetime_of
@@ -33,6 +34,10 @@ def list_identities(
     tx: Transaction, name: str, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
 ) -> Page:
     """List the identities of a user. Only administrators may read those of others. Raises `NotFoundProblem`."""
+    if not scopes.allows(tx.principal.scopes, "read"):  # a token for one project shows nothing about its user
+        raise ForbiddenProblem(
+            "This request needs a token with the scope 'read' for all projects.", code="insufficient-scope"
+        )
     user_id = users.find_user(tx, name).id
     order = listing.parse_order("id", {"id": identity.c.id})
     statement = select(identity).where(identity.c.user_id == user_id)
