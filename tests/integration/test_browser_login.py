@@ -21,6 +21,7 @@ from tests.support.identity_provider import FakeProvider, provider_running
 from tests.support.rest_server import Server
 
 from marey_client.cli import browser_login
+from marey_client.cli.terminal.failures import WrongUsage
 from marey_server.app import connect_database
 from marey_server.process.doctor import examine
 from marey_server.process.settings import Settings
@@ -146,7 +147,7 @@ def test_the_port_of_a_login_takes_only_the_code_of_its_sign_in() -> None:
         assert answers == [404] * 4 + [200]
         listener.code = None
         begun_s = time.monotonic()
-        with pytest.raises(browser_login.WrongUsage, match="in time"):
+        with pytest.raises(WrongUsage, match="in time"):
             listener.wait("mine", 0.05)
         assert time.monotonic() - begun_s < 60
 
