@@ -31,6 +31,7 @@ from marey_schemas.access import (
     UserCreate,
 )
 from marey_schemas.items import Collection
+from marey_schemas.sign_ins import Identity, IdentityLink
 
 ANY_STATE = {"If-Match": "*"}
 """Header that makes the server accept a change even if the resource has changed since the caller read it."""
@@ -76,6 +77,18 @@ class Users:
     def disable(self, name: str) -> None:
         """Disable a user; the data of the user is kept."""
         self.transport.send("DELETE", f"/users/{name}", headers=ANY_STATE)
+
+    def identities(self, name: str) -> Iterator[Identity]:
+        """List the people at identity providers who can sign in as a user."""
+        return pages(self.transport, Identity, f"/users/{name}/identities")
+
+    def link(self, name: str, identity: IdentityLink) -> Identity:
+        """Let a person at an identity provider sign in as a user."""
+        return self.transport.post(Identity, f"/users/{name}/identities", identity, repeatable=True)
+
+    def unlink(self, name: str, identity_id: str) -> None:
+        """End the link of a person with a user, and all sign-ins of the user."""
+        self.transport.send("DELETE", f"/users/{name}/identities/{identity_id}", repeatable=False)
 
     def end_tokens(self, name: str, which: EndTokens = EndTokens.ALL) -> User:
         """Revoke all tokens of a user, or only the tokens from `marey login`; the token of this client stays valid."""

@@ -23,6 +23,7 @@ from marey_schemas.access import Login, Me, NewToken, Project, ProjectCreate
 from marey_schemas.audit import AuditEntry
 from marey_schemas.invitations import AcceptedInvitation, InvitationAcceptance, SignedUp, SignUp
 from marey_schemas.queue.workers import Worker
+from marey_schemas.sign_ins import BrowserSignIn, BrowserSignInCode, BrowserSignInCreate
 
 
 class Marey:
@@ -78,6 +79,17 @@ class Marey:
         The request is sent again if its answer is lost, because a repeated request has no further effect.
         """
         return self.transport.post(SignedUp, "/sign-up", request, repeatable=True)
+
+    def begin_sign_in(self, request: BrowserSignInCreate) -> BrowserSignIn:
+        """Begin a sign-in with the identity provider of the server; a person completes it in a browser.
+
+        Raises `NotFound` if the server has no identity provider.
+        """
+        return self.transport.post(BrowserSignIn, "/sign-ins", request, repeatable=False)
+
+    def finish_sign_in(self, sign_in: str, request: BrowserSignInCode) -> NewToken:
+        """Return the token of a sign-in for the code that the browser got. Raises `NotFound` if it is not valid."""
+        return self.transport.post(NewToken, f"/sign-ins/{sign_in}/token", request, repeatable=False)
 
     def accept_invitation(self, code: str) -> AcceptedInvitation:
         """Become a member of a project with the code of an invitation.

@@ -51,6 +51,8 @@ AUDIT_WORDS: Mapping[AuditKind, str] = {
     "user.created": "created the user",
     "user.changed": "changed the user",
     "user.limited": "changed the quotas of the user",
+    "identity.linked": "linked a person at an identity provider with the user",
+    "identity.unlinked": "ended the link of a person at an identity provider with the user",
     "token.created": "created a token of the user",
     "token.rotated": "replaced a token of the user",
     "token.revoked": "revoked a token of the user",

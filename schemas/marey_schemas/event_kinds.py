@@ -51,6 +51,8 @@ ServerAuditKind = Literal[
     "user.created",
     "user.changed",
     "user.limited",
+    "identity.linked",
+    "identity.unlinked",
     "token.created",
     "token.rotated",
     "token.revoked",

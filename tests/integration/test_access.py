@@ -116,6 +116,8 @@ def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
         "POST /users": "administrator",
         "DELETE /users/{user}": "administrator",
         "PATCH /users/{user}/quotas": "administrator",
+        "POST /users/{user}/identities": "administrator",
+        "DELETE /users/{user}/identities/{identity}": "administrator",
         "PATCH /projects/{project}/quotas": "administrator",
         "GET /audit": "administrator",
         "GET /workers": "administrator",

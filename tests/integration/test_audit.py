@@ -98,6 +98,9 @@ def change_users_and_tokens(story: Story) -> None:
     story.send(root, "DELETE", f"/tokens/{made['id']}", None, ("token.revoked", "root", "root", None))
     story.send(root, "DELETE", "/users/ben", None, ("user.changed", "root", *ben))
     story.send(root, "PATCH", "/users/ben", {"disabled": False}, ("user.changed", "root", *ben))
+    person, path = {"issuer": "https://login.invalid", "subject": "sub-ben"}, "/users/ben/identities"
+    linked = story.send(root, "POST", path, person, ("identity.linked", "root", *ben))
+    story.send(root, "DELETE", f"{path}/{linked['id']}", None, ("identity.unlinked", "root", *ben))
 
 
 def change_projects_and_members(story: Story) -> None:
@@ -296,7 +299,7 @@ def test_filters_select_by_kind_actor_subject_and_time(story: Story) -> None:
     assert story.entries(actor="olga") == [one for one in whole if one["actor"] == "olga"] != whole
     ben = story.entries(subject="ben")
     assert ben == [one for one in whole if one["about"] == "ben"]
-    assert {one["kind"].partition(".")[0] for one in ben} == {"user", "token", "member"}
+    assert {one["kind"].partition(".")[0] for one in ben} == {"user", "token", "member", "identity"}
     lab_id = next(one["subject"] for one in whole if one["kind"] == "project.changed")
     assert story.entries(subject=lab_id) == [one for one in whole if one["subject"] == lab_id] != []
     assert story.entries(subject="ben", actor="olga", kind="member.removed") == [

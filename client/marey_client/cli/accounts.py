@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from marey_client.cli.browser_login import sign_in_in_browser
 from marey_client.cli.projects import ByteLimit, DefaultLimits, ItemLimit, changed_limits, print_quotas
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, UserName, connect
@@ -43,19 +44,43 @@ def login(
             "name and a new password.",
         ),
     ] = False,
-    days: Annotated[int, typer.Option(min=1, max=90, help="Number of days for which the login is valid.")] = 7,
+    browser: Annotated[
+        bool,
+        typer.Option(
+            "--browser", help="Sign in with the identity provider of your team, in a browser, instead of a password."
+        ),
+    ] = False,
+    paste: Annotated[
+        bool,
+        typer.Option(
+            "--paste",
+            help="With --browser: the browser runs on another machine; the command asks for the code that it shows.",
+        ),
+    ] = False,
+    days: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            max=90,
+            help="Number of days for which the login is valid; with --browser, the server may allow fewer.",
+        ),
+    ] = 7,
 ) -> None:
     """Log in to a server, and store the server's address and a token in a file that only you can read."""
     from marey_client.credentials import logins_path, store_login
     from marey_client.marey import Marey
     from marey_schemas.access import Login
 
-    if with_token and invitation:
-        raise WrongUsage("give only one of --with-token and --invitation")
+    if with_token + invitation + browser > 1:
+        raise WrongUsage("give only one of --with-token, --invitation and --browser")
+    if (paste and not browser) or (browser and name is not None):
+        raise WrongUsage("--paste belongs to --browser, and --name does not: the identity provider says who you are")
     with connect(context, anonymous=True) as marey:
         url = marey.transport.url
         if with_token:
             secret = typer.get_text_stream("stdin").read().strip()
+        elif browser:
+            secret = sign_in_in_browser(marey, days * SECONDS_PER_DAY, paste=paste)
         elif invitation:
             secret = _sign_up(marey, name, days)
         else:
@@ -226,6 +251,59 @@ def change_user(
     if as_json:
         return print_json(changed)
     return print_message(f"user {changed.name} is changed")
+
+
+@user.command("link")
+def link_user(
+    context: typer.Context,
+    name: UserName,
+    subject: Annotated[
+        str, typer.Argument(help="Id of the person at the identity provider; the refused sign-in shows it.")
+    ],
+    issuer: Annotated[
+        str | None, typer.Option(help="Address of the identity provider; default: the provider of the server.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Let a person at an identity provider sign in as a user (for administrators)."""
+    from marey_schemas.sign_ins import IdentityLink
+
+    with connect(context) as marey:
+        made = marey.users.link(name, IdentityLink(subject=subject, issuer=issuer))
+    if as_json:
+        return print_json(made)
+    return print_message(f"{subject} at {made.issuer} can sign in as {name}; the link is {made.id}")
+
+
+@user.command("links")
+def list_links(
+    context: typer.Context,
+    name: Annotated[str | None, typer.Argument(help="User name; default: yourself.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show the people at identity providers who can sign in as a user; default: yourself."""
+    with connect(context) as marey:
+        me = None if name else marey.me().user
+        who = name or (me.name if me else None)
+        if who is None:
+            raise WrongUsage("the token in use does not belong to a user; give the name of a user")
+        found = list(marey.users.identities(who))
+    if as_json:
+        return print_json(found)
+    rows = [(one.id, one.issuer, one.subject, one.created_at.date(), one.last_used_at) for one in found]
+    return print_table(("id", "identity provider", "person", "since", "last sign-in"), rows)
+
+
+@user.command("unlink")
+def unlink_user(
+    context: typer.Context,
+    name: UserName,
+    link: Annotated[str, typer.Argument(help="Id of the link; `marey user links` lists the ids.")],
+) -> None:
+    """End the link of a person with a user, and all logins of the user (for administrators)."""
+    with connect(context) as marey:
+        marey.users.unlink(name, link)
+    print_message(f"the link {link} and all logins of {name} have ended")
 
 
 @user.command("quota")

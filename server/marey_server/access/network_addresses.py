@@ -9,6 +9,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Iterable
 from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
+from urllib.parse import urlsplit
 
 Address = IPv4Address | IPv6Address
 Network = IPv4Network | IPv6Network
@@ -78,3 +79,16 @@ def literal_address(host: str) -> str | None:
         return socket.inet_ntoa(socket.inet_aton(name))
     except OSError:
         return None
+
+
+def is_protected(url: str) -> bool:
+    """Return whether nobody can read requests to a URL on their way: https, or http to an address of this machine."""
+    try:
+        parts = urlsplit(url)
+        host, _ = parts.hostname, parts.port  # which is a number only if the URL is well formed
+    except ValueError:
+        return False
+    if not host or not url.isascii() or not url.isprintable() or " " in url:
+        return False
+    address = literal_address(host) if parts.scheme == "http" else None
+    return parts.scheme == "https" or (address is not None and ip_address(address).is_loopback)

@@ -73,6 +73,14 @@ def derive_successor(token_key: bytes, rotation_id: str, prefix: str) -> IssuedT
     return _user_token(prefix, hmac.digest(token_key, f"rotation {rotation_id}".encode(), "sha256").hex())
 
 
+def derive_from_cookie(cookie: str, purpose: str, state: str) -> str:
+    """Derive the nonce or the verifier that the server sends to an identity provider: 64 hexadecimal digits.
+
+    So the database need not store them, and only the browser with the cookie can continue a sign-in.
+    """
+    return hmac.digest(cookie.encode("utf-8", "surrogatepass"), f"{purpose} {state}".encode(), "sha256").hex()
+
+
 def _user_token(prefix: str, secret: str) -> IssuedToken:
     return IssuedToken(f"{_USER}{prefix}_{secret}", prefix, hash_secret(secret))
 

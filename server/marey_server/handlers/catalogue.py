@@ -13,6 +13,7 @@ from marey_server.handlers import (
     exports,
     folder_roles,
     health,
+    identities,
     imports,
     invitations,
     items,
@@ -31,6 +32,7 @@ from marey_server.http.resource import Resource
 
 RESOURCES: tuple[type[Resource], ...] = (
     *access.RESOURCES,
+    *identities.RESOURCES,
     *projects.RESOURCES,
     *invitations.RESOURCES,
     *collections.RESOURCES,

@@ -39,6 +39,8 @@ PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
     "script": ("Name of the script.", _NAME),
     "schedule": ("Name of the schedule.", _NAME),
     "proposal": ("Number of the proposal.", {"type": "integer", "minimum": 1, "maximum": 999_999_999}),
+    "identity": ("Id of the identity.", _NAME),
+    "sign_in": ("Id of the sign-in.", _NAME),
     "invitation": ("Id or prefix of the invitation.", _NAME),
     "webhook": ("Id of the webhook.", _NAME),
     "delivery": ("Id of the delivery.", _NAME),

@@ -19,12 +19,17 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def parse_query(model: type[Model] | None, arguments: Mapping[str, Sequence[bytes]]) -> Model | None:
-    """Return the query parameters as `model`. Raises `BadRequestProblem` for unknown, repeated or invalid ones."""
+    """Return the query parameters as `model`. Raises `BadRequestProblem` for unknown, repeated or invalid ones.
+
+    Unknown parameters are ignored if the configuration of the model says so (`extra="ignore"`).
+    """
     known = {field.alias or name: field for name, field in model.model_fields.items()} if model else {}
     values: dict[str, str] = {}
     faults = []
     for name, given in arguments.items():
         if name not in known:
+            if model is not None and model.model_config.get("extra") == "ignore":
+                continue
             faults.append(FieldError(pointer=name, code="unknown-parameter", detail=_known_parameters(known)))
         elif len(given) > 1:
             faults.append(

@@ -1,10 +1,11 @@
-"""Checks of a server's machine, which also work while no server runs: settings, clock, disk, rights, database, kernels.
+"""Checks of a server's machine, which also work while no server runs: settings, disk, database, kernels, sign-in.
 
 The checks do not change stored data, and do not create a database that does not exist.
 """
 
 from __future__ import annotations
 
+import asyncio
 import os
 import stat
 from collections.abc import Callable, Iterator, Mapping
@@ -13,8 +14,9 @@ from typing import Literal, NamedTuple
 
 from marey_motion.warm_up import kernels_are_compiled
 from marey_server.access.principal import SYSTEM
-from marey_server.errors import ApiProblem
+from marey_server.errors import ApiProblem, UnavailableProblem
 from marey_server.process.disk_space import DiskSpace
+from marey_server.process.identity_provider import IdentityProvider
 from marey_server.process.settings import Settings, misspelt_variables
 from marey_server.store.clock_setting import read_clock
 from marey_server.store.database.connections import Database
@@ -41,6 +43,8 @@ def examine(
     yield _check_disk(settings)
     yield _check_rights(settings)
     yield from _check_database(settings, connect)
+    if settings.oidc_issuer is not None:
+        yield _check_identity_provider(settings)
     compiled = kernels_are_compiled()
     missing = "not all kernels are compiled, so first uses wait; run `python -m marey_motion.warm_up`"
     yield Finding("kernels", "ok" if compiled else "warning", "compiled" if compiled else missing)
@@ -65,6 +69,18 @@ def _check_rights(settings: Settings) -> Finding:
     if stat.S_IMODE(folder.stat().st_mode) & 0o077:
         return Finding("data folder", "warning", f"other users can open {folder}; run `chmod 700 {folder}`")
     return Finding("data folder", "ok", f"only its owner can open {folder}")
+
+
+def _check_identity_provider(settings: Settings) -> Finding:
+    file = settings.oidc_client_secret_file
+    if file is not None and stat.S_IMODE(file.stat().st_mode) & 0o007:
+        return Finding("identity provider", "warning", f"other users can read {file}; run `chmod o= {file}`")
+    provider = IdentityProvider(settings)
+    try:
+        asyncio.run(provider.check())
+    except UnavailableProblem as error:
+        return Finding("identity provider", "fault", error.detail)
+    return Finding("identity provider", "ok", f"it answers; register the redirect URI {provider.redirect_uri} there")
 
 
 def _check_database(settings: Settings, connect: Callable[[Settings], Database]) -> Iterator[Finding]:

@@ -20,6 +20,7 @@ from marey_server.access.principal import SYSTEM
 from marey_server.errors import ApiProblem, UnavailableProblem
 from marey_server.process.services import Services
 from marey_server.store import leader, rate_limits
+from marey_server.store.credentials import browser_sign_ins
 from marey_server.store.datasets.proposals import WaitingMerges
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.jobs import reaper
@@ -193,13 +194,15 @@ async def _in_thread(services: Services, function: Callable[P, T], *args: P.args
 
 
 async def _forget_tries(services: Services, holder: str) -> None:
-    """Delete the expired rows of the limits on sign-ins.
+    """Delete the expired rows of the limits on sign-ins, and sign-ins that were not completed in a browser.
 
     The deletion takes little time, because there are few rows: each sign-in adds three rows, and passwords are hashed
     one by one.
     """
     if await _write(services, _leads, holder):
         while await _write(services, rate_limits.forget_ended) == rate_limits.FORGOTTEN_AT_ONCE:
+            pass
+        while await _write(services, browser_sign_ins.delete_expired) == rate_limits.FORGOTTEN_AT_ONCE:
             pass
 
 

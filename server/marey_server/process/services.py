@@ -23,6 +23,7 @@ from marey_server.motions.searching import SearchableKey
 from marey_server.process.children import Children
 from marey_server.process.computing import ComputeThreads
 from marey_server.process.disk_space import DiskSpace
+from marey_server.process.identity_provider import IdentityProvider
 from marey_server.process.memory import RequestMemory
 from marey_server.process.observe import Metrics
 from marey_server.process.password_lanes import PasswordLane, RefusedTries
@@ -102,6 +103,7 @@ class Services:
         self.unknown_lane = PasswordLane("unknown")
         """Lane for all other sign-ins."""
         self.refused_tries = RefusedTries()
+        self.identity_provider = None if settings.oidc_issuer is None else IdentityProvider(settings)
         self.refusal_brake = RefusalBrake()
         self.turns = Turns()
         self.compute_threads = ComputeThreads()

@@ -16,6 +16,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
 from marey_schemas.sizes import KIB, MIB
 from marey_server.process.blob_settings import BlobSettings
+from marey_server.process.identity_settings import IdentitySettings
 from marey_server.process.process_settings import ProcessSettings
 from marey_server.process.secret_files import read_secret
 from marey_server.process.trace_settings import TraceSettings
@@ -28,7 +29,7 @@ PREFIX = "MAREY_"
 """Prefix of the variables: MAREY_PORT sets `port`. Client, worker and tests have other variables with this prefix."""
 
 
-class Settings(ProcessSettings, BlobSettings, TraceSettings):
+class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
     """Settings of a server. The environment variable of the setting `data` is MAREY_DATA, and so on."""
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, toml_file="marey.toml", extra="forbid", frozen=True)

@@ -42,7 +42,7 @@ def create_user(tx: Transaction, request: UserCreate, *, password_hash: str | No
     return _insert(tx, request.name, request.display_name, request.administrator, password_hash)
 
 
-def sign_up(tx: Transaction, name: str, display_name: str | None, password_hash: str) -> Principal:
+def sign_up(tx: Transaction, name: str, display_name: str | None, password_hash: str | None) -> Principal:
     """Create a user without a check of rights; the new user becomes the transaction's principal, and is returned.
 
     Raises `ConflictProblem` if the name is taken.
@@ -223,6 +223,14 @@ def authenticated(tx: Transaction, name: str, verified_hash: str) -> Principal:
     row = tx.execute(statement.where(user.c.disabled.is_(False))).first()
     if row is None:
         raise wrong_password()
+    return _principal(row)
+
+
+def active_principal(tx: Transaction, user_id: str) -> Principal:
+    """Return the principal of a user whom an identity provider has signed in. Raises `ForbiddenProblem` if disabled."""
+    row = tx.execute(select(user).where(user.c.id == user_id, user.c.disabled.is_(False))).first()
+    if row is None:
+        raise ForbiddenProblem("Your user is disabled; ask an administrator.", code="user-disabled")
     return _principal(row)
 
 

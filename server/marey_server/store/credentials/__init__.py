@@ -1,1 +1,1 @@
-"""Tokens, their rotation, and limits on sign-ins."""
+"""Tokens and their rotation, limits on sign-ins, and sign-ins with an identity provider."""

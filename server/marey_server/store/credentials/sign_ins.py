@@ -37,7 +37,7 @@ _IN_WORDS: dict[LimitScope, str] = {
     "address": "address of yours",
     "account": "user name or code from unknown addresses",
 }
-_MINUTE_US = 60_000_000
+MINUTE_US = 60_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,11 +86,11 @@ def _limits(attempt: SignInTry, *, known: bool) -> Iterator[tuple[RateLimit, Lim
     few, many = attempt.per_minute, MORE_FOR_MANY * attempt.per_minute
     pair, address = key_of("pair", attempt.name, attempt.address), key_of("address", attempt.address)
     limits: list[tuple[RateLimit, LimitScope]] = [
-        (RateLimit(pair, few, _MINUTE_US // few), "account-at-address"),
-        (RateLimit(address, many, _MINUTE_US // many), "address"),
+        (RateLimit(pair, few, MINUTE_US // few), "account-at-address"),
+        (RateLimit(address, many, MINUTE_US // many), "address"),
     ]
     if not known:
-        limits.append((RateLimit(key_of("account", attempt.name), many, _MINUTE_US // few), "account"))
+        limits.append((RateLimit(key_of("account", attempt.name), many, MINUTE_US // few), "account"))
     yield from sorted(limits, key=lambda limit: limit[0].key)
 
 

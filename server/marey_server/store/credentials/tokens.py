@@ -161,7 +161,7 @@ def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
 
 
 def create_session(tx: Transaction, expires_in_s: int) -> NewToken:
-    """Create the token of a sign-in for the transaction's principal, whose password was checked."""
+    """Create the token of a sign-in for the transaction's principal, whom a password or a provider has identified."""
     request = TokenCreate(name="sign-in", scopes=tx.principal.scopes, expires_in_s=expires_in_s)
     return _insert(tx, tx.principal.user_id, request, tx.now_us + expires_in_s * 1_000_000, session=True)
 

@@ -1,8 +1,10 @@
 """Tables of the database, for SQLite and Postgres. Times are integer microseconds since the epoch, UTC, named `_us`."""
 
 from marey_server.store.tables.access import (
+    browser_sign_in,
     folder_role,
     holding,
+    identity,
     invitation,
     invitation_use,
     member,
@@ -76,6 +78,7 @@ __all__ = [
     "blob",
     "blob_chunk",
     "blob_holder",
+    "browser_sign_in",
     "collection",
     "commit_parent",
     "coverage_stream",
@@ -90,6 +93,7 @@ __all__ = [
     "folder_role",
     "holding",
     "idempotency_key",
+    "identity",
     "invitation",
     "invitation_use",
     "item",

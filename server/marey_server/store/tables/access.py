@@ -37,6 +37,33 @@ token = Table(
     Index("uq_token_successor_of", "successor_of", unique=True),
 )
 
+identity = Table(  # a person at an identity provider, who signs in as a user
+    "identity",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("user_id", ID, ForeignKey("user.id"), nullable=False, index=True),
+    Column("issuer", String(512), nullable=False),
+    Column("subject", String(255), nullable=False),
+    Column("created_us", Micros, nullable=False),
+    Column("last_used_us", Micros),
+    Index("uq_identity_issuer_subject", "issuer", "subject", unique=True),
+)
+
+browser_sign_in = Table(  # a sign-in with an identity provider that is not complete; it contains only hashes of secrets
+    "browser_sign_in",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("challenge", String(64), nullable=False),  # hash of the secret of the program that began it
+    Column("port", Integer),  # at which this program waits for the code
+    Column("lifetime_s", Integer, nullable=False),  # of the token
+    Column("browser_hash", String(64)),  # of the cookie of the browser that opened it
+    Column("state_hash", String(64), unique=True),  # of the state that the provider sends back, once
+    Column("code_hash", String(64)),  # of the code that the browser got
+    Column("identity_id", ID, ForeignKey("identity.id"), index=True),
+    Column("created_us", Micros, nullable=False),
+    Column("expires_us", Micros, nullable=False, index=True),
+)
+
 sign_in_limit = Table(  # sign-ins, and other things that are limited in the same way
     "sign_in_limit",
     metadata,

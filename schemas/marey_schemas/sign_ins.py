@@ -1,0 +1,75 @@
+"""Sign-in with the identity provider of a team, and the identities that are linked with users."""
+
+from datetime import datetime
+from typing import Annotated
+
+from pydantic import Field, SecretStr, StringConstraints
+
+from marey_schemas.base import Answer, Request
+
+VERIFIER_PATTERN = r"^[A-Za-z0-9_-]{43,128}$"
+CALLBACK_PATH = "/sign-ins/callback"
+"""Path, below the root of the API, to which the identity provider sends the browser back."""
+
+Subject = Annotated[str, StringConstraints(min_length=1, max_length=255, pattern=r"^[\x20-\x7e]+$")]
+"""Id of a person at an identity provider: at most 255 ASCII characters (OpenID Connect Core, section 2)."""
+
+
+class BrowserSignInCreate(Request):
+    """Request of a program to sign in its user with the identity provider, in a browser."""
+
+    challenge: str = Field(
+        pattern=r"^[0-9a-f]{64}$",
+        description="SHA-256, in hexadecimal digits, of a random secret that the program keeps, the *verifier*.",
+    )
+    port: int | None = Field(
+        None,
+        ge=1024,
+        le=65535,
+        description="Port of this machine at which the program waits for the code: the server sends the browser to "
+        "http://127.0.0.1:<port>/. Null: the browser shows the code, and the person copies it into the program.",
+    )
+    expires_in_s: int = Field(
+        7 * 86400,
+        ge=60,
+        le=90 * 86400,
+        description="Seconds for which the new token is valid; the server may allow fewer.",
+    )
+
+
+class BrowserSignIn(Answer):
+    """A sign-in that has begun: the person opens `url` in a browser."""
+
+    id: str
+    url: str = Field(description="Address to open in a browser; only one browser can open it.")
+    expires_at: datetime = Field(description="Time until which the sign-in must be complete.")
+
+
+class BrowserSignInCode(Request):
+    """Request for the token of a sign-in that was completed in a browser."""
+
+    code: SecretStr = Field(max_length=200, description="Code that the browser got or showed.")
+    verifier: SecretStr = Field(max_length=200, description="Secret whose SHA-256 is the `challenge` of the sign-in.")
+
+
+class IdentityLink(Request):
+    """Request to link a person at the identity provider with a user."""
+
+    subject: Subject = Field(description="Id of the person at the identity provider: the claim `sub` of its ID tokens.")
+    issuer: str | None = Field(
+        None,
+        max_length=512,
+        pattern=r"^https?://[\x21-\x7e]+$",
+        description="Address of the identity provider; null: the provider in the server's settings.",
+    )
+
+
+class Identity(Answer):
+    """A person at an identity provider, who can sign in as a user."""
+
+    id: str
+    user: str
+    issuer: str
+    subject: str
+    created_at: datetime
+    last_used_at: datetime | None = Field(None, description="Time of the last sign-in; null: none yet.")
