@@ -6,9 +6,11 @@ import argparse
 import secrets
 import sys
 import time
+from pathlib import Path
 
 from tests.support.endurance.faults import FAULTS
 from tests.support.endurance.trial_by_faults import FaultTrial, run
+from tests.support.endurance.workload import KINDS
 
 
 def main() -> None:
@@ -23,6 +25,8 @@ def main() -> None:
     faults.add_argument("--s3", choices=["seaweedfs", "moto"], default="seaweedfs")
     faults.add_argument("--workers", type=int, default=6)
     faults.add_argument("--slow", type=float, default=0.0, help="seconds that each drawn skeleton takes")
+    faults.add_argument("--jobs", action="append", default=[], choices=sorted(KINDS), help="only these kinds of jobs")
+    faults.add_argument("--logs", type=Path, help="folder to which the logs are copied at the end")
     faults.add_argument("--only", action="append", default=[], choices=sorted(FAULTS))
     faults.add_argument("--without-fence", action="store_true", help="negative control: the trial must find faults")
     given = parser.parse_args()
@@ -35,7 +39,7 @@ def main() -> None:
     say(f"the seed is {seed}")
     trial = FaultTrial(
         given.rounds, given.seconds, seed, given.every, given.s3, given.workers, given.only, given.slow,
-        not given.without_fence,
+        not given.without_fence, given.jobs, given.logs,
     )  # fmt: skip
     broken = run(trial, say)
     for one in broken:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
@@ -107,9 +108,14 @@ class Installation:
 
 @contextlib.contextmanager
 def installation(
-    s3: str, *, workers: int = WORKERS, module: str = SERVE, settings: Sequence[tuple[str, str]] = ()
+    s3: str,
+    *,
+    workers: int = WORKERS,
+    module: str = SERVE,
+    settings: Sequence[tuple[str, str]] = (),
+    keep_logs: Path | None = None,
 ) -> Iterator[Installation]:
-    """Run an installation with the S3 server of this name while the `with` block runs.
+    """Run an installation with the S3 server of this name while the `with` block runs; at its end, copy the logs.
 
     Processes whose parents are killed become children of this process, so that `stop_marey` finds them.
     """
@@ -124,6 +130,8 @@ def installation(
         storage.start()
         made = Installation(folder, postgres, storage, _blobs_in(storage, folder))
         environment = QUICK_LEASES | made.settings | dict(settings)
+        if keep_logs is not None:
+            stack.callback(_copy_logs, made, keep_logs)
         stack.callback(_kill_all, made)
         for number in range(SERVERS):
             link = stack.enter_context(TcpProxy(postgres.port))
@@ -157,3 +165,10 @@ def _kill_all(made: Installation) -> None:
     for process in (*made.workers, *made.servers):
         if process.process is not None and process.process.poll() is None:
             process.kill()
+
+
+def _copy_logs(made: Installation, folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for process in (*made.workers, *made.servers):
+        shutil.copyfile(process.log, folder / f"{process.log.parent.name}.log")
+    shutil.copyfile(made.postgres.folder / "log", folder / "postgres.log")

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 from benchmarks.pipeline_under_fire import write_takes
 from tests.support.endurance.faults import Fault, inject, plan
@@ -35,19 +36,25 @@ class FaultTrial:
     slow_s: float = 0.0
     fenced: bool = True
     """False: the servers do not compare fences, so that the trial must find faults."""
+    only: Collection[str] = ()
+    """Kinds of jobs; empty: all."""
+    keep_logs: Path | None = None
 
 
 def run(trial: FaultTrial, say: Say) -> list[str]:
     """Run a trial, and return the rules that were broken."""
     faults = plan(trial.seed, trial.seconds, trial.every_s, trial.names)
     module = SERVE if trial.fenced else WITHOUT_FENCE
-    with installation(trial.s3, workers=trial.workers, module=module) as made:
+    with installation(trial.s3, workers=trial.workers, module=module, keep_logs=trial.keep_logs) as made:
+        say("the installation runs")
         takes = write_takes(made.folder / "material", TAKES, seconds=1.0)
         broken: list[str] = []
         ends = {}
+        first = new_workload(made.client(), "peace", takes, slow_s=trial.slow_s, kinds=trial.only)
+        say("the clips are imported")
         for name, planned in (("peace", []), ("fire", faults)):
             begun = time.monotonic()
-            work = new_workload(made.client(), name, takes, slow_s=trial.slow_s)
+            work = first if name == "peace" else first.beside(name)
             broken += _submit_under(made, work, trial.rounds, planned, say)
             broken += work.await_end(END_S)
             ends[name] = work.ends()

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from marey_client import Marey
@@ -43,27 +44,35 @@ class Ends:
 
 @dataclass
 class Workload:
-    """Jobs of one project. The same numbers give the same jobs in every project."""
+    """Jobs whose results go to one folder of a project. The same numbers give the same jobs in every folder."""
 
     marey: Marey
     lab: ProjectHandle
+    folder: str
     clips: list[str]
     rig: str
-    slow_s: float = 0.0
+    slow_s: float
     """Duration of the jobs that draw a skeleton, in seconds."""
+    kinds: tuple[str, ...]
+    """Kinds of jobs, of which one call of `submit` after another takes the next."""
     submitted: dict[str, str] = field(default_factory=dict)
     """Ids of the jobs by label."""
     cancelled: set[str] = field(default_factory=set)
     """Labels of jobs whose cancellation the server has confirmed."""
+    earlier: set[str] = field(default_factory=set)
+    """Ids of the jobs of earlier workloads in the project."""
 
     def submit(self, number: int) -> None:
         """Submit the next jobs: one, or several that depend on each other."""
-        every = tuple(KINDS.values())
-        every[number % len(every)](self, number)
+        KINDS[self.kinds[number % len(self.kinds)]](self, number)
+
+    def beside(self, folder: str) -> Workload:
+        """Return the same workload for another folder."""
+        return replace(self, folder=folder, submitted={}, cancelled=set(), earlier=self.earlier | set(self._ids()))
 
     def add(self, label: str, kind: str, **request: Any) -> str:
         """Submit a job and return its id. Its results are stored in a folder of its own."""
-        wanted = {"cache": "off", "max_attempts": MAX_ATTEMPTS, **request, "kind": kind, "into": f"results/{label}"}
+        wanted = {"cache": "off", "max_attempts": MAX_ATTEMPTS, **request, "kind": kind, "into": f"{self.folder}/{label}"}
         self.submitted[label] = self.lab.submit(JobCreate.model_validate(wanted)).id
         return self.submitted[label]
 
@@ -101,7 +110,11 @@ class Workload:
         return Ends(told, self._contents(), faults, attempts)
 
     def _listed(self, **filters: Any) -> list[Job]:
-        return list(self.marey.jobs.list(self.lab.name, filters=filters))
+        listed = self.marey.jobs.list(self.lab.name, limit=1000, filters=filters)
+        return [job for job in listed if job.id not in self.earlier]
+
+    def _ids(self) -> Iterator[str]:
+        return (job.id for job in self._listed())
 
     def _faults_of(self, job: Job, attempts: Counter[str]) -> Iterator[str]:
         tries = list(self.marey.jobs.attempts(job.id)) if job.size is None else []
@@ -125,8 +138,8 @@ class Workload:
                 yield f"{ended[job]} events tell the end of the job {job}"
 
     def _contents(self) -> dict[str, str]:
-        """Commit all items to a dataset, whose digests are the same on every server."""
-        dataset = self.lab.datasets.create("everything", collection="")
+        """Commit the items of the folder to a dataset, whose digests are the same on every server."""
+        dataset = self.lab.datasets.create(self.folder, collection=self.folder)
         dataset.commit("after all jobs")
         return {f"{one.path} ({one.kind})": json.dumps(one.parts, sort_keys=True) for one in dataset.entries()}
 
@@ -187,7 +200,7 @@ def _draw(work: Workload, number: int) -> str:
 
 
 def _draw_then_add(work: Workload, number: int) -> None:
-    work.add(f"add-{number}", "add", params={"a": number, "b": 1}, after=[_draw(work, number)], cache="use")
+    work.add(f"add-{number}", "add", params={"a": number, "b": 1}, after=[_draw(work, number)])
 
 
 def _tally(work: Workload, number: int) -> None:
@@ -225,13 +238,18 @@ KINDS: dict[str, Callable[[Workload, int], object]] = {
 """Functions that submit jobs, by what the jobs do; a trial calls them in turn."""
 
 
-def new_workload(marey: Marey, name: str, takes: Any, *, slow_s: float = 0.0) -> Workload:
-    """Create a project with the clips of a folder of takes and a skeleton, and a schedule that adds every minute."""
-    lab = marey.create_project(ProjectCreate(name=name))
+def new_workload(marey: Marey, folder: str, takes: Path, *, slow_s: float = 0.0, kinds: Collection[str] = ()) -> Workload:
+    """Create the project `lab` with the clips of a folder of takes and a skeleton, and a schedule that adds every minute."""
+    lab = marey.create_project(ProjectCreate(name="lab"))
     [rig] = lab.imports.upload(find_files([takes.parent / "game.bvh"]).files)
     entries = lab.imports.upload(find_files([takes]).files)
     assert rig.skeleton is not None
     lab.schedules.create(
         "every-minute", "* * * * *", JobCreate(kind="add", params=ON_SCHEDULE, cache="off", max_attempts=MAX_ATTEMPTS)
     )
-    return Workload(marey, lab, [entry.item or "" for entry in entries], rig.skeleton, slow_s)
+    files = [{"name": "first.bvh", "blob": Blobs(marey.transport).put(CLIP.encode())}]
+    first = JobCreate(kind="import", params={"files": files, "unit_scale_m": UNIT_SCALE_M})
+    marey.jobs.wait(lab.submit(first).id)  # later imports use its skeleton, whichever folder they go to
+    work = Workload(marey, lab, folder, [entry.item or "" for entry in entries], rig.skeleton, slow_s, tuple(kinds or KINDS))
+    work.earlier |= {job.id for job in marey.jobs.list(lab.name)}
+    return work
