@@ -68,7 +68,7 @@ def _kill_server(made: Installation, fault: Fault) -> None:
 def _kill_worker(made: Installation, fault: Fault) -> None:
     worker = made.workers[fault.target % len(made.workers)]
     worker.kill()
-    worker.start()
+    worker.begin()
 
 
 def _pause_server(made: Installation, fault: Fault) -> None:

@@ -20,7 +20,7 @@ import psutil
 from tests.support.attached_worker import python_path
 from tests.support.endurance.postgres import PostgresProcess
 from tests.support.s3_servers import KEY_ID, MAKERS, SECRET_KEY, S3Server
-from tests.support.server_process import PATIENT, QUICK_LEASES, MareyProcess, ServerProcess
+from tests.support.server_process import PATIENT, QUICK_LEASES, ServerProcess, WorkerProcess
 from tests.support.tcp_proxy import TcpProxy
 
 from marey_client import Marey
@@ -49,21 +49,19 @@ class TrialServer(ServerProcess):
         super().spawn([self._module, *arguments[1:]], environment, stdin)
 
 
-class TrialWorker(MareyProcess):
+class TrialWorker(WorkerProcess):
     """A worker that runs all kinds of jobs, those of tests too, and reaches a server through its own proxy."""
 
-    def __init__(self, folder: Path, name: str, token: str, link: TcpProxy) -> None:
+    def __init__(self, folder: Path, token: str, link: TcpProxy) -> None:
         folder.mkdir()
-        super().__init__(folder / "worker.log")
-        self.folder, self.name, self.link = folder, name, link
+        super().__init__(folder / "worker.log", PYTHONPATH=python_path(), TMPDIR=str(folder))
+        self.link = link
         self._token = token
 
-    def start(self) -> None:
+    def begin(self) -> None:
         """Start the worker."""
-        url = f"http://127.0.0.1:{self.link.port}"
-        words = ["marey_worker", "--attached", "--server", url, "--name", self.name, "--cache", str(self.folder)]
-        environment = {"PYTHONPATH": python_path(), "TMPDIR": str(self.folder)}
-        self.spawn(words, environment, stdin=f"{self._token}\n".encode())
+        folder = self.log.parent
+        self.start(f"http://127.0.0.1:{self.link.port}", self._token, folder, name=folder.name)
 
 
 @dataclass
@@ -140,9 +138,8 @@ def installation(
             made.servers.append(server.start())
         for number in range(workers):
             link = stack.enter_context(TcpProxy(made.servers[number % SERVERS].port))
-            name = f"worker{number}"
-            made.workers.append(TrialWorker(folder / name, name, made.servers[0].token, link))
-            made.workers[-1].start()
+            made.workers.append(TrialWorker(folder / f"worker{number}", made.servers[0].token, link))
+            made.workers[-1].begin()
         yield made
 
 
