@@ -34,7 +34,10 @@ PATIENCE_S = 60.0
 
 
 class Writers:
-    """Two threads that upload bytes, create items that refer to them, and submit jobs; `done` contains what the server has confirmed."""
+    """Two threads that upload bytes, create items that refer to them, and submit jobs.
+
+    `done` and `jobs` contain what the server has confirmed.
+    """
 
     def __init__(self, server: Server, token: str) -> None:
         self.done: dict[str, bytes] = {}

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
-from tests.support.endurance.installation import SERVERS, WORKERS, Installation
+from tests.support.endurance.installation import SERVERS, Installation
 from tests.support.server_process import QUICK_LEASES
 from tests.support.tcp_proxy import TcpProxy
 

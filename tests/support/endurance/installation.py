@@ -80,6 +80,11 @@ class Installation:
         """Return an administrator's client of one server, whose retries last longer than any fault."""
         return Marey(self.servers[number].url, self.servers[0].token, retries=PATIENT)
 
+    def begin_work(self) -> None:
+        """Start the workers."""
+        for worker in self.workers:
+            worker.begin()
+
     def check_store(self) -> list[str]:
         """Return what `marey db fsck` finds."""
         given = {name.removeprefix("MAREY_").lower(): text for name, text in self.settings.items()}
@@ -115,6 +120,7 @@ def installation(
 ) -> Iterator[Installation]:
     """Run an installation with the S3 server of this name while the `with` block runs; at its end, copy the logs.
 
+    The workers start with `begin_work`.
     Processes whose parents are killed become children of this process, so that `stop_marey` finds them.
     """
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)
@@ -139,7 +145,6 @@ def installation(
         for number in range(workers):
             link = stack.enter_context(TcpProxy(made.servers[number % SERVERS].port))
             made.workers.append(TrialWorker(folder / f"worker{number}", made.servers[0].token, link))
-            made.workers[-1].begin()
         yield made
 
 

@@ -58,7 +58,12 @@ class PostgresProcess:
         user = {} if self._made.system_user is None else {"user": self._made.system_user}
         with open(self.folder / "log", "ab") as log:
             self._process = subprocess.Popen(
-                words, stdout=log, stderr=log, cwd=self.folder, start_new_session=True, **user  # type: ignore[call-overload]
+                words,
+                stdout=log,
+                stderr=log,
+                cwd=self.folder,
+                start_new_session=True,
+                **user,  # type: ignore[call-overload]
             )
         deadline = time.monotonic() + START_S
         while not self._answers():
@@ -76,7 +81,9 @@ class PostgresProcess:
     def kill_a_backend(self, number: int) -> None:
         """Kill the process of one connection with SIGKILL; Postgres then ends all others and repairs its files."""
         assert self._process is not None
-        backends = [one for one in psutil.Process(self._process.pid).children() if "127.0.0.1" in " ".join(one.cmdline())]
+        backends = [
+            one for one in psutil.Process(self._process.pid).children() if "127.0.0.1" in " ".join(one.cmdline())
+        ]
         if backends:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(sorted(one.pid for one in backends)[number % len(backends)], signal.SIGKILL)

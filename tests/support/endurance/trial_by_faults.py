@@ -12,7 +12,7 @@ from pathlib import Path
 
 from benchmarks.pipeline_under_fire import write_takes
 from tests.support.endurance.faults import Fault, inject, plan
-from tests.support.endurance.installation import SERVE, SERVERS, WITHOUT_FENCE, WORKERS, Installation, installation
+from tests.support.endurance.installation import SERVE, WITHOUT_FENCE, WORKERS, Installation, installation
 from tests.support.endurance.workload import Ends, Workload, new_workload
 
 TAKES = 6
@@ -46,16 +46,18 @@ def run(trial: FaultTrial, say: Say) -> list[str]:
     faults = plan(trial.seed, trial.seconds, trial.every_s, trial.names)
     module = SERVE if trial.fenced else WITHOUT_FENCE
     with installation(trial.s3, workers=trial.workers, module=module, keep_logs=trial.keep_logs) as made:
+        made.begin_work()
         say("the installation runs")
         takes = write_takes(made.folder / "material", TAKES, seconds=1.0)
         broken: list[str] = []
-        ends = {}
+        ends: dict[str, Ends] = {}
         first = new_workload(made.client(), "peace", takes, slow_s=trial.slow_s, kinds=trial.only)
         say("the clips are imported")
-        for name, planned in (("peace", []), ("fire", faults)):
+        phases: dict[str, list[Fault]] = {"peace": [], "fire": faults}
+        for name, planned in phases.items():
             begun = time.monotonic()
             work = first if name == "peace" else first.beside(name)
-            broken += _submit_under(made, work, trial.rounds, planned, say)
+            _submit_under(made, work, trial.rounds, planned, say)
             broken += work.await_end(END_S)
             ends[name] = work.ends()
             broken += [f"{name}: {one}" for one in ends[name].faults]
@@ -66,10 +68,8 @@ def run(trial: FaultTrial, say: Say) -> list[str]:
     return broken
 
 
-def _submit_under(
-    made: Installation, work: Workload, rounds: int, faults: list[Fault], say: Say
-) -> list[str]:
-    """Submit all jobs, a few at a time if faults happen meanwhile; return what could not be done."""
+def _submit_under(made: Installation, work: Workload, rounds: int, faults: list[Fault], say: Say) -> None:
+    """Submit all jobs; if faults happen meanwhile, a few at a time."""
     pause_s = sum(one.after_s + one.seconds for one in faults) / 2 / max(1, rounds)
     stopping = threading.Event()
     with ThreadPoolExecutor(1) as pool:
@@ -79,10 +79,10 @@ def _submit_under(
                 time.sleep(fault.after_s)
                 say(f"fault {number + 1} of {len(faults)}: {fault}")
                 inject(made, fault)
-        finally:
-            if (stops := submitting.exception(END_S) if not stopping.is_set() else None) is not None:
-                raise stops
-    return []
+        except BaseException:
+            stopping.set()
+            raise
+        submitting.result()
 
 
 def _submit_all(work: Workload, rounds: int, pause_s: float, stopping: threading.Event) -> None:

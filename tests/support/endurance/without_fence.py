@@ -25,7 +25,7 @@ HIGHEST = 50
 _complete, _held_parameters = completion._complete, fencing.held_parameters
 
 
-def _no_fence(_fence: int) -> ColumnElement[bool]:
+def _no_fence(fence: int) -> ColumnElement[bool]:
     return true()
 
 
@@ -35,9 +35,8 @@ def _any_fence(attempts: Collection[_Place]) -> dict[str, Any]:
 
 def _complete_whichever(tx: Transaction, requests: Mapping[_Place, CompleteRequest]) -> dict[_Place, Any]:
     """Complete jobs for any attempt, as the statement without the fence would."""
-    newest = dict(
-        tx.execute(select(job.c.id, job.c.fence).where(job.c.id.in_([job_id for job_id, _ in requests]))).all()
-    )
+    rows = tx.execute(select(job.c.id, job.c.fence).where(job.c.id.in_([job_id for job_id, _ in requests])))
+    newest: dict[str, int] = {row.id: row.fence for row in rows}
     moved = {(job_id, newest.get(job_id, fence)): request for (job_id, fence), request in requests.items()}
     done = _complete(tx, moved)
     return {(job_id, fence): done[place] for job_id, fence in requests if (place := (job_id, newest[job_id])) in done}
@@ -46,7 +45,7 @@ def _complete_whichever(tx: Transaction, requests: Mapping[_Place, CompleteReque
 def remove() -> None:
     """Remove the comparison of fences from this process."""
     fencing.same_fence = _no_fence
-    completion.held_parameters = _any_fence
+    setattr(completion, "held_parameters", _any_fence)  # noqa: B010 - a name that the module imports
     completion._complete = _complete_whichever
     holds = and_(job.c.state == RUNNING, attempt.c.ended_us.is_(None) | true())
     tokens._ATTEMPT_TOKEN = Prepared(

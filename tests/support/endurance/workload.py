@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections import Counter
@@ -15,7 +16,6 @@ from marey_client.blobs import Blobs
 from marey_client.errors import Conflict
 from marey_client.imports import find_files
 from marey_client.load.scratch import CLIP, UNIT_SCALE_M
-from marey_client.paging import pages
 from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate
 from marey_schemas.items import Event
@@ -72,7 +72,13 @@ class Workload:
 
     def add(self, label: str, kind: str, **request: Any) -> str:
         """Submit a job and return its id. Its results are stored in a folder of its own."""
-        wanted = {"cache": "off", "max_attempts": MAX_ATTEMPTS, **request, "kind": kind, "into": f"{self.folder}/{label}"}
+        wanted = {
+            "cache": "off",
+            "max_attempts": MAX_ATTEMPTS,
+            **request,
+            "kind": kind,
+            "into": f"{self.folder}/{label}",
+        }
         self.submitted[label] = self.lab.submit(JobCreate.model_validate(wanted)).id
         return self.submitted[label]
 
@@ -185,7 +191,9 @@ def _retarget_many(work: Workload, number: int) -> None:
 
 def _annotate_and_cut(work: Workload, number: int) -> None:
     clips = [work.clip(number)]
-    steps = work.add(f"annotate-{number}", "annotate", inputs={"clips": clips}, params={"proposal": {"method": "steps"}})
+    steps = work.add(
+        f"annotate-{number}", "annotate", inputs={"clips": clips}, params={"proposal": {"method": "steps"}}
+    )
     work.add(f"cut-{number}", "cut", inputs={"annotations": [{"job": steps}], "clips": clips})
 
 
@@ -216,10 +224,8 @@ def _refuse(work: Workload, number: int) -> None:
 def _cancel(work: Workload, number: int) -> None:
     label = f"cancelled-{number}"
     job = work.add(label, "misbehave", params={"how": "sleep", "seconds": 120})
-    try:
+    with contextlib.suppress(Conflict):  # an earlier try was carried out, but its answer was lost
         work.marey.jobs.cancel(job)
-    except Conflict:  # an earlier try was carried out, but its answer was lost
-        pass
     work.cancelled.add(label)
 
 
@@ -238,8 +244,10 @@ KINDS: dict[str, Callable[[Workload, int], object]] = {
 """Functions that submit jobs, by what the jobs do; a trial calls them in turn."""
 
 
-def new_workload(marey: Marey, folder: str, takes: Path, *, slow_s: float = 0.0, kinds: Collection[str] = ()) -> Workload:
-    """Create the project `lab` with the clips of a folder of takes and a skeleton, and a schedule that adds every minute."""
+def new_workload(
+    marey: Marey, folder: str, takes: Path, *, slow_s: float = 0.0, kinds: Collection[str] = ()
+) -> Workload:
+    """Create the project `lab` with clips and a skeleton from files, and with a schedule that adds every minute."""
     lab = marey.create_project(ProjectCreate(name="lab"))
     [rig] = lab.imports.upload(find_files([takes.parent / "game.bvh"]).files)
     entries = lab.imports.upload(find_files([takes]).files)
@@ -250,6 +258,8 @@ def new_workload(marey: Marey, folder: str, takes: Path, *, slow_s: float = 0.0,
     files = [{"name": "first.bvh", "blob": Blobs(marey.transport).put(CLIP.encode())}]
     first = JobCreate(kind="import", params={"files": files, "unit_scale_m": UNIT_SCALE_M})
     marey.jobs.wait(lab.submit(first).id)  # later imports use its skeleton, whichever folder they go to
-    work = Workload(marey, lab, folder, [entry.item or "" for entry in entries], rig.skeleton, slow_s, tuple(kinds or KINDS))
+    work = Workload(
+        marey, lab, folder, [entry.item or "" for entry in entries], rig.skeleton, slow_s, tuple(kinds or KINDS)
+    )
     work.earlier |= {job.id for job in marey.jobs.list(lab.name)}
     return work

@@ -206,4 +206,6 @@ TALLY = KindDeclaration(
 ADD = KindDeclaration("add", "Adds.", AddParams, "marey_test_kinds:add", 1, {})
 MISBEHAVE = KindDeclaration("misbehave", "Fails.", MisbehaveParams, "marey_test_kinds:misbehave", 1, {})
 MAKE = KindDeclaration("make", "Makes clips.", MakeParams, "marey_test_kinds:make", 1, {"clips": Kind.CLIP})
-DRAW = KindDeclaration("draw", "Draws a skeleton.", DrawParams, "marey_test_kinds:draw", 1, {"skeletons": Kind.SKELETON})
+DRAW = KindDeclaration(
+    "draw", "Draws a skeleton.", DrawParams, "marey_test_kinds:draw", 1, {"skeletons": Kind.SKELETON}
+)

@@ -1,0 +1,59 @@
+"""The trials of a whole installation, in short forms; `make soak` runs the long ones."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from tests.support.endurance.faults import FAULTS, plan
+from tests.support.endurance.measured_growth import growth_of
+
+pytestmark = pytest.mark.timeout(900)
+
+
+def trial(*words: str) -> subprocess.CompletedProcess[str]:
+    """Run a trial as its users do: it adopts orphans of its processes, which would disturb other tests."""
+    command = [sys.executable, "-m", "tests.support.endurance", *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=800, check=False)
+
+
+def test_jobs_under_faults_have_the_results_of_a_quiet_run() -> None:
+    done = trial("faults", "--rounds", "10", "--seconds", "12", "--every", "1", "--workers", "3")
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
+    assert re.search(r"fire: 15 jobs .* 10 succeeded|fire: 15 jobs .* 11 succeeded", done.stdout), done.stdout
+
+
+@pytest.mark.soak
+def test_the_trial_finds_that_fences_are_not_compared() -> None:
+    """Several workers are suspended while they draw, and each then completes a job that another worker has."""
+    words = ("--rounds", "6", "--seconds", "18", "--every", "0.6", "--workers", "3", "--slow", "6", "--jobs", "draw")
+    done = trial("faults", *words, "--only", "worker suspended", "--without-fence")
+    assert done.returncode == 1, done.stdout[-6000:] + done.stderr[-3000:]
+    assert re.search(r"BROKEN (the item draw|peace|fire)", done.stdout), done.stdout
+
+
+@pytest.mark.soak
+def test_a_short_load_breaks_no_rule() -> None:
+    done = trial("load", "--minutes", "1.5", "--rate", "8")
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
+
+
+def test_equal_seeds_give_equal_faults_and_every_kind_happens() -> None:
+    plans = [plan(seed, 200.0, 1.0) for seed in (1, 1, 2)]
+    assert plans[0] == plans[1] != plans[2]
+    assert {fault.name for fault in plans[0]} == set(FAULTS)
+    assert {fault.name for fault in plan(1, 20.0, 1.0, ["server killed"])} == {"server killed"}
+
+
+def test_growth_is_found_with_its_interval() -> None:
+    chance = np.random.default_rng(1)
+    times_s = np.arange(0.0, 1800.0, 5.0)
+    grown = growth_of(times_s, 200 + times_s / 36 + chance.normal(0, 1, len(times_s)))
+    assert abs(grown.slope_mb_h - 100) < grown.margin_mb_h < 10
+    steady = growth_of(times_s, 200 + chance.normal(0, 1, len(times_s)))
+    assert abs(steady.slope_mb_h) < 2 * steady.margin_mb_h
+    with pytest.raises(ValueError, match="run the trial for longer"):
+        growth_of(times_s[:5], times_s[:5])
