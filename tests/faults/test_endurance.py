@@ -37,7 +37,7 @@ def test_the_trial_finds_that_fences_are_not_compared() -> None:
 
 @pytest.mark.soak
 def test_a_short_load_breaks_no_rule() -> None:
-    done = trial("load", "--minutes", "1.5", "--rate", "8")
+    done = trial("load", "--minutes", "1", "--rate", "8", "--read-ms", "5000")
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
 
 

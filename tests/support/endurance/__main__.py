@@ -33,6 +33,7 @@ def _parser() -> argparse.ArgumentParser:
     load = trials.add_parser("load", help="reads stay quick, heartbeats in time, and the memory of servers bounded")
     load.add_argument("--minutes", type=float, default=30)
     load.add_argument("--rate", type=float, default=20, help="requests per second")
+    load.add_argument("--read-ms", type=float, default=1_000, help="greatest 99th percentile of reads and lists")
     for one, workers in ((faults, WORKERS), (load, 2)):
         one.add_argument("--seed", type=int, default=None, help="equal seeds give equal faults or requests")
         one.add_argument("--s3", choices=["seaweedfs", "moto"], default="seaweedfs")
@@ -51,7 +52,7 @@ def main() -> None:
 
     say(f"the seed is {seed}")
     if given.trial == "load":
-        trial = trial_by_load.LoadTrial(given.minutes, given.rate, seed, given.s3, given.workers)
+        trial = trial_by_load.LoadTrial(given.minutes, given.rate, seed, given.s3, given.workers, given.read_ms)
         broken = trial_by_load.run(trial, say)
     else:
         broken = trial_by_faults.run(

@@ -11,10 +11,11 @@ import ctypes
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 
 import psutil
 from tests.support.attached_worker import python_path
@@ -115,7 +116,7 @@ def installation(
     *,
     workers: int = WORKERS,
     module: str = SERVE,
-    settings: Sequence[tuple[str, str]] = (),
+    settings: Mapping[str, str] = MappingProxyType({}),
     keep_logs: Path | None = None,
 ) -> Iterator[Installation]:
     """Run an installation with the S3 server of this name while the `with` block runs; at its end, copy the logs.
@@ -133,7 +134,7 @@ def installation(
         stack.callback(storage.stop)
         storage.start()
         made = Installation(folder, postgres, storage, _blobs_in(storage, folder))
-        environment = QUICK_LEASES | made.settings | dict(settings)
+        environment = {**QUICK_LEASES, **made.settings, **settings}
         if keep_logs is not None:
             stack.callback(_copy_logs, made, keep_logs)
         stack.callback(_kill_all, made)
