@@ -30,17 +30,17 @@ class Fault:
         return f"{self.name}, number {self.target}, {self.seconds:.1f} s"
 
 
-def plan(seed: int, seconds: float, every_s: float, names: Collection[str] = ()) -> list[Fault]:
+def plan(seed: int, seconds: float, every_s: float, names: Collection[str]) -> list[Fault]:
     """Return the faults that fit into `seconds`; equal arguments give equal faults.
 
-    Every kind of fault happens once before any happens twice. `names` limits the kinds.
+    Every kind of fault happens once before any happens twice. `names` are the kinds.
     """
     draw = random.Random(seed)
     found: list[Fault] = []
     waiting: list[str] = []
     spent_s = 0.0
     while spent_s < seconds:
-        waiting = waiting or draw.sample(chosen := sorted(names or FAULTS), len(chosen))
+        waiting = waiting or draw.sample(sorted(names), len(names))
         lasts_s = LEASE_S * draw.uniform(1.2, 1.8)
         found.append(Fault(every_s * draw.uniform(0.3, 1.7), waiting.pop(), draw.randrange(1 << 16), lasts_s))
         spent_s += found[-1].after_s + (lasts_s if FAULTS[found[-1].name].lasts else 0.5)
