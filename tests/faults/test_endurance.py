@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 from tests.support.endurance.faults import FAULTS, plan
+from tests.support.endurance.installation import left_behind
 from tests.support.endurance.measured_growth import growth_of
 
 pytestmark = pytest.mark.timeout(900)
@@ -47,6 +48,15 @@ def test_equal_seeds_give_equal_faults_and_every_kind_happens() -> None:
     assert plans[0] == plans[1] != plans[2]
     assert {fault.name for fault in plans[0]} == set(FAULTS)
     assert {fault.name for fault in plan(1, 20.0, 1.0, ["server killed"])} == {"server killed"}
+
+
+def test_a_process_that_is_left_behind_is_found() -> None:
+    with subprocess.Popen(["sleep", "60"]) as left:
+        try:
+            assert f"the process {left.pid} is left: sleep 60" in left_behind(())
+            assert not any(str(left.pid) in one for one in left_behind({left.pid}))
+        finally:
+            left.kill()
 
 
 def test_growth_is_found_with_its_interval() -> None:

@@ -11,7 +11,7 @@ import ctypes
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +20,7 @@ from types import MappingProxyType
 import psutil
 from tests.support.attached_worker import python_path
 from tests.support.endurance.postgres import PostgresProcess
+from tests.support.forked_programs import nursery
 from tests.support.s3_servers import KEY_ID, MAKERS, SECRET_KEY, S3Server
 from tests.support.server_process import PATIENT, QUICK_LEASES, ServerProcess, WorkerProcess
 from tests.support.tcp_proxy import TcpProxy
@@ -35,6 +36,8 @@ SERVE = "marey_client.cli"
 WITHOUT_FENCE = "tests.support.endurance.without_fence"
 """Module that runs `marey` without the comparison of fences."""
 PREFIX = "marey-trial-"
+DYING_S = 3.0
+"""Time in which the children of a process that was killed must notice this, in seconds."""
 
 
 class TrialServer(ServerProcess):
@@ -100,14 +103,19 @@ class Installation:
             status = process.stop()
             if isinstance(process, ServerProcess) and status != 0:
                 faults.append(f"{process.log.parent.name} ended with the status {status}")
-        orphans = [one for one in psutil.Process().children() if one.status() != psutil.STATUS_ZOMBIE]
-        known = {"postgres", "weed"}
-        for one in orphans:
-            with contextlib.suppress(psutil.NoSuchProcess):
-                words = " ".join(one.cmdline())
-                if one.name() not in known and "forked_programs" not in words and "moto.server" not in words:
-                    faults.append(f"the process {one.pid} is left: {words}")
+        faults += left_behind({nursery().pid, self.postgres.pid, self.s3.pid})
         return faults
+
+
+def left_behind(known: Collection[int]) -> list[str]:
+    """Return the children of this process that still run after a moment, except those with the given ids."""
+    _, left = psutil.wait_procs([one for one in psutil.Process().children() if one.pid not in known], timeout=DYING_S)
+    found = []
+    for one in left:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if one.status() != psutil.STATUS_ZOMBIE:
+                found.append(f"the process {one.pid} is left: {' '.join(one.cmdline())}")
+    return found
 
 
 @contextlib.contextmanager
@@ -121,8 +129,8 @@ def installation(
 ) -> Iterator[Installation]:
     """Run an installation with the S3 server of this name while the `with` block runs; at its end, copy the logs.
 
-    The workers start with `begin_work`.
-    Processes whose parents are killed become children of this process, so that `stop_marey` finds them.
+    The workers start with `begin_work`. Processes whose parents are killed become children of this process, so that
+    `stop_marey` finds them.
     """
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)
     with ExitStack() as stack:

@@ -47,6 +47,12 @@ class PostgresProcess:
         upgrade_schema(self.address())
         self._run(DATABASE, _CLOCK)
 
+    @property
+    def pid(self) -> int:
+        """The id of the running process."""
+        assert self._process is not None
+        return self._process.pid
+
     def address(self, port: int | None = None, database: str = DATABASE) -> str:
         """Return the address of a database, at another port if a proxy is in front of the server."""
         return f"postgresql+psycopg://postgres@127.0.0.1:{port or self.port}/{database}"
@@ -80,10 +86,7 @@ class PostgresProcess:
 
     def kill_a_backend(self, number: int) -> None:
         """Kill the process of one connection with SIGKILL; Postgres then ends all others and repairs its files."""
-        assert self._process is not None
-        backends = [
-            one for one in psutil.Process(self._process.pid).children() if "127.0.0.1" in " ".join(one.cmdline())
-        ]
+        backends = [one for one in psutil.Process(self.pid).children() if "127.0.0.1" in " ".join(one.cmdline())]
         if backends:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(sorted(one.pid for one in backends)[number % len(backends)], signal.SIGKILL)
