@@ -30,11 +30,18 @@ def test_jobs_under_faults_have_the_results_of_a_quiet_run() -> None:
 
 @pytest.mark.soak
 def test_the_trial_finds_that_fences_are_not_compared() -> None:
-    """Several workers are suspended while they draw, and each then completes a job that another worker has."""
-    words = ("--rounds", "6", "--seconds", "18", "--every", "0.6", "--workers", "3", "--slow", "6", "--jobs", "draw")
-    done = trial("faults", *words, "--only", "worker suspended", "--without-fence")
-    assert done.returncode == 1, done.stdout[-6000:] + done.stderr[-3000:]
-    assert re.search(r"BROKEN (the item draw|peace|fire)", done.stdout), done.stdout
+    """A worker that is suspended while it draws completes a job that another worker has by then.
+
+    In one trial, all suspended workers may be idle, so there are up to three.
+    """
+    words = ("--rounds", "8", "--seconds", "40", "--every", "0.6", "--slow", "9", "--jobs", "draw")
+    told = ""
+    for _ in range(3):
+        done = trial("faults", *words, "--only", "worker suspended", "--without-fence")
+        told += done.stdout[-3000:] + done.stderr[-1000:]
+        if done.returncode == 1 and re.search(r"BROKEN (the item draw|fire)", done.stdout):
+            return
+    pytest.fail(told)
 
 
 @pytest.mark.soak

@@ -41,7 +41,7 @@ def plan(seed: int, seconds: float, every_s: float, names: Collection[str]) -> l
     spent_s = 0.0
     while spent_s < seconds:
         waiting = waiting or draw.sample(sorted(names), len(names))
-        lasts_s = LEASE_S * draw.uniform(1.2, 1.8)
+        lasts_s = LEASE_S * draw.uniform(1.5, 2.3)
         found.append(Fault(every_s * draw.uniform(0.3, 1.7), waiting.pop(), draw.randrange(1 << 16), lasts_s))
         spent_s += found[-1].after_s + (lasts_s if FAULTS[found[-1].name].lasts else 0.5)
     return found
