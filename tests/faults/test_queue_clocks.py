@@ -89,7 +89,7 @@ def test_a_worker_that_does_not_stop_at_the_time_limit_loses_its_job_even_if_it_
     for _ in range(12):
         desk.heartbeat(lease)
         desk.clock.advance(50)
-    for _ in range(20):  # it sends heartbeats on and on, and the server has no time to take the job back
+    for _ in range(20):  # the server has no time to take the job back
         desk.heartbeat(lease)
         desk.clock.advance(50)
     assert desk.reap() == 1

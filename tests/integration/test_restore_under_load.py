@@ -110,7 +110,7 @@ def copy_objects(source: Bucket, target: Bucket) -> int:
 
 
 @contextmanager
-def restored(database_url: str, data: Path, folder: Path, server_of: Callable[[], Any]) -> Iterator[Callable[[], str]]:
+def restored(database_url: str, data: Path, folder: Path) -> Iterator[Callable[[], str]]:
     """Make a backup now; yield a function that restores it, and returns the address of the new database."""
     with ExitStack() as stack:
         if database_url.startswith("sqlite"):
@@ -123,7 +123,7 @@ def restored(database_url: str, data: Path, folder: Path, server_of: Callable[[]
             dump(database_url.replace("+psycopg", ""), folder / "backup.dump")
 
             def restore() -> str:
-                url = stack.enter_context(empty_postgres_database(server_of(), "restored"))
+                url = stack.enter_context(empty_postgres_database(make_url(database_url), "restored"))
                 restore_dump(folder / "backup.dump", database_address(url.set(drivername="postgresql")))
                 return database_address(url)
 
@@ -157,7 +157,7 @@ def test_a_backup_under_load_is_restored_with_everything_that_was_confirmed_befo
             assert copy_objects(source, target) > 0
             writers.await_more(4)
             studies, jobs = dict(writers.done), set(writers.jobs)
-            with restored(database_url, tmp_path, elsewhere, lambda: make_url(database_url)) as restore:
+            with restored(database_url, tmp_path, elsewhere) as restore:
                 writers.await_more(2)
                 after = settings(elsewhere, restore(), target)
                 missing = findings(after)
