@@ -57,6 +57,8 @@ soak: $(VENV)/.installed-dev lint ## Long forms of all tests, on both databases;
 	$(BIN)/python -m tests.support.motion_fuzz $$((300 * $(EFFORT)))
 	$(BIN)/python -m tests.support.hostile_figures
 	$(BIN)/python -m tests.support.hostile_figures --postgres
+	$(BIN)/python -m tests.support.endurance faults
+	$(BIN)/python -m tests.support.endurance load
 
 lint: $(VENV)/.installed-dev ## Style, types, and which package may import which
 	$(BIN)/ruff check .

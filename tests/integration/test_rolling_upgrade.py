@@ -1,21 +1,34 @@
-"""Two versions of the server at one database: migrations in phases, and an earlier server that goes on."""
+"""Two versions of the server at one database: migrations in phases, and clients and jobs that go on meanwhile."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
+import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
 import sqlalchemy
 from alembic import command
 from sqlalchemy import Connection
+from tests.support.attached_worker import python_path
 from tests.support.queue_desk import KINDS
 from tests.support.rest_server import Server
+from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
+from tests.support.store_fixtures import skeleton_tree
+from tests.support.tcp_proxy import TcpProxy
 
+from marey_client import Marey, blobs
+from marey_schemas.access import ProjectCreate
 from marey_schemas.queue import job_kinds
+from marey_schemas.queue.jobs import JobCreate
 from marey_server import commands
 from marey_server.app import open_database
 from marey_server.process.settings import Settings
@@ -34,6 +47,7 @@ def upgrade() -> None:
 def downgrade() -> None:
     {downgrade}
 '''
+PATIENCE_S = 120.0
 ADD = 'op.add_column("job", sa.Column("next_note", sa.String(40), server_default="new"))'
 DROP = 'op.drop_column("job", "next_note")'
 
@@ -147,3 +161,100 @@ def test_steps_after_the_upgrade_wait_until_they_are_wanted(
         assert not schema.schema_fits(connection), "an earlier version may use what was removed"
         served = sqlalchemy.select(server_state.c.value).where(server_state.c.key == schema.SERVED_FROM)
         assert connection.execute(served).scalar_one() == removing > first
+
+
+# -- requests, uploads and jobs while servers are replaced -------------------------------------------------------------
+
+
+class Visitors:
+    """A thread that writes and reads, and one that sends a file in many pieces, each with the usual retries."""
+
+    def __init__(self, url: str, token: str, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.written, self.pieces = 0, 0
+        self._url, self._token, self._file = url, token, file
+        self._stopping = threading.Event()
+        send_piece = blobs._send_piece
+
+        def count_piece(*given: Any) -> Any:
+            self.pieces += 1
+            return send_piece(*given)
+
+        monkeypatch.setattr(blobs, "PIECE_BYTES", 1 << 15)
+        monkeypatch.setattr(blobs, "_send_piece", count_piece)
+        self._pool = ThreadPoolExecutor(2)
+        self._running = [self._pool.submit(self._write), self._pool.submit(self._upload)]
+
+    def stop(self) -> None:
+        """Wait until the file is sent, and end the visits. Raises what a client raised."""
+        self._stopping.set()
+        self._pool.shutdown()
+        for one in self._running:
+            one.result()
+
+    def await_more(self, count: int) -> None:
+        """Wait until so many more items are written and pieces are sent."""
+        written, pieces = self.written + count, self.pieces + count
+        deadline = time.monotonic() + PATIENCE_S
+        while self.written < written or self.pieces < pieces:
+            failed = [one.exception() for one in self._running if one.done()]
+            assert not failed, failed
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+
+    def _write(self) -> None:
+        with Marey(self._url, self._token) as marey:
+            rigs = marey.project("lab").skeletons
+            while not self._stopping.is_set():
+                made = rigs.create(f"rig {self.written}", {"hierarchy": skeleton_tree()})
+                assert rigs.get(made.id).id == made.id
+                self.written += 1
+
+    def _upload(self) -> None:
+        with Marey(self._url, self._token) as marey:
+            blobs.send_in_pieces(marey.transport, self._file, blobs.digest_of_file(self._file))
+
+
+def test_no_client_with_retries_sees_a_failure_while_servers_are_replaced(
+    database_url: str, following: NextVersion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On Postgres, the servers overlap; on SQLite, the second starts when the first has ended."""
+    overlap = not database_url.startswith("sqlite")
+    settings = QUICK_LEASES | {"PYTHONPATH": python_path()}
+    old, new = (ServerProcess(tmp_path, database_url, **settings) for _ in range(2))
+    worker = WorkerProcess(tmp_path / "worker.log", PYTHONPATH=python_path())
+    (file := tmp_path / "file").write_bytes(os.urandom(1 << 22))
+    with ExitStack() as stack:
+        for process in (old, new, worker):
+            stack.callback(process.stop)
+        old.start()
+        front = stack.enter_context(TcpProxy(old.port))
+        address = f"http://127.0.0.1:{front.port}"
+        worker.start(address, old.token, tmp_path, name="steady")
+        with Marey(address, old.token) as marey:
+            lab = marey.create_project(ProjectCreate(name="lab"))
+            job = lab.submit(JobCreate(kind="draw", params={"name": "slow", "seed": 1, "seconds": 8}))
+            while marey.jobs.get(job.id).state != "running":
+                time.sleep(0.1)
+            visitors = Visitors(address, old.token, file, monkeypatch)
+            stack.callback(visitors.stop)
+            visitors.await_more(3)
+            following.add("before", ADD, DROP)
+            if overlap:
+                with following.runs():
+                    assert schema.upgrade_schema(database_url, while_serving=True).additive
+                new.start()
+            else:
+                assert old.stop() == 0
+                with following.runs():
+                    schema.upgrade_schema(database_url)
+                new.start()
+            front.target_port = new.port
+            visitors.await_more(3)
+            assert old.stop() == 0
+            visitors.await_more(3)
+            ended = marey.jobs.wait(job.id, timeout_s=PATIENCE_S)
+            visitors.stop()
+            assert [one.outcome for one in marey.jobs.attempts(ended.id)] == ["succeeded"]
+            assert marey.blobs.fetch(blobs.digest_of_file(file)) == file.read_bytes()
+            assert len(list(lab.skeletons.list())) == visitors.written + 1
+    new.check_database()

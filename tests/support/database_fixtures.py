@@ -93,11 +93,17 @@ def postgres_url() -> Iterator[URL]:
 @contextlib.contextmanager
 def new_postgres_database(server: URL, purpose: str) -> Iterator[URL]:
     """Create a Postgres database with the newest schema, yield its address, and drop it after the `with` block."""
+    with empty_postgres_database(server, purpose) as url:
+        upgrade_schema(database_address(url))
+        yield url
+
+
+@contextlib.contextmanager
+def empty_postgres_database(server: URL, purpose: str) -> Iterator[URL]:
+    """Create a Postgres database without tables, yield its address, and drop it after the `with` block."""
     name = f"marey_{purpose}_{os.getpid()}"
     _administer(server, f"CREATE DATABASE {name} TEMPLATE template0 ENCODING 'UTF8'")
-    url = server.set(database=name)
-    upgrade_schema(database_address(url))
-    yield url
+    yield server.set(database=name)
     _administer(server, f"DROP DATABASE {name} WITH (FORCE)")
 
 

@@ -100,6 +100,11 @@ class Nursery:
             )
         self._ordering = threading.Lock()
 
+    @property
+    def pid(self) -> int:
+        """The id of the process."""
+        return self._process.pid
+
     def start(
         self, arguments: Sequence[str], environment: Mapping[str, str], *, output: int, with_stdin: bool
     ) -> ForkedProgram:

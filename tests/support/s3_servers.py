@@ -51,6 +51,12 @@ class S3Server:
     def endpoint(self) -> str:
         return f"http://127.0.0.1:{self.port}"
 
+    @property
+    def pid(self) -> int:
+        """The id of the running process."""
+        assert self._process is not None
+        return self._process.pid
+
     def bucket(self, prefix: str, **changes: object) -> Bucket:
         """Return the settings of a bucket on this server; tests use one bucket with different prefixes."""
         settings = Bucket(

@@ -131,12 +131,16 @@ class ServerProcess(MareyProcess):
 class WorkerProcess(MareyProcess):
     """`python -m marey_worker`, started separately, so that it survives the end of the server."""
 
+    def __init__(self, log: Path, **environment: str) -> None:
+        super().__init__(log)
+        self.environment = environment
+
     def start(self, url: str, token: str, folder: Path, *, name: str, fault: str | None = None) -> Self:
         """Start the worker, and return this object.
 
         The worker connects to the server without further help of the test.
         """
-        environment = {"MAREY_FAULT": fault} if fault else {}
+        environment = self.environment | ({"MAREY_FAULT": fault} if fault else {})
         arguments = ["marey_worker", "--attached", "--server", url, "--name", name, "--cache", str(folder / "cache")]
         self.spawn(arguments, environment, stdin=f"{token}\n".encode())
         return self

@@ -28,6 +28,7 @@ class TcpProxy:
         self.port: int = self._listener.getsockname()[1]
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
+        self._open: set[socket.socket] = set()
 
     def __enter__(self) -> Self:
         accepting = threading.Thread(target=self._accept, daemon=True)
@@ -45,6 +46,12 @@ class TcpProxy:
         """Lose the next `count` answers to requests that contain `text`; `lost` counts them."""
         with self._losing:
             self._lose = text, self.lost + count
+
+    def cut(self) -> None:
+        """Close all connections, as a router does that forgets them."""
+        for one in self._open.copy():
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
 
     def _loses(self, request: bytes) -> bool:
         with self._losing:
@@ -68,10 +75,13 @@ class TcpProxy:
 
     def _forward(self, client: socket.socket) -> None:
         with (
+            contextlib.ExitStack() as leaving,
             client,
             contextlib.suppress(OSError),
             socket.create_connection(("127.0.0.1", self.target_port), 5) as server,
         ):
+            leaving.callback(self._open.discard, client)
+            self._open.add(client)
             selector = selectors.DefaultSelector()
             selector.register(client, selectors.EVENT_READ, (server, self.drop_requests))
             selector.register(server, selectors.EVENT_READ, (client, self.drop_answers))

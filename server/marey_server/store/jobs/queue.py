@@ -14,6 +14,7 @@ from sqlalchemy import (
     Row,
     and_,
     bindparam,
+    case,
     cast,
     exists,
     func,
@@ -147,7 +148,7 @@ def _leases_again(
 
     Raises `LeaseLostProblem` if all of them have ended.
     """
-    renewed = update(job).where(HELD).values(lease_expires_us=_renewed(tx, policy)).returning(*_LEASE_COLUMNS)
+    renewed = update(job).where(HELD).values(**_renewed(tx, policy)).returning(*_LEASE_COLUMNS)
     rows = sorted(tx.execute(renewed, held_parameters(places)).all(), key=_pick_order)
     if not rows:
         raise LeaseLostProblem("All leases of this claim have ended. Claim jobs with a new `claim_id`.")
@@ -175,7 +176,7 @@ def heartbeat(
     holds the job.
     """
     require_attempt(tx.principal, job_id, fence)
-    values: dict[str, Any] = {"lease_expires_us": _renewed(tx, policy), **COUNT_ATTEMPT}
+    values: dict[str, Any] = {**_renewed(tx, policy), **COUNT_ATTEMPT}
     if request.progress is not None:
         values["progress"] = request.progress.model_dump(mode="json")
     columns = (job.c.lease_expires_us, job.c.cancel_requested_us, job.c.deadline_us)
@@ -189,8 +190,18 @@ def heartbeat(
     )
 
 
-def _renewed(tx: Transaction, policy: QueuePolicy) -> ColumnElement[int]:
-    return earlier(job.c.deadline_us + policy.end_grace_us, tx.now_us + policy.lease_ttl_us)
+def _renewed(tx: Transaction, policy: QueuePolicy) -> dict[str, Any]:
+    """Return the values that renew a lease.
+
+    The time for which the lease had expired does not count towards the time limit: the clock of the database may have
+    jumped. The worker measures the limit with its own clock; the server's limit is for workers that do not stop.
+    """
+    late = and_(job.c.lease_expires_us < tx.now_us, job.c.cancel_requested_us.is_(None))
+    deadline_us = job.c.deadline_us + case((late, tx.now_us - job.c.lease_expires_us), else_=0)
+    return {
+        "deadline_us": deadline_us,
+        "lease_expires_us": earlier(deadline_us + policy.end_grace_us, tx.now_us + policy.lease_ttl_us),
+    }
 
 
 # -- the claim in one statement ----------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 import ctypes
 import math
 import os
+import random
 import resource
 import time
 from collections.abc import Sequence
@@ -170,6 +171,22 @@ def make(context: Context, params: MakeParams) -> dict[str, int]:
     return {"made": params.results}
 
 
+class DrawParams(Request):
+    name: str
+    seed: int
+    seconds: float = 0.0
+
+
+def draw(context: Context, params: DrawParams) -> dict[str, int]:
+    """Make a skeleton whose bone lengths are drawn, after a pause."""
+    time.sleep(params.seconds)
+    chance = random.Random(params.seed)
+    joints = [{"name": f"j{n}", "parent": n - 1, "offset": [0.0, round(chance.random(), 6), 0.0]} for n in range(5)]
+    parts = {"hierarchy": {"schema": "marey/skeleton@1", "joints": joints}}
+    context.stage([StagedOutput(name="drawn", kind=Kind.SKELETON, item_name=params.name, parts=parts)])
+    return {"seed": params.seed}
+
+
 class TallyParams(Request):
     tasks: int
 
@@ -189,3 +206,6 @@ TALLY = KindDeclaration(
 ADD = KindDeclaration("add", "Adds.", AddParams, "marey_test_kinds:add", 1, {})
 MISBEHAVE = KindDeclaration("misbehave", "Fails.", MisbehaveParams, "marey_test_kinds:misbehave", 1, {})
 MAKE = KindDeclaration("make", "Makes clips.", MakeParams, "marey_test_kinds:make", 1, {"clips": Kind.CLIP})
+DRAW = KindDeclaration(
+    "draw", "Draws a skeleton.", DrawParams, "marey_test_kinds:draw", 1, {"skeletons": Kind.SKELETON}
+)

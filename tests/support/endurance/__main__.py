@@ -1,0 +1,72 @@
+"""Long trials of an installation with Postgres and S3: `python -m tests.support.endurance faults` or `load`.
+
+`faults` runs mixed jobs once in peace and once while processes are killed; `load` sends requests at a stated rate. The
+exit status is 1 if a rule was broken.
+"""
+
+from __future__ import annotations
+
+import argparse
+import secrets
+import sys
+import time
+from pathlib import Path
+
+from tests.support.endurance import trial_by_faults, trial_by_load
+from tests.support.endurance.faults import FAULTS
+from tests.support.endurance.installation import WORKERS
+from tests.support.endurance.workload import KINDS
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m tests.support.endurance")
+    trials = parser.add_subparsers(dest="trial", required=True)
+    faults = trials.add_parser("faults", help="the results of mixed jobs must be the same under faults")
+    faults.add_argument("--rounds", type=int, default=1_340, help="calls that submit jobs; 1,340 make 2,010 jobs")
+    faults.add_argument("--seconds", type=float, default=600, help="duration of the faults")
+    faults.add_argument("--every", type=float, default=3.0, help="mean seconds between two faults")
+    faults.add_argument("--slow", type=float, default=0.0, help="seconds that a job draws a skeleton")
+    faults.add_argument("--jobs", action="append", default=[], choices=sorted(KINDS), help="only jobs of this kind")
+    faults.add_argument("--only", action="append", default=[], choices=sorted(FAULTS), help="only this kind of fault")
+    faults.add_argument("--without-fence", action="store_true", help="negative control: the trial must find faults")
+    faults.add_argument("--logs", type=Path, help="folder to which the logs are copied at the end")
+    load = trials.add_parser("load", help="reads stay quick, heartbeats in time, and the memory of servers bounded")
+    load.add_argument("--minutes", type=float, default=30)
+    load.add_argument("--rate", type=float, default=20, help="requests per second")
+    load.add_argument("--read-ms", type=float, default=1_000, help="greatest 99th percentile of reads and lists")
+    for one, workers in ((faults, WORKERS), (load, 2)):
+        one.add_argument("--seed", type=int, default=None, help="equal seeds give equal faults or requests")
+        one.add_argument("--s3", choices=["seaweedfs", "moto"], default="seaweedfs")
+        one.add_argument("--workers", type=int, default=workers)
+    return parser
+
+
+def main() -> None:
+    """Run a trial."""
+    given = _parser().parse_args()
+    seed = secrets.randbelow(2**32) if given.seed is None else given.seed
+    begun = time.monotonic()
+
+    def say(text: str) -> None:
+        print(f"{time.monotonic() - begun:6.1f} s  {text}", flush=True)
+
+    say(f"the seed is {seed}")
+    if given.trial == "load":
+        trial = trial_by_load.LoadTrial(given.minutes, given.rate, seed, given.s3, given.workers, given.read_ms)
+        broken = trial_by_load.run(trial, say)
+    else:
+        broken = trial_by_faults.run(
+            trial_by_faults.FaultTrial(
+                given.rounds, given.seconds, seed, given.every, given.s3, given.workers, given.only, given.slow,
+                not given.without_fence, given.jobs, given.logs,
+            ),
+            say,
+        )  # fmt: skip
+    for one in broken:
+        say(f"BROKEN {one}")
+    say(f"{len(broken)} rules broken; the seed was {seed}")
+    sys.exit(1 if broken else 0)
+
+
+if __name__ == "__main__":
+    main()
