@@ -186,6 +186,12 @@ class Settings(ProcessSettings, BlobSettings):
         ge=0,
         description="Greatest number of unfinished jobs of a user, including their tasks.",
     )
+    user_daily_inputs: int = Field(
+        Quotas.user_daily_inputs,
+        ge=0,
+        description="Number of inputs of jobs, with those of their tasks, that a user may submit at once, and then per "
+        "day.",
+    )
     user_followers: int = Field(
         256,
         ge=0,
