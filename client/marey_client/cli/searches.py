@@ -235,7 +235,8 @@ def _print(answer: SearchAnswer) -> None:
         )
         left = error if one.finished_error is None else one.finished_error
         what = f"{one.type} {one.joint}" if one.joint else one.type
-        rows.append((one.step, what, f"{one.searched_error:.3f}", f"{left:.3f}", unit, "yes" if one.reached else "no"))
+        searched = "" if one.searched_error is None else f"{one.searched_error:.3f}"
+        rows.append((one.step, what, searched, f"{left:.3f}", unit, "yes" if one.reached else "no"))
     columns = ("step", "constraint", "after search", "final error", "unit", "reached")
     print_table(columns, rows, right=columns[2:4])
     for number, step in enumerate(answer.steps):
