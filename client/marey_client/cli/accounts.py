@@ -10,7 +10,7 @@ import typer
 
 from marey_client.cli.projects import ByteLimit, DefaultLimits, ItemLimit, changed_limits, print_quotas
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.invocation import AsJson, UserName, connect
+from marey_client.cli.terminal.invocation import AsJson, UserName, connect, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 from marey_client.cli.terminal.secrets import ask_secret
 
@@ -52,6 +52,8 @@ def login(
 
     if with_token and invitation:
         raise WrongUsage("give only one of --with-token and --invitation")
+    if with_token:
+        refuse_ignored(context, "with --with-token", "name", "days")
     with connect(context, anonymous=True) as marey:
         url = marey.transport.url
         if with_token:
