@@ -264,7 +264,7 @@ def move_blobs(**settings: Any) -> None:
     """
     from marey_server.app import connect_database
     from marey_server.errors import ApiProblem
-    from marey_server.store.object_storage.moving import CannotMove, Moved, move_blobs
+    from marey_server.store.object_upkeep.moving import CannotMove, Moved, move_blobs
 
     chosen = read_settings(**settings)
     if chosen.database_url is None:

@@ -30,7 +30,7 @@ from marey_server.store.events import newest_number
 from marey_server.store.items.summaries import summarise
 from marey_server.store.jobs.inputs import NamingJob
 from marey_server.store.object_storage.backing import ObjectBlobs
-from marey_server.store.object_storage.checking import PAGE, StoreDefect, check_blob, check_objects
+from marey_server.store.object_upkeep.checking import PAGE, StoreDefect, check_blob, check_objects
 from marey_server.store.quotas import holdings
 from marey_server.store.tables import (
     blob,

@@ -33,7 +33,7 @@ from marey_server.store.database.prepared import Prepared
 from marey_server.store.datasets import proposals
 from marey_server.store.items.drafts import Draft
 from marey_server.store.jobs import retrying
-from marey_server.store.object_storage.checking import StoreDefect
+from marey_server.store.object_upkeep.checking import StoreDefect
 from marey_server.store.purging import candidates, versions
 from marey_server.store.quotas import holdings
 from marey_server.store.tables import blob, collection, revision_part
