@@ -218,7 +218,7 @@ def examine(**settings: Any) -> list[tuple[str, str, str]]:
         chosen = read_settings(**settings)
     except CommandFailed as error:
         return [("settings", "fault", str(error))]
-    findings = examine_machine(chosen, os.environ, connect_database)
+    findings = examine_machine(chosen, os.environ, connect_database, settings.get("database_url"))
     return [(one.check, one.state, one.detail) for one in findings]
 
 

@@ -10,12 +10,14 @@ import stat
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from typing import Literal, NamedTuple
+from urllib.parse import urlsplit
 
 from marey_motion.warm_up import kernels_are_compiled
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ApiProblem
+from marey_server.process.administrators import TOKEN_FILE
 from marey_server.process.disk_space import DiskSpace
-from marey_server.process.settings import Settings, misspelt_variables
+from marey_server.process.settings import PREFIX, Settings, misspelt_variables
 from marey_server.store.clock_setting import read_clock
 from marey_server.store.database.connections import Database
 from marey_server.store.database.opening import DatabaseUnusable, opening, sqlite_file
@@ -34,12 +36,19 @@ class Finding(NamedTuple):
 
 
 def examine(
-    settings: Settings, environment: Mapping[str, str], connect: Callable[[Settings], Database]
+    settings: Settings,
+    environment: Mapping[str, str],
+    connect: Callable[[Settings], Database],
+    url_in_command: str | None = None,
 ) -> Iterator[Finding]:
-    """Yield one finding for each check of this machine; `connect` opens the database of the settings."""
+    """Yield one finding for each check of this machine; `connect` opens the database of the settings.
+
+    `url_in_command` is the URL of the database if the command line names it.
+    """
     yield _check_variables(environment)
     yield _check_disk(settings)
     yield _check_rights(settings)
+    yield _check_secrets(settings, url_in_command)
     yield from _check_database(settings, connect)
     compiled = kernels_are_compiled()
     missing = "not all kernels are compiled, so first uses wait; run `python -m marey_motion.warm_up`"
@@ -65,6 +74,19 @@ def _check_rights(settings: Settings) -> Finding:
     if stat.S_IMODE(folder.stat().st_mode) & 0o077:
         return Finding("data folder", "warning", f"other users can open {folder}; run `chmod 700 {folder}`")
     return Finding("data folder", "ok", f"only its owner can open {folder}")
+
+
+def _check_secrets(settings: Settings, url_in_command: str | None) -> Finding:
+    """Check who can read the files that contain secrets, and that the command line contains no password."""
+    files = (settings.database_password_file, settings.s3_secret_key_file, settings.data / TOKEN_FILE)
+    readable = [file for file in files if file is not None and file.is_file() and file.stat().st_mode & 0o007]
+    warnings = [f"all users can open {file}; run `chmod o-rwx {file}`." for file in readable]
+    if url_in_command is not None and urlsplit(url_in_command).password is not None:
+        warnings.append(
+            "other users can read the password in --database-url in the list of processes; name a file with "
+            f"{PREFIX}DATABASE_PASSWORD_FILE, or give the whole URL in the variable {PREFIX}DATABASE_URL."
+        )
+    return Finding("secrets", "warning" if warnings else "ok", " ".join(warnings) or "not readable by all users")
 
 
 def _check_database(settings: Settings, connect: Callable[[Settings], Database]) -> Iterator[Finding]:
