@@ -153,7 +153,7 @@ def test_inputs_of_submitted_jobs_are_limited_per_day_even_if_the_jobs_are_cance
     things = tuple(ItemInput(item=one) for one in desk.things(4))
     desk.cancel(desk.submit("square", inputs={"things": things}))
     ruled = {"things": things, "ruler": things[0]}  # each row has the ruler: the job and its two tasks
-    with pytest.raises(QuotaExceededProblem, match="10 inputs per day, and this request needs 7 more") as refused:
+    with pytest.raises(QuotaExceededProblem, match="10 inputs per day, and this needs 7 more") as refused:
         desk.submit("square", inputs=ruled, cache="off")
     assert refused.value.context["wait_s"] == pytest.approx(0.1 * 86400, abs=60)
     with pytest.raises(QuotaExceededProblem, match="needs 16 more") as refused:

@@ -15,7 +15,7 @@ _BYTES = "user_daily_bytes"
 _INPUTS = "user_daily_inputs"
 _SENTENCES = {
     _BYTES: "You may send {most:,} new bytes per day, and this request needs {amount:,} more.",
-    _INPUTS: "You may submit jobs with {most:,} inputs per day, and this request needs {amount:,} more.",
+    _INPUTS: "You may submit jobs with {most:,} inputs per day, and this needs {amount:,} more.",
 }
 
 
@@ -84,7 +84,7 @@ def _require(tx: Transaction, quota: str, amount: int, wait_s: int) -> None:
     if wait_s == 0 and not never:
         return
     remedy = f"The operator can raise the setting `{quota}`."
-    when = "" if never else f"Send the request again in {wait_s} s. "
+    when = "" if never else f"Try again in {wait_s} s. "
     raise QuotaExceededProblem(
         f"{_SENTENCES[quota].format(most=most, amount=amount)} {when}{remedy}",
         context={"quota": quota, "limit": most, "wait_s": None if never else wait_s},
