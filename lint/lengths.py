@@ -1,4 +1,7 @@
-"""Rule: a function has at most 40 lines without its signature, a module at most 400; docstrings do not count."""
+"""Rule: a function has at most 40 lines without its signature, a module at most 400; docstrings do not count.
+
+A line of text in a page has at most 120 characters; tables, code and addresses of links may be longer.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,11 @@ from lint.sources import Definition, House, Offence
 
 MOST_LINES_OF_FUNCTION = 40
 MOST_LINES_OF_MODULE = 400
+MOST_CHARACTERS = 120
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Yield the functions and modules that have too many lines."""
+    """Yield the functions and modules that have too many lines, and the lines of pages that are too long."""
     for module in house.modules.values():
         documented = [node for _, node in module.definitions]
         lines = module.lines - sum(docstring_lines(node) for node in (module.tree, *documented))
@@ -26,6 +30,14 @@ def find(house: House) -> Iterator[Offence]:
             if lines > MOST_LINES_OF_FUNCTION:
                 message = f"{name} has {lines} lines, more than {MOST_LINES_OF_FUNCTION}; split it"
                 yield Offence(module.path, node.lineno, f"{module.name}.{name}", message)
+
+    for path, text in house.pages.items():
+        in_code = False
+        for number, line in enumerate(text.splitlines(), 1):
+            in_code ^= line.lstrip().startswith("```")
+            if len(line) > MOST_CHARACTERS and not in_code and not line.startswith(("|", "[")):
+                message = f"the line has {len(line)} characters, more than {MOST_CHARACTERS}; wrap it"
+                yield Offence(path, number, path.name, message)
 
 
 def docstring_lines(node: Definition | ast.Module) -> int:

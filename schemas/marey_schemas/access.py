@@ -268,7 +268,10 @@ class RunningJobs(Answer):
 class ProjectQuotasInUse(QuotasInUse):
     """Used amounts and limits of the quotas of a project."""
 
-    running_jobs: RunningJobs = Field(description="The project's jobs that workers run; parents of tasks do not count.")
+    running_jobs: RunningJobs | None = Field(
+        None,
+        description="The project's jobs that workers run; parents of tasks do not count. Null: the server is too old.",
+    )
 
 
 class MemberChange(Request):

@@ -116,8 +116,10 @@ class ConstraintError(Answer):
     error_cm: float | None = None
     error_deg: float | None = None
     error_s: float | None = None
-    searched_error: float = Field(
-        description="Error after the search of the tree and before numerical optimisation, in the unit of the error."
+    searched_error: float | None = Field(
+        None,
+        description="Error after the search of the tree and before numerical optimisation, in the unit of the error. "
+        "Null: the server is too old.",
     )
     finished_error: float | None = Field(
         None, description="Error after inverse kinematics, in the unit of the error; null without inverse kinematics."

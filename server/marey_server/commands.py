@@ -219,7 +219,7 @@ def examine(**settings: Any) -> list[tuple[str, str, str]]:
         chosen = read_settings(**settings)
     except CommandFailed as error:
         return [("settings", "fault", str(error))]
-    findings = examine_machine(chosen, os.environ, connect_database)
+    findings = examine_machine(chosen, os.environ, connect_database, settings.get("database_url"))
     return [(one.check, one.state, one.detail) for one in findings]
 
 
@@ -265,7 +265,7 @@ def move_blobs(**settings: Any) -> None:
     """
     from marey_server.app import connect_database
     from marey_server.errors import ApiProblem
-    from marey_server.store.object_storage.moving import CannotMove, Moved, move_blobs
+    from marey_server.store.object_upkeep.moving import CannotMove, Moved, move_blobs
 
     chosen = read_settings(**settings)
     if chosen.database_url is None:

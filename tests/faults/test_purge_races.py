@@ -32,7 +32,7 @@ from marey_schemas.queue.worker_protocol import CompleteRequest, FailRequest, Le
 from marey_server import faults
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ApiProblem, ConflictProblem, GoneProblem, NotFoundProblem
-from marey_server.store import collections, datasets, events, fsck, items, projects, purging, quotas
+from marey_server.store import collections, datasets, events, fsck, items, projects, purging
 from marey_server.store.database.connections import Database
 from marey_server.store.datasets import proposals
 from marey_server.store.folder_roles import managing
@@ -45,6 +45,7 @@ from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.retrying import retry_job
 from marey_server.store.purge_lock import begin_purge
 from marey_server.store.purging import erasing
+from marey_server.store.quotas import holdings
 from marey_server.store.tables import item_facet, job
 from marey_server.store.transaction import Transaction
 
@@ -167,7 +168,7 @@ class Scene:
         def act_beside_deletion(tx: Transaction) -> Any:
             with pytest.MonkeyPatch.context() as patch:
                 if while_publishing:
-                    patch.setattr(quotas, "hold", delete_and_hold)
+                    patch.setattr(holdings, "hold", delete_and_hold)
                 done = act(tx)
             if not while_publishing:
                 self.delete(item)
@@ -177,7 +178,7 @@ class Scene:
             request = PurgeRequest(item=item)
             return recording(tx, "lab", request, preparation(tx, "lab", request))
 
-        hold = quotas.hold
+        hold = holdings.hold
         preparation, recording = requiring(WRITE, purging.prepare_purge), requiring(WRITE, purging.record_purge)
         principal, database = who or self.desk.user, self.desk.database
         if not database.is_sqlite:

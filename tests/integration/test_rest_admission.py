@@ -98,6 +98,19 @@ def test_arrays_take_from_the_memory_of_requests_before_they_are_decoded(
         assert (refused.status_code, refused.json()["code"]) == (503, "memory")
 
 
+def test_claims_of_too_many_workers_of_one_user_are_refused_before_they_get_a_job(
+    database: Database, tmp_path: Path
+) -> None:
+    with running(database, tmp_path, user_workers=1) as server:
+        server.make_project()
+        client = server.client(server.make_user("worker", administrator=True, scopes=("work",)))
+        for worker, status in (("a", 200), ("b", 429), ("a", 200)):
+            answer = client.post("/leases", json={"worker": worker, "kinds": ["errand"]})
+            assert answer.status_code == status
+            if status == 429:
+                assert (answer.json()["code"], answer.headers["Retry-After"].isdigit()) == ("too-many-workers", True)
+
+
 @pytest.mark.parametrize("chunked", [False, True])
 def test_guests_may_send_short_bodies_only(server: Server, owner: httpx.Client, *, chunked: bool) -> None:
     etag = owner.get("/projects/lab").headers["ETag"]

@@ -243,7 +243,7 @@ def test_a_move_that_is_interrupted_says_what_to_do(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("marey_server.store.object_storage.moving.move_blobs", interrupt)
+    monkeypatch.setattr("marey_server.store.object_upkeep.moving.move_blobs", interrupt)
     with pytest.raises(commands.CommandFailed, match=r"stopped; 0 blobs .* were moved before; run the command again"):
         commands.move_blobs(data=tmp_path, database_url=copied_sqlite(sqlite_template, tmp_path), **in_bucket)
     monkeypatch.undo()

@@ -22,7 +22,7 @@ from marey_server.store.jobs import completion
 from marey_server.store.jobs.finishing import commit_deferred
 from marey_server.store.object_storage.backing import ObjectBlobs
 from marey_server.store.object_storage.client import Bucket, ObjectStorage
-from marey_server.store.object_storage.moving import Moved, move_blobs
+from marey_server.store.object_upkeep.moving import Moved, move_blobs
 from marey_server.store.transaction import Transaction
 
 LARGE_FILES = [bytes([number]) * 2**20 for number in range(12)]

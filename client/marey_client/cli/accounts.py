@@ -11,7 +11,7 @@ import typer
 from marey_client.cli.browser_login import sign_in_in_browser
 from marey_client.cli.projects import ByteLimit, DefaultLimits, ItemLimit, changed_limits, print_quotas
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.invocation import AsJson, UserName, connect
+from marey_client.cli.terminal.invocation import AsJson, UserName, connect, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 from marey_client.cli.terminal.secrets import ask_secret
 
@@ -75,6 +75,8 @@ def login(
         raise WrongUsage("give only one of --with-token, --invitation and --browser")
     if (paste and not browser) or (browser and name is not None):
         raise WrongUsage("--paste belongs to --browser, and --name does not: the identity provider says who you are")
+    if with_token:
+        refuse_ignored(context, "with --with-token", "name", "days")
     with connect(context, anonymous=True) as marey:
         url = marey.transport.url
         if with_token:

@@ -31,7 +31,7 @@ from marey_client.cli import (
 from marey_client.cli.datasets import archives, proposals, versions
 from marey_client.cli.difference import diff
 from marey_client.cli.files import downloading, listing, records, uploading
-from marey_client.cli.operation import bench, capacity
+from marey_client.cli.operation import bench, capacity, costs
 from marey_client.cli.queue import jobs, pipelines, schedules, scripts
 from marey_client.cli.terminal.invocation import Invocation
 
@@ -84,6 +84,7 @@ for register in (
     processes,
     doctor,
     bench,
+    costs,
     capacity,
     accounts,
     tokens,

@@ -9,7 +9,7 @@ import typer
 
 from marey_client.cli.processes import DatabaseUrl, DataFolder
 from marey_client.cli.terminal.failures import interrupted_by_sigterm
-from marey_client.cli.terminal.invocation import AsJson, connect, credential_of
+from marey_client.cli.terminal.invocation import AsJson, connect, credential_of, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, progress
 
 if TYPE_CHECKING:
@@ -61,7 +61,11 @@ def doctor(
     """
     findings: list[Finding] = []
     if chaos:
+        refuse_ignored(context, "with --chaos", "local", "remote", "data", "database_url")
         return _print(_test_by_faults(context, seed, faults), as_json)
+    refuse_ignored(context, "without --chaos", "seed", "faults")
+    if not local:
+        refuse_ignored(context, "with --no-local", "data", "database_url")
     if local:
         from marey_client import embedded
 

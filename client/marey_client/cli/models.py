@@ -10,7 +10,7 @@ import typer
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import SEEDED_JOB, Wait, follow, input_at, print_commit
-from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.invocation import AsJson, connect, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.formats import DEFAULT_FORMAT, SAMPLE_FORMATS
@@ -87,6 +87,8 @@ def sample(
         raise WrongUsage(f"{format!r} is not a format; the formats are {', '.join(SAMPLE_FORMATS)}")
     if into is not None and out is not None:
         raise WrongUsage("--out writes files and --into creates clips; give only one of the two")
+    if into is not None:
+        refuse_ignored(context, "with --into", "format", "unit")
     with connect(context) as marey:
         found = model_at(marey, place)
         if into is not None:

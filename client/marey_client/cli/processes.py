@@ -25,7 +25,8 @@ DataFolder = Annotated[
 DatabaseUrl = Annotated[
     str | None,
     typer.Option(
-        help="URL of a Postgres database, postgresql://...; default: the SQLite file marey.db in the data folder."
+        help="URL of a Postgres database, postgresql://...; default: the SQLite file marey.db in the data folder. "
+        "Other users can see it: if it contains a password, give it in the variable MAREY_DATABASE_URL instead."
     ),
 ]
 

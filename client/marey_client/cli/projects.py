@@ -139,7 +139,8 @@ def changed_limits(defaults: bool, **given: int | None) -> dict[str, int | None]
 
 def print_quotas(quotas: QuotasInUse) -> None:
     """Print a table of the quotas with their use and limits."""
-    rows = [(name.replace("_", " "), quota["used"], quota["allowed"]) for name, quota in quotas.model_dump().items()]
+    known = quotas.model_dump(exclude_none=True).items()
+    rows = [(name.replace("_", " "), quota["used"], quota.get("allowed")) for name, quota in known]
     columns = ("quota", "used", "allowed")
     print_table(columns, [(name, f"{used:,}", _limit_text(allowed)) for name, used, allowed in rows], right=columns[1:])
 

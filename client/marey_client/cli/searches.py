@@ -11,7 +11,7 @@ import typer
 from marey_client.cli.models import model_at
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import SEEDED_JOB, Wait, follow, print_ended
-from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.invocation import AsJson, connect, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_client.cli.terminal.typed_values import read_json
@@ -138,6 +138,8 @@ def search(
             "a search needs at least one constraint; give --at WHEN:JOINT=x,y,z or another "
             "option that adds a constraint"
         )
+    if not constraints:
+        refuse_ignored(context, "without an option that adds a constraint", "tolerance_cm", "tolerance_deg")
     asked |= params
     if start is not None:
         asked["start"] = _start(start)
@@ -235,7 +237,8 @@ def _print(answer: SearchAnswer) -> None:
         )
         left = error if one.finished_error is None else one.finished_error
         what = f"{one.type} {one.joint}" if one.joint else one.type
-        rows.append((one.step, what, f"{one.searched_error:.3f}", f"{left:.3f}", unit, "yes" if one.reached else "no"))
+        searched = "" if one.searched_error is None else f"{one.searched_error:.3f}"
+        rows.append((one.step, what, searched, f"{left:.3f}", unit, "yes" if one.reached else "no"))
     columns = ("step", "constraint", "after search", "final error", "unit", "reached")
     print_table(columns, rows, right=columns[2:4])
     for number, step in enumerate(answer.steps):

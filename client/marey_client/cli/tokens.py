@@ -12,7 +12,7 @@ import typer
 
 from marey_client.cli.accounts import SECONDS_PER_DAY
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.invocation import AsJson, connect, credential_of
+from marey_client.cli.terminal.invocation import AsJson, connect, credential_of, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_schemas.wording import counted
 
@@ -120,6 +120,8 @@ def list_tokens(
     The column `scopes` shows what a token allows, and in which projects. The column `labels` shows the labels that a
     worker may announce with this token.
     """
+    if everybody:
+        refuse_ignored(context, "with --everybody", "user")
     within_s = None if expiring is None else expiring * SECONDS_PER_DAY
     with connect(context) as marey:
         tokens = list(marey.tokens.list(user=user, everybody=everybody, prefix=prefix, ends_within_s=within_s))

@@ -32,16 +32,20 @@ class Schedules:
         *,
         timezone: str = "UTC",
         overlapping: bool = False,
+        paused: bool = False,
         description: str = "",
     ) -> Schedule:
         """Create a schedule that submits `job` at the times of a cron expression, such as "0 3 * * 1-5".
+
+        A schedule that is created paused submits nothing until it is resumed.
 
         Raises `Conflict` if the name is taken or the project has too many schedules, and `Invalid` if the expression,
         the time zone or the job is not valid.
         """
         request = ScheduleCreate(
-            name=name, cron=cron, job=job, timezone=timezone, overlapping=overlapping, description=description
-        )
+            name=name, cron=cron, job=job, timezone=timezone, overlapping=overlapping, paused=paused,
+            description=description,
+        )  # fmt: skip
         return self.transport.post(Schedule, self.url, request)
 
     def list(self) -> Iterator[Schedule]:

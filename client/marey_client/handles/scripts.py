@@ -8,6 +8,7 @@ from typing import Any
 
 from marey_client.paging import pages
 from marey_client.transport import Transport
+from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.comparisons import GOALS, MOST_COMPARED, Goal, RunComparison
 from marey_schemas.queue.jobs import Job, JobInput
 from marey_schemas.queue.scripts import Script, ScriptCreate, ScriptRun, ScriptRunCreate, Value
@@ -61,15 +62,21 @@ class ScriptHandle:
         into: str = "",
         seed: int = 0,
         message: str = "",
+        commit: OutputsCommit | str | None = None,
+        allow_expired_consent: str | None = None,
     ) -> Job:
         """Submit a job that runs the script, and return it.
 
         `values` are the values of its parameters, and `inputs` are items, folders or outputs of other jobs. The clips
-        that the script writes are stored in the folder `into`. Raises `Invalid` if a value or an input is wrong.
+        that the script writes are stored in the folder `into`, and committed as `commit` says, such as "gaits@trial".
+        If the consent for an input clip has ended, the run fails, unless `allow_expired_consent` gives a reason.
+        Raises `Invalid` if a value or an input is wrong.
         """
         request = ScriptRunCreate(
-            values=dict(values or {}), inputs=dict(inputs or {}), into=into, seed=seed, message=message
-        )
+            values=dict(values or {}), inputs=dict(inputs or {}), into=into, seed=seed, message=message,
+            commit=OutputsCommit.of(commit), allow_expired_consent=allow_expired_consent is not None,
+            consent_reason=allow_expired_consent,
+        )  # fmt: skip
         return self.transport.post(Job, f"{self.url}/runs", request)
 
     def runs(self, *, sort: str = "-created_at", limit: int = 50) -> tuple[ScriptRun, ...]:

@@ -53,8 +53,10 @@ class CheckoutAnswer(Answer):
     """Result of a checkout, with the numbers of entries that it changed in the folder of a dataset."""
 
     commit: str = Field(description="Digest of the commit whose content the folder has now.")
-    taken: int = Field(description="Number of entries that the folder has now.")
-    entries: int = Field(description="Number of entries of the version.")
+    taken: int | None = Field(
+        None, description="Number of entries that the folder has now. Null: the server is too old."
+    )
+    entries: int | None = Field(None, description="Number of entries of the version. Null: the server is too old.")
     added: int
     removed: int
     moved: int

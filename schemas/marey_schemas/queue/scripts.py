@@ -15,6 +15,7 @@ from marey_schemas.consents import ConsentOverride
 from marey_schemas.formats import FORMATS, WHOLE_FORMATS, ExportFormat
 from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath, Message
+from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import InputSpec, JobInput, JobState, Resources
 from marey_schemas.sizes import GIB, MIB
 
@@ -328,7 +329,10 @@ class ScriptRunCreate(ConsentOverride):
     inputs: dict[FieldName, JobInput | tuple[JobInput, ...]] = Field(default_factory=dict)
     into: CollectionPath = Field("", description="The collection that receives the clips.")
     seed: int = Field(0, ge=0, lt=2**63, description="Value of the environment variable MAREY_SEED of the script.")
-    message: Message = ""
+    message: Message = Field("", description="Message of the run, shown in the history of its results.")
+    commit: OutputsCommit | None = Field(
+        None, description="Commit of the outputs to a branch of a dataset, made when the run succeeds."
+    )
 
 
 class ScriptRun(Answer):

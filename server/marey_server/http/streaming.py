@@ -7,7 +7,6 @@ import base64
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from types import MappingProxyType
 from urllib.parse import quote
 
@@ -19,14 +18,14 @@ from marey_server.http.exchange import JOINED_BYTES
 from marey_server.http.reply import Rendered
 from marey_server.http.resource import Resource
 from marey_server.store import blobs
-from marey_server.store.object_storage.backing import ObjectBlobs
-from marey_server.store.object_storage.client import StoredObject
 from marey_server.store.transaction import Transaction
 
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 PIECE_BYTES = MIB
 SIGNED_FOR_S = 60
 """Seconds for which anybody who has a signed URL can read the blob; a download that has begun may take longer."""
+_REDIRECTED = {"Cache-Control": NOT_STORED, "Vary": "*"}
+"""Headers of an answer that refers a client, which may read the blob, to object storage."""
 HELD_BYTES = 2 * PIECE_BYTES
 """Memory that a long blob needs while it is sent: one piece is being sent, and the next one is being read."""
 
@@ -80,14 +79,15 @@ def parse_range(header: str | None, if_range: str | None, etag: str) -> ByteRang
 class _Opened:
     """Blob about to be sent: its size, the requested range, and the first piece.
 
-    `stored` is set if the client is to read the bytes from object storage; then there is no first piece.
+    `stored_as` is the name of an object if the client is to read the bytes from object storage; then there is no first
+    piece.
     """
 
     size: int
     start: int
     stop: int
     first: bytes = b""
-    stored: StoredObject | None = None
+    stored_as: str | None = None
 
 
 def _open_blob(
@@ -102,7 +102,7 @@ def _open_blob(
     if head:
         return _Opened(size, start, stop)
     if redirect_bytes is not None and size >= redirect_bytes and (stored := blobs.object_of(tx, digest)):
-        return _Opened(size, start, stop, stored=stored)
+        return _Opened(size, start, stop, stored_as=stored.name)
     return _Opened(size, start, stop, blobs.read_blob(tx, digest, start, min(stop, start + PIECE_BYTES)))
 
 
@@ -149,8 +149,9 @@ class BlobSender(Resource):
         }
         if matches(self.request.headers.get("If-None-Match"), etag):
             return Rendered(304, fields, b"")
-        if opened.stored is not None:
-            return await self._redirect(opened.stored)
+        if opened.stored_as is not None:
+            url = self.services.database.submit_signed_url(opened.stored_as, SIGNED_FOR_S)
+            return Rendered(307, {"Location": await asyncio.wrap_future(url), **_REDIRECTED}, b"")
         if wanted is not None:
             fields["Content-Range"] = f"bytes {opened.start}-{opened.stop - 1}/{opened.size}"
         fields |= {"Content-Type": media_type, "Content-Disposition": disposition, **headers}
@@ -164,14 +165,6 @@ class BlobSender(Resource):
         if sends_pieces:
             await self._send_rest(digest, position, stop)
         return None
-
-    async def _redirect(self, stored: StoredObject) -> Rendered:
-        """Return the answer that refers the client, which may read the blob, to object storage."""
-        backing = self.services.database.blobs
-        assert isinstance(backing, ObjectBlobs)
-        sign = partial(backing.storage.signed_url, stored.name, SIGNED_FOR_S)
-        location = await asyncio.wrap_future(self.services.database.submit_move(sign))
-        return Rendered(307, {"Location": location, "Cache-Control": NOT_STORED, "Vary": "*"}, b"")
 
     async def _send_rest(self, digest: str, position: int, end: int) -> None:
         """Send the pieces after the first one, one at a time, and wait until all are sent."""

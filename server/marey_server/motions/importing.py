@@ -15,13 +15,14 @@ from marey_schemas.options.imports import ImportOptions
 from marey_server.access.folder_rights import FolderRoleProblem
 from marey_server.errors import ApiProblem, InvalidProblem
 from marey_server.motions.loading import LOADING
-from marey_server.store import blobs, items, projects, quotas
+from marey_server.store import blobs, items, projects
 from marey_server.store.blob_backings import Spool
 from marey_server.store.documents import PreparedDocument, prepare_document
 from marey_server.store.folder_roles.rights import rights_of_caller, rights_shown
 from marey_server.store.items import Draft, ItemFilters, Published
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
+from marey_server.store.quotas import daily
 from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:  # numeric modules take a second to load, so they are loaded only for imports
@@ -243,7 +244,7 @@ def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> l
                 stored.append(_publish_alone(tx, row, file, sent_bytes + sum(one.sent_bytes for one in stored)))
         entries += [entry for one in stored for entry in one.entries]
         sent_bytes += sum(one.sent_bytes for one in stored)
-    quotas.count_sent(tx, sent_bytes)
+    daily.count_sent(tx, sent_bytes)
     return entries
 
 
@@ -287,7 +288,7 @@ def _publish(tx: Transaction, row: ProjectRow, files: Sequence[PreparedImport], 
         sources = {one.digest: one.content for file in fresh for one in file.sources if one.content is not None}
         new_bytes = blobs.put_uncounted(tx, sources, project_id=row.id) if sources else 0
         if new_bytes:
-            quotas.require_sendable(tx, sent_bytes + new_bytes)
+            daily.require_sendable(tx, sent_bytes + new_bytes)
         drafts: dict[str, tuple[Draft, ...]] = {
             file.name: file.drafts if file.graph is None else (graph_draft(tx, row.name, file.graph),) for file in fresh
         }

@@ -11,13 +11,15 @@ import stat
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from typing import Literal, NamedTuple
+from urllib.parse import urlsplit
 
 from marey_motion.warm_up import kernels_are_compiled
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ApiProblem, UnavailableProblem
+from marey_server.process.administrators import TOKEN_FILE
 from marey_server.process.disk_space import DiskSpace
 from marey_server.process.identity_provider import IdentityProvider
-from marey_server.process.settings import Settings, misspelt_variables
+from marey_server.process.settings import PREFIX, Settings, misspelt_variables
 from marey_server.store.clock_setting import read_clock
 from marey_server.store.database.connections import Database
 from marey_server.store.database.opening import DatabaseUnusable, opening, sqlite_file
@@ -36,12 +38,19 @@ class Finding(NamedTuple):
 
 
 def examine(
-    settings: Settings, environment: Mapping[str, str], connect: Callable[[Settings], Database]
+    settings: Settings,
+    environment: Mapping[str, str],
+    connect: Callable[[Settings], Database],
+    url_in_command: str | None = None,
 ) -> Iterator[Finding]:
-    """Yield one finding for each check of this machine; `connect` opens the database of the settings."""
+    """Yield one finding for each check of this machine; `connect` opens the database of the settings.
+
+    `url_in_command` is the URL of the database if the command line names it.
+    """
     yield _check_variables(environment)
     yield _check_disk(settings)
     yield _check_rights(settings)
+    yield _check_secrets(settings, url_in_command)
     yield from _check_database(settings, connect)
     if settings.oidc_issuer is not None:
         yield _check_identity_provider(settings)
@@ -72,15 +81,30 @@ def _check_rights(settings: Settings) -> Finding:
 
 
 def _check_identity_provider(settings: Settings) -> Finding:
-    file = settings.oidc_client_secret_file
-    if file is not None and stat.S_IMODE(file.stat().st_mode) & 0o007:
-        return Finding("identity provider", "warning", f"other users can read {file}; run `chmod o= {file}`")
     provider = IdentityProvider(settings)
     try:
         asyncio.run(provider.check())
     except UnavailableProblem as error:
         return Finding("identity provider", "fault", error.detail)
     return Finding("identity provider", "ok", f"it answers; register the redirect URI {provider.redirect_uri} there")
+
+
+def _check_secrets(settings: Settings, url_in_command: str | None) -> Finding:
+    """Check who can read the files that contain secrets, and that the command line contains no password."""
+    files = (
+        settings.database_password_file,
+        settings.s3_secret_key_file,
+        settings.oidc_client_secret_file,
+        settings.data / TOKEN_FILE,
+    )
+    readable = [file for file in files if file is not None and file.is_file() and file.stat().st_mode & 0o007]
+    warnings = [f"all users can open {file}; run `chmod o-rwx {file}`." for file in readable]
+    if url_in_command is not None and urlsplit(url_in_command).password is not None:
+        warnings.append(
+            "other users can read the password in --database-url in the list of processes; name a file with "
+            f"{PREFIX}DATABASE_PASSWORD_FILE, or give the whole URL in the variable {PREFIX}DATABASE_URL."
+        )
+    return Finding("secrets", "warning" if warnings else "ok", " ".join(warnings) or "not readable by all users")
 
 
 def _check_database(settings: Settings, connect: Callable[[Settings], Database]) -> Iterator[Finding]:

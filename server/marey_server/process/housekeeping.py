@@ -27,7 +27,7 @@ from marey_server.store.jobs import reaper
 from marey_server.store.jobs.finishing import commit_deferred
 from marey_server.store.jobs.reaper import StartGrace
 from marey_server.store.object_storage.backing import ObjectBlobs
-from marey_server.store.object_storage.moving import move_uploads
+from marey_server.store.object_upkeep.moving import move_uploads
 from marey_server.store.retention import retire
 from marey_server.store.schedules.firing import submit_due
 from marey_server.store.transaction import Transaction

@@ -118,7 +118,7 @@ class Services:
         self._seal_key = database.read(SYSTEM, read_seal_key)
         self.queue_policy = QueuePolicy(settings.lease_ttl_s, settings.heartbeat_s, settings.cancel_grace_s)
         self.start_grace = StartGrace(self.queue_policy)
-        self.worker_memory = WorkerMemory()
+        self.worker_memory = WorkerMemory(most_of_user=settings.user_workers)
         self._reading_figures: asyncio.Task[None] | None = None
         self._watch()
 

@@ -22,6 +22,7 @@ from marey_server.process.secret_files import read_secret
 from marey_server.process.trace_settings import TraceSettings
 from marey_server.process.worker_pools import WorkerPools
 from marey_server.store.jobs.policy import QueuePolicy
+from marey_server.store.monitoring.workers import ALIVE_S, MOST_OF_USER, MOST_REMEMBERED
 from marey_server.store.retention import Retention
 from marey_server.store.transaction import Quotas
 
@@ -187,10 +188,23 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
         ge=0,
         description="Greatest number of unfinished jobs of a user, including their tasks.",
     )
+    user_daily_inputs: int = Field(
+        Quotas.user_daily_inputs,
+        ge=0,
+        description="Number of inputs of jobs, with those of their tasks, that a user may submit at once, and then per "
+        "day.",
+    )
     user_followers: int = Field(
         256,
         ge=0,
         description="Greatest number of open connections over which a user may follow events.",
+    )
+    user_workers: int = Field(
+        MOST_OF_USER,
+        ge=1,
+        le=MOST_REMEMBERED,
+        description="Greatest number of workers of a user, by their names, that have claimed jobs in the last "
+        f"{ALIVE_S:.0f} seconds.",
     )
     user_items: int = Field(
         Quotas.user_items, ge=0, description="Greatest number of existing items that a user has created."

@@ -25,7 +25,7 @@ from marey_server.store.blob_backings import CHUNK_BYTES, Spool
 from marey_server.store.jobs import reach
 from marey_server.store.object_storage.client import StoredObject
 from marey_server.store.projects import is_visible, writable_projects
-from marey_server.store.quotas import count_sent
+from marey_server.store.quotas.daily import count_sent
 from marey_server.store.tables import (
     attempt_blob,
     blob,

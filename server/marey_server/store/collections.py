@@ -11,7 +11,7 @@ from marey_schemas.access import Role
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Page
 from marey_server.access.folder_rights import FolderRights
 from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
-from marey_server.store import listing, projects, quotas
+from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
 from marey_server.store.folder_roles.rights import (
@@ -23,6 +23,7 @@ from marey_server.store.folder_roles.rights import (
 from marey_server.store.ids import new_id
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
+from marey_server.store.quotas import holdings
 from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import collection, item
 from marey_server.store.transaction import Transaction
@@ -255,7 +256,7 @@ def delete_collection(tx: Transaction, project: str, collection_id: str, *, expe
         .values(deleted_us=tx.now_us, rev=item.c.rev + 1)
         .returning(item.c.creator_id, item.c.stored_bytes)
     )
-    quotas.release(tx, project_row.id, quotas.by_creator(gone))
+    holdings.release(tx, project_row.id, holdings.by_creator(gone))
     tx.audit("collection.deleted", collection_id, about=path, project_id=project_row.id, path=path)
 
 
@@ -293,7 +294,7 @@ def restore_collection(
         .values(deleted_us=None, rev=item.c.rev + 1)
         .returning(item.c.creator_id, item.c.stored_bytes)
     )
-    quotas.hold(tx, project_row.id, quotas.by_creator(back))
+    holdings.hold(tx, project_row.id, holdings.by_creator(back))
     tx.audit("collection.restored", collection_id, about=gone.path, project_id=project_row.id, path=gone.path)
     return _shown(tx, project_row, row)
 

@@ -20,7 +20,6 @@ from marey_schemas.encoding.canonical import array_digest, canonical_json
 from marey_schemas.kinds import PARTS, Kind
 from marey_server.access.principal import SYSTEM
 from marey_server.access.webhook_signatures import is_secret
-from marey_server.store import quotas
 from marey_server.store.blobs import digest_of, read_blob
 from marey_server.store.database.connections import Database
 from marey_server.store.datasets.chunks import StoredChunks, chunk_in
@@ -31,7 +30,8 @@ from marey_server.store.events import newest_number
 from marey_server.store.items.summaries import summarise
 from marey_server.store.jobs.inputs import NamingJob
 from marey_server.store.object_storage.backing import ObjectBlobs
-from marey_server.store.object_storage.checking import PAGE, StoreDefect, check_blob, check_objects
+from marey_server.store.object_upkeep.checking import PAGE, StoreDefect, check_blob, check_objects
+from marey_server.store.quotas import holdings
 from marey_server.store.tables import (
     blob,
     collection,
@@ -104,7 +104,7 @@ def check_store(
             if progress is not None:
                 progress(name, count)
     if miscounted and repair:
-        database.write(SYSTEM, quotas.recount)
+        database.write(SYSTEM, holdings.recount)
 
 
 def _check_page(
@@ -194,7 +194,7 @@ def _check_item(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         if (summary.shown, summary.frames, summary.skeleton_id) != (row.summary, row.frames, row.skeleton_id):
             findings.append(StoreDefect("summary-wrong", row.id, "the summary is not that of the newest revision"))
         findings += _check_named_items(tx, row, bodies)
-    if (size := tx.execute(select(quotas.BYTES_OF_ITEM).where(item.c.id == row.id)).scalar_one()) != row.stored_bytes:
+    if (size := tx.execute(select(holdings.BYTES_OF_ITEM).where(item.c.id == row.id)).scalar_one()) != row.stored_bytes:
         detail = f"its revisions take {size} bytes, but {row.stored_bytes} are recorded"
         findings.append(StoreDefect(MISCOUNTED, row.id, detail))
     place = tx.execute(select(collection).where(collection.c.id == row.collection_id)).first()
@@ -253,7 +253,7 @@ def _check_holding(tx: Transaction, row: Row[Any], owner: Column[str]) -> list[S
 
     `owner` is the column of `item` that names the project or user.
     """
-    counted, recorded = quotas.count_held(tx, owner, row.id), quotas.read_held(tx, row.id)
+    counted, recorded = holdings.count_held(tx, owner, row.id), holdings.read_held(tx, row.id)
     return (
         []
         if counted == recorded

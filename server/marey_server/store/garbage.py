@@ -27,7 +27,7 @@ from marey_server.store.database.connections import Database
 from marey_server.store.idempotency import LIFETIME_US as KEY_LIFETIME_US
 from marey_server.store.invitations import validity
 from marey_server.store.jobs.fencing import RUNNING
-from marey_server.store.object_storage.sweeping import sweep_objects
+from marey_server.store.object_upkeep.sweeping import sweep_objects
 from marey_server.store.tables import (
     attempt_blob,
     blob,

@@ -43,12 +43,13 @@ from marey_server.errors import (
     TooManyRequestsProblem,
     UnauthenticatedProblem,
 )
-from marey_server.store import listing, quotas, rate_limits
+from marey_server.store import listing, rate_limits
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
 from marey_server.store.invitations.validity import withdraw_unauthorised
+from marey_server.store.quotas import counting, limits
 from marey_server.store.rate_limits import RateLimit, key_of
 from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import folder_role, invitation, member, project, queue_share
@@ -252,7 +253,7 @@ def list_projects(
 
 def read_quotas(tx: Transaction, name: str) -> ProjectQuotasInUse:
     """Return the number of items, bytes and running jobs of a project, and the limits."""
-    return quotas.show_project_quotas(tx, require(tx, name).id)
+    return limits.show_project_quotas(tx, require(tx, name).id)
 
 
 # -- changing ---------------------------------------------------------------------------------------------------------
@@ -303,7 +304,7 @@ def create_project(tx: Transaction, request: ProjectCreate) -> Project:
             f"{request.name!r}.",
             code="insufficient-scope",
         )
-    quotas.require_room(tx, "user_projects")
+    counting.require_room(tx, "user_projects")
     made = ProjectRow(
         new_id("project"), request.name, request.title, request.description, request.visibility,
         tx.now_us, tx.now_us, None, 1, None, Role.OWNER, False,
@@ -356,7 +357,7 @@ def restore_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev = N
     seen = require(tx, name, deleted=True)
     own = member.c.project_id == seen.id, member.c.user_id == tx.principal.user_id, member.c.role == Role.OWNER.value
     if tx.execute(select(member.c.project_id).where(*own)).first() is not None:
-        quotas.require_room(tx, "user_projects")
+        counting.require_room(tx, "user_projects")
     with taken(_name_taken(name)):
         restored = _change(tx, seen, {"deleted_us": None}, expected_rev, project.c.deleted_us.is_not(None))
     tx.audit("project.restored", seen.id, about=name, project_id=seen.id, name=name)
@@ -369,7 +370,7 @@ def change_quotas(tx: Transaction, name: str, change: ProjectQuotaChange) -> Pro
     found = tx.execute(select(project.c.id).where(project.c.name == name, project.c.deleted_us.is_(None))).scalar()
     if found is None:
         raise NotFoundProblem(f"There is no project {name!r}.", code="no-project")
-    return quotas.change_project_limits(tx, found, name, change)
+    return limits.change_project_limits(tx, found, name, change)
 
 
 def _change(

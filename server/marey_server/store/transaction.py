@@ -44,6 +44,7 @@ class Quotas:
     user_uploads: int = 1000
     user_upload_bytes: int = 128 * 2**30
     user_daily_bytes: int = 256 * 2**30
+    user_daily_inputs: int = 5_000_000
     user_tokens: int = 1000
     user_projects: int = 1000
     user_jobs: int = 200_000

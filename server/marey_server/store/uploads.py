@@ -26,7 +26,8 @@ from marey_server.store import blob_backings, blobs
 from marey_server.store.blob_backings import CHUNK_BYTES
 from marey_server.store.database.clock import DAY_US
 from marey_server.store.ids import new_id
-from marey_server.store.quotas import count_sent, require_room, take_back_sent
+from marey_server.store.quotas.counting import require_room
+from marey_server.store.quotas.daily import count_sent, take_back_sent
 from marey_server.store.tables import blob, job, upload, upload_chunk
 from marey_server.store.transaction import Transaction
 

@@ -19,12 +19,13 @@ from marey_server.errors import (
     PreconditionFailedProblem,
     UnauthenticatedProblem,
 )
-from marey_server.store import listing, quotas
+from marey_server.store import listing
 from marey_server.store.credentials import tokens
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
 from marey_server.store.invitations.validity import withdraw_unauthorised
+from marey_server.store.quotas import holdings, limits
 from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import invitation, schedule, user
 from marey_server.store.transaction import Transaction
@@ -89,13 +90,13 @@ def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
             "projects.",
             code="insufficient-scope",
         )
-    return quotas.show_quotas(tx, "user", find_user(tx, name).id)
+    return holdings.show_quotas(tx, "user", find_user(tx, name).id)
 
 
 def change_quotas(tx: Transaction, name: str, change: QuotaChange) -> QuotasInUse:
     """Change the quotas of a user, and return all of them and their use. Only administrators may do this."""
     require_administrator(tx.principal)
-    return quotas.change_user_limits(tx, find_user(tx, name).id, name, change)
+    return limits.change_user_limits(tx, find_user(tx, name).id, name, change)
 
 
 def list_users(tx: Transaction, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT) -> Page:

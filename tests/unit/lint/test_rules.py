@@ -136,6 +136,13 @@ def test_long_functions_and_modules_are_found_and_docstrings_do_not_count() -> N
     assert messages(lengths.find(house({"marey_x.a": "x = 1\n" * 401}))) == ["401 lines, more than 400; split it"]
 
 
+def test_a_long_line_of_text_in_a_page_is_found() -> None:
+    long = "word " * 30
+    page = f"| {long} |\n```\n{long}\n```\n[1]: {long}\nshort\n{long}\n"
+    (offence,) = lengths.find(house({}, {"docs/page.md": page}))
+    assert (offence.line, offence.message) == (7, "the line has 150 characters, more than 120; wrap it")
+
+
 def test_a_list_that_repeats_words_of_a_vocabulary_is_found() -> None:
     home = "class State(StrEnum):\n    A = 'waiting'\n    B = 'queued'\n    C = 'running'\n    D = 'failed'\n"
     copy = "OPEN = ('waiting', 'queued', 'running')\n"

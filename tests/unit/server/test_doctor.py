@@ -35,8 +35,22 @@ def states(folder: Path, **settings: object) -> dict[str, tuple[str, str]]:
 def test_a_sound_machine_has_no_faults(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "kernels_are_compiled", lambda: True)
     found = states(data)
-    assert list(found) == ["settings", "disk", "data folder", "database", "clock", "kernels"]
+    assert list(found) == ["settings", "disk", "data folder", "secrets", "database", "clock", "kernels"]
     assert {state for state, _ in found.values()} == {"ok"}
+
+
+def test_secrets_that_other_users_can_read_are_found(data: Path, tmp_path: Path) -> None:
+    url, secret = "postgresql://marey@127.0.0.1:1/marey", tmp_path / "password"
+    secret.write_text("hidden-one")
+    secret.chmod(0o604)
+    state, detail = states(data, database_url=url, database_password_file=secret)["secrets"]
+    assert (state, detail) == ("warning", f"all users can open {secret}; run `chmod o-rwx {secret}`.")
+    secret.chmod(0o640)
+    assert states(data, database_url=url, database_password_file=secret)["secrets"][0] == "ok"
+    state, detail = states(data, database_url=url.replace("marey@", "marey:hidden-two@"))["secrets"]
+    assert state == "warning"
+    assert "MAREY_DATABASE_PASSWORD_FILE" in detail
+    assert "hidden-two" not in detail
 
 
 def test_each_fault_of_a_machine_is_found(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:

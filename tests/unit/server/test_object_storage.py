@@ -22,11 +22,12 @@ from marey_server.process.settings import Settings
 from marey_server.store import blobs, documents, fsck, garbage, items, uploads
 from marey_server.store.blob_backings import CHUNK_BYTES, DatabaseBlobs, DirectoryBlobs
 from marey_server.store.blobs import GRACE_US, digest_of
-from marey_server.store.object_storage import awaiting, backing, sweeping
+from marey_server.store.object_storage import awaiting, backing
 from marey_server.store.object_storage.awaiting import BytesAwaited, Carried
 from marey_server.store.object_storage.backing import COMMIT_WITHIN_US, ObjectBlobs
 from marey_server.store.object_storage.client import Bucket, ObjectStorage, ObjectStorageProblem, StoredObject
-from marey_server.store.object_storage.moving import CannotMove, Moved, move_blobs, move_uploads
+from marey_server.store.object_upkeep import sweeping
+from marey_server.store.object_upkeep.moving import CannotMove, Moved, move_blobs, move_uploads
 from marey_server.store.tables import blob_chunk, document, upload_chunk
 from marey_server.store.transaction import Transaction
 

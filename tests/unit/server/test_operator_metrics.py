@@ -14,7 +14,7 @@ from marey_server.store.tables import server_state
 def figures(desk: Desk) -> Figures:
     memory = WorkerMemory()
     for name, version in (("a", "1.0"), ("b", "1.0"), ("c", "<script>")):
-        memory.hear("tok", ClaimRequest(worker=name, kinds=("errand",), version=version))
+        memory.hear("usr", "tok", ClaimRequest(worker=name, kinds=("errand",), version=version))
     return desk.database.read(SYSTEM, read_figures, memory.heard(), "1.0")
 
 

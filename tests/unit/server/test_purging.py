@@ -25,7 +25,7 @@ from marey_schemas.purges import DatasetHolder, HeldItem, ItemHolder, JobHolder,
 from marey_schemas.queue.jobs import JobState
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ApiProblem, ConflictProblem, GoneProblem, InvalidProblem, NotFoundProblem
-from marey_server.store import blobs, collections, datasets, events, fsck, garbage, items, purging, quotas, transaction
+from marey_server.store import blobs, collections, datasets, events, fsck, garbage, items, purging, transaction
 from marey_server.store import projects as store_projects
 from marey_server.store.blobs import GRACE_US
 from marey_server.store.database.clock import DAY_US
@@ -33,8 +33,9 @@ from marey_server.store.database.prepared import Prepared
 from marey_server.store.datasets import proposals
 from marey_server.store.items.drafts import Draft
 from marey_server.store.jobs import retrying
-from marey_server.store.object_storage.checking import StoreDefect
+from marey_server.store.object_upkeep.checking import StoreDefect
 from marey_server.store.purging import candidates, versions
+from marey_server.store.quotas import holdings
 from marey_server.store.tables import blob, collection, revision_part
 from marey_server.store.tables import document as documents
 from marey_server.store.tables import item as item_rows
@@ -559,7 +560,7 @@ def test_quotas_count_a_purged_item_no_more_than_a_deleted_one(house: House) -> 
     house.delete(one)
 
     def held(tx: Transaction) -> Any:
-        return quotas.show_quotas(tx, "project", store_projects.require(tx, "lab").id)
+        return holdings.show_quotas(tx, "project", store_projects.require(tx, "lab").id)
 
     before = house.read(held)
     house.purge(item=one)

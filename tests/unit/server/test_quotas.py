@@ -148,6 +148,41 @@ def test_tasks_of_a_job_that_gets_its_inputs_later_count_as_well(desk: Desk) -> 
     )
 
 
+def test_inputs_of_submitted_jobs_are_limited_per_day_even_if_the_jobs_are_cancelled(desk: Desk) -> None:
+    desk.database.quotas = Quotas(user_daily_inputs=10)
+    things = tuple(ItemInput(item=one) for one in desk.things(4))
+    desk.cancel(desk.submit("square", inputs={"things": things}))
+    ruled = {"things": things, "ruler": things[0]}  # each row has the ruler: the job and its two tasks
+    with pytest.raises(QuotaExceededProblem, match="10 inputs per day, and this needs 7 more") as refused:
+        desk.submit("square", inputs=ruled, cache="off")
+    assert refused.value.context["wait_s"] == pytest.approx(0.1 * 86400, abs=60)
+    with pytest.raises(QuotaExceededProblem, match="needs 16 more") as refused:
+        desk.submit("survey", inputs={"things": things}, params={"number": 3})
+    assert refused.value.context["wait_s"] is None
+    desk.clock.advance(0.1 * 86400 + 60)
+    desk.submit("square", inputs=ruled, cache="off")
+
+
+def test_inputs_that_jobs_get_later_count_for_their_author(desk: Desk) -> None:
+    desk.database.quotas = Quotas(user_daily_inputs=7)
+    maker = desk.submit("sum")
+    late = desk.submit_many(
+        *(JobCreate(kind="square", inputs={"things": {"job": maker}}, into=f"{n}") for n in range(2))
+    )
+    lease = desk.claim()
+    desk.stage(lease, *(f"thing{number}" for number in range(4)))
+    desk.complete(lease)  # each of the two jobs gets four inputs for one that was counted
+    states = [desk.state(job) for job in late]
+    assert sorted(states) == ["failed", "running"]
+    failure = desk.job(late[states.index("failed")]).failure
+    assert failure is not None
+    assert (failure.code, failure.detail) == (
+        "quota-exceeded",
+        "The job and its tasks would get 3 inputs, more than its author may submit now (quota `user_daily_inputs`). "
+        "Retry the job later.",
+    )
+
+
 def test_new_bytes_are_limited_per_day_and_become_free_with_time(lab: Lab, clock: AdjustableClock) -> None:
     lab.database.quotas = Quotas(user_daily_bytes=1000)
     lab.write(blobs.put_blob, b"a" * 600)

@@ -159,6 +159,19 @@ def test_overlapping_jobs_are_submitted_if_the_schedule_allows_them(desk: Desk) 
     assert len(jobs_of(desk)) == 3
 
 
+def test_a_schedule_over_a_folder_is_refused_when_its_author_has_submitted_too_many_inputs(desk: Desk) -> None:
+    desk.database.quotas = Quotas(user_daily_inputs=5)
+    desk.things(4, "raw")
+    work = JobCreate(kind="square", inputs={"things": {"collection": "raw"}}, cache="off")
+    create(desk, overlapping=True, job=work)
+    for problem in (None, "5 inputs per day"):
+        desk.clock.advance(HOUR_S)
+        firing.submit_due(desk.database)
+        shown = read(desk).problem
+        assert shown is None if problem is None else problem in shown
+    assert len(jobs_of(desk)) == 1 + 2  # one job with two tasks
+
+
 def test_a_paused_schedule_submits_nothing_until_it_is_resumed(desk: Desk) -> None:
     assert create(desk, paused=True).next_at is None
     desk.clock.advance(HOUR_S)

@@ -8,6 +8,7 @@ import pytest
 from pydantic import ValidationError
 from tests.support.queue_desk import Desk
 
+from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import JobCreate
 from marey_schemas.queue.scripts import Script, ScriptCreate, ScriptRunCreate, is_allowed, read_repositories
 from marey_server.errors import (
@@ -109,6 +110,15 @@ def test_wrong_values_are_refused_at_submission(desk: Desk, values: dict[str, An
         run(desk, **values)
     assert refused.value.errors[0].pointer.startswith("/params/values/")
     assert listed(desk, "created_at") == []
+
+
+def test_a_run_is_committed_as_its_request_says(desk: Desk) -> None:
+    outputs = {"copy": {"kind": "clip", "format": "bvh"}, "fields": {"kind": "fields"}}
+    register(desk, argv=[*MEASURE["argv"], "{output:copy}"], outputs=outputs)
+    request = ScriptRunCreate(values={"size": 2}, into="made", commit=OutputsCommit(dataset="gaits"))
+    with pytest.raises(InvalidProblem) as refused:
+        desk.database.write(desk.user, runs.run_script, "lab", "measure", request)
+    assert [one.pointer for one in refused.value.errors] == ["/commit/dataset"]
 
 
 def test_a_job_may_not_bring_its_own_declaration(desk: Desk) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import mmap
 import os
 import socket
 import subprocess
@@ -29,7 +30,7 @@ from marey_worker.scripts.checkout import FetchFailed
 from marey_worker.scripts.confinement import landlock_version
 from marey_worker.scripts.fields import read_fields
 from marey_worker.scripts.files import OUTPUTS, collect
-from marey_worker.scripts.guard import LOG_BYTES, fault_of_files
+from marey_worker.scripts.guard import LOG_BYTES, fault_of_files, nameless_bytes
 
 pytestmark = pytest.mark.skipif(landlock_version() == 0, reason="scripts need Linux with Landlock")
 
@@ -365,3 +366,26 @@ def test_a_program_of_the_commit_runs_without_a_shell(repository: Repository) ->
     result = repository.run("", values, argv=argv, parameters={"text": {"type": "text"}})
     assert result["fields"] == {"answer": 42, "name": "x", "good": True}
     assert result["values"] == values
+
+
+@pytest.mark.parametrize("by_root", [True, False])
+def test_a_memory_file_counts_while_it_is_mapped_and_its_descriptor_is_closed(
+    monkeypatch: pytest.MonkeyPatch, *, by_root: bool
+) -> None:
+    def refuse(path: Any, **options: Any) -> os.stat_result:
+        if not by_root and "map_files" in str(path):
+            raise PermissionError(path)
+        return real(path, **options)
+
+    real = os.stat
+    monkeypatch.setattr(os, "stat", refuse)
+    this, size = [psutil.Process()], 8 * 2**20
+    before = nameless_bytes(this)
+    file = os.memfd_create("kept")
+    os.write(file, bytes(size))
+    kept = mmap.mmap(file, size)
+    os.close(file)
+    kept.madvise(mmap.MADV_DONTNEED)  # so that the pages do not count as memory of the process
+    assert nameless_bytes(this) - before >= size
+    kept.close()
+    assert nameless_bytes(this) - before < size

@@ -17,7 +17,7 @@ import signal
 import stat
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
@@ -213,7 +213,7 @@ class _Watch:
         if sum(map(_resident, family)) > order.memory_mb * MIB:
             return f"it used more than {order.memory_mb} MiB of memory"
         if time.monotonic() > self._measure_at:
-            fault = fault_of_files(Path(order.folder), _nameless_files(family), order.written_mb)
+            fault = fault_of_files(Path(order.folder), nameless_bytes(family), order.written_mb)
             self._measure_at = time.monotonic() + MEASURE_EVERY_S
             if fault is not None:
                 return fault
@@ -260,9 +260,16 @@ def _resident(one: psutil.Process) -> int:
         return 0
 
 
-def _nameless_files(family: Iterable[psutil.Process]) -> int:
-    """Return how many bytes the open files take that have no name any more, or never had one (memory files)."""
+def nameless_bytes(family: Collection[psutil.Process]) -> int:
+    """Return how many bytes files take that have no name any more, or never had one (memory files).
+
+    These are files that processes have opened or mapped; a mapped file exists even if its descriptor is closed. Only
+    root may ask for the size of such a file; for other users, a file counts up to the end of its mapped part.
+    """
     sizes: dict[tuple[int, int], int] = {}
+    for one in family:
+        for file, size in _mapped_files(one.pid):
+            sizes[file] = max(size, sizes.get(file, 0))
     for one in family:
         try:
             descriptors = os.listdir(f"/proc/{one.pid}/fd")
@@ -278,12 +285,31 @@ def _nameless_files(family: Iterable[psutil.Process]) -> int:
     return sum(sizes.values())
 
 
-def fault_of_files(folder: Path, nameless_bytes: int, written_mb: int) -> str | None:
+def _mapped_files(pid: int) -> Iterator[tuple[tuple[int, int], int]]:
+    """Yield the device and inode of each nameless file that a process has mapped, and its bytes."""
+    try:
+        lines = Path(f"/proc/{pid}/maps").read_text(errors="replace").splitlines()
+    except OSError:
+        return  # it has ended
+    for line in lines:
+        addresses, _, offset, device, inode, *path = line.split(maxsplit=5)
+        if inode == "0" or not (path and path[0].endswith(" (deleted)")):
+            continue
+        first, last = (int(one, 16) for one in addresses.split("-"))
+        major, minor = (int(one, 16) for one in device.split(":"))
+        try:
+            size = os.stat(f"/proc/{pid}/map_files/{first:x}-{last:x}").st_blocks * BLOCK_BYTES
+        except OSError:
+            size = int(offset, 16) + last - first
+        yield (os.makedev(major, minor), int(inode)), size
+
+
+def fault_of_files(folder: Path, nameless: int, written_mb: int) -> str | None:
     """Return why the files below a folder are too large, too many or out of sight, or None; links are not followed.
 
-    `nameless_bytes` is what files without a name take in addition.
+    `nameless` is the number of bytes that files without a name take in addition.
     """
-    total, count, waiting = nameless_bytes, 0, [(str(folder), 0)]
+    total, count, waiting = nameless, 0, [(str(folder), 0)]
     while waiting:
         path, depth = waiting.pop()
         try:

@@ -17,7 +17,7 @@ from marey_client.cli.datasets.combining import (
 )
 from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, parse, short
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.invocation import AsJson, connect, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 from marey_schemas.datasets.proposal_states import CheckState, ProposalState, Verdict
 from marey_schemas.kinds import Kind
@@ -261,6 +261,8 @@ def merge(
     --ours, --theirs or --base, or resolved by a commit to the source. The exit status is 1 while a conflict is left.
     """
     at = parse(place)
+    if withdraw:
+        refuse_ignored(context, "with --withdraw", "message", "commit", "ours", "theirs", "base", "when_green")
     with connect(context) as marey:
         handle = at.on(marey).proposals.at(number)
         if withdraw:

@@ -279,10 +279,10 @@ def checkout(
         return print_json(found)
     named = {name: getattr(found, name) for name in ("added", "removed", "moved", "changed")}
     counts = ", ".join(f"{count:,} {name}" for name, count in named.items() if count)
-    return print_message(
-        f"the folder has {found.taken:,} of {counted(found.entries, 'entry')} of {short(found.commit)} now: "
-        f"{counts or 'nothing differed'}"
-    )
+    content = short(found.commit)
+    if found.taken is not None and found.entries is not None:
+        content = f"{found.taken:,} of {counted(found.entries, 'entry')} of {content}"
+    return print_message(f"the folder has {content} now: {counts or 'nothing differed'}")
 
 
 def _pairs(one: Commit) -> list[tuple[str, object]]:

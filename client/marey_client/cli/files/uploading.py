@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.terminal.failures import Refused
+from marey_client.cli.terminal.failures import Refused, WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, progress
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
@@ -52,6 +52,8 @@ def upload(
     from marey_schemas.options.imports import ImportOptions
 
     if left_handed:
+        if options.get("handedness", "left") != "left":
+            raise WrongUsage("--left-handed and --handedness right contradict each other; give only one of them")
         options["handedness"] = "left"
     found = find_files(places)
     if found.left_out:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from marey_client.cli.terminal.failures import WrongUsage, interrupted_by_sigterm
-from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.invocation import AsJson, connect, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, print_table, progress
 
 if TYPE_CHECKING:
@@ -56,6 +56,8 @@ def load(
     jobs, and no others, through the REST API; they run in this command. The test takes processor time of the server
     from other users. Stop it with Ctrl-C. For administrators, the output shows what the server used.
     """
+    if other_workers:
+        refuse_ignored(context, "with --other-workers", "workers", "work_ms")
     plan = _plan(rates, seconds, replicates, 0 if other_workers else workers, work_ms, seed)
     with connect(context) as marey, interrupted_by_sigterm():
         _measure(marey, plan, as_json)

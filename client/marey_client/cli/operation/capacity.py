@@ -1,30 +1,21 @@
-"""Commands `capacity`, which computes what an amount of work needs, and `bench costs`, which measures and predicts."""
+"""Command `capacity`, which computes what an amount of work needs."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from marey_client.cli.operation.bench import Seed, WorkMs, bench
-from marey_client.cli.terminal.failures import WrongUsage, interrupted_by_sigterm
 from marey_client.cli.terminal.invocation import AsJson
-from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table, progress
+from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 
-if TYPE_CHECKING:
-    from marey_client.load.calibrating import Calibration
-
-CHECKED = "2,8"
-MOST_CHECKED = 64
 MOST = 10**15
 """Greatest amount of anything; infinity and numbers near the end of the range of floats have no sensible answer."""
-FURTHER = 32
-"""Number of workers for which jobs per second are predicted and not measured."""
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module; `bench costs` is registered with the group `bench`."""
+    """Register the command of this module."""
     app.command()(capacity)
 
 
@@ -79,96 +70,6 @@ def capacity(
     measured = found["measured"]
     print_message(f"costs measured on {measured['date']}: {measured['machine']}; {measured['load']}")
     return None
-
-
-@bench.command("costs")
-def measure_costs(
-    database_url: Annotated[
-        str | None, typer.Option(help="URL of an empty Postgres database; default: an SQLite file.")
-    ] = None,
-    workers: Annotated[str, typer.Option(help="Numbers of workers to predict and to measure.")] = CHECKED,
-    rounds: Annotated[int, typer.Option(min=1, max=20, help="Number of rounds; in each, all numbers take turns.")] = 5,
-    work_ms: WorkMs = 0.0,
-    seed: Seed = 0,
-    as_json: AsJson = False,
-) -> None:
-    """Measure the costs of a job on a new server, predict jobs per second from them, and compare with measurements.
-
-    The costs come from runs with 1, 4 and 16 workers. A simulation of the queue predicts the jobs per second of
-    other numbers of workers, which are measured in the same rounds. The server is removed at the end.
-    """
-    from dataclasses import asdict
-
-    from marey_client import embedded
-    from marey_client.load.calibrating import ALONE, CROWDED, SOME, calibrate
-    from marey_client.load.own_server import own_server
-
-    counts = _counts(workers, (ALONE, SOME, CROWDED))
-    if database_url is not None:
-        embedded.database("require_empty", data=None, database_url=database_url)
-    with interrupted_by_sigterm(), own_server(database_url) as marey, progress() as advance:
-        found = calibrate(
-            marey, counts, rounds=rounds, work_s=work_ms / 1000, on_drain=lambda what: advance(what, 0, None)
-        )
-    known = (SOME, found.some_per_s)
-    predicted = embedded.predict_jobs(_job_costs(found), known, (*counts, FURTHER), found.work_s, seed)
-    if as_json:
-        print_json({**asdict(found), "predicted": predicted, "difference": _differences(found, predicted)})
-    else:
-        _print(found, predicted)
-
-
-def _counts(text: str, used: tuple[int, ...]) -> tuple[int, ...]:
-    """Return numbers of workers. Raises `WrongUsage` if one is not valid, or used to measure the costs."""
-    try:
-        counts = tuple(int(one) for one in text.split(","))
-    except ValueError:
-        counts = ()
-    if not counts or not all(1 < count <= MOST_CHECKED and count not in used for count in counts):
-        raise WrongUsage(
-            f"--workers {text}: give numbers from 2 to {MOST_CHECKED} with commas between them, such as {CHECKED}; not "
-            f"{', '.join(map(str, used))}, from which the costs are measured"
-        )
-    return counts
-
-
-def _job_costs(found: Calibration) -> dict[str, float]:
-    """Return the costs of a job, without those of the database, which a simulation of the queue does not need."""
-    return {
-        "claim_s": found.claim_s, "complete_s": found.complete_s, "busy_s": found.busy_s,
-        "variation": found.variation, "database_s": 0.0, "database_bytes": 0.0,
-    }  # fmt: skip
-
-
-def _differences(found: Calibration, predicted: dict[int, float]) -> dict[int, float]:
-    """Return predicted over measured jobs per second, minus 1, by number of workers."""
-    return {count: predicted[count] / measured - 1 for count, measured in found.checked.items()}
-
-
-def _print(found: Calibration, predicted: dict[int, float]) -> None:
-    differences = _differences(found, predicted)
-    rows = [
-        (
-            count,
-            f"{expected:.1f}",
-            f"{found.checked[count]:.1f}" if count in differences else "",
-            f"{100 * differences[count]:+.1f} %" if count in differences else "",
-        )
-        for count, expected in predicted.items()
-    ]
-    columns = ("workers", "predicted jobs/s", "measured jobs/s", "difference")
-    print_table(columns, rows, right=columns)
-    print_pairs(
-        [
-            ("claim", f"{1e3 * found.claim_s:.2f} ms"),
-            ("completion", f"{1e3 * found.complete_s:.2f} ms"),
-            ("variation of requests", f"{found.variation:.2f}"),
-            ("work", f"{1e3 * found.work_s:.2f} ms"),
-            ("server occupied", f"{1e3 * found.busy_s:.2f} ms per job"),
-            ("processor time", f"{1e3 * found.processor_s:.2f} ms per job"),
-            ("database", f"{found.database_bytes:,.0f} bytes per job"),
-        ]
-    )
 
 
 def _percent(share: float) -> str:

@@ -48,6 +48,9 @@ def create(
     job: JobFile,
     timezone: TimeZone = "UTC",
     overlap: Overlapping = False,
+    paused: Annotated[
+        bool, typer.Option("--paused", help="Submit no jobs until `marey schedule change --resume`.")
+    ] = False,
     description: Description = "",
     as_json: AsJson = False,
 ) -> None:
@@ -61,9 +64,10 @@ def create(
     wanted = JobCreate.model_validate(read_json(job))
     with connect(context) as marey:
         made = marey.project(project).schedules.create(
-            name, cron, wanted, timezone=timezone, overlapping=overlap, description=description
+            name, cron, wanted, timezone=timezone, overlapping=overlap, paused=paused, description=description
         )
-    return print_json(made) if as_json else print_message(f"{name} submits its first job at {_next(made)}")
+    first = "is paused" if made.paused else f"submits its first job at {_next(made)}"
+    return print_json(made) if as_json else print_message(f"{name} {first}")
 
 
 @schedule.command("ls")

@@ -11,9 +11,10 @@ from marey_client.cli.addresses import Address
 from marey_client.cli.queue.comparing import ScriptName, compare
 from marey_client.cli.queue.jobs import input_of_kind
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.following import Into, Wait, follow
-from marey_client.cli.terminal.invocation import AsJson, ProjectName, connect
+from marey_client.cli.terminal.following import SCRIPT_RUN, Into, Wait, follow, print_commit
+from marey_client.cli.terminal.invocation import AllowExpiredConsent, AsJson, ProjectName, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
+from marey_client.cli.terminal.schema_options import Chosen, add_command
 from marey_client.cli.terminal.typed_values import assignment, json_or_text, read_json
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ OWN_COLUMNS = ("job", "state", "commit", "seed", "author", "created_at", "finish
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
+    add_command(script, run, job=SCRIPT_RUN)
     app.add_typer(script, name="script")
 
 
@@ -101,11 +103,11 @@ def show(context: typer.Context, project: ProjectName, name: ScriptName, as_json
     return print_table(("", "name", "type", "default", "meaning"), rows)
 
 
-@script.command("run")
 def run(
     context: typer.Context,
     project: ProjectName,
     name: ScriptName,
+    job: Chosen,
     values: Annotated[
         list[str] | None, typer.Option("--value", help="Value of a parameter as name=value; may be repeated.")
     ] = None,
@@ -114,7 +116,7 @@ def run(
         typer.Option("--input", help="Input as name=folder or name=folder/item[@revision]; may be repeated."),
     ] = None,
     into: Into = "",
-    seed: Annotated[int, typer.Option(min=0, help="Value of MAREY_SEED in the environment of the script.")] = 0,
+    allow_expired_consent: AllowExpiredConsent = None,
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
@@ -132,18 +134,20 @@ def run(
         for key, text in map(assignment, values or ()):
             is_text = key in declared.parameters and declared.parameters[key].type == "text"
             given[key] = text if is_text else json_or_text(text)
-        job = handle.run(
+        submitted = handle.run(
             given,
             inputs={role: tuple(some) if specs[role].many else some[-1] for role, some in found.items()},
             into=into.strip("/"),
-            seed=seed,
+            allow_expired_consent=allow_expired_consent,
+            **job,
         )
-        ended = follow(marey, job, wait=wait, as_json=as_json)
+        ended = follow(marey, submitted, wait=wait, as_json=as_json)
     if ended is None:
         return None
     if as_json:
         return print_json(ended)
     print_message(f"{ended.id} {ended.state}")
+    print_commit(ended)
     return print_pairs((ended.result or {}).get("fields", {}).items())
 
 

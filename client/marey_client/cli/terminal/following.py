@@ -49,12 +49,15 @@ class _CommittingJob(OptionsOf):
 
     @property
     def _job(self) -> OptionsOf:
-        return OptionsOf(self.model, only=self.only)
+        return OptionsOf(self.model, short=self.short, only=self.only)
 
 
 FINDINGS_JOB = OptionsOf("marey_schemas.queue.jobs:JobCreate", only=("priority", "cache"))
 JOB = _CommittingJob("marey_schemas.queue.jobs:JobCreate", only=("priority", "cache"))
 SEEDED_JOB = _CommittingJob("marey_schemas.queue.jobs:JobCreate", only=("seed", "priority", "cache"))
+SCRIPT_RUN = _CommittingJob(
+    "marey_schemas.queue.scripts:ScriptRunCreate", short={"message": "-m"}, only=("seed", "message")
+)
 
 Sources = Annotated[
     list[str],

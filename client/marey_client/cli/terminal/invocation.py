@@ -58,6 +58,19 @@ def credential_of(context: typer.Context) -> Credential:
     return resolve(given.server, given.token_file)
 
 
+def refuse_ignored(context: typer.Context, when: str, *names: str) -> None:
+    """Raise `WrongUsage` if the user has given an option that would have no effect.
+
+    `when` says with or without which other option it has no effect; `names` are the names of parameters.
+    """
+    from marey_client.cli.terminal.failures import WrongUsage
+
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name) if parameter.name in names else None
+        if source is not None and source.name == "COMMANDLINE":
+            raise WrongUsage(f"{parameter.opts[0]} has no effect {when}; leave it out")
+
+
 @contextmanager
 def connect_other(url: str | None, token_file: Path | None, first: Marey) -> Iterator[Marey]:
     """Return a connection to the server at `url`, or, without `url`, the given connection to the first server."""

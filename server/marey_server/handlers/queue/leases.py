@@ -27,9 +27,9 @@ from marey_server.errors import BadRequestProblem
 from marey_server.http.declarations import Access, Bytes, RequestBody, reads, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
-from marey_server.store.jobs import completion, logs, queue, reaper, staging
+from marey_server.store.jobs import completion, logs, queue, staging
 from marey_server.store.jobs.staging import PreparedOutput
-from marey_server.store.monitoring.workers import list_workers
+from marey_server.store.monitoring.workers import claim_and_remember, list_workers
 from marey_server.store.wakeups import wakeups, work_topic
 
 LOOK_FOR_WORK_S = 15.0
@@ -48,14 +48,14 @@ class Leases(Resource):
     @writes(access=Access.WORKER, scope="work", body=ClaimRequest, answer=LeaseList, reserved=True)
     async def post(self, body: ClaimRequest) -> Reply:
         """Claim jobs; if there are none, wait for jobs up to `wait_s` seconds. A lease that is not renewed expires."""
+        services = self.services
         loop = asyncio.get_running_loop()
         deadline = loop.time() + body.wait_s
         with wakeups.listen([work_topic(kind) for kind in body.kinds]) as listener:
             while True:
                 leases = await self.change(
-                    reaper.claim_after_reaping, body, self.services.start_grace, self.services.queue_policy
+                    claim_and_remember, body, services.worker_memory, services.start_grace, services.queue_policy
                 )
-                self._remember(body)
                 left_s = deadline - loop.time()
                 self.uneventful = not leases
                 if leases or left_s <= 0:
@@ -63,11 +63,6 @@ class Leases(Resource):
                 await listener.wait(min(left_s, LOOK_FOR_WORK_S))
                 if not self.is_awaited():  # claim nothing for a caller that has gone
                     return Reply(LeaseList())
-
-    def _remember(self, claim: ClaimRequest) -> None:
-        """Remember, in memory only, that the worker has claimed jobs."""
-        if self.principal is not None:
-            self.services.worker_memory.hear(self.principal.token_id, claim)
 
 
 class Workers(Resource):

@@ -35,7 +35,7 @@ from marey_server.store.database.clock import DAY_US, datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.ids import new_id
 from marey_server.store.jobs.fencing import AUTHOR_MAY_RUN, RUNNING, lease_lost
-from marey_server.store.quotas import require_room
+from marey_server.store.quotas.counting import require_room
 from marey_server.store.tables import attempt, job, token, user
 from marey_server.store.transaction import Transaction
 

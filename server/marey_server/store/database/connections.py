@@ -17,6 +17,7 @@ import time
 from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import sqlalchemy
@@ -279,6 +280,14 @@ class Database:
     def submit_move(self, function: Callable[[], T]) -> Future[T]:
         """Run a function that moves bytes to or from object storage in a thread; return the future of its result."""
         return self._moving.submit(SERVER, function)
+
+    def submit_signed_url(self, object_name: str, valid_s: int) -> Future[str]:
+        """Sign a URL with which anybody can read an object for `valid_s` seconds; return its future.
+
+        Only a database whose blobs are in object storage has such objects.
+        """
+        assert isinstance(self.blobs, ObjectBlobs)
+        return self.submit_move(partial(self.blobs.storage.signed_url, object_name, valid_s))
 
     async def notifications(self, channel: str) -> AsyncGenerator[None]:
         """Listen to a channel of Postgres: yield once when the server listens, and then after each notification.

@@ -16,7 +16,7 @@ from sqlalchemy import Row, select
 from marey_schemas.datasets.commits import Commit
 from marey_schemas.datasets.contents import ReceivedCommit, ReceivedRevision, StoredRevisions
 from marey_server.errors import ConflictProblem, InvalidProblem
-from marey_server.store import items, projects, quotas
+from marey_server.store import items, projects
 from marey_server.store.datasets.chunks import StoredChunks, store_chunks
 from marey_server.store.datasets.committing import (
     PreparedCommit,
@@ -37,6 +37,7 @@ from marey_server.store.items.facets import fill_facets
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges, last_purge, require_no_purge_since
+from marey_server.store.quotas import daily
 from marey_server.store.tables import dataset_commit, item, revision
 from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.records import (
@@ -169,7 +170,7 @@ def store_revisions(
     rights = rights_of_caller(tx, project_row)
     added = publish_contents(tx, project_row, placed, author_id=tx.principal.user_id, rights=rights)
     fill_facets(tx, project_row.id, local.facets)
-    quotas.count_sent(tx, tx.new_document_bytes)
+    daily.count_sent(tx, tx.new_document_bytes)
     return StoredRevisions(added=added)
 
 

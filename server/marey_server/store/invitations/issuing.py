@@ -23,7 +23,7 @@ from marey_server.store.database.clock import datetime_of
 from marey_server.store.ids import new_id
 from marey_server.store.invitations.validity import is_open, is_unspent, withdraw
 from marey_server.store.projects import ProjectRow
-from marey_server.store.quotas import require_room
+from marey_server.store.quotas.counting import require_room
 from marey_server.store.tables import invitation, project, user
 from marey_server.store.transaction import Transaction
 

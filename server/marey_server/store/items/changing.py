@@ -12,7 +12,7 @@ from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import FieldError
 from marey_server.errors import ConflictProblem, InvalidProblem
-from marey_server.store import collections, documents, projects, quotas
+from marey_server.store import collections, documents, projects
 from marey_server.store.database.violations import taken
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.folder_roles.rights import rights_of_caller
@@ -31,7 +31,8 @@ from marey_server.store.items.revisions import (
 )
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
-from marey_server.store.quotas import Held
+from marey_server.store.quotas import daily, holdings
+from marey_server.store.quotas.holdings import Held
 from marey_server.store.revs import ExpectedRev, change_row, is_expected, moved_on
 from marey_server.store.tables import item, item_tag
 from marey_server.store.transaction import Transaction
@@ -74,7 +75,7 @@ def create_item(tx: Transaction, project: str, kind: Kind, request: ItemCreate) 
     )  # fmt: skip
     rights = rights_of_caller(tx, project_row)
     made = publish(tx, project_row, [draft], author_id=tx.principal.user_id, rights=rights)[0]
-    quotas.count_sent(tx, tx.new_document_bytes)
+    daily.count_sent(tx, tx.new_document_bytes)
     return _shown(tx, project_row, kind, made.item)
 
 
@@ -109,8 +110,8 @@ def put_part(
         if write_head(tx, kind, item_id, parts, bodies, unchanged, added_bytes=added):
             made = NewRevision(item_id, found.head + 1, parts, message)
             write_revisions(tx, [made], author_id=tx.principal.user_id, job_id=None)
-            quotas.hold(tx, project_row.id, {found.creator_id: Held(stored_bytes=added)})
-            quotas.count_sent(tx, tx.new_document_bytes)
+            holdings.hold(tx, project_row.id, {found.creator_id: Held(stored_bytes=added)})
+            daily.count_sent(tx, tx.new_document_bytes)
             shown = _shown(tx, project_row, kind, item_id)
             tx.emit("item.revised", **event_of_item(project_row, shown), revision=shown.revision, job=None)
             return shown
@@ -136,7 +137,7 @@ def set_parts(
         raise moved_on(found.rev)
     made = NewRevision(item_id, found.head + 1, parts, message)
     write_revisions(tx, [made], author_id=tx.principal.user_id, job_id=None)
-    quotas.hold(tx, project_row.id, {found.creator_id: Held(stored_bytes=added)})
+    holdings.hold(tx, project_row.id, {found.creator_id: Held(stored_bytes=added)})
     shown = _shown(tx, project_row, kind, item_id)
     tx.emit("item.revised", **event_of_item(project_row, shown), revision=shown.revision, job=None)
 
@@ -195,7 +196,7 @@ def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expe
     gone = shown_items(tx, [found])[0]
     absent = _moved_away(kind, item_id)
     row = change_row(tx, item, which, {"deleted_us": tx.now_us}, expected_rev=expected_rev, absent=absent)
-    quotas.release(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
+    holdings.release(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
     tx.audit("item.deleted", about=gone.name, **event_of_item(project_row, gone))
 
 
@@ -220,7 +221,7 @@ def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, exp
     )
     with taken(name_taken):
         row = change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))
-    quotas.hold(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
+    holdings.hold(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
     shown = _shown(tx, project_row, kind, item_id)
     tx.audit("item.restored", about=shown.name, **event_of_item(project_row, shown))
     return shown

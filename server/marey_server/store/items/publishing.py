@@ -18,7 +18,7 @@ from marey_schemas.sizes import batched
 from marey_server import faults
 from marey_server.access.folder_rights import FolderRights
 from marey_server.errors import ConflictProblem, InvalidProblem
-from marey_server.store import collections, documents, quotas
+from marey_server.store import collections, documents
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.ids import new_id
 from marey_server.store.items import references
@@ -27,7 +27,8 @@ from marey_server.store.items.revisions import NewRevision, read_part_digests, w
 from marey_server.store.items.summaries import summarise
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
-from marey_server.store.quotas import Held
+from marey_server.store.quotas import holdings
+from marey_server.store.quotas.holdings import Held
 from marey_server.store.tables import item, item_tag, lineage, revision_part
 from marey_server.store.transaction import Transaction
 
@@ -70,7 +71,7 @@ def publish(
     publication = _Publication(tx, project_row, author_id, rights, job_id, refer_to_deleted)
     for together in _in_turns(_load_parts(tx, drafts)):
         publication.add(together)
-    quotas.hold(tx, project_row.id, publication.added)
+    holdings.hold(tx, project_row.id, publication.added)
     faults.point("publish.before_commit")
     tx.after_commit(lambda: faults.point("publish.after_commit"))
     return [publication.done[draft.name_in_batch] for draft in drafts]

@@ -26,7 +26,8 @@ from marey_server.store.jobs.fencing import WAITING
 from marey_server.store.jobs.inputs import MOST_INPUTS, Pin, PinnedInputs, items_by_id, pin, record_named_items
 from marey_server.store.jobs.layout import NewJob, Submission
 from marey_server.store.jobs.result_places import find_clash
-from marey_server.store.quotas import room_of
+from marey_server.store.quotas.counting import room_of
+from marey_server.store.quotas.daily import count_late
 from marey_server.store.tables import job
 from marey_server.store.transaction import Transaction, in_lists
 
@@ -54,6 +55,7 @@ def pin_late_inputs(tx: Transaction, ids: Sequence[str]) -> list[Ended]:
         try:
             head = _with_late_inputs(tx, row)
             _take_room(tx, head.submission, room)
+            _count_inputs(tx, head.submission, known=sum(map(len, row.inputs.values())))
             heads.append(head)
         except LateInputError as error:
             failure = failure_document(FailureReason.ERROR, error.code, str(error))
@@ -128,6 +130,24 @@ def _take_room(tx: Transaction, submission: Submission, room: dict[str, int]) ->
         )
         raise LateInputError(QuotaExceededProblem.code, detail)
     room[author_id] -= tasks
+
+
+def _count_inputs(tx: Transaction, submission: Submission, known: int) -> None:
+    """Count the inputs that a job gets now against the quota of its author; `known` were counted at the submission.
+
+    Raises `LateInputError` if the quota would be exceeded.
+    """
+    if submission.author_id is None:
+        return
+    more = layout.count_inputs(submission) - known
+    try:
+        count_late(tx, submission.author_id, more)
+    except QuotaExceededProblem as problem:
+        detail = (
+            f"The job and its tasks would get {more:,} inputs, more than its author may submit now (quota "
+            "`user_daily_inputs`). Retry the job later."
+        )
+        raise LateInputError(problem.error_code, detail) from problem
 
 
 def _write(tx: Transaction, heads: Sequence[NewJob], tasks: Sequence[NewJob]) -> None:

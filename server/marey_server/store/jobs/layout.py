@@ -146,6 +146,14 @@ def count_tasks(submission: Submission) -> int:
     return count if count > 1 else 0
 
 
+def count_inputs(submission: Submission) -> int:
+    """Return the number of inputs that the rows of a job and of its tasks contain."""
+    tasks = 0 if submission.unbound else count_tasks(submission)
+    count = sum(map(len, submission.pins.values()))
+    split = len(submission.pins.get(submission.kind.fan_out or "", ())) if tasks else 0
+    return split + (count - split) * (tasks + 1)
+
+
 def _spread(head: NewJob) -> list[NewJob]:
     """Make a job with several tasks a parent job, and return its tasks, which start together with it.
 

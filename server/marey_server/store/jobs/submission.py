@@ -39,12 +39,13 @@ from marey_server.store.jobs.events import emit_job_events, wake_workers
 from marey_server.store.jobs.exports import record_permission
 from marey_server.store.jobs.inputs import FoundItem, find_items, late_inputs, pin_inputs, record_named_items
 from marey_server.store.jobs.late_inputs import pin_late_inputs
-from marey_server.store.jobs.layout import NewJob, Submission, lay_out, naming, new_row
+from marey_server.store.jobs.layout import NewJob, Submission, count_inputs, lay_out, naming, new_row
 from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.jobs.result_places import find_clash, result_folders
 from marey_server.store.projects import ProjectRow, require
 from marey_server.store.purge_lock import hold_off_purges
-from marey_server.store.quotas import require_room
+from marey_server.store.quotas import daily
+from marey_server.store.quotas.counting import require_room
 from marey_server.store.scripts.registry import record_runs, resolve_params
 from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import Transaction, in_lists
@@ -115,13 +116,15 @@ def submit_checked(
 
     `upstream` maps the ids of existing jobs, on which the new jobs depend, to their states; these existing jobs must be
     locked. If a new job depends on another new job, this dependency counts as unfinished. Raises `ForbiddenProblem` if
-    the role of the caller is too low for an export. Also raises `ForbiddenProblem` if the caller may not write to the
-    folder of the results.
+    the role of the caller is too low for an export, or if the caller may not write to the folder of the results. Raises
+    `QuotaExceededProblem` for too many unfinished jobs, or too many inputs in a day.
     """
     rights = rights_of_caller(tx, project)
     for submitted in submissions:
         _require_folders(rights, submitted)
         record_permission(tx, project, submitted.id, submitted.kind, submitted.params, submitted.pins)
+    inputs = sum(map(count_inputs, submissions))
+    daily.require_submittable(tx, inputs)
     heads = [_head(project, one, upstream) for one in submissions]
     tasks, sources = lay_out(tx, [one for one in heads if not one.unbound])
     everything = [*heads, *tasks]
@@ -141,6 +144,7 @@ def submit_checked(
     bindable = [one.id for one in heads if one.unbound and one.state == "waiting" and not one.dependencies_left]
     ended += pin_late_inputs(tx, bindable)
     propagate_ends(tx, ended)
+    daily.count_submitted(tx, inputs)
     faults.point("submit.before_commit")
     tx.after_commit(lambda: faults.point("submit.after_commit"))
     if ended or sources or bindable or tasks:  # what was inserted has been changed since, or is not the whole of it

@@ -13,9 +13,9 @@ from typing import Any
 from sqlalchemy import ColumnElement, FromClause, Select, and_, exists, false, func, or_, select
 
 from marey_server.access.labels import keys_within
-from marey_server.store.jobs.claiming.limits import count_leased
 from marey_server.store.jobs.claiming.turns import projects_with_queued_jobs
 from marey_server.store.jobs.fencing import QUEUED, RUNNING
+from marey_server.store.quotas.running_jobs import count_leased
 from marey_server.store.tables import attempt, job, project, queue_share
 from marey_server.store.transaction import Transaction, in_lists
 

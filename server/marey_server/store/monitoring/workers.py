@@ -6,29 +6,36 @@ claims that it received; the attempts in the database show the workers of other 
 
 from __future__ import annotations
 
+import math
+import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import NamedTuple
 
 from sqlalchemy import and_, func, select
 
-from marey_schemas.lru import LruCache
-from marey_schemas.queue.worker_protocol import ClaimRequest
+from marey_schemas.queue.worker_protocol import ClaimRequest, Lease
 from marey_schemas.queue.workers import Worker
 from marey_schemas.sizes import KIB, MIB
 from marey_server.access.roles import require_administrator
+from marey_server.errors import TooManyRequestsProblem
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.jobs.fencing import RUNNING
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
+from marey_server.store.jobs.reaper import StartGrace, claim_after_reaping
 from marey_server.store.tables import attempt, job
 from marey_server.store.transaction import Transaction
 
 MOST_REMEMBERED = 5000
 MOST_BYTES = 16 * MIB
 LARGEST_CLAIM_BYTES = 64 * KIB
-"""Limits of the claims that a process remembers. Workers that have been silent longest are forgotten first; a longer
-claim is not remembered."""
+"""Limits of the claims that a process remembers. If there are too many, the user with the most workers loses the one
+that has been silent longest; a longer claim is not remembered."""
+MOST_OF_USER = 2000
+"""Default of the greatest number of workers of one user that are alive, in one server process."""
 FORGOTTEN_AFTER_S = 24 * 3600.0
 ALIVE_S = 60.0
 """Seconds after a claim in which a worker counts as alive. Workers claim again at least every 30 seconds, or every 15
@@ -56,32 +63,107 @@ class HeardWorker:
         return self.age_s <= ALIVE_S
 
 
-class WorkerMemory:
-    """Last claim of each worker that claimed jobs from this process."""
+class _Remembered(NamedTuple):
+    """Last claim of a worker, the time at which it was received, and the memory that it takes."""
 
-    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
+    at_s: float
+    claim: ClaimRequest
+    size_bytes: int
+
+
+class WorkerMemory:
+    """Last claim of each worker that claimed jobs from this process. It is thread-safe.
+
+    A worker chooses its name, so one user could send claims with any number of names. The number of workers of a user
+    that are alive is limited, and workers of other users are never forgotten for them. A worker that has been silent
+    for `ALIVE_S` does not count, so workers may be replaced by others with new names.
+
+    Parameters
+    ----------
+    clock_s : clock that never goes back, in seconds
+    most_of_user : greatest number of workers of one user that are alive
+    """
+
+    def __init__(self, clock_s: Callable[[], float] = time.monotonic, most_of_user: int = MOST_OF_USER) -> None:
         self._clock_s = clock_s
-        self._claims: LruCache[WorkerKey, tuple[float, ClaimRequest]] = LruCache(
-            max_entries=MOST_REMEMBERED,
-            max_bytes=MOST_BYTES,
-            largest_bytes=LARGEST_CLAIM_BYTES,
-            size_of=lambda remembered: _size_bytes(remembered[1]),
+        self._most_of_user = most_of_user
+        self._of_user: dict[str | None, OrderedDict[WorkerKey, _Remembered]] = {}
+        """Workers of each user, those that have been silent longest first."""
+        self._count = self._held_bytes = 0
+        self._lock = threading.Lock()
+
+    def require_place(self, user_id: str | None, token_id: str | None, worker: str) -> None:
+        """Raise `TooManyRequestsProblem` if the worker is not alive yet, and too many others of its user are."""
+        now_s = self._clock_s()
+        with self._lock:
+            workers = self._of_user.get(user_id, OrderedDict())
+            known = workers.get(WorkerKey(token_id, worker))
+            last = next(islice(reversed(workers.values()), self._most_of_user - 1, None), None)
+        if known is not None and now_s - known.at_s <= ALIVE_S:
+            return
+        if last is None or (left_s := ALIVE_S - (now_s - last.at_s)) < 0:
+            return
+        raise TooManyRequestsProblem(
+            f"You have {self._most_of_user:,} workers with different names that claimed jobs in the last {ALIVE_S:.0f} "
+            "seconds, and more are not allowed. Let workers keep their names, start fewer workers with more slots, or "
+            "ask the operator to raise the setting `user_workers`.",
+            code="too-many-workers",
+            headers={"Retry-After": str(max(1, math.ceil(left_s)))},
+            context={"quota": "user_workers", "limit": self._most_of_user},
         )
 
-    def hear(self, token_id: str | None, claim: ClaimRequest) -> None:
+    def hear(self, user_id: str | None, token_id: str | None, claim: ClaimRequest) -> None:
         """Remember an accepted claim."""
-        self._claims.put(WorkerKey(token_id, claim.worker), (self._clock_s(), claim))
+        size = _size_bytes(claim)
+        if size > LARGEST_CLAIM_BYTES:
+            return
+        key = WorkerKey(token_id, claim.worker)
+        with self._lock:
+            workers = self._of_user.setdefault(user_id, OrderedDict())
+            if key in workers:
+                self._subtract(workers.pop(key))
+            workers[key] = _Remembered(self._clock_s(), claim, size)
+            self._count += 1
+            self._held_bytes += size
+            while self._count > MOST_REMEMBERED or self._held_bytes > MOST_BYTES:
+                self._forget_one()
+
+    def _forget_one(self) -> None:
+        user_id, workers = max(self._of_user.items(), key=lambda one: len(one[1]))
+        self._subtract(workers.popitem(last=False)[1])
+        if not workers:
+            del self._of_user[user_id]
+
+    def _subtract(self, forgotten: _Remembered) -> None:
+        self._count -= 1
+        self._held_bytes -= forgotten.size_bytes
 
     def heard(self) -> list[HeardWorker]:
         """Return the remembered workers that were heard in the last `FORGOTTEN_AFTER_S`."""
         now_s = self._clock_s()
-        heard = [HeardWorker(key, claim, now_s - at_s) for key, (at_s, claim) in self._claims.items()]
+        with self._lock:
+            every = [one for workers in self._of_user.values() for one in workers.items()]
+        heard = [HeardWorker(key, last.claim, now_s - last.at_s) for key, last in every]
         return [one for one in heard if one.age_s <= FORGOTTEN_AFTER_S]
 
 
 def _size_bytes(claim: ClaimRequest) -> int:
     texts = (claim.worker, claim.version or "", *claim.kinds, *claim.labels, *claim.labels.values())
     return 512 + sum(64 + 4 * len(text) for text in texts)
+
+
+def claim_and_remember(
+    tx: Transaction, request: ClaimRequest, memory: WorkerMemory, grace: StartGrace, policy: QueuePolicy
+) -> list[Lease]:
+    """Claim jobs as `claim_after_reaping` does, and remember the worker.
+
+    Raises `TooManyRequestsProblem` if too many workers of the caller are alive.
+    """
+    caller = tx.principal
+    memory.require_place(caller.user_id, caller.token_id, request.worker)
+    leases = claim_after_reaping(tx, request, grace, policy)
+    memory.hear(caller.user_id, caller.token_id, request)
+    return leases
 
 
 class _Running(NamedTuple):

@@ -14,7 +14,6 @@ from pathlib import Path
 from sqlalchemy import Connection, bindparam, select, update
 
 from marey_server.store.blob_backings import CHUNK_BYTES, BlobBacking
-from marey_server.store.database.prepared import Prepared, padded
 from marey_server.store.object_storage.awaiting import (
     Carried,
     LookAgain,
@@ -33,10 +32,8 @@ Garbage collection deletes objects that no row names a day after their transfer 
 that a row is going to name.
 """
 
-_PLACES = Prepared(
-    select(blob.c.digest, blob.c.object_id, blob.c.size_bytes).where(
-        blob.c.digest.in_(bindparam("digests", expanding=True))
-    )
+_PLACES = select(blob.c.digest, blob.c.object_id, blob.c.size_bytes).where(
+    blob.c.digest.in_(bindparam("digests", expanding=True))
 )
 
 
@@ -126,7 +123,7 @@ class _InTransaction:
     ) -> list[tuple[WantedBytes, StoredObject | None]]:
         """Return the ranges, by default whole blobs, with the objects that contain them; None: they are local."""
         places = []
-        for row in _PLACES.run(connection, {"digests": padded(ranges)}) if ranges else ():
+        for row in connection.execute(_PLACES, {"digests": list(ranges)}).all() if ranges else ():
             start, stop = ranges[row.digest] or (0, row.size_bytes)
             wanted = WantedBytes(row.digest, start, stop, start == 0 and stop >= row.size_bytes)
             places.append((wanted, StoredObject(row.digest, row.object_id) if row.object_id else None))

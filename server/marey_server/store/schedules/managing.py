@@ -18,12 +18,13 @@ from marey_server.errors import (
     InvalidProblem,
     NotFoundProblem,
 )
-from marey_server.store import listing, projects, quotas
+from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.ids import new_id
 from marey_server.store.jobs.inputs import late_inputs
 from marey_server.store.jobs.submission import check_request
 from marey_server.store.projects import ProjectRow
+from marey_server.store.quotas import counting
 from marey_server.store.revs import ExpectedRev, change_row, is_expected, moved_on
 from marey_server.store.schedules.times import next_time_us
 from marey_server.store.tables import schedule, user
@@ -52,7 +53,7 @@ def create_schedule(tx: Transaction, project: str, request: ScheduleCreate) -> S
     row = projects.require(tx, project)
     _check_job(tx, row, request.job)
     due_us = next_time_us(request.cron, request.timezone, tx.now_us)
-    quotas.require_place(tx, row.id, schedule)
+    counting.require_place(tx, row.id, schedule)
     values = {
         "id": new_id("schedule"), "project_id": row.id, "name": request.name, "cron": request.cron,
         "timezone": request.timezone, "job": request.job.model_dump(mode="json", exclude_unset=True),

@@ -11,10 +11,11 @@ from marey_schemas.items import Page
 from marey_schemas.problems import FieldError
 from marey_schemas.queue.scripts import SCRIPT, Script, ScriptCreate, ScriptDeclaration, ScriptParams, is_allowed
 from marey_server.errors import ConflictProblem, ForbiddenProblem, InvalidProblem, NotFoundProblem
-from marey_server.store import listing, projects, quotas
+from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.ids import new_id
 from marey_server.store.projects import ProjectRow
+from marey_server.store.quotas import counting
 from marey_server.store.tables import script, script_run, user
 from marey_server.store.transaction import Transaction
 
@@ -47,7 +48,7 @@ def register_script(tx: Transaction, project: str, request: ScriptCreate, allowe
     if not is_allowed(request.repository, allowed):
         detail = "This server does not allow the repository; ask its operator to add it to `script_repositories`."
         raise _invalid("/repository", "repository-not-allowed", detail)
-    quotas.require_place(tx, row.id, script)
+    counting.require_place(tx, row.id, script)
     values: dict[str, Any] = {
         "id": new_id(SCRIPT), "project_id": row.id, "name": request.name, "description": request.description,
         "declaration": request.declaration.model_dump(mode="json"), "author_id": tx.principal.user_id,

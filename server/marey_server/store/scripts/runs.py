@@ -35,6 +35,7 @@ def run_script(tx: Transaction, project: str, name: str, request: ScriptRunCreat
         into=request.into,
         seed=request.seed,
         message=request.message,
+        commit=request.commit,
     )
     (made,) = submit(tx, project, (wanted,))
     return made

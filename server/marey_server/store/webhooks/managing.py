@@ -13,10 +13,11 @@ from marey_schemas.webhooks import NewWebhook, Webhook, WebhookChange, WebhookCr
 from marey_server.access.network_addresses import Network, literal_address, may_connect
 from marey_server.access.webhook_signatures import issue_secret
 from marey_server.errors import InvalidProblem, NotFoundProblem
-from marey_server.store import events, listing, projects, quotas
+from marey_server.store import events, listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.ids import new_id
 from marey_server.store.projects import ProjectRow
+from marey_server.store.quotas import counting
 from marey_server.store.tables import user, webhook, webhook_delivery
 from marey_server.store.transaction import Transaction
 
@@ -88,7 +89,7 @@ def create_webhook(tx: Transaction, project: str, request: WebhookCreate, networ
     """
     project_row = projects.require(tx, project)
     _require_public(request.url, networks)
-    quotas.require_place(tx, project_row.id, webhook)
+    counting.require_place(tx, project_row.id, webhook)
     secret = issue_secret()
     while events.number_events(tx) == events.NUMBERED_AT_ONCE:
         pass

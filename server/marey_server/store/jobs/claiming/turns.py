@@ -29,8 +29,8 @@ from sqlalchemy import (
 
 from marey_schemas.access import Role
 from marey_server.store.database.prepared import Prepared
-from marey_server.store.jobs.claiming.limits import count_leased, key_of_lock, name_of_lock
 from marey_server.store.jobs.fencing import QUEUED
+from marey_server.store.quotas.running_jobs import count_leased, key_of_lock, name_of_lock
 from marey_server.store.tables import job, member, project, queue_share
 from marey_server.store.transaction import Transaction
 

@@ -1,0 +1,1 @@
+"""Quotas: limits on what one user, or one project, may have."""

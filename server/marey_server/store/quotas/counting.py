@@ -1,0 +1,133 @@
+"""Quotas of things that are counted each time another one is added, such as tokens, jobs and schedules.
+
+The transaction that adds something counts it, so the count is always exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Select, Table, and_, exists, func, or_, select
+
+from marey_schemas.access import Role
+from marey_server.errors import QuotaExceededProblem
+from marey_server.store.invitations.validity import is_unspent
+from marey_server.store.tables import UNFINISHED, blob, invitation, job, member, project, token, upload, upload_chunk
+from marey_server.store.transaction import Transaction
+
+
+@dataclass(frozen=True, slots=True)
+class _Rule:
+    """Text about a quota in errors: its name, and what the user can do."""
+
+    noun: str
+    remedy: str
+
+
+_RULES = {
+    "user_uploads": _Rule("open uploads", "Finish or delete one of them, such as {oldest}."),
+    "user_upload_bytes": _Rule(
+        "bytes of uploads that are open, or whose pieces are not deleted yet",
+        "Finish or delete one of them, such as {oldest}.",
+    ),
+    "user_tokens": _Rule("valid tokens", "Revoke one that you do not need; see `marey token ls`."),
+    "user_projects": _Rule("projects that you own", "Delete one, or let another owner take over."),
+    "user_jobs": _Rule("unfinished jobs", "Wait until some have ended, or cancel some; see `marey job ls`."),
+    "user_invitations": _Rule(
+        "open invitations",
+        "Withdraw one that is not needed; see `marey member invitations` and `marey user invitations`.",
+    ),
+}
+
+
+def require_room(tx: Transaction, quota: str, more: int = 1) -> None:
+    """Check that the caller can add `more` things of the kind that a quota limits, without exceeding this quota.
+
+    `quota` is a field of `Quotas`, such as "user_uploads"; for quotas of bytes, `more` is a number of bytes. The server
+    and attempts of jobs have no quotas. Concurrent checks of one user run one after another. Raises
+    `QuotaExceededProblem`.
+    """
+    user_id = tx.principal.user_id
+    if user_id is None or tx.principal.kind != "user":
+        return
+    tx.lock(f"{quota} {user_id}")
+    used, limit = int(tx.execute(_used(tx, quota, user_id)).scalar_one()), getattr(tx.quotas, quota)
+    if used + more <= limit:
+        return
+    remedy = _remedy(tx, quota, user_id) if used else f"The operator can raise the setting `{quota}`."
+    raise exceeded("You have", quota, _RULES[quota].noun, used, limit, more, remedy)
+
+
+def _remedy(tx: Transaction, quota: str, user_id: str) -> str:
+    oldest = tx.execute(select(upload.c.id).where(*_open(user_id)).order_by(upload.c.created_us).limit(1)).scalar()
+    if quota == "user_upload_bytes" and oldest is None:
+        return "Wait until the server has deleted the pieces of finished uploads, which it does every hour."
+    return _RULES[quota].remedy.format(oldest=oldest)
+
+
+def room_of(tx: Transaction, quota: str, user_id: str) -> int:
+    """Return how many things of a kind a user may still add; concurrent writes may take the same room.
+
+    Unlike `require_room`, this concerns a user who is not the caller, and locks nothing.
+    """
+    return int(getattr(tx.quotas, quota) - tx.execute(_used(tx, quota, user_id)).scalar_one())
+
+
+def exceeded(
+    subject: str, quota: str, noun: str, used: int, limit: int, more: int, remedy: str
+) -> QuotaExceededProblem:
+    return QuotaExceededProblem(
+        f"{subject} {used:,} {noun}, the limit is {limit:,}, and this needs {more:,} more. {remedy}",
+        context={"quota": quota, "used": used, "limit": limit},
+    )
+
+
+def _used(tx: Transaction, quota: str, user_id: str) -> Select[Any]:
+    if quota == "user_uploads":
+        return select(func.count()).select_from(upload).where(*_open(user_id))
+    if quota == "user_upload_bytes":
+        taking_space = or_(and_(*_open(user_id)), and_(*_useless(user_id)))
+        return select(func.coalesce(func.sum(upload.c.length), 0)).where(taking_space)
+    if quota == "user_tokens":
+        valid = or_(token.c.expires_us.is_(None), token.c.expires_us > tx.now_us)
+        counted = token.c.user_id == user_id, ~token.c.session, token.c.rotation_hash.is_(None), valid
+        return select(func.count()).select_from(token).where(*counted)
+    if quota == "user_jobs":
+        return select(func.count()).select_from(job).where(job.c.author_id == user_id, UNFINISHED)
+    if quota == "user_invitations":
+        return select(func.count()).select_from(invitation).where(invitation.c.inviter_id == user_id, is_unspent(tx))
+    owned = select(func.count()).select_from(member.join(project, project.c.id == member.c.project_id))
+    return owned.where(member.c.user_id == user_id, member.c.role == Role.OWNER.value, project.c.deleted_us.is_(None))
+
+
+def _open(user_id: str) -> tuple[Any, ...]:
+    return upload.c.user_id == user_id, upload.c.finished_digest.is_(None), upload.c.dropped.is_(False)
+
+
+def _useless(user_id: str) -> tuple[Any, ...]:
+    """Return the conditions for finished uploads whose pieces no blob needs, and which are not deleted yet.
+
+    Their bytes were stored already, so they do not count towards `user_daily_bytes`.
+    """
+    has_pieces = exists().where(upload_chunk.c.upload_id == upload.c.id)
+    has_blob = exists().where(blob.c.upload_id == upload.c.id)
+    return upload.c.user_id == user_id, upload.c.finished_digest.is_not(None), has_pieces, ~has_blob
+
+
+def require_place(tx: Transaction, project_id: str, table: Table) -> None:
+    """Check that a project may have one more row of a table, which has the column `project_id`.
+
+    The quota is `project_<table>s`, such as `project_webhooks`. Concurrent checks of one project run one after another.
+    Raises `QuotaExceededProblem`.
+    """
+    noun, quota = f"{table.name}s", f"project_{table.name}s"
+    tx.lock(f"{noun} {project_id}")
+    limit = getattr(tx.quotas, quota)
+    used = tx.execute(select(func.count()).where(table.c.project_id == project_id)).scalar_one()
+    if used >= limit:
+        raise QuotaExceededProblem(
+            f"The project has {used:,} {noun}, and the limit is {limit:,}. Delete one that is not needed, or ask the "
+            f"operator to raise the setting `{quota}`.",
+            context={"quota": quota, "used": used, "limit": limit},
+        )
