@@ -21,6 +21,7 @@ from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
 from marey_schemas.queue.log_lines import LogForm, log_to_standard_error, usual_form
 from marey_schemas.queue.scripts import REPOSITORIES_VARIABLE, SCRIPT
 from marey_schemas.sizes import MIB
+from marey_worker.one_job import NamedJob, OneJobWorker
 from marey_worker.supervisor import Supervisor, WorkerOptions, default_cache, runnable_kinds
 
 BRIEF = Retries(tries=6)
@@ -38,8 +39,12 @@ def work(
     cache_mb: int | None = None,
     log_form: LogForm | None = None,
     attached: bool = False,
+    job: str | None = None,
+    task: int | None = None,
 ) -> None:
     """Run a worker until SIGTERM or SIGINT, then exit; the exit status is not 0 if a job was running at that time.
+
+    With `job`, the worker runs only this job, or the task of this job with the position `task`, and then ends.
 
     Without `log_form`, the variable `MAREY_LOG_FORM` sets the form of the log. If neither is given, log lines are text
     if standard error is a terminal, otherwise JSON. With `attached`, the worker also stops when standard input closes,
@@ -58,7 +63,12 @@ def work(
         slots=slots, kinds=_known_kinds(kinds), labels=labels,
         cache=cache or default_cache(os.environ), **given,
     )  # fmt: skip
-    supervisor = Supervisor(Transport(credential.url, credential.bearer, retries=BRIEF), options)
+    transport = Transport(credential.url, credential.bearer, retries=BRIEF)
+    supervisor: Supervisor | OneJobWorker
+    if job is None:
+        supervisor = Supervisor(transport, options)
+    else:
+        supervisor = OneJobWorker(transport, options, NamedJob(job, task))
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: threading.Thread(target=supervisor.stop).start())
     if attached:
@@ -140,7 +150,7 @@ def _known_kinds(names: tuple[str, ...]) -> tuple[str, ...]:
     return found or runnable
 
 
-def _stop_at_end_of_input(supervisor: Supervisor) -> None:
+def _stop_at_end_of_input(supervisor: Supervisor | OneJobWorker) -> None:
     while os.read(sys.stdin.fileno(), 4096):
         pass
     supervisor.stop()
