@@ -14,7 +14,7 @@ from marey_server.access.principal import SYSTEM
 from marey_server.errors import ApiProblem
 from marey_server.launchers.launcher import HEALTHY_AFTER_S, EngineError, LaunchedWorker, Launcher, WorkerRequest
 from marey_server.launchers.pool_size import PoolLimits, PoolSize
-from marey_server.launchers.rounds import Lead, ask, repeat
+from marey_server.launchers.rounds import ServerLead, ask, repeat
 from marey_server.process.worker_pools import WorkerPool
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import SERVER
@@ -55,7 +55,7 @@ class PoolKeeper:
         self._reach = _reach(pool)
         self._other_reaches = [_reach(other) for other in other_pools]
         self._clock_s = clock_s
-        self._lead = Lead(database, f"pool {pool.name}")
+        self._lead = ServerLead(database, f"pool {pool.name}")
         self._size = PoolSize(PoolLimits(pool.least, pool.most, pool.slots, shrink_after_s=pool.idle_s))
         self._unanswered: tuple[str, int] | None = None
         """Key and count of a start whose answer was lost."""

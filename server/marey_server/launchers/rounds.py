@@ -55,7 +55,7 @@ async def ask(call: Awaitable[T]) -> T:
         raise EngineError(f"the engine did not answer within {ENGINE_S:.0f} s") from None
 
 
-class Lead:
+class ServerLead:
     """Lead among the servers that share a database, in the form of a lease with a name."""
 
     def __init__(self, database: Database, name: str) -> None:

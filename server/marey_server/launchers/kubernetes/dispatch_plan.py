@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from marey_schemas.backoff import Backoff
-from marey_server.launchers.kubernetes.own_pod_jobs import Dispatch, Place, dispatch_of, job_of, places_of, pods_of
+from marey_server.launchers.kubernetes.own_pod_jobs import Dispatch, PodPlace, dispatch_of, job_of, places_of, pods_of
 from marey_server.launchers.kubernetes.states import is_over
 from marey_server.store.jobs.claiming.own_pods import WaitingJob
 
@@ -55,7 +55,7 @@ class DispatchPlan:
                 break
             parallel = 1 if size is None else min(size, room)
             job_id = one.id if size is None else str(one.parent)
-            number = max(numbers.get(job_id, 0), one.fence if size is None else 0) + 1
+            number = numbers.get(job_id, one.fence if size is None else 0) + 1
             starts.append(Started(one, Dispatch(job_id, number, one.fence, size, parallel)))
             room -= parallel
         return starts
@@ -76,11 +76,11 @@ class DispatchPlan:
         return {job_id for job_id, names in unclaimed.items() if any(now_s < self._next_s[name] for name in names)}
 
 
-def _places_of(one: WaitingJob) -> Iterable[Place]:
+def _places_of(one: WaitingJob) -> Iterable[PodPlace]:
     """Yield the places in which a job may run: of its own, and among the tasks of its parent."""
-    yield Place(one.id)
+    yield PodPlace(one.id)
     if one.parent is not None:
-        yield Place(one.parent, one.position)
+        yield PodPlace(one.parent, one.position)
 
 
 def _newest_numbers(jobs: Iterable[Mapping[str, Any]]) -> dict[str, int]:

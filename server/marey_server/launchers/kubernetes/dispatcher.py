@@ -33,7 +33,7 @@ from marey_server.launchers.kubernetes.own_pod_jobs import (
 from marey_server.launchers.kubernetes.states import end_of, group_pods, is_over, worker_names
 from marey_server.launchers.kubernetes.worker_jobs import WorkerJobs
 from marey_server.launchers.launcher import EngineError, WorkerRequest, read_options
-from marey_server.launchers.rounds import Lead, ask, repeat
+from marey_server.launchers.rounds import ServerLead, ask, repeat
 from marey_server.process.settings import Settings
 from marey_server.process.worker_pools import OwnPods
 from marey_server.store.database.connections import Database
@@ -68,7 +68,7 @@ class Dispatcher:
         self._database = database
         self._url = url
         self._clock_s = clock_s
-        self._lead = Lead(database, "own pods")
+        self._lead = ServerLead(database, "own pods")
         self._lead_until_s = float("-inf")
         key = database.read(SYSTEM, read_pod_key)
         self._jobs = WorkerJobs(self._options, own_pod_labels(self._options), lambda job: pod_token(key, job_of(job)))

@@ -39,7 +39,7 @@ class Dispatch:
 
 
 @dataclass(frozen=True)
-class Place:
+class PodPlace:
     """A job, or a task of a parent job, that a pod runs."""
 
     job: str
@@ -97,15 +97,15 @@ def dispatch_of(job: Mapping[str, Any]) -> tuple[int, int]:
     return int(stored.get("number", 0)), int(stored.get("fence", 0))
 
 
-def places_of(job: Mapping[str, Any]) -> Iterator[Place]:
+def places_of(job: Mapping[str, Any]) -> Iterator[PodPlace]:
     """Yield the places of a Job whose pods have not ended for good."""
     if is_over(job):
         return
     size, ended = _size_of(job), ended_indexes(job)
     if size is None:
-        yield Place(job_of(job))
+        yield PodPlace(job_of(job))
     else:
-        yield from (Place(job_of(job), index) for index in range(size) if index not in ended)
+        yield from (PodPlace(job_of(job), index) for index in range(size) if index not in ended)
 
 
 def pods_of(job: Mapping[str, Any]) -> int:

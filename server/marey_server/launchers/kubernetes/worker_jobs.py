@@ -7,6 +7,7 @@ import logging
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from typing import TypeVar
 
+from marey_server import faults
 from marey_server.launchers.kubernetes.cluster import Cluster, NoSuchObject, ObjectExists
 from marey_server.launchers.kubernetes.manifests import Manifest, token_secret
 from marey_server.launchers.kubernetes.options import ClusterOptions
@@ -84,6 +85,7 @@ class WorkerJobs:
             if not job["metadata"]["labels"].items() <= made["metadata"].get("labels", {}).items():
                 raise EngineError(f"the cluster has another Job with the name {name}") from None
         self.view.put_job(made)
+        faults.point("dispatch.before_token")
         await self._supply_token(made)
         return made
 
