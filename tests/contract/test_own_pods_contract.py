@@ -13,7 +13,6 @@ from tests.support.cluster.stub import IMAGE, running_cluster
 from tests.support.tiers import CLUSTER_IMAGE_VARIABLE, CLUSTER_VARIABLE
 
 
-@pytest.mark.slow
 class TestStubCluster(OwnPodContract):
     @pytest.fixture
     def cluster(self, tmp_path: Path) -> Iterator[NamedCluster]:
@@ -25,7 +24,6 @@ class TestStubCluster(OwnPodContract):
 
 
 @pytest.mark.cluster
-@pytest.mark.slow
 class TestClusterOfKubeconfig(OwnPodContract):
     @pytest.fixture
     def cluster(self) -> Iterator[NamedCluster]:

@@ -58,6 +58,14 @@ def finish(marey: Marey, job: Job, folder: Path) -> list[str | None]:
     return [attempt.outcome for attempt in marey.jobs.attempts(job.id)]
 
 
+def run_out_of_memory(cluster: StubCluster, marey: Marey, job_id: str, attempt: int) -> None:
+    """Wait until an attempt of a job has sent a heartbeat, and let the container of its pod have no memory left."""
+    cluster.wait_for(lambda: running(cluster) and marey.jobs.get(job_id).attempt == attempt, PATIENCE_S)
+    (pod,) = cluster.running_pods()
+    cluster.run(lambda: cluster.kubelet.kill(pod, "OOMKilled"))
+    cluster.wait_for(lambda: not running(cluster), PATIENCE_S)
+
+
 def running(cluster: StubCluster) -> bool:
     return bool(cluster.running_pods())
 
@@ -146,12 +154,8 @@ def test_a_job_that_exhausts_the_memory_of_every_pod_fails(
     folder = tmp_path / "job"
     with server.client() as marey:
         job = submit(marey, folder)
-        for number in range(3):
-            cluster.wait_for(lambda: (folder / "started").exists() and running(cluster), PATIENCE_S)
-            (folder / "started").unlink()
-            (pod,) = cluster.running_pods()
-            cluster.run(lambda pod=pod: cluster.kubelet.kill(pod, "OOMKilled"))
-            cluster.wait_for(lambda number=number: len(list(marey.jobs.attempts(job.id))) > number, PATIENCE_S)
+        for attempt in (1, 2, 3):
+            run_out_of_memory(cluster, marey, job.id, attempt)
         failed = marey.jobs.wait(job.id, timeout_s=PATIENCE_S, require_success=False)
         assert (failed.state, failed.attempt) == ("failed", 3)
         other = marey.jobs.submit("lab", JobCreate(kind="add", params={"a": 1, "b": 2}, resources=LARGE))
