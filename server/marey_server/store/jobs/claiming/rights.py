@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hmac
 
-from sqlalchemy import bindparam, select
+from sqlalchemy import select
 
 from marey_schemas.queue.jobs import JobState
 from marey_schemas.queue.own_pods import OWN_POD_LABEL
@@ -18,15 +18,10 @@ from marey_server.access.labels import first_outside
 from marey_server.access.principal import Principal
 from marey_server.errors import ForbiddenProblem
 from marey_server.store.credentials.server_key import read_server_key
-from marey_server.store.database.prepared import Prepared
 from marey_server.store.tables import job
 from marey_server.store.transaction import Transaction
 
 _POD = "mareypod_"
-_STATE = Prepared(select(job.c.state).where(job.c.id == bindparam("of_job")))
-_TASK = Prepared(
-    select(job.c.id).where(job.c.parent_id == bindparam("of_parent"), job.c.position == bindparam("at_position"))
-)
 
 
 def read_pod_key(tx: Transaction) -> bytes:
@@ -45,7 +40,7 @@ def resolve_pod_token(tx: Transaction, text: str) -> Principal | None:
     if not text.startswith(_POD) or not text.isascii():
         return None
     key = read_pod_key(tx)
-    if not hmac.compare_digest(text, pod_token(key, job_id)) or tx.first(_STATE, {"of_job": job_id}) is None:
+    if not hmac.compare_digest(text, pod_token(key, job_id)) or _read_state(tx, job_id) is None:
         return None
     token_key = hmac.digest(key, f"claims of {job_id}".encode(), "sha256")
     return Principal("pod", scopes=("work",), token_id=job_id, job_id=job_id, token_key=token_key)
@@ -84,13 +79,17 @@ def named_job(tx: Transaction, request: ClaimRequest) -> str | None:
     """Return the id of the job that a claim names; "" for a task that does not exist."""
     if request.task is None or request.job is None:
         return request.job
-    row = tx.first(_TASK, {"of_parent": request.job, "at_position": request.task})
-    return "" if row is None else str(row.id)
+    task = select(job.c.id).where(job.c.parent_id == request.job, job.c.position == request.task)
+    return tx.execute(task).scalar_one_or_none() or ""
 
 
 def state_of_named(tx: Transaction, request: ClaimRequest) -> JobState | None:
     """Return the state of the job that a claim names; None if there is no such job, or the caller may not know it."""
     if tx.principal.kind != "pod" and not tx.principal.administrator:
         return None
-    row = tx.first(_STATE, {"of_job": named_job(tx, request)})
-    return None if row is None else JobState(row.state)
+    return _read_state(tx, named_job(tx, request))
+
+
+def _read_state(tx: Transaction, job_id: str | None) -> JobState | None:
+    state = tx.execute(select(job.c.state).where(job.c.id == job_id)).scalar_one_or_none()
+    return None if state is None else JobState(state)
