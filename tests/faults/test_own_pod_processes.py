@@ -12,11 +12,14 @@ from tests.support.attached_worker import python_path
 from tests.support.cluster.dispatching import LARGE, OWN_IMAGE
 from tests.support.cluster.kubelet import MAREY
 from tests.support.cluster.stub import IMAGE, StubCluster, running_cluster
+from tests.support.git_repositories import committed
 from tests.support.server_process import QUICK_LEASES, ServerProcess
 
 from marey_client import Marey
+from marey_client.explanations import explain_job
 from marey_schemas.access import ProjectCreate
 from marey_schemas.queue.jobs import Job, JobCreate
+from marey_schemas.queue.scripts import ScriptCreate
 
 pytestmark = pytest.mark.timeout(900)
 
@@ -138,6 +141,31 @@ def test_a_stopped_pod_returns_its_job_and_counts_as_a_failure_of_the_pod(
         marey.jobs.cancel(again.id)
         assert marey.jobs.wait(again.id, timeout_s=PATIENCE_S, require_success=False).state == "cancelled"
         cluster.wait_for(lambda: not running(cluster), PATIENCE_S)
+    server.check_database()
+
+
+@pytest.mark.soak
+def test_a_script_with_an_image_runs_in_a_pod_with_this_image(
+    cluster: StubCluster, server: ServerProcess, tmp_path: Path
+) -> None:
+    code = "import json, sys; json.dump({'ran': 1}, open(sys.argv[1], 'w'))"
+    repository, commit = committed(tmp_path / "scripts", {"run.py": code})
+    server.environment["MAREY_SCRIPT_REPOSITORIES"] = json.dumps([repository])
+    cluster.kubelet.paused = True
+    server.start()
+    declared = {
+        "name": "train", "repository": repository, "commit": commit, "argv": ["python", "run.py", "{output:fields}"],
+        "outputs": {"fields": {"kind": "fields"}}, "limits": {"seconds": 60, "memory_mb": 512}, "image": OWN_IMAGE,
+    }  # fmt: skip
+    with server.client() as marey:
+        project = marey.create_project(ProjectCreate(name="lab"))
+        project.scripts.register(ScriptCreate.model_validate(declared))
+        job = project.scripts.at("train").run({}, into="trained")
+        cluster.wait_for(lambda: "its script names the image" in explain_job(marey, job.id)[0])
+        cluster.kubelet.paused = False
+        assert marey.jobs.wait(job.id, timeout_s=PATIENCE_S).result["fields"] == {"ran": 1}
+    (pod,) = cluster.all("pods")
+    assert pod["spec"]["containers"][0]["image"] == OWN_IMAGE
     server.check_database()
 
 
