@@ -29,7 +29,7 @@ from marey_server.launchers.kubernetes.options import ClusterOptions
 from marey_server.launchers.slurm import SlurmOptions
 from marey_server.process.observe import Metrics
 from marey_server.process.settings import Settings
-from marey_server.process.worker_pools import WorkerPool
+from marey_server.process.worker_pools import OwnPods, WorkerPool
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = Path(__file__).parent / "reference"
@@ -186,6 +186,9 @@ def settings_page() -> str:
         "`MAREY_POOLS` as a list of JSON objects. [Run workers on Slurm](../how-to/run-workers-on-slurm.md) and "
         "[Run Marey on Kubernetes](../how-to/run-on-kubernetes.md) have examples.\n\n"
         + _table(("setting", "default", "meaning"), _fields_of(WorkerPool))
+        + "## Own pods\n\nThe setting `own_pods` has these members, in `marey.toml` below a line `[own_pods]`, in "
+        "`MAREY_OWN_PODS` as a JSON object.\n\n"
+        + _table(("setting", "default", "meaning"), _fields_of(OwnPods))
         + "".join(
             f"## Options of the launcher {name}\n\nIn `launcher_options` for all pools, and in `options` of a pool.\n\n"
             + _table(("option", "default", "meaning"), _fields_of(options))

@@ -21,7 +21,7 @@ pytest_plugins = (
     "tests.support.s3_servers",
 )
 
-pytest.register_assert_rewrite("tests.support.launcher_contract")
+pytest.register_assert_rewrite("tests.support.launcher_contract", "tests.support.cluster.contract")
 
 MEMORY = Path("/dev/shm")
 ENOUGH_BYTES = 4 << 30

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 from marey_client.errors import Forbidden, Unauthenticated
 from marey_schemas.access import RunningJobs
 from marey_schemas.queue.jobs import Attempt, Job, JobState
+from marey_schemas.queue.own_pods import GPUS_LABEL, OWN_POD_LABEL
+from marey_schemas.queue.scripts import SCRIPT
 from marey_schemas.queue.workers import Worker
 
 if TYPE_CHECKING:
@@ -95,6 +97,11 @@ def _why_queued(
             f"queued: the project runs {limit.used} jobs, and its limit is {limit.allowed}; the job can start when "
             "fewer of them run. An administrator can change the limit (`marey project quota`)."
         )
+    if OWN_POD_LABEL in job.labels:
+        return (
+            f"queued: it runs in a pod of its own, {_why_own_pod(job)}. The server starts this pod in its cluster; "
+            "other workers never claim the job. If no pod starts, the log of the server says why."
+        )
     shown = " ".join(f"{name}={value}" for name, value in sorted(job.labels.items()))
     wanted = f"jobs of the kind {job.kind}" + (f" and has the labels {shown}" if shown else "")
     if workers and not any(_may_fit(worker, job) for worker in workers):
@@ -107,6 +114,15 @@ def _why_queued(
         f"queued: no worker that can run jobs of the kind {job.kind} in this project has asked for one; is "
         "`marey worker` running?"
     )
+
+
+def _why_own_pod(job: Job) -> str:
+    image = (job.params.get("declaration") or {}).get("image") if job.kind == SCRIPT else None
+    if image is not None:
+        return f"because its script names the image {image}"
+    if (gpus := job.labels.get(GPUS_LABEL)) is not None:
+        return f"because it needs {gpus} graphics processors"
+    return "because of its memory limit or its expected duration"
 
 
 def _may_fit(worker: Worker, job: Job) -> bool:

@@ -272,6 +272,7 @@ def connect_database(settings: Settings) -> Database:
         readers=settings.resolved_database_threads,
         blobs=_backing_of(settings),
         quotas=settings.quotas,
+        pod_rules=None if settings.own_pods is None else settings.own_pods.rules,
     )
 
 

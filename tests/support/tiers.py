@@ -21,6 +21,10 @@ from tests.support.database_fixtures import BACKENDS
 
 MOCAP_VARIABLE = "MAREY_TEST_MOCAP"
 """Environment variable with the path of the folder of real motion capture."""
+CLUSTER_VARIABLE = "MAREY_TEST_KUBECONFIG"
+"""Environment variable with the kubeconfig of a real cluster, which has a namespace `marey`."""
+CLUSTER_IMAGE_VARIABLE = "MAREY_TEST_CLUSTER_IMAGE"
+"""Environment variable with the image of the worker, named by its digest, as this cluster pulls it."""
 SLURM_PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch")
 SYSTEM_PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
 """Folders in which daemons are looked for, also by users whose `PATH` does not contain them."""
@@ -90,6 +94,10 @@ def _needs_slurm(item: pytest.Item) -> bool:
 
 def _needs_kubectl(item: pytest.Item) -> bool:
     return item.get_closest_marker("kubectl") is not None
+
+
+def _needs_cluster(item: pytest.Item) -> bool:
+    return item.get_closest_marker("cluster") is not None
 
 
 def _on_other_database(item: pytest.Item) -> bool:
@@ -197,6 +205,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         reasons = {f"need Slurm (tests/support/install_slurm.sh): no {', '.join(missing)}": _needs_slurm, **reasons}
     if shutil.which("kubectl") is None:
         reasons = {"need kubectl": _needs_kubectl, **reasons}
+    if unset := [name for name in (CLUSTER_VARIABLE, CLUSTER_IMAGE_VARIABLE) if name not in os.environ]:
+        reasons = {f"need a Kubernetes cluster ({' and '.join(unset)} not set)": _needs_cluster, **reasons}
     kept, gone = [], []
     for item in items:
         reason = next((reason for reason, applies in reasons.items() if applies(item)), None)

@@ -37,12 +37,12 @@ PLAIN_TEXT = "text/plain; charset=utf-8"
 _NONE: bytes = msgpack.packb(None)
 
 
-def claim(transport: Transport, request: ClaimRequest) -> tuple[Lease, ...]:
+def claim_from(transport: Transport, request: ClaimRequest) -> LeaseList:
     """Claim jobs. If the answer is lost, the request is repeated and gets the same leases."""
     response = transport.send(
         "POST", "/leases", content=as_json(request), repeatable=True, timeout_s=request.wait_s + 30.0
     )
-    return read_model(LeaseList, response).leases
+    return read_model(LeaseList, response)
 
 
 class AttemptApi:

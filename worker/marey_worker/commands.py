@@ -22,6 +22,7 @@ from marey_schemas.queue.log_lines import LogForm, log_to_standard_error, usual_
 from marey_schemas.queue.scripts import REPOSITORIES_VARIABLE, SCRIPT
 from marey_schemas.sizes import MIB
 from marey_schemas.tracing.export import closing, open_optional_tracer
+from marey_worker.one_job import NamedJob, OneJobWorker
 from marey_worker.supervisor import Supervisor, WorkerOptions, default_cache, runnable_kinds
 
 SERVICE = "marey-worker"
@@ -41,8 +42,12 @@ def work(
     cache_mb: int | None = None,
     log_form: LogForm | None = None,
     attached: bool = False,
+    job: str | None = None,
+    task: int | None = None,
 ) -> None:
     """Run a worker until SIGTERM or SIGINT, then exit; the exit status is not 0 if a job was running at that time.
+
+    With `job`, the worker runs only this job, or the task of this job with the position `task`, and then ends.
 
     Without `log_form`, the variable `MAREY_LOG_FORM` sets the form of the log. If neither is given, log lines are text
     if standard error is a terminal, otherwise JSON. With `attached`, the worker also stops when standard input closes,
@@ -62,13 +67,18 @@ def work(
         cache=cache or default_cache(os.environ), **given,
     )  # fmt: skip
     tracer = open_optional_tracer(SERVICE, os.environ)
-    supervisor = Supervisor(Transport(credential.url, credential.bearer, retries=BRIEF), options, tracer)
+    transport = Transport(credential.url, credential.bearer, retries=BRIEF)
+    worker: Supervisor | OneJobWorker
+    if job is None:
+        worker = Supervisor(transport, options, tracer)
+    else:
+        worker = OneJobWorker(transport, options, NamedJob(job, task), tracer)
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: threading.Thread(target=supervisor.stop).start())
+        signal.signal(number, lambda *_: threading.Thread(target=worker.stop).start())
     if attached:
-        threading.Thread(target=_stop_at_end_of_input, args=(supervisor,), name="attached", daemon=True).start()
+        threading.Thread(target=_stop_at_end_of_input, args=(worker,), name="attached", daemon=True).start()
     with closing(tracer):
-        status = supervisor.run()
+        status = worker.run()
     logging.shutdown()
     os._exit(status)  # threads that wait for work hold nothing
 
@@ -145,7 +155,7 @@ def _known_kinds(names: tuple[str, ...]) -> tuple[str, ...]:
     return found or runnable
 
 
-def _stop_at_end_of_input(supervisor: Supervisor) -> None:
+def _stop_at_end_of_input(supervisor: Supervisor | OneJobWorker) -> None:
     while os.read(sys.stdin.fileno(), 4096):
         pass
     supervisor.stop()

@@ -26,7 +26,7 @@ from marey_schemas.queue.worker_protocol import INTERRUPTED_STATUS, ClaimRequest
 from marey_schemas.tracing.export import Tracer
 from marey_worker import faults
 from marey_worker.attempt import RunningAttempt
-from marey_worker.attempt_api import AttemptApi, claim
+from marey_worker.attempt_api import AttemptApi, claim_from
 from marey_worker.attempt_limits import Stop
 from marey_worker.job_io.input_cache import InputCache
 from marey_worker.messages import Done, Failed
@@ -177,7 +177,7 @@ class Supervisor:
             claim_id=opened.id,
             version=version("marey"),
         )
-        return claim(opened.transport, wanted)
+        return claim_from(opened.transport, wanted).leases
 
     def _attempt(self, lease: Lease, child: ChildProcess, finisher: Executor) -> Future[None]:
         """Run a job; return a future that ends when the results are stored and the end of the job is reported.

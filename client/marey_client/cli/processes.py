@@ -98,6 +98,10 @@ def worker(
     log_form: Annotated[
         LogForm | None, typer.Option(help="Format of the log: text (the default at a terminal) or json.")
     ] = None,
+    job: Annotated[
+        str | None, typer.Option(help="Run only this job, then end; used by pods that the server starts for one job.")
+    ] = None,
+    task: Annotated[int | None, typer.Option(min=0, help="Run only the task of --job that has this position.")] = None,
 ) -> None:
     """Run a worker, which runs the jobs of a server until you stop the worker. The token must have the scope `work`."""
     if context.invoked_subcommand is not None:
@@ -115,6 +119,8 @@ def worker(
         cache=cache,
         cache_mb=cache_mb,
         log_form=log_form,
+        job=job,
+        task=task,
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 
+from marey_schemas.queue.own_pods import IMAGE_VARIABLE
 from marey_schemas.queue.scripts import REPOSITORIES_VARIABLE
 from marey_schemas.queue.worker_protocol import FAULT_VARIABLE
 
@@ -23,7 +24,9 @@ PASSED_ON_PREFIXES = ("CUDA_", "KMP_", "LC_", "MKL_", "NUMBA_", "OMP_", "OPENBLA
 """Prefixes of further variables that are passed on: settings of the interpreter and of numeric libraries."""
 EXTRA_VARIABLE = "MAREY_CHILD_VARIABLES"
 """Variable that lists further variables to pass on, separated by commas."""
-OWN_VARIABLES = frozenset({EXTRA_VARIABLE, FAULT_VARIABLE, REPOSITORIES_VARIABLE, "MAREY_LOG_FORM", "MAREY_LOG_LEVEL"})
+OWN_VARIABLES = frozenset(
+    {EXTRA_VARIABLE, FAULT_VARIABLE, IMAGE_VARIABLE, REPOSITORIES_VARIABLE, "MAREY_LOG_FORM", "MAREY_LOG_LEVEL"}
+)
 """Marey's own variables that are passed on; none is a secret."""
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Variables that limit the threads of numeric libraries."""

@@ -14,6 +14,7 @@ from marey_schemas.datasets.naming import MAIN, DatasetName, Version
 from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath, Message
 from marey_schemas.queue.commits import CommitConflict, JobCommit, OutputsCommit
+from marey_schemas.queue.own_pods import GPUS_LABEL, MOST_GPUS
 
 
 class JobState(StrEnum):
@@ -122,10 +123,22 @@ JobInput = ExistingInput | JobOutputsInput
 
 
 class Resources(Request):
-    """Limits of time and memory of one attempt to run a job."""
+    """Limits of time and memory of one attempt to run a job, and what else it needs."""
 
     time_limit_s: int = Field(3600, ge=1, le=7 * 86400)
     memory_limit_mb: int = Field(4096, ge=64, le=1_048_576)
+    gpus: int = Field(
+        0,
+        ge=0,
+        le=MOST_GPUS,
+        description=f"Number of graphics processors; the job then has the label `{GPUS_LABEL}`.",
+    )
+    expected_s: int | None = Field(
+        None,
+        ge=1,
+        le=7 * 86400,
+        description="Expected duration of the job. On a server with own pods, a long job gets one.",
+    )
 
 
 CacheMode = Literal["use", "refresh", "off"]

@@ -17,6 +17,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath, Message
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import InputSpec, JobInput, JobState, Resources
+from marey_schemas.queue.own_pods import Image
 from marey_schemas.sizes import GIB, MIB
 
 SCRIPT = "script"
@@ -195,6 +196,11 @@ class ScriptDeclaration(Request):
     inputs: dict[FieldName, ScriptInput] = Field(default_factory=dict, max_length=MOST_DECLARED)
     outputs: dict[FieldName, ScriptOutput] = Field(min_length=1, max_length=MOST_DECLARED)
     limits: ScriptLimits = ScriptLimits()
+    image: Image | None = Field(
+        None,
+        description="Container image in which the script runs, named by its digest; it contains a worker of Marey. The "
+        "server must allow it, and start pods of a job's own. null: the image of the worker.",
+    )
 
     @field_validator("commit", mode="before")
     @classmethod

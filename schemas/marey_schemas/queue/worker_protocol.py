@@ -41,6 +41,9 @@ class ClaimRequest(Request):
         None, max_length=64, description="Version of Marey that the worker runs, shown to administrators."
     )
     job: str | None = Field(None, description="Claim only this job.")
+    task: int | None = Field(
+        None, ge=0, le=1_000_000, description="Claim only the task of `job` that has this position."
+    )
     claim_id: str | None = Field(
         None,
         min_length=16,
@@ -134,6 +137,9 @@ class LeaseList(Answer):
     """Leases granted by a claim; empty if there was no work."""
 
     leases: tuple[Lease, ...] = ()
+    state: JobState | None = Field(
+        None, description="State of the job, if the claim names one and gets no lease; null if there is no such job."
+    )
 
 
 class Heartbeat(Request):

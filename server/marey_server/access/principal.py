@@ -16,10 +16,11 @@ class Principal:
     `scopes` are texts such as `write` or `write!project=walk`. The kind `attempt` is a worker that runs a job. Such a
     worker does not have the rights of a user, not even those of the job's author. It may read the inputs of the job and
     the documents to which these inputs refer. It may write only data of its attempt. After the end of the attempt
-    (`ended`), the worker may only repeat the request that ended the attempt.
+    (`ended`), the worker may only repeat the request that ended the attempt. The kind `pod` is a pod that was started
+    for the job `job_id`; it may only claim this job.
     """
 
-    kind: Literal["anonymous", "user", "attempt", "system"]
+    kind: Literal["anonymous", "user", "attempt", "pod", "system"]
     user_id: str | None = None
     user_name: str | None = None
     administrator: bool = False

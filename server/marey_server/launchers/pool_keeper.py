@@ -1,7 +1,4 @@
-"""Task that keeps the number of workers of a pool between its limits, as the queue needs them.
-
-An error of the engine, or of the database, never stops the server: it is logged, and the task tries again later.
-"""
+"""Task that keeps the number of workers of a pool between its limits, as the queue needs them."""
 
 from __future__ import annotations
 
@@ -9,35 +6,28 @@ import asyncio
 import logging
 import secrets
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TypeVar
 
 from marey_schemas.backoff import Backoff
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ApiProblem
 from marey_server.launchers.launcher import HEALTHY_AFTER_S, EngineError, LaunchedWorker, Launcher, WorkerRequest
 from marey_server.launchers.pool_size import PoolLimits, PoolSize
+from marey_server.launchers.rounds import ServerLead, ask, repeat
 from marey_server.process.worker_pools import WorkerPool
-from marey_server.store import leader
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import SERVER
 from marey_server.store.monitoring.demand import Demand, JobReach, read_demand
-
-T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
 ROUND_S = 10.0
 """Seconds between two rounds."""
-ENGINE_S = 60.0
-"""Greatest number of seconds that a call of an engine may take."""
 MOST_EXPLAINED = 10
 """Greatest number of ends in a round for which the engine is asked for the reason."""
-LEAD_TTL_US = 60_000_000
 VISIBLE_AFTER_S = 60.0
 """Seconds after a start for which a worker counts although the engine does not list it yet."""
-FAULT_PAUSES = Backoff(first_s=10.0, longest_s=300.0, jitter=0.25)
 START_PAUSES = Backoff(first_s=5.0, longest_s=600.0, jitter=0.25)
 QUIET_ENDS = ("finished", "stopped", "deadline", "preempted")
 """Reasons of ends that are logged as information, and that do not pause the next start."""
@@ -65,8 +55,7 @@ class PoolKeeper:
         self._reach = _reach(pool)
         self._other_reaches = [_reach(other) for other in other_pools]
         self._clock_s = clock_s
-        self._lead = f"pool {pool.name}"
-        self._holder = secrets.token_hex(8)
+        self._lead = ServerLead(database, f"pool {pool.name}")
         self._size = PoolSize(PoolLimits(pool.least, pool.most, pool.slots, shrink_after_s=pool.idle_s))
         self._unanswered: tuple[str, int] | None = None
         """Key and count of a start whose answer was lost."""
@@ -80,37 +69,24 @@ class PoolKeeper:
 
     async def keep(self) -> None:
         """Adjust the number of workers again and again, until the task is cancelled."""
-        faults = 0
-        while True:
-            try:
-                await self.adjust()
-                if faults:
-                    log.info("pool %s: the engine answers again", self._pool.name)
-                faults = 0
-            except (EngineError, ApiProblem) as error:
-                faults += 1
-                log.warning("pool %s: %s", self._pool.name, getattr(error, "detail", error))
-            except Exception:
-                faults += 1
-                log.exception("pool %s: its workers could not be adjusted", self._pool.name)
-            await asyncio.sleep(FAULT_PAUSES.delay_s(faults) if faults else ROUND_S)
+        await repeat(f"pool {self._pool.name}", self.adjust, ROUND_S)
 
     async def close(self) -> None:
         """Release the launcher, and let another server keep the pool."""
         try:
             await self._launcher.close()
             if self._launcher.outlives_server:
-                await self._write(leader.give_up_lead, self._lead, self._holder)
+                await self._lead.give_up()
         except (EngineError, ApiProblem) as error:
             log.warning("pool %s: %s", self._pool.name, getattr(error, "detail", error))
 
     async def adjust(self) -> None:
         """Start or stop workers once, if this process is the leader. Raises `EngineError` and `ApiProblem`."""
-        if self._launcher.outlives_server and not await self._leads():
+        if self._launcher.outlives_server and not await self._lead.take():
             self._size.forget()
             self._ended = None
             return
-        listed = await self._ask(self._launcher.list())
+        listed = await ask(self._launcher.list())
         await self._note_ends(listed)
         present = self._present(listed)
         demand = await self._read_demand(present)
@@ -127,7 +103,7 @@ class PoolKeeper:
             log.info("pool %s: stopping %d workers that have no jobs", self._pool.name, len(superfluous))
         self._stopped.update(superfluous)
         if stopping := tuple(sorted(self._stopped)):
-            await self._ask(self._launcher.stop(stopping))
+            await ask(self._launcher.stop(stopping))
 
     # -- workers --
 
@@ -139,7 +115,7 @@ class PoolKeeper:
             gpus=pool.gpus, deadline_s=pool.deadline_s,
         )  # fmt: skip
         self._unanswered = key, count
-        names = await self._ask(self._launcher.start(request, count, key=key))
+        names = await ask(self._launcher.start(request, count, key=key))
         self._unanswered = None
         now_s = self._clock_s()
         self._started.update(dict.fromkeys(names, now_s))
@@ -165,7 +141,7 @@ class PoolKeeper:
         ended = {worker.name for worker in listed if worker.state == "ended"}
         news = set() if self._ended is None else ended - self._ended
         for name in sorted(news)[:MOST_EXPLAINED]:
-            end = await self._ask(self._launcher.why_ended(name))
+            end = await ask(self._launcher.why_ended(name))
             if end is None:
                 continue
             quiet = end.reason in QUIET_ENDS or name in self._stopped
@@ -183,17 +159,6 @@ class PoolKeeper:
 
     # -- engine and database --
 
-    async def _ask(self, call: Awaitable[T]) -> T:
-        try:
-            async with asyncio.timeout(ENGINE_S):
-                return await call
-        except TimeoutError:
-            raise EngineError(f"the engine did not answer within {ENGINE_S:.0f} s") from None
-
-    async def _leads(self) -> bool:
-        fence = await self._write(leader.take_lead, self._lead, self._holder, LEAD_TTL_US)
-        return fence is not None
-
     async def _read_demand(self, present: list[str]) -> Demand:
         pool = self._pool
         read = partial(
@@ -204,6 +169,3 @@ class PoolKeeper:
             others=self._other_reaches,
         )
         return await asyncio.wrap_future(self._database.queue_read(SERVER, SYSTEM, read))
-
-    async def _write(self, function: Callable[..., T], *args: object) -> T:
-        return await asyncio.wrap_future(self._database.submit_write(SYSTEM, function, *args))

@@ -7,7 +7,7 @@ import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import EntryPoint, entry_points
-from typing import cast
+from typing import Any, Protocol, cast
 
 from marey_server.launchers.launcher import (
     ENTRY_POINTS,
@@ -32,6 +32,8 @@ BUILT_IN = {
     "slurm": "marey_server.launchers.slurm:SlurmLauncher",
 }
 """Launchers of this package, which are imported only if the settings name them."""
+DISPATCHER = "marey_server.launchers.kubernetes.dispatcher:Dispatcher"
+"""Class that starts pods of a job's own; the client of Kubernetes is imported only if the settings need it."""
 FIXED_POOL, FIXED_KEY = "local", "fixed"
 """Parts of the names of the workers in `local_workers`."""
 
@@ -44,7 +46,7 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
     Raises `LauncherUnusable`.
     """
     settings = services.settings
-    keepers = [
+    keepers: list[Keeper] = [
         PoolKeeper(
             pool,
             _launcher_of(pool, services, address),
@@ -62,7 +64,9 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
             LaunchContext(FIXED_POOL, address, token, data, settings.log_form, settings.log_level, variables=variables)
         )
         await fixed.start(WorkerRequest(), settings.local_workers, key=FIXED_KEY)
-    if settings.pools and settings.worker_url is None and settings.launcher != "local":
+    if settings.own_pods is not None:
+        keepers.append(_dispatcher(services, address))
+    if (settings.pools or settings.own_pods) and settings.worker_url is None and settings.launcher != "local":
         log.info("workers in pools reach this server at %s; the setting worker_url names another address", address)
     tasks = [asyncio.create_task(keeper.keep()) for keeper in keepers]
     try:
@@ -72,6 +76,25 @@ async def keeping_workers(services: Services, address: str) -> AsyncIterator[Non
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
         await asyncio.gather(*(keeper.close() for keeper in keepers), *([fixed.close()] if fixed else []))
+
+
+class Keeper(Protocol):
+    """Task of the server that starts and stops workers."""
+
+    async def keep(self) -> None:
+        """Adjust the workers again and again, until the task is cancelled."""
+        ...
+
+    async def close(self) -> None:
+        """Release what the keeper holds."""
+        ...
+
+
+def _dispatcher(services: Services, address: str) -> Keeper:
+    """Return the dispatcher of jobs that need a pod of their own. Raises `LauncherUnusable`."""
+    settings = services.settings
+    make = _load(EntryPoint("kubernetes", DISPATCHER, ENTRY_POINTS))
+    return cast(Keeper, make(settings, services.database, settings.worker_url or address))
 
 
 def find_launcher(name: str) -> MakeLauncher:
@@ -84,10 +107,14 @@ def find_launcher(name: str) -> MakeLauncher:
             known = ", ".join(sorted({*BUILT_IN, *others}))
             raise LauncherUnusable(f"launcher: there is no launcher {name!r}, only: {known}")
         found = others[name]
+    return cast(MakeLauncher, _load(found))
+
+
+def _load(found: EntryPoint) -> Any:
     try:
-        return cast(MakeLauncher, found.load())
+        return found.load()
     except (ImportError, AttributeError) as error:
-        raise LauncherUnusable(f"launcher: {name} cannot be loaded: {error}") from error
+        raise LauncherUnusable(f"launcher: {found.name} cannot be loaded: {error}") from error
 
 
 def _launcher_of(pool: WorkerPool, services: Services, address: str) -> Launcher:

@@ -167,7 +167,7 @@ class Services:
         user_id = None if scopes.only_work(principal.scopes) else principal.user_id
         self._client_keys.put(hashed, user_id or hashed)
         token_id, now = principal.token_id, time.monotonic()
-        if token_id is None:
+        if token_id is None or principal.kind == "pod":  # the token of a pod has no row
             return
         noted = self._tokens_noted.get(token_id)
         if noted is not None and now - noted < tokens.NOTE_USE_EVERY_S:

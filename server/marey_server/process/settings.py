@@ -20,7 +20,7 @@ from marey_server.process.identity_settings import IdentitySettings
 from marey_server.process.process_settings import ProcessSettings
 from marey_server.process.secret_files import read_secret
 from marey_server.process.trace_settings import TraceSettings
-from marey_server.process.worker_pools import WorkerPools
+from marey_server.process.worker_pools import OwnPods, WorkerPools
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.monitoring.workers import ALIVE_S, MOST_OF_USER, MOST_REMEMBERED
 from marey_server.store.retention import Retention
@@ -279,12 +279,24 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
     )
     launcher_options: dict[str, Any] = Field({}, description="Options of the launcher.")
     pools: WorkerPools = Field((), description="Pools of workers, whose sizes follow the queue; see below.")
+    own_pods: OwnPods | None = Field(
+        None,
+        description="Pods in which jobs run that need more than a worker of a pool has, see below; only with the "
+        "launcher kubernetes. Absent: no job gets a pod of its own.",
+    )
     worker_url: str | None = Field(
         None,
         pattern=r"^https?://",
         description="Address at which workers in pools reach the server. Absent: the address that the server listens "
         "on.",
     )
+
+    @field_validator("own_pods")
+    @classmethod
+    def _check_own_pods(cls, own_pods: OwnPods | None, others: ValidationInfo) -> OwnPods | None:
+        if own_pods is not None and others.data.get("launcher") != "kubernetes":
+            raise ValueError("only the launcher kubernetes starts pods; set launcher to kubernetes, or remove own_pods")
+        return own_pods
 
     @field_validator("data")
     @classmethod

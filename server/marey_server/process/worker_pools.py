@@ -6,8 +6,10 @@ from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from marey_schemas.queue.own_pods import GPUS_LABEL
 from marey_schemas.sizes import MIB
 from marey_server.access.labels import MOST_LABELS
+from marey_server.access.own_pods import PodRules
 
 SHORTEST_DEADLINE_S = 600
 
@@ -63,6 +65,38 @@ class WorkerPool(BaseModel):
         if self.least > self.most:
             raise ValueError(f"least is {self.least}, but must not be greater than most, which is {self.most}")
         return self
+
+
+class OwnPods(BaseModel):
+    """Pods in which a server runs one job each."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    most: int = Field(20, ge=1, le=1000, description="Greatest number of such pods at the same time.")
+    memory_mb: int = Field(4096, ge=64, description="A job whose memory limit in MiB is greater gets a pod of its own.")
+    expected_s: int = Field(60, ge=0, description="A job that is expected to take more seconds gets a pod of its own.")
+    labels: dict[str, dict[str, str]] = Field(
+        default_factory=dict,
+        max_length=100,
+        description="Labels of jobs, as name=value, each with the labels that nodes must have to run these jobs, such "
+        f'as {{"gpu=a100": {{"accelerator": "a100"}}}}. A job with other labels, except {GPUS_LABEL}, gets no pod of '
+        "its own.",
+    )
+    images: tuple[str, ...] = Field(
+        (),
+        max_length=1000,
+        description="Images that scripts may name: an image with its digest, the name of a repository of images, or a "
+        "prefix that ends in /. Empty: none.",
+    )
+    cpus: int | None = Field(None, ge=1, le=1024, description="Processors of a pod. Absent: as the launcher's options.")
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="Options of the launcher for these pods, in addition to launcher_options."
+    )
+
+    @property
+    def rules(self) -> PodRules:
+        """The properties of a job that gets such a pod."""
+        return PodRules(self.memory_mb, self.expected_s, frozenset(self.labels), self.images)
 
 
 def _with_different_names(pools: tuple[WorkerPool, ...]) -> tuple[WorkerPool, ...]:

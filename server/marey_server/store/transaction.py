@@ -13,6 +13,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from marey_schemas.event_kinds import AuditKind, OrdinaryEventKind
 from marey_schemas.sizes import batched
 from marey_server.access.folder_rights import FolderRights
+from marey_server.access.own_pods import PodRules
 from marey_server.access.principal import Principal
 from marey_server.access.roles import STRICTEST
 from marey_server.store import tables
@@ -96,6 +97,7 @@ class Transaction:
         quotas: Quotas = Quotas(),
         observer: Observer = IGNORED,
         *,
+        pod_rules: PodRules | None = None,
         now_us: int | None = None,
     ) -> None:
         self.connection = connection
@@ -105,6 +107,8 @@ class Transaction:
         self.blobs = blobs
         self.quotas = quotas
         self.observer = observer
+        self.pod_rules = pod_rules
+        """Rules by which jobs get a pod of their own; None if the server starts no such pods."""
         self.before_statement: Callable[[], object] = bool
         """Called before each statement of `execute`; an error that it raises stops the transaction."""
         self.folder_rights: dict[tuple[str, str | None], FolderRights] = {}
@@ -130,7 +134,9 @@ class Transaction:
 
     def beside(self, principal: Principal) -> Transaction:
         """Return a transaction for another `principal` on the same connection; the two are committed together."""
-        other = Transaction(self.connection, principal, self._clock, self.blobs, self.quotas, self.observer)
+        other = Transaction(
+            self.connection, principal, self._clock, self.blobs, self.quotas, self.observer, pod_rules=self.pod_rules
+        )
         other.before_statement = self.before_statement
         other.trace_of_jobs = self.trace_of_jobs
         return other

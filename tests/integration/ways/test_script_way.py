@@ -6,7 +6,6 @@ import contextlib
 import json
 import re
 import shlex
-import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 import psutil
 import pytest
 from tests.support.command_line import CommandLine
+from tests.support.git_repositories import committed
 from tests.support.server_process import QUICK_LEASES, ServerProcess
 
 from marey_client import Marey
@@ -145,15 +145,3 @@ def test_a_cancelled_run_ends_at_once_and_the_run_of_a_killed_worker_is_repeated
     finally:
         process.stop()
     process.check_database()
-
-
-def committed(folder: Path, files: dict[str, str]) -> tuple[str, str]:
-    """Commit files to a new repository; return its address and the name of the commit."""
-    folder.mkdir()
-    for name, text in files.items():
-        (folder / name).write_text(text)
-    who = ["-c", "user.name=tester", "-c", "user.email=tester@example.org"]
-    for words in (["init", "-q"], ["add", "."], [*who, "commit", "-q", "-m", "files"]):
-        subprocess.run(["git", "-C", str(folder), *words], check=True)
-    found = subprocess.run(["git", "-C", str(folder), "rev-parse", "HEAD"], check=True, capture_output=True, text=True)
-    return f"file://{folder}", found.stdout.strip()

@@ -77,6 +77,9 @@ def _admit_job(job: Document) -> None:
     indexed = spec.get("completionMode") == "Indexed"
     if "backoffLimitPerIndex" in spec and not indexed:
         raise _invalid(job, "spec.backoffLimitPerIndex: requires indexed completion mode")
+    actions = {rule["action"] for rule in spec.get("podFailurePolicy", {}).get("rules", ())}
+    if "FailIndex" in actions and "backoffLimitPerIndex" not in spec:
+        raise _invalid(job, "spec.podFailurePolicy.rules: FailIndex requires backoffLimitPerIndex")
     if indexed and spec.get("completions") is None:
         raise _invalid(job, "spec.completions: Required value: when completion mode is Indexed")
     if spec.get("podReplacementPolicy") == "TerminatingOrFailed" and "podFailurePolicy" in spec:

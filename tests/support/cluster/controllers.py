@@ -74,7 +74,8 @@ class Controllers:
             self._fail(name, "DeadlineExceeded", "Job was active longer than specified deadline")
             return
         indexes = [str(index) for index in range(spec["completions"])] if _indexed(job) else [""]
-        states = {index: self._drive_index(job, index, pods) for index in indexes}
+        room = [spec.get("parallelism", len(indexes))]
+        states = {index: self._drive_index(job, index, pods, room) for index in indexes}
         succeeded = [index for index, state in states.items() if state == "succeeded"]
         failed = [index for index, state in states.items() if state == "failed"]
         self._change_status(name, lambda status: status.update(_counts(job, states, succeeded, failed)))
@@ -87,8 +88,11 @@ class Controllers:
             else:
                 self._end(name, "Complete", "CompletionsReached", "Reached expected number of succeeded pods")
 
-    def _drive_index(self, job: Document, index: str, pods: list[Document]) -> str:
-        """Return the state of an index after the missing pods were created."""
+    def _drive_index(self, job: Document, index: str, pods: list[Document], room: list[int]) -> str:
+        """Return the state of an index after the missing pods were created.
+
+        `room` contains the number of further indexes that may have pods now.
+        """
         present = [pod for pod in pods if pod["metadata"]["uid"] not in self._suspended]
         own = [pod for pod in present if pod["metadata"]["labels"].get(INDEX_LABEL, "") == index]
         limit = job["spec"].get("backoffLimitPerIndex", job["spec"].get("backoffLimit", 6))
@@ -103,8 +107,11 @@ class Controllers:
             self._succeeded.add(key)
         if key in self._succeeded:
             return "succeeded"
-        if self._failures.get(key, 0) > limit:
+        if self._failures.get(key, 0) > limit or any(_fails_at_once(job, pod) for pod in own):
             return "failed"
+        room[0] -= 1
+        if room[0] < 0:
+            return "waiting"
         active = [pod for pod in own if pod["status"]["phase"] in ("Pending", "Running")]
         if not active:
             self._create_pod(job, index)
@@ -167,6 +174,17 @@ def _ignored(job: Document, pod: Document) -> bool:
     for rule in job["spec"].get("podFailurePolicy", {}).get("rules", ()):
         if any(condition(pod, one["type"]) for one in rule.get("onPodConditions", ())):
             return bool(rule["action"] == "Ignore")
+    return False
+
+
+def _fails_at_once(job: Document, pod: Document) -> bool:
+    """Return whether the failure policy of a Job ends the Job, or its index, because of the exit status of a pod."""
+    every = pod["status"].get("containerStatuses", ())
+    codes = {one["name"]: one["state"].get("terminated", {}).get("exitCode") for one in every}
+    for rule in job["spec"].get("podFailurePolicy", {}).get("rules", ()):
+        wanted = rule.get("onExitCodes", {})
+        if wanted and wanted["operator"] == "In" and codes.get(wanted["containerName"]) in wanted["values"]:
+            return rule["action"] in ("FailJob", "FailIndex")
     return False
 
 

@@ -122,7 +122,9 @@ class Kubelet:
                 started = now()
                 process = await self._start(pod)
                 self._report(pod, "Running", {"running": {"startedAt": started}}, restarts)
+                overdue = self._kill_when_overdue(pod)
                 status = await process.wait()
+                overdue.cancel()
                 ended = _ended(status, started, self._killed.pop(name, None))
                 present = self.objects.read("pods", name)
                 over = "deletionTimestamp" in present["metadata"] or condition(present, "DisruptionTarget")
@@ -132,6 +134,18 @@ class Kubelet:
             self._report(pod, "Succeeded" if status == 0 else "Failed", {"terminated": ended}, restarts)
         finally:
             del self._running[name]
+
+    def _kill_when_overdue(self, pod: Document) -> asyncio.TimerHandle:
+        """Schedule the end of a pod at its deadline, which its status then gives as the reason."""
+        name = pod["metadata"]["name"]
+        reason = {"reason": "DeadlineExceeded", "message": "Pod was active on the node longer than the deadline"}
+
+        def end() -> None:
+            self.objects.change("pods", name, lambda one: one["status"].update(reason))
+            self._terminate(name)
+
+        seconds = pod["spec"].get("activeDeadlineSeconds", 10**6)
+        return asyncio.get_running_loop().call_later(seconds, end)
 
     async def _start(self, pod: Document) -> Process:
         name = pod["metadata"]["name"]

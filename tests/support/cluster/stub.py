@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, Literal, TypeVar
 
 import yaml
 from tests.support.cluster.admission import Rights, shipped_rights
@@ -30,6 +30,9 @@ PATIENCE_S = 90.0
 class StubCluster:
     """Cluster with one namespace. Its pods are processes of this machine that run the command of their image."""
 
+    instance = "marey"
+    """First part of the names of Jobs."""
+
     def __init__(self, folder: Path, certificate: Path | None = None) -> None:
         self.objects = Objects()
         self.kubelet = Kubelet(self.objects, folder / "pods", {IMAGE: MAREY})
@@ -48,9 +51,18 @@ class StubCluster:
     @property
     def kubeconfig(self) -> Path:
         """Kubeconfig with the rights of the shipped role."""
-        file = self._folder / "kubeconfig"
+        return self.kubeconfig_of("server")
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of the launcher for this cluster."""
+        return {"image": IMAGE, "kubeconfig": str(self.kubeconfig), "relist_s": 1, "timeout_s": 30.0}
+
+    def kubeconfig_of(self, caller: Literal["server", "operator"]) -> Path:
+        """Write and return the kubeconfig of a caller."""
+        file = self._folder / f"kubeconfig-{caller}"
         cluster = {"name": "stub", "cluster": {"server": self.url}}
-        user = {"name": "server", "user": {"token": "server-token"}}
+        user = {"name": "server", "user": {"token": f"{caller}-token"}}
         context = {"name": "stub", "context": {"cluster": "stub", "user": "server", "namespace": NAMESPACE}}
         whole = {"apiVersion": "v1", "kind": "Config", "clusters": [cluster], "users": [user], "contexts": [context],
                  "current-context": "stub"}  # fmt: skip

@@ -84,6 +84,14 @@ def test_a_job_that_no_worker_fits_says_what_a_worker_would_need() -> None:
     assert "and has the labels gpu=a100 has asked for a job" in explain(waiting, [], [], NOW, [])[0]
 
 
+def test_a_job_with_a_pod_of_its_own_says_why() -> None:
+    pod = {"marey/own-pod": "yes"}
+    assert "its memory limit or its expected" in explain(job(labels=pod), [], [], NOW, [worker(("retarget",), {})])[0]
+    assert "it needs 2 graphics processors" in explain(job(labels={"marey/gpus": "2"} | pod), [], [], NOW)[0]
+    own = job(kind="script", params={"declaration": {"image": "torch@sha256:ab"}}, labels=pod)
+    assert "names the image torch@sha256:ab. The server starts this pod in its cluster" in explain(own, [], [], NOW)[0]
+
+
 def test_a_job_that_the_limit_of_its_project_holds_back_says_so() -> None:
     fitting = [worker(("retarget",), {})]
     full, room = RunningJobs(used=2, allowed=2), RunningJobs(used=1, allowed=2)

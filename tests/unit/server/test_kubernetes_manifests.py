@@ -10,6 +10,7 @@ from tests.support.cluster.objects import Refused
 
 from marey_server.launchers.kubernetes.manifests import Manifest, Pool, pool_deployment, token_secret, worker_job
 from marey_server.launchers.kubernetes.options import ClusterOptions
+from marey_server.launchers.kubernetes.own_pod_jobs import Dispatch, own_pod_job
 from marey_server.launchers.launcher import LauncherUnusable, WorkerRequest, read_options
 
 FILES = Path(__file__).parent / "manifests"
@@ -34,6 +35,9 @@ MANIFESTS: dict[str, Manifest] = {
     "job-with-gpu": worker_job(Pool("gpu", "https://marey.example.org", RICH, GPU), "prod-gpu-k1-0"),
     "indexed-job": worker_job(Pool("gpu", "https://marey.example.org", RICH, GPU), "prod-gpu-k1", count=3),
 }
+OWN = Pool("OWN-PODS", "http://marey:8460", RICH, WorkerRequest({"marey/own-pod": "yes"}, ("model",), gpus=1))
+MANIFESTS["own-pod"] = own_pod_job(OWN, Dispatch("job_01m8h", 3, 2), time_limit_s=3600, environment={"A": "b"})
+MANIFESTS["own-pods-of-tasks"] = own_pod_job(OWN, Dispatch("job_01m8h", 1, 0, 9, 4), time_limit_s=3600)
 OWNER = {**MANIFESTS["job"], "metadata": {**MANIFESTS["job"]["metadata"], "uid": UID}}
 MANIFESTS["secret"] = token_secret(OWNER, "marey_secret")
 

@@ -13,7 +13,7 @@ from tests.support.queue_desk import Desk
 
 from marey_schemas.backoff import Backoff
 from marey_server.errors import UnavailableProblem
-from marey_server.launchers import pool_keeper
+from marey_server.launchers import pool_keeper, rounds
 from marey_server.launchers.launcher import EngineError, LaunchedWorker, WorkerEnd, WorkerRequest
 from marey_server.launchers.pool_keeper import PoolKeeper
 from marey_server.process.worker_pools import WorkerPool
@@ -188,7 +188,7 @@ def test_an_engine_or_a_database_that_fails_is_asked_again(
         raise asyncio.CancelledError
 
     monkeypatch.setattr(pool.keeper, "adjust", adjust)
-    monkeypatch.setattr(pool_keeper, "FAULT_PAUSES", Backoff(0.0, 0.0))
+    monkeypatch.setattr(rounds, "FAULT_PAUSES", Backoff(0.0, 0.0))
     with pytest.raises(asyncio.CancelledError):
         run(pool.keeper.keep())
     for words in ("pool gpu: no controller", "pool gpu: no database", "RuntimeError: a bug"):
@@ -196,7 +196,7 @@ def test_an_engine_or_a_database_that_fails_is_asked_again(
 
 
 def test_an_engine_that_does_not_answer_is_an_error(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pool_keeper, "ENGINE_S", 0.05)
+    monkeypatch.setattr(rounds, "ENGINE_S", 0.05)
     pool.launcher.silent = True
     with pytest.raises(EngineError, match="the engine did not answer within"):
         pool.adjust()

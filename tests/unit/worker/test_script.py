@@ -21,6 +21,7 @@ from marey_motion import read_motion
 from marey_motion.gait import generate_gait
 from marey_schemas.consents import CONSENT_EXPIRED
 from marey_schemas.kinds import Kind
+from marey_schemas.queue.own_pods import IMAGE_VARIABLE
 from marey_schemas.queue.scripts import REPOSITORIES_VARIABLE, ScriptDeclaration, ScriptParams
 from marey_worker.attempt_limits import remove_folder
 from marey_worker.context import JobRefused
@@ -307,6 +308,15 @@ def test_a_clip_that_cannot_be_read_fails_the_job(repository: Repository) -> Non
     outputs = {"clip": {"kind": "clip", "format": "bvh"}}
     error = refusal(repository, "import sys; open(sys.argv[-1], 'w').write('HIER')", argv=argv, outputs=outputs)
     assert error.code == "bad-clip"
+
+
+def test_a_script_with_an_image_runs_only_in_this_image(
+    repository: Repository, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = f"registry.example.org/torch@sha256:{'a' * 64}"
+    assert refusal(repository, WRITE_FIELDS, image=image).code == "wrong-image"
+    monkeypatch.setenv(IMAGE_VARIABLE, image)
+    assert repository.run(WRITE_FIELDS + "# again\n", image=image)["fields"]
 
 
 def test_only_commits_of_branches_and_tags_of_allowed_repositories_run(

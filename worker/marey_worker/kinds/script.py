@@ -21,6 +21,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
 from marey_schemas.processes.environment import clean_environment, thread_limits
 from marey_schemas.queue.comparisons import Curves
+from marey_schemas.queue.own_pods import IMAGE_VARIABLE
 from marey_schemas.queue.scripts import PYTHON, ScriptDeclaration, ScriptParams
 from marey_schemas.queue.worker_protocol import StagedOutput
 from marey_worker.context import Context, JobRefused
@@ -49,6 +50,8 @@ def run(context: Context, params: ScriptParams) -> dict[str, Any]:
     declared = params.declaration
     if declared is None:
         raise JobRefused("no-declaration", "the job has no declaration of its script; submit it to a newer server")
+    if declared.image is not None and declared.image != os.environ.get(IMAGE_VARIABLE):
+        raise JobRefused("wrong-image", f"the script needs the image {declared.image}; this worker runs in another one")
     if landlock_version() == 0:
         raise JobRefused("no-confinement", "this worker cannot confine scripts: it needs Linux 5.13 with Landlock")
     folder = Path(tempfile.mkdtemp(prefix="run-", dir=context.scratch))

@@ -28,6 +28,7 @@ from marey_server.http.declarations import Access, Bytes, RequestBody, reads, wr
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store.jobs import completion, logs, queue, staging
+from marey_server.store.jobs.claiming.rights import state_of_named
 from marey_server.store.jobs.staging import PreparedOutput
 from marey_server.store.monitoring.workers import claim_and_remember, list_workers
 from marey_server.store.wakeups import wakeups, work_topic
@@ -58,8 +59,9 @@ class Leases(Resource):
                 )
                 left_s = deadline - loop.time()
                 self.uneventful = not leases
-                if leases or left_s <= 0:
-                    return Reply(LeaseList(leases=tuple(leases)))
+                state = await self.look_up(state_of_named, body) if body.job is not None and not leases else None
+                if leases or left_s <= 0 or (state is not None and state.terminal):
+                    return Reply(LeaseList(leases=tuple(leases), state=state))
                 await listener.wait(min(left_s, LOOK_FOR_WORK_S))
                 if not self.is_awaited():  # claim nothing for a caller that has gone
                     return Reply(LeaseList())

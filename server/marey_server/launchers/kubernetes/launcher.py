@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from collections.abc import Awaitable, Iterable, Sequence
-from typing import TypeVar
 
-from marey_server.launchers.kubernetes.cluster import Cluster, NoSuchObject, ObjectExists
-from marey_server.launchers.kubernetes.manifests import Manifest, Pool, job_labels, token_secret, worker_job
+from marey_server.launchers.kubernetes.cluster import NoSuchObject
+from marey_server.launchers.kubernetes.manifests import Manifest, Pool, job_labels, worker_job
 from marey_server.launchers.kubernetes.options import ClusterOptions
 from marey_server.launchers.kubernetes.states import (
-    blocked_reason,
     end_of,
     group_pods,
     has_ended,
@@ -20,7 +17,7 @@ from marey_server.launchers.kubernetes.states import (
     worker_names,
     worker_of,
 )
-from marey_server.launchers.kubernetes.view import ClusterView
+from marey_server.launchers.kubernetes.worker_jobs import WorkerJobs
 from marey_server.launchers.launcher import (
     EngineError,
     LaunchContext,
@@ -31,9 +28,7 @@ from marey_server.launchers.launcher import (
 )
 
 log = logging.getLogger(__name__)
-T = TypeVar("T")
 
-REQUESTS_AT_ONCE = 8
 MOST_REMEMBERED = 1024
 """Number of stopped workers that are remembered."""
 
@@ -51,13 +46,9 @@ class KubernetesLauncher:
     def __init__(self, context: LaunchContext, options: ClusterOptions) -> None:
         self._context = context
         self._options = options
-        self._cluster = Cluster(options)
-        selector = ",".join(f"{name}={text}" for name, text in job_labels(context.pool, options).items())
-        self._view = ClusterView(self._cluster, selector, relist_s=options.relist_s, timeout_s=options.timeout_s)
-        self._with_token: set[str] = set()
+        self._jobs = WorkerJobs(options, job_labels(context.pool, options), lambda _: context.token)
+        self._view, self._cluster = self._jobs.view, self._jobs.cluster
         self._stopped: dict[str, None] = {}
-        self._blocked: dict[str, str] = {}
-        self._requests = asyncio.Semaphore(REQUESTS_AT_ONCE)
 
     async def start(self, request: WorkerRequest, count: int, *, key: str) -> tuple[str, ...]:
         """Create the Jobs of `count` workers. Jobs with these names that exist already are left as they are."""
@@ -68,14 +59,12 @@ class KubernetesLauncher:
             jobs = [worker_job(pool, base, count=count)]
         else:
             jobs = [worker_job(pool, f"{base}-{number}") for number in range(count)]
-        made = await self._all(self._create(job) for job in jobs)
+        made = await self._jobs.create(jobs)
         return tuple(name for job in made for name in worker_names(job))
 
     async def list(self) -> tuple[LaunchedWorker, ...]:
         """Return the workers of all Jobs of the pool; ended workers stay until the cluster deletes their Jobs."""
-        await self._view.refresh()
-        await self._supply_tokens()
-        self._log_blocked()
+        await self._jobs.refresh()
         return tuple(launched_workers(self._view.jobs.values(), self._view.pods.values()))
 
     async def stop(self, names: tuple[str, ...]) -> None:
@@ -97,7 +86,7 @@ class KubernetesLauncher:
                     deletions.append(self._delete_pod(pods[name], name))
                 else:
                     without_pod.append(name)
-        await self._all(deletions)
+        await self._jobs.all(deletions)
         if without_pod:
             raise EngineError(f"workers of a larger Job that have no pods yet cannot be stopped: {sorted(without_pod)}")
 
@@ -119,51 +108,13 @@ class KubernetesLauncher:
 
     async def close(self) -> None:
         """Close the connections; the workers continue."""
-        await self._view.close()
-        await self._cluster.close()
+        await self._jobs.close()
 
-    # -- Jobs and their tokens --
-
-    async def _create(self, job: Manifest) -> Manifest:
-        name: str = job["metadata"]["name"]
-        try:
-            made = await self._cluster.create_job(job)
-        except ObjectExists:
-            made = await self._cluster.read_job(name)
-            if not job["metadata"]["labels"].items() <= made["metadata"].get("labels", {}).items():
-                raise EngineError(f"the cluster has another Job with the name {name}") from None
-        self._view.put_job(made)
-        await self._supply_token(made)
-        return made
-
-    async def _supply_tokens(self) -> None:
-        """Create the Secrets of Jobs whose server died between the creation of the Job and of its Secret."""
-        jobs = self._view.jobs
-        self._with_token &= jobs.keys()
-        waiting = {worker.name for worker in launched_workers(jobs.values(), self._view.pods.values())
-                   if worker.state == "starting"}  # fmt: skip
-        missing = [job for name, job in jobs.items() if name not in self._with_token and waiting & {*worker_names(job)}]
-        await self._all(self._supply_token(job) for job in missing)
-
-    async def _supply_token(self, job: Manifest) -> None:
-        """Create the Secret with the token of a Job's workers, unless it exists."""
-        name = job["metadata"]["name"]
-        if name in self._with_token:
-            return
-        try:
-            await self._cluster.create_secret(token_secret(job, self._context.token))
-        except ObjectExists:
-            log.debug("the Secret of the Job %s exists", name)
-        self._with_token.add(name)
+    # -- Jobs --
 
     async def _delete_job(self, job: str, workers: Iterable[str]) -> None:
-        try:
-            await self._cluster.delete_job(job)
-        except NoSuchObject:
-            log.debug("the Job %s has been deleted already", job)
-        else:
+        if await self._jobs.delete(job):
             self._remember_stopped(workers)
-        self._view.drop_job(job)
 
     async def _delete_pod(self, pod: str, worker: str) -> None:
         try:
@@ -192,25 +143,3 @@ class KubernetesLauncher:
             log.debug("the log of the pod %s cannot be read: %s", pod, error)
             return end
         return WorkerEnd(end.reason, end.status, f"{end.detail}\n{lines}".strip())
-
-    def _log_blocked(self) -> None:
-        """Log why workers cannot start, such as an image that does not exist; once as long as one is blocked."""
-        blocked = {name: reason for pod in self._view.pods.values()
-                   if (reason := blocked_reason(pod)) is not None and (name := worker_of(pod)) is not None}  # fmt: skip
-        for name, reason in blocked.items():
-            if name not in self._blocked:
-                log.warning("worker %s cannot start: %s", name, reason)
-        self._blocked = blocked
-
-    async def _all(self, calls: Iterable[Awaitable[T]]) -> Sequence[T]:
-        """Make all calls, some at the same time; afterwards, raise the first error."""
-
-        async def limited(call: Awaitable[T]) -> T:
-            async with self._requests:
-                return await call
-
-        results = await asyncio.gather(*map(limited, calls), return_exceptions=True)
-        for result in results:
-            if isinstance(result, BaseException):
-                raise result
-        return [result for result in results if not isinstance(result, BaseException)]

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+from marey_schemas.queue.own_pods import Image
 
 Name = Annotated[str, StringConstraints(pattern=r"^[a-z0-9]([a-z0-9-]*[a-z0-9])?$", max_length=63)]
 """Name of an object in Kubernetes."""
-
-
-def _with_digest(image: str) -> str:
-    if re.fullmatch(r"[^\s@]+@sha256:[0-9a-f]{64}", image) is None:
-        raise ValueError("the image must be named by its digest, as in registry.example.org/marey-worker@sha256:...")
-    return image
 
 
 class ClusterOptions(BaseModel):
@@ -23,9 +18,7 @@ class ClusterOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    image: Annotated[str, AfterValidator(_with_digest)] = Field(
-        description="Image of the workers, named by its digest."
-    )
+    image: Image = Field(description="Image of the workers, named by its digest.")
     namespace: Name = Field("marey", description="Namespace of the workers.")
     instance: Annotated[Name, StringConstraints(max_length=16)] = Field(
         "marey",

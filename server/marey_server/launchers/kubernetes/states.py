@@ -66,16 +66,21 @@ def _state(job: Document, name: str, pods: Sequence[Document]) -> tuple[WorkerSt
 
 def has_ended(job: Document, worker: str) -> bool:
     """Return whether a worker of a Job has ended and is not started again."""
-    if _condition(job, "Complete") or _condition(job, "Failed"):
+    if is_over(job):
         return True
-    status = job.get("status") or {}
     index = worker.removeprefix(job["metadata"]["name"]).lstrip("-")
-    ended = f"{status.get('completedIndexes') or ''},{status.get('failedIndexes') or ''}"
-    return bool(index) and int(index) in _indexes(ended)
+    return bool(index) and int(index) in ended_indexes(job)
 
 
-def _indexes(text: str) -> set[int]:
-    """Return the numbers in a list such as `0,3-5`."""
+def is_over(job: Document) -> bool:
+    """Return whether a Job has ended."""
+    return _condition(job, "Complete") is not None or _condition(job, "Failed") is not None
+
+
+def ended_indexes(job: Document) -> set[int]:
+    """Return the indexes of an Indexed Job whose workers have ended; the status lists them as in `0,3-5`."""
+    status = job.get("status") or {}
+    text = f"{status.get('completedIndexes') or ''},{status.get('failedIndexes') or ''}"
     ranges = [part.partition("-") for part in text.split(",") if part]
     return {number for first, _, last in ranges for number in range(int(first), int(last or first) + 1)}
 

@@ -34,6 +34,7 @@ from marey_server.store import listing
 from marey_server.store.database.clock import DAY_US, datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.ids import new_id
+from marey_server.store.jobs.claiming.rights import resolve_pod_token
 from marey_server.store.jobs.fencing import AUTHOR_MAY_RUN, RUNNING, lease_lost
 from marey_server.store.quotas.counting import require_room
 from marey_server.store.tables import attempt, job, token, user
@@ -89,6 +90,8 @@ def resolve_token(tx: Transaction, text: str) -> Principal:
         return _resolve_attempt(tx, secret)
     if (parts := split_user_token(text)) is not None:
         return _resolve_user(tx, *parts)
+    if (pod := resolve_pod_token(tx, text)) is not None:
+        return pod
     raise unknown_token()
 
 

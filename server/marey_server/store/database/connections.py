@@ -23,6 +23,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import sqlalchemy
 from sqlalchemy import Connection, exc, make_url
 
+from marey_server.access.own_pods import PodRules
 from marey_server.access.principal import Principal
 from marey_server.errors import ApiProblem
 from marey_server.store.blob_backings import BlobBacking, DatabaseBlobs
@@ -67,6 +68,7 @@ class Database:
         clock: Clock | None = None,
         blobs: BlobBacking | ObjectBlobs | None = None,
         quotas: Quotas | None = None,
+        pod_rules: PodRules | None = None,
         echo: bool = False,
     ) -> None:
         self.url = make_url(url)
@@ -86,6 +88,7 @@ class Database:
         self._high_water_us = 0
         self.blobs: BlobBacking | ObjectBlobs = blobs or DatabaseBlobs()
         self.quotas = quotas or Quotas()
+        self.pod_rules = pod_rules
         self.observer: Observer = IGNORED
         """Receiver of numbers about the transactions of this process; the server replaces it."""
         self._lane: AbstractContextManager[Any] = threading.Lock() if self.is_sqlite else nullcontext()
@@ -194,7 +197,16 @@ class Database:
 
     def _transaction(self, connection: Connection, principal: Principal, now_us: int | None = None) -> Transaction:
         blobs = self.blobs.local if isinstance(self.blobs, ObjectBlobs) else self.blobs  # see `run_and_move`
-        return Transaction(connection, principal, self.clock, blobs, self.quotas, self.observer, now_us=now_us)
+        return Transaction(
+            connection,
+            principal,
+            self.clock,
+            blobs,
+            self.quotas,
+            self.observer,
+            pod_rules=self.pod_rules,
+            now_us=now_us,
+        )
 
     def _run_and_commit(self, tx: Transaction, function: Callable[[Transaction], T]) -> T:
         with tx.connection.begin() as transaction:

@@ -37,12 +37,12 @@ from marey_schemas.queue.worker_protocol import (
     PinnedInput,
 )
 from marey_server import faults
-from marey_server.access.labels import first_outside, keys_within
-from marey_server.access.principal import Principal
+from marey_server.access.labels import keys_within
 from marey_server.access.secret_tokens import IssuedToken, derive_attempt_token, issue_attempt_token, sealed
-from marey_server.errors import ForbiddenProblem, InvalidProblem, LeaseLostProblem
+from marey_server.errors import InvalidProblem, LeaseLostProblem
 from marey_server.store.credentials.server_key import read_seal_key
 from marey_server.store.database.prepared import Prepared
+from marey_server.store.jobs.claiming.rights import named_job, require_worker
 from marey_server.store.jobs.claiming.turns import (
     Restriction,
     Turn,
@@ -84,8 +84,7 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
     if request.protocol != PROTOCOL_VERSION:
         detail = f"The worker uses version {request.protocol} of the protocol, but the server uses {PROTOCOL_VERSION}."
         raise InvalidProblem(detail, errors=[FieldError(pointer="/protocol", code="protocol", detail=detail)])
-    scopes = _require_worker(tx.principal)
-    _require_labels(tx.principal, request)
+    scopes = require_worker(tx.principal, request)
     claim_id = request.claim_id if tx.principal.token_key else None
     wanted = _wanted(tx, request, scopes, policy)
     places, turns = _read_turns(tx, claim_id, wanted)
@@ -285,25 +284,6 @@ def _pick_order(row: Row[Any]) -> tuple[Any, ...]:
 _CLAIM_STATEMENTS = {one_job: Prepared(_claim_statement(one_job=one_job)) for one_job in (False, True)}
 
 
-def _require_worker(caller: Principal) -> list[str]:
-    """Return the caller's `work` scopes, each for all projects or for one. Raises `ForbiddenProblem` without any."""
-    scopes = [scope for scope in caller.scopes if scope.partition("!")[0] == "work"]
-    if not scopes or caller.kind not in ("user", "system"):
-        raise ForbiddenProblem("Claiming jobs needs a user's token with the scope `work`.", code="insufficient-scope")
-    return scopes
-
-
-def _require_labels(caller: Principal, request: ClaimRequest) -> None:
-    """Raise `ForbiddenProblem` if the worker announces a label that the caller's token does not allow."""
-    if (beyond := first_outside(request.labels, caller.labels)) is not None:
-        raise ForbiddenProblem(
-            f"The worker announces the label {beyond!r}, but its token is bound to other labels. Start the worker "
-            "without this label, or with a token that allows it.",
-            code="label-not-allowed",
-            context={"label": beyond},
-        )
-
-
 class _Wanted(NamedTuple):
     """Statements of a claim, with the parameters for what it asks for."""
 
@@ -315,14 +295,15 @@ class _Wanted(NamedTuple):
 
 def _wanted(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], policy: QueuePolicy) -> _Wanted:
     caller = tx.principal
-    restriction = Restriction(request.job is not None, "work" not in scopes, not caller.administrator)
+    own_projects = caller.kind == "user" and not caller.administrator
+    restriction = Restriction(request.job is not None, "work" not in scopes, own_projects)
     jobs: dict[str, Any] = {
         "now_us": tx.now_us,
         "kinds": list(request.kinds),
         "label_keys": keys_within(request.labels),
     }
     if restriction.one_job:
-        jobs["one_job"] = request.job
+        jobs["one_job"] = named_job(tx, request)
     projects: dict[str, Any] = {}
     if restriction.named_projects:
         projects["project_names"] = [scope.partition("=")[2] for scope in scopes]

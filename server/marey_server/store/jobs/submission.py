@@ -27,6 +27,7 @@ from marey_schemas.queue.scripts import ScriptParams
 from marey_server import faults
 from marey_server.access.folder_rights import FolderRights
 from marey_server.access.labels import labels_key
+from marey_server.access.own_pods import labels_of_job
 from marey_server.errors import InvalidProblem
 from marey_server.field_errors import field_errors, json_pointer
 from marey_server.store.database.prepared import Prepared
@@ -168,9 +169,11 @@ def _check(
         found = field_errors(error, request.params, lambda steps: f"{at}/params{json_pointer(steps)}")
         detail = f"These parameters are not valid for {kind.name}: {found[0].pointer}: {found[0].detail}"
         raise InvalidProblem(detail, errors=found) from error
+    image = None
     if isinstance(params, ScriptParams):
         params = resolve_params(tx, project, params, at)
         kind, request = _with_script(params, request)
+        image = None if params.declaration is None else params.declaration.image
     pins = pin_inputs(tx, project, kind, request, known, at)
     if (clash := find_clash(kind, params, pins, request.into)) is not None:
         unnamed = "Two results of the job, or a result and an input, would have the same place, or a path is too long."
@@ -183,7 +186,7 @@ def _check(
         plain,
         pins,
         tasks,
-        labels_key(request.labels),
+        labels_key(labels_of_job(request, image, tx.pod_rules, at)),
         tx.principal.user_id,
         after=tuple(dict.fromkeys((*request.after, *late))),
         unbound=bool(late),

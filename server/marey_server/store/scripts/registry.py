@@ -10,6 +10,7 @@ from sqlalchemy import Row, Select, delete, insert, select
 from marey_schemas.items import Page
 from marey_schemas.problems import FieldError
 from marey_schemas.queue.scripts import SCRIPT, Script, ScriptCreate, ScriptDeclaration, ScriptParams, is_allowed
+from marey_server.access.own_pods import require_allowed_image
 from marey_server.errors import ConflictProblem, ForbiddenProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import listing, projects
 from marey_server.store.database.clock import datetime_of
@@ -36,7 +37,7 @@ def read_script(tx: Transaction, project: str, name: str) -> Script:
 def register_script(tx: Transaction, project: str, request: ScriptCreate, allowed: Sequence[str]) -> Script:
     """Register a script. `allowed` are the repositories that the server allows.
 
-    Raises `ForbiddenProblem` if no scripts are allowed, `InvalidProblem` if the repository is not allowed,
+    Raises `ForbiddenProblem` if no scripts are allowed, `InvalidProblem` if repository or image is not allowed,
     `ConflictProblem` if the name is taken, and `QuotaExceededProblem` if the project has too many scripts.
     """
     row = projects.require(tx, project)
@@ -48,6 +49,8 @@ def register_script(tx: Transaction, project: str, request: ScriptCreate, allowe
     if not is_allowed(request.repository, allowed):
         detail = "This server does not allow the repository; ask its operator to add it to `script_repositories`."
         raise _invalid("/repository", "repository-not-allowed", detail)
+    if request.image is not None:
+        require_allowed_image(request.image, tx.pod_rules, "/image")
     counting.require_place(tx, row.id, script)
     values: dict[str, Any] = {
         "id": new_id(SCRIPT), "project_id": row.id, "name": request.name, "description": request.description,

@@ -1,0 +1,42 @@
+"""Pods of a job's own: the labels of jobs that need one, and the images that scripts name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Annotated
+
+from pydantic import AfterValidator
+
+OWN_POD_LABEL = "marey/own-pod"
+"""Label of jobs that run in a pod of their own. The server sets it; only a pod that runs one job has it."""
+OWN_POD_VALUE = "yes"
+GPUS_LABEL = "marey/gpus"
+"""Label of jobs that need graphics processors; its value is their number."""
+MOST_GPUS = 64
+
+REFUSED_STATUS = 42
+"""Exit status of a worker in a pod of a job's own that the server refuses; to start it again would not help."""
+
+IMAGE_VARIABLE = "MAREY_SCRIPT_IMAGE"
+"""Environment variable with the image in which a worker runs; the launcher sets it for scripts with an own image."""
+
+
+def with_digest(image: str) -> str:
+    """Return the name of an image. Raises `ValueError` if it does not end in a digest."""
+    if len(image) > 500 or re.fullmatch(r"[A-Za-z0-9][\w.:/-]*@sha256:[0-9a-f]{64}", image, re.ASCII) is None:
+        raise ValueError("the image must be named by its digest, as in registry.example.org/marey-worker@sha256:...")
+    return image
+
+
+Image = Annotated[str, AfterValidator(with_digest)]
+"""Name of a container image with its digest."""
+
+
+def is_allowed_image(image: str, allowed: Iterable[str]) -> bool:
+    """Return whether an image is in the list.
+
+    An entry is an image with its digest, the name of a repository (all its digests), or a prefix that ends in `/`.
+    """
+    repository = image.partition("@")[0]
+    return any(one in (image, repository) or (one.endswith("/") and image.startswith(one)) for one in allowed)
