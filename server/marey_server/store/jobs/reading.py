@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from sqlalchemy import ColumnElement, Row, Select, and_, case, func, select, update
@@ -166,8 +166,8 @@ def _parts(project_id: str, filters: JobFilters, order: listing.Order) -> list[S
         return [select(job.c.id).where(*_conditions(project_id, filters))]
     parts = []
     for state, kind in dict.fromkeys(pairs):
-        states, kinds = (() if one is None else (one,) for one in (state, kind))
-        part = select(job.c.id).where(*_conditions(project_id, replace(filters, states=states, kinds=kinds)))
+        one = JobFilters(() if state is None else (state,), () if kind is None else (kind,), author=filters.author)
+        part = select(job.c.id).where(*_conditions(project_id, one))
         is_rare = state in UNFINISHED or not (kind or filters.author)
         by_state = state not in (None, JobState.SUCCEEDED) and is_rare
         parts.append(part.where(NOT_SUCCEEDED) if by_state else part)
