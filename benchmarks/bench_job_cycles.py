@@ -35,7 +35,8 @@ def run() -> list[Row]:
     """Measure the rates of single cycles in alternating rounds, then how soon a job starts."""
     with local_postgres() as postgres, load.in_processes(1) as start:
         peer = make_url(new_database(postgres, "peer")).set(drivername="postgresql").render_as_string(False)
-        with local_server(MAREY_WARM_UP="false", MAREY_DATABASE_URL=new_database(postgres, "marey")) as server:
+        address = new_database(postgres, "marey")
+        with local_server(MAREY_WARM_UP="false", MAREY_DATABASE_URL=address) as server:  # cycles need no kernels
             job = {"kind": "export", "inputs": {"clips": [{"item": seed(server, 4, 26).clip}]}, "cache": "off"}
             start(prepare_peer, peer).result()
             rounds = []

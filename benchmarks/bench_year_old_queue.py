@@ -72,7 +72,9 @@ class MeasuredQueue:
     def _backends(self) -> list[int]:
         if self.database.is_sqlite:
             return []
-        connected = text("SELECT pid FROM pg_stat_activity WHERE datname = current_database()")
+        connected = text(
+            "SELECT pid FROM pg_stat_activity WHERE datname = current_database() AND backend_type = 'client backend'"
+        )
         with self.database.engine.connect() as connection:
             return list(connection.execute(connected).scalars())
 
@@ -143,8 +145,11 @@ class MeasuredQueue:
 
 
 def _processor_s_of(pid: int) -> float:
-    """Return the processor time of a process of this machine, which Linux counts in nanoseconds."""
-    return int(Path(f"/proc/{pid}/schedstat").read_text().split()[0]) / 1e9
+    """Return the processor time of a process of this machine, which Linux counts in nanoseconds; 0 if it has ended."""
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_text().split()[0]) / 1e9
+    except (FileNotFoundError, ProcessLookupError):  # of a connection that an operation has closed
+        return 0.0
 
 
 FAILED = JobFilters(states=(JobState.FAILED,))
