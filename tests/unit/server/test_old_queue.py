@@ -138,14 +138,16 @@ def test_an_id_of_a_time_sorts_before_the_ids_that_are_made_later() -> None:
     assert first_id_at("job", now_us - 1000) < new_id("job") < first_id_at("job", now_us + DAY_US)
 
 
-def test_old_jobs_are_deleted_although_another_job_has_tasks(desk: Desk) -> None:
+def test_old_jobs_are_deleted_although_a_job_waits_for_a_task_of_another_one(desk: Desk) -> None:
     things = tuple(ItemInput(item=thing) for thing in desk.things(3))
     whole = desk.submit("square", inputs={"things": things})
-    for lease in desk.claim_many():
+    leases = desk.claim_many()
+    desk.submit("rig", after=(leases[0].job,))
+    for lease in leases:
         desk.stage(lease, f"square of {lease.position}")
         desk.complete(lease)
     alone = desk.submit()
-    desk.complete(desk.claim())
+    desk.complete(desk.claim(kinds=("errand",)))
     desk.clock.advance(11 * DAY_US / 1_000_000)
     assert retire(desk.database, Retention(jobs_days=9)).jobs == 1
     with pytest.raises(NotFoundProblem):
