@@ -17,6 +17,7 @@ from marey_server.access.principal import SYSTEM
 from marey_server.app import open_database
 from marey_server.process.settings import Settings
 from marey_server.store import items, projects, users
+from marey_server.store.database.connections import Database
 from marey_server.store.transaction import Transaction
 
 FRAMES, JOINTS = 4, 26
@@ -27,11 +28,16 @@ def fill(data: Path, clips: int) -> None:
     """Create a data folder with a project that contains a skeleton and `clips` different short clips."""
     database = open_database(Settings(data=data))
     try:
-        skeleton = database.write(SYSTEM, _make_project)
-        for start in range(0, clips, CLIPS_PER_WRITE):
-            database.write(SYSTEM, _make_clips, skeleton, range(start, min(clips, start + CLIPS_PER_WRITE)))
+        fill_database(database, clips)
     finally:
         database.close()
+
+
+def fill_database(database: Database, clips: int) -> None:
+    """Create a project that contains a skeleton and `clips` different short clips."""
+    skeleton = database.write(SYSTEM, _make_project)
+    for start in range(0, clips, CLIPS_PER_WRITE):
+        database.write(SYSTEM, _make_clips, skeleton, range(start, min(clips, start + CLIPS_PER_WRITE)))
 
 
 def _make_project(tx: Transaction) -> RevisionRef:

@@ -7,7 +7,19 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from lint import circles, class_names, constants, docstrings, folders, lengths, lists, small_modules, unused, wording
+from lint import (
+    circles,
+    class_names,
+    constants,
+    docstrings,
+    folders,
+    lengths,
+    lists,
+    migrations,
+    small_modules,
+    unused,
+    wording,
+)
 from lint.exceptions import apply_baseline, apply_exceptions, read_baseline, read_exceptions, shown, shrink_baseline
 from lint.sources import House, Offence, read_house
 
@@ -22,6 +34,7 @@ RULES: Mapping[str, Callable[[House], Iterator[Offence]]] = {
     "docstrings": docstrings.find,
     "lists": lists.find,
     "constants": constants.find,
+    "migrations": migrations.find,
 }
 """Rules by their names in `exceptions.toml`; the rule on wording is missing, because it has a baseline instead."""
 

@@ -58,7 +58,8 @@ NUMBERED_AT_ONCE = 10_000
 CHANNEL = "marey_events"
 """Channel of Postgres on which servers announce to each other that events got numbers."""
 
-_LAST_NUMBER = "last_event_number"
+LAST_NUMBER = "last_event_number"
+"""Key of the number of the last numbered event, in the table `server_state`."""
 _LAST_DELETED = "last_deleted_event"
 DELETED_AT_ONCE = 1000
 """Greatest number of events that are deleted in one transaction."""
@@ -214,7 +215,7 @@ def number_events(tx: Transaction) -> int:
     """
     if not tx.is_postgres or not tx.execute(select(exists().where(_UNNUMBERED))).scalar():
         return 0
-    of_counter = server_state.c.key == _LAST_NUMBER
+    of_counter = server_state.c.key == LAST_NUMBER
     last = int(tx.execute(select(server_state.c.value).where(of_counter).with_for_update()).scalar_one())
     oldest = (
         select(event.c.seq, func.row_number().over(order_by=event.c.seq).label("place"))

@@ -15,7 +15,6 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Table, delete, exists, literal, select, tuple_
 
-from marey_schemas.queue.jobs import JobState
 from marey_schemas.sizes import MIB
 from marey_server import faults
 from marey_server.access.principal import SYSTEM
@@ -146,7 +145,7 @@ def _staged_documents(tx: Transaction) -> set[str]:
     Documents that are staged after this read are not deleted either, because staging updates the time of their rows.
     After an attempt has completed, its staged documents are kept only while something else refers to them.
     """
-    running = select(job.c.id).where(job.c.state == JobState.RUNNING.value)
+    running = select(job.c.id).where(job.c.state == RUNNING)
     staged = select(staged_output.c.draft).where(staged_output.c.job_id.in_(running))
     drafts = tx.execute(staged.execution_options(yield_per=1000)).scalars()
     return {digest for draft in drafts for digest in draft["parts"].values()}

@@ -11,7 +11,15 @@ _ID_IN_TEXT = re.compile(rf"\b[a-z]+_[{_ALPHABET}]{{26}}\b")
 
 def new_id(prefix: str) -> str:
     """Create an id like `clip_01k9m3...`: 48 bits of time in milliseconds and 80 random bits in Crockford's base 32."""
-    number = (time.time_ns() // 1_000_000) << 80 | secrets.randbits(80)
+    return _id_of(prefix, (time.time_ns() // 1_000_000) << 80 | secrets.randbits(80))
+
+
+def first_id_at(prefix: str, time_us: int) -> str:
+    """Return an id that sorts before all ids created at this time or later, and after all ids created earlier."""
+    return _id_of(prefix, max(time_us, 0) // 1000 << 80)
+
+
+def _id_of(prefix: str, number: int) -> str:
     digits = [_ALPHABET[(number >> shift) & 31] for shift in range(125, -1, -5)]
     return f"{prefix}_{''.join(digits)}"
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, Select, UnaryExpression, and_, or_
+from sqlalchemy import ColumnElement, Row, Select, UnaryExpression, and_, or_, select, union_all
 
 from marey_schemas.encoding.canonical import canonical_json
 from marey_server.errors import BadRequestProblem
@@ -106,16 +106,28 @@ def _mac(tx: Transaction, payload: bytes) -> bytes:
 
 
 def read_page(
-    tx: Transaction, statement: Select[Any], order: Order, identity: Any, cursor: str | None, limit: int
+    tx: Transaction,
+    statement: Select[Any],
+    order: Order,
+    identity: Any,
+    cursor: str | None,
+    limit: int,
+    parts: Sequence[Select[Any]] = (),
 ) -> tuple[Sequence[Row[Any]], str | None]:
     """Return at most `limit` rows of `statement` after the cursor, and the cursor of the next page.
 
-    `identity` is JSON that distinguishes this list from every other: its subject and filters.
+    `identity` is JSON that distinguishes this list from every other: its subject and filters. `parts`, if given, select
+    the last column of the order, in place of conditions of `statement`: the list contains the rows of all parts. Each
+    part is read only up to the limit, so it should have an index that ends with the order.
     """
     if not 1 <= limit <= MAX_LIMIT:
         raise BadRequestProblem(f"The parameter `limit` must be between 1 and {MAX_LIMIT}.", code="bad-limit")
-    if cursor is not None:
-        statement = statement.where(order.after(read_cursor(tx, cursor, order, identity)))
+    after = () if cursor is None else (order.after(read_cursor(tx, cursor, order, identity)),)
+    if parts:
+        firsts = (part.where(*after).order_by(*order.clauses()).limit(limit + 1).subquery() for part in parts)
+        statement = statement.where(order.columns[-1][0].in_(union_all(*map(select, firsts))))
+    else:
+        statement = statement.where(*after)
     rows = tx.execute(statement.order_by(*order.clauses()).limit(limit + 1)).all()
     if len(rows) <= limit:
         return rows, None

@@ -9,15 +9,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import ColumnElement, and_, delete, exists, insert, or_, select, tuple_, update
+from sqlalchemy import ColumnElement, and_, delete, exists, func, insert, or_, select, tuple_, update
 
 from marey_server.access.principal import SYSTEM
 from marey_server.store import events
 from marey_server.store.database.clock import DAY_US
 from marey_server.store.database.connections import Database
 from marey_server.store.garbage import BATCH
+from marey_server.store.ids import first_id_at
 from marey_server.store.purge_lock import hold_off_purges_of_jobs
 from marey_server.store.tables import (
+    HAS_LONG_LOG,
     attempt,
     dataset_commit,
     job,
@@ -35,7 +37,7 @@ from marey_server.store.webhooks import outbox
 from marey_server.store.webhooks.managing import forget_old_secrets
 
 DELETED_LOG = b"[This log was deleted because it was old.]\n"
-"""Text that replaces a deleted log. Logs that are not longer than this text are kept."""
+"""Text that replaces a deleted log. Logs that are not longer than this text are kept (`HAS_LONG_LOG`)."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,15 @@ def _retire_audit_entries(database: Database, days: int) -> int:
     return deleted
 
 
+def _first_young_job(tx: Transaction, age_us: int) -> str:
+    """Return an id that is greater than the ids of all jobs that ended before `age_us` ago.
+
+    Ids sort by the time of creation, so a search for old jobs reads no younger ones. Ids are made with the clock of the
+    server, which may differ from that of the database; the greatest difference that is allowed for is a day.
+    """
+    return first_id_at("job", tx.now_us - age_us + DAY_US)
+
+
 # -- logs --------------------------------------------------------------------------------------------------------------
 
 
@@ -119,8 +130,9 @@ def _old_logs(tx: Transaction, age_us: int, after: tuple[str, int]) -> list[tupl
         select(attempt.c.job_id, attempt.c.fence)
         .where(
             tuple_(attempt.c.job_id, attempt.c.fence) > tuple_(*after),
+            attempt.c.job_id < _first_young_job(tx, age_us),
             attempt.c.ended_us < tx.now_us - age_us,
-            attempt.c.log_bytes > len(DELETED_LOG),
+            HAS_LONG_LOG,
         )
         .order_by(attempt.c.job_id, attempt.c.fence)
         .limit(BATCH)
@@ -162,7 +174,7 @@ def _old_jobs(tx: Transaction, age_us: int, after: str) -> list[str]:
     Such a job ended long ago, and no other job depends on it. Neither the job nor one of its tasks created a revision
     or a commit.
     """
-    tasks = select(task.c.id).where(task.c.parent_id == job.c.id)
+    tasks = select(task.c.id).where(task.c.parent_id == job.c.id).correlate(job)
     with_tasks = or_(job_dependency.c.on_job_id == job.c.id, job_dependency.c.on_job_id.in_(tasks))
     others = and_(job_dependency.c.job_id != job.c.id, job_dependency.c.job_id.not_in(tasks))
     task_needed = or_(task.c.finished_us.is_(None), _made_something(task.c.id))
@@ -170,7 +182,8 @@ def _old_jobs(tx: Transaction, age_us: int, after: str) -> list[str]:
         select(job.c.id)
         .where(
             job.c.id > after,
-            job.c.parent_id.is_(None),
+            job.c.id < _first_young_job(tx, age_us),
+            func.coalesce(job.c.parent_id, "") == "",  # `IS NULL` makes SQLite read an index that contains every job
             job.c.finished_us < tx.now_us - age_us,
             ~_made_something(job.c.id),
             ~exists().where(task.c.parent_id == job.c.id, task_needed),

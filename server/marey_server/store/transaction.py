@@ -32,6 +32,15 @@ Event = tuple[OrdinaryEventKind, str | None, str, dict[str, Any]]
 
 _INSERT_EVENT = Prepared(sqlalchemy.insert(tables.event))
 
+_KEY_OF_LOCK = sqlalchemy.func.hashtextextended(sqlalchemy.bindparam("name", type_=sqlalchemy.Text), 0)
+_LOCKS = {
+    shared: Prepared(sqlalchemy.select(acquire(_KEY_OF_LOCK).label("acquired")))
+    for shared, acquire in (
+        (False, sqlalchemy.func.pg_advisory_xact_lock),
+        (True, sqlalchemy.func.pg_advisory_xact_lock_shared),
+    )
+}
+
 
 def in_lists(values: Iterable[T]) -> Iterator[list[T]]:
     """Divide values into lists that are short enough for one statement each, for example for `IN`."""
@@ -190,9 +199,8 @@ class Transaction:
         """
         if not self.is_postgres or (name, shared) in self._locks:
             return
-        functions = sqlalchemy.func
-        acquire = functions.pg_advisory_xact_lock_shared if shared else functions.pg_advisory_xact_lock
-        self.execute(sqlalchemy.select(acquire(functions.hashtextextended(name, 0))))
+        self.before_statement()
+        self.run(_LOCKS[shared], {"name": name})
         if not self.connection.in_nested_transaction():  # whose rollback would release the lock
             self._locks.add((name, shared))
 

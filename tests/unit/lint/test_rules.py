@@ -5,7 +5,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from lint import circles, class_names, constants, docstrings, folders, lengths, lists, small_modules, unused, wording
+from lint import (
+    circles,
+    class_names,
+    constants,
+    docstrings,
+    folders,
+    lengths,
+    lists,
+    migrations,
+    small_modules,
+    unused,
+    wording,
+)
 from lint.commit_subject import faults_of
 from lint.exceptions import apply_baseline, apply_exceptions, read_baseline, shrink_baseline
 from lint.sample import draw
@@ -206,6 +218,72 @@ def test_pages_are_read_but_not_their_code() -> None:
 
 def test_a_module_of_an_old_name_is_found() -> None:
     assert messages(wording.find(house({"marey_x.settling": ""}))) == ["module settling is called propagation now"]
+
+
+MIGRATION = """
+import sqlalchemy as sa
+from alembic import op
+phase = "{phase}"
+FILL = "UPDATE job SET note = 'old'"
+def upgrade() -> None:
+    op.create_table("note", sa.Column("id", sa.Integer, nullable=False))
+    {step}
+def downgrade() -> None:
+    op.drop_table("note")
+"""
+
+
+def migration_offences(step: str, phase: str = "before") -> list[str]:
+    """Return the messages about a migration with this step."""
+    path = ROOT / "migrations" / "versions" / "0099_next.py"
+    return messages(migrations.find(House({}, {}, {path: MIGRATION.format(phase=phase, step=step)})))
+
+
+@pytest.mark.parametrize(
+    ("step", "fault"),
+    [
+        ('op.drop_column("job", "note")', "does more than add"),
+        ('op.drop_index("ix_job_claim", "job")', "does more than add"),
+        ('op.rename_table("job", "task")', "does more than add"),
+        ('op.alter_column("job", "note", nullable=False)', "does more than add"),
+        ('op.alter_column("job", "note", type_=sa.String(4))', "does more than add"),
+        ('op.create_check_constraint("short", "job", "priority < 4")', "does more than add"),
+        ('with op.batch_alter_table("job") as job: job.drop_column("note")', "does more than add"),
+        ('remove = op.drop_table; remove("job")', "does more than add"),
+        ('op.get_bind().execute(sa.text("DELETE FROM job"))', "does more than add"),
+        ('op.add_column("job", sa.Column("note", sa.Text, nullable=False))', "no default in the database"),
+        ('op.add_column("job", sa.Column("note", sa.Text, nullable=False, default=""))', "no default in the database"),
+        ('op.add_column("job", sa.Column("note", sa.Text, unique=True))', "narrows the table"),
+        ('op.add_column("job", NOTE)', "cannot be checked"),
+        ('op.create_index("uq_job_note", "job", ["note"], unique=True)', "a unique index narrows"),
+        ('op.execute("ALTER TABLE job ALTER COLUMN note SET NOT NULL")', "does more than set storage parameters"),
+        ('op.execute("ALTER TABLE job SET (fillfactor = 70); DROP TABLE note")', "does more than set"),
+        ("op.execute(FILL)", "does more than set"),
+    ],
+)
+def test_a_migration_before_the_new_servers_that_does_more_than_add_is_found(step: str, fault: str) -> None:
+    (message,) = migration_offences(step)
+    assert fault in message
+    assert migration_offences(step, "stopped") == migration_offences(step, "after") == []
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        'op.add_column("job", sa.Column("note", sa.Text))',
+        'op.add_column("job", sa.Column("note", sa.Text, nullable=False, server_default=sa.text("0")))',
+        'op.create_index("ix_job_note", "job", ["note"])',
+        'op.create_index("uq_note_id", "note", ["id"], unique=True)',
+        'op.execute(f"ALTER TABLE {1} SET (autovacuum_vacuum_scale_factor = {2})")',
+    ],
+)
+def test_a_migration_that_only_adds_may_run_before_the_new_servers(step: str) -> None:
+    assert migration_offences(step) == []
+
+
+def test_a_migration_of_an_unknown_phase_is_found() -> None:
+    (message,) = migration_offences("pass", "befor")
+    assert "the phase 'befor' is unknown" in message
 
 
 def test_an_exception_with_a_reason_lets_one_offence_pass_and_is_reported_when_nothing_needs_it() -> None:

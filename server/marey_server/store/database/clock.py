@@ -8,8 +8,9 @@ import time
 from datetime import UTC, datetime, timedelta
 from typing import Protocol
 
-from sqlalchemy import Connection, insert, select, text, update
+from sqlalchemy import Connection, insert, select, update
 
+from marey_server.store.database.prepared import run_texts
 from marey_server.store.tables import server_state
 
 FAR_AHEAD_DAYS = 366
@@ -59,7 +60,8 @@ class DatabaseClock:
         Raises `ClockFarAhead` if the wall clock is implausibly far ahead when the process first asks for the time.
         """
         if connection.dialect.name == "postgresql":
-            return int(connection.execute(text(POSTGRES_NOW)).scalar_one())
+            ((now_us,),) = run_texts(connection, (POSTGRES_NOW,))  # in every write: see docs/decisions/0012
+            return int(now_us)
         with self._lock:
             if self._start_us is None:
                 stored_us, wall_us = stored_high_water_us(connection), wall_clock_us()

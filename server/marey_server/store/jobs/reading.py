@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, and_, case, func, select, update
+from sqlalchemy import ColumnElement, Row, Select, and_, case, func, select, update
 
 from marey_schemas.access import Role
 from marey_schemas.items import Page
@@ -24,7 +24,7 @@ from marey_server.store.jobs.policy import DEFAULT_POLICY, QueuePolicy
 from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
-from marey_server.store.tables import attempt, job, user
+from marey_server.store.tables import NOT_SUCCEEDED, attempt, job, user
 from marey_server.store.transaction import Transaction
 
 SORT_KEYS: dict[str, ColumnElement[Any]] = {
@@ -76,9 +76,9 @@ def list_jobs(
     conditions = _conditions(project_row.id, filters)
     total = None
     if count:
-        counted = select_jobs().where(*conditions).with_only_columns(func.count(), maintain_column_froms=True)
-        total = tx.execute(counted).scalar_one()
-    rows, next_cursor = listing.read_page(tx, select_jobs().where(*conditions), order, identity, cursor, limit)
+        total = tx.execute(select(func.count()).select_from(job).where(*conditions)).scalar_one()
+    parts = _parts(project_row.id, filters, order)
+    rows, next_cursor = listing.read_page(tx, select_jobs(), order, identity, cursor, limit, parts)
     return Page(items=tuple(as_documents(tx, rows)), next_cursor=next_cursor, count=total)
 
 
@@ -147,8 +147,31 @@ def _conditions(project_id: str, filters: JobFilters) -> list[ColumnElement[bool
     if filters.kinds:
         conditions.append(job.c.kind.in_(filters.kinds))
     if filters.author is not None:
-        conditions.append(user.c.name == filters.author)
+        conditions.append(job.c.author_id == select(user.c.id).where(user.c.name == filters.author).scalar_subquery())
     return conditions
+
+
+MOST_PARTS = 100
+"""Greatest number of pairs of a state and a kind for which the jobs are looked up one after another."""
+
+
+def _parts(project_id: str, filters: JobFilters, order: listing.Order) -> list[Select[Any]]:
+    """Divide a list into parts, each of which is stored in an index in the order of the list; return ids of jobs.
+
+    Without this division, a list of few jobs, such as those that wait, would read all jobs of the project. Succeeded
+    jobs are not indexed by state, because most jobs have succeeded.
+    """
+    pairs = [(state, kind) for state in filters.states or (None,) for kind in filters.kinds or (None,)]
+    if filters.parent is not None or order.columns[0][0] is not SORT_KEYS["created_at"] or len(pairs) > MOST_PARTS:
+        return [select(job.c.id).where(*_conditions(project_id, filters))]
+    parts = []
+    for state, kind in dict.fromkeys(pairs):
+        one = JobFilters(() if state is None else (state,), () if kind is None else (kind,), author=filters.author)
+        part = select(job.c.id).where(*_conditions(project_id, one))
+        is_rare = state in UNFINISHED or not (kind or filters.author)
+        by_state = state not in (None, JobState.SUCCEEDED) and is_rare
+        parts.append(part.where(NOT_SUCCEEDED) if by_state else part)
+    return parts
 
 
 # -- cancelling --------------------------------------------------------------------------------------------------------

@@ -118,7 +118,8 @@ def _keys(project_id: str, startable: ColumnElement[bool]) -> Select[Any]:
 
 def _count_running(tx: Transaction, workers: Sequence[str]) -> dict[str, int]:
     """Return the number of jobs of each worker whose leases have not expired."""
-    current = and_(attempt.c.job_id == job.c.id, attempt.c.fence == job.c.fence)
+    by_job = job.c.id.concat("")  # so that SQLite looks up the attempts of running jobs, not the jobs of all attempts
+    current = and_(attempt.c.job_id == by_job, attempt.c.fence == job.c.fence)
     counted: dict[str, int] = {}
     for names in in_lists(workers):
         rows = tx.execute(

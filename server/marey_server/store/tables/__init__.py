@@ -41,7 +41,9 @@ from marey_server.store.tables.items import (
     revision_part,
 )
 from marey_server.store.tables.queue import (
+    HAS_LONG_LOG,
     LEASED,
+    NOT_SUCCEEDED,
     ONE_RUNS_PER_KEY,
     UNFINISHED,
     attempt,
@@ -67,9 +69,11 @@ from marey_server.store.tables.serving import (
 )
 
 __all__ = [
+    "HAS_LONG_LOG",
     "INDEXED_CHARACTERS",
     "INDEXED_FACTS",
     "LEASED",
+    "NOT_SUCCEEDED",
     "ONE_RUNS_PER_KEY",
     "UNFINISHED",
     "MemberStart",

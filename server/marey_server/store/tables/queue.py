@@ -25,6 +25,21 @@ UNFINISHED = text("state IN ('waiting', 'queued', 'running')")
 LEASED = text("state = 'running' AND lease_expires_us IS NOT NULL")
 """Condition of `ix_job_leased`: a worker runs the job. A parent job whose tasks run has no lease."""
 
+HAS_LONG_LOG = text("log_bytes > 43")
+"""Condition of `ix_attempt_log`: the log is longer than the text that replaces an old one."""
+
+NOT_SUCCEEDED = text("job.state <> 'succeeded'")
+"""Condition of `ix_job_list_state`, for queries; SQLite uses the index only if the query contains this condition."""
+
+
+def _listing_index(name: str, *columns: str, of: str = "parent_id IS NULL") -> Index:
+    """Return an index for lists of jobs, which contain no tasks; it ends with the order of the lists."""
+    condition = text(of)
+    return Index(
+        f"ix_job_list_{name}", "project_id", *columns, "id", sqlite_where=condition, postgresql_where=condition
+    )
+
+
 ONE_RUNS_PER_KEY = "uq_job_concurrency"
 """Index that refuses a second running job of a concurrency key; a claim that violates it is repeated."""
 
@@ -81,6 +96,11 @@ job = Table(
     Column("finished_us", Micros),
     Column("rev", Integer, nullable=False, default=1),
     Index("ix_job_listing", "project_id", "id"),
+    _listing_index("created", "created_us"),
+    _listing_index("state", "state", "created_us", of="parent_id IS NULL AND state <> 'succeeded'"),
+    _listing_index("kind", "kind", "created_us"),
+    _listing_index("author", "author_id", "created_us"),
+    _listing_index("priority", "priority"),
     Index(
         "ix_job_claim",  # in the order of claims; the columns after the id show whether this worker can run the job
         "project_id",
@@ -176,6 +196,7 @@ attempt = Table(
         sqlite_where=text("claim_id IS NOT NULL"),
         postgresql_where=text("claim_id IS NOT NULL"),
     ),
+    Index("ix_attempt_log", "job_id", "fence", sqlite_where=HAS_LONG_LOG, postgresql_where=HAS_LONG_LOG),
 )
 
 job_log = Table(
