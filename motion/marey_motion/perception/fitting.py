@@ -55,7 +55,7 @@ class PairDifferences:
 
 @dataclass(frozen=True)
 class FitQuality:
-    """How well fitted differences agree with perceived ones, over pairs of motions.
+    """The agreement of fitted with perceived differences, over pairs of motions.
 
     The paper prints a column "difference" without saying what it is; rss, rmse_percent and l2 are candidates.
 

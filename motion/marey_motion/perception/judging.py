@@ -52,7 +52,7 @@ class Judgements:
 
 @dataclass(frozen=True, eq=False)
 class DifferenceTable:
-    """How different people found n motions.
+    """The differences of n motions that people perceived.
 
     Parameters
     ----------

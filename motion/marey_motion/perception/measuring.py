@@ -1,4 +1,4 @@
-"""What the metric sees of a clip: rotations, positions and velocities of joints, without place and heading."""
+"""The view that the metric has of a clip: rotations, positions and velocities of joints, without place and heading."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from marey_motion.perception.metric import JOINT_CLASSES, WITHOUT_ANGLES, Measur
 from marey_motion.skeleton import Skeleton
 
 _SAME_REST = 1e-3
-_WHOLE = 1e-9
+_ROUNDED_FRAMES = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class MeasuredClip:
         MeasuredClip    n frames
         """
         whole = np.round(times)
-        times = np.where(np.abs(times - whole) <= _WHOLE, whole, times)
+        times = np.where(np.abs(times - whole) <= _ROUNDED_FRAMES, whole, times)
         before = np.floor(times).astype(np.int64)
         share = (times - before)[:, None, None]
         if self.cyclic:

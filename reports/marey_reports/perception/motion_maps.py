@@ -85,8 +85,8 @@ def draw_components(one: NamedClip, other: NamedClip, metric: PerceptualMetric) 
     _bar(figure, images[-1], len(maps) - 1)
     caption = (
         f"Perceptual distance of every pair of moments of {one.name} and {other.name}, by each component of the metric "
-        f"{metric.name} and by all of them. All maps have one scale, so a component that is dark everywhere decides "
-        "where the whole is dark."
+        f"{metric.name} and by all of them. All maps have one scale: the component with the greatest distances has the "
+        "greatest influence on the whole."
     )
     shares = [*metric.shares, 1.0]
     table = {"component": titles, "share": shares, "mean_distance": [float(each.mean()) for each in maps]}

@@ -54,7 +54,7 @@ def test_a_clip_corresponds_to_itself_and_a_shifted_cycle_to_its_shift() -> None
         np.testing.assert_array_equal(curve.path, np.stack([np.arange(n)] * 2, axis=1))
         np.testing.assert_allclose(curve.times, np.arange(n), atol=1e-9)
         assert clip_distance(clip, clip, METRIC).total == 0.0
-    later = loop.at(np.arange(n) + 17.0)
+    later = loop.at(17.0 + np.arange(n, dtype=np.float64))
     curve = registration_curve(loop, later, METRIC)
     assert curve.shift == n - 17
     assert clip_distance(loop, later, METRIC).total == 0.0

@@ -1,5 +1,6 @@
 """Perceptual distances of frames: measurements, shapings, published weights, axioms, units and motion maps."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -58,7 +59,8 @@ def test_the_published_table_is_as_printed() -> None:
     sums = {}
     for measurement, rows in PUBLISHED.items():
         for shaping, (difference, constant, norm, *weights) in rows.items():
-            assert difference and constant and norm and len(weights) == 8
+            assert None not in (difference, constant, norm)
+            assert len(weights) == 8
             assert [weight is None for weight in weights] == [
                 measurement == "angles" and name in ("hand", "toe") for name in classes_of("positions")
             ]
@@ -70,11 +72,12 @@ def test_the_published_table_is_as_printed() -> None:
     assert "1.027" in doubtful_weights(published_component("velocities", "sigmoid"))
     assert not doubtful_weights(published_component("angles", "euclid"))
     assert published_component("velocities", "sigmoid").weights["thigh"] == 0.0
+    table: Mapping[str, Mapping[Shaping, tuple[float | None, ...]]] = PUBLISHED
     # The mean of the experiment's table is 5/6, so these are the typical differences of a joint.
     expected = {"angles": (0.0222, 0.0261, 0.0267), "positions": (0.0513, 0.0771, 0.0807)}
     expected["velocities"] = (0.0145, 0.0174, 0.0180)
-    for measurement, numbers in expected.items():
-        raw = [(5 / 6 - float(row[1] or 0)) / float(row[2] or 0) for row in PUBLISHED[measurement].values()]  # type: ignore[index]
+    for measured_by, numbers in expected.items():
+        raw = [(5 / 6 - float(row[1] or 0)) / float(row[2] or 0) for row in table[measured_by].values()]
         assert (np.sqrt(raw[0]), raw[1], raw[2] / (1 - raw[2])) == pytest.approx(numbers, abs=2.5e-4)
 
 
@@ -122,6 +125,14 @@ def test_maps_are_those_of_the_formulas(measurement: Measurement, shaping: Shapi
         np.testing.assert_allclose(paired_distances(a, b, metric), np.diag(expected), rtol=1e-9, atol=1e-9)
 
 
+def turned(points: Floats, angle: float) -> Floats:
+    return np.asarray(quaternions.rotate_vectors(quaternions.from_axis_angle((0.0, 1.0, 0.0), angle), points))
+
+
+def squares_after_turn(angle: float, one: Floats, other: Floats) -> float:
+    return float(np.sum((one - turned(other, angle)) ** 2))
+
+
 def test_kovar_alignment_is_the_best_rotation_and_shift() -> None:
     a, b = (clip.at(np.arange(0.0, 40.0, 13.0)) for clip in walks())
     squares = Component("positions", "euclid", 0.0, 1.0, {"calf": 1.0})
@@ -131,13 +142,10 @@ def test_kovar_alignment_is_the_best_rotation_and_shift() -> None:
     for i, j in np.ndindex(expected.shape):
         one, other = (each - each.mean(axis=0) * (1, 0, 1) for each in (a.positions[i], b.positions[j]))
 
-        def turned(angle: float, other: Floats = other) -> Floats:
-            return np.asarray(quaternions.rotate_vectors(quaternions.from_axis_angle((0.0, 1.0, 0.0), angle), other))
-
         best = minimize_scalar(
-            lambda angle: np.sum((one - turned(angle)) ** 2), bounds=(-1, 1), method="bounded", options={"xatol": 1e-12}
-        )  # noqa: B023, E501
-        expected[i, j] = np.linalg.norm((one - turned(best.x))[calves], axis=1).mean() ** 2
+            squares_after_turn, bounds=(-1, 1), args=(one, other), method="bounded", options={"xatol": 1e-12}
+        )
+        expected[i, j] = np.linalg.norm((one - turned(other, best.x))[calves], axis=1).mean() ** 2
     np.testing.assert_allclose(motion_map(a, b, metric), expected, rtol=1e-5)
     np.testing.assert_allclose(paired_distances(a, b, metric), np.diag(expected), rtol=1e-5)
 
@@ -169,7 +177,9 @@ def test_signs_place_and_heading_make_no_difference() -> None:
     motion, turn = Motion.of(gait), quaternions.from_axis_angle((0.0, 1.0, 0.0), 2.1)
     rotations = motion.rotations.copy()
     rotations[:, 0] = quaternions.multiply(turn, rotations[:, 0])
-    places = np.asarray(quaternions.rotate_vectors(turn, motion.root_translations)) + (30.0, 0.0, -70.0)
+    places = np.array((30.0, 0.0, -70.0)) + np.asarray(
+        quaternions.rotate_vectors(turn, motion.root_translations), np.float64
+    )
     moved = measured(gait, motion._replace(root_translations=places, rotations=-rotations))
     at_home = measured(gait)
     np.testing.assert_allclose(moved.positions, at_home.positions, atol=1e-12)
@@ -183,8 +193,9 @@ def test_signs_place_and_heading_make_no_difference() -> None:
 def test_units_change_n_by_their_powers_except_for_the_sigmoid() -> None:
     a, b = walks()
     factors = {}
-    for shaping in ("manhattan", "euclid", "sigmoid"):
-        component = Component("positions", shaping, 0.0, 1.0, {"forearm": 1.0})  # type: ignore[arg-type]
+    shapings: tuple[Shaping, ...] = ("manhattan", "euclid", "sigmoid")
+    for shaping in shapings:
+        component = Component("positions", shaping, 0.0, 1.0, {"forearm": 1.0})
         ratio = motion_map(a, b, metric_of(component, length_unit_m=0.01)) / motion_map(a, b, metric_of(component))
         factors[shaping] = ratio.min(), ratio.max()
     assert factors["manhattan"] == pytest.approx((100.0, 100.0), rel=1e-12)
@@ -206,7 +217,7 @@ def test_long_maps_come_in_blocks_and_bad_input_is_refused(monkeypatch: pytest.M
     assert [start for start, _ in blocks] == list(range(0, a.frame_count, 7))
     np.testing.assert_array_equal(np.concatenate([block for _, block in blocks]), whole)
     monkeypatch.setattr(maps, "MOST_CELLS", 10)
-    refused = {
+    refused: dict[str, Callable[[], object]] = {
         "map-too-large": lambda: motion_map(a, b, metric),
         "frame-rates-differ": lambda: next(map_blocks(a, replace(b, rate_hz=30.0), metric)),
         "skeletons-differ": lambda: next(map_blocks(a, replace(b, skeleton=game_skeleton()), metric)),
@@ -216,7 +227,7 @@ def test_long_maps_come_in_blocks_and_bad_input_is_refused(monkeypatch: pytest.M
         with pytest.raises(MotionError) as error:
             call()
         assert error.value.code == code
-    for wrong in (
+    wrong_metrics: tuple[Callable[[], object], ...] = (
         lambda: Component("angles", "euclid", 0.0, 1.0, {"hand": 1.0}),
         lambda: Component("angles", "euclid", np.nan, 1.0, {"head": 1.0}),
         lambda: Component("angles", "power", 0.0, 1.0, {"head": 1.0}, exponent=0.0),
@@ -224,7 +235,8 @@ def test_long_maps_come_in_blocks_and_bad_input_is_refused(monkeypatch: pytest.M
         lambda: published_metric(shares=(0.5, 0.6, -0.1)),
         lambda: replace(metric, length_unit_m=0.0),
         lambda: replace(metric, shares=(1.0,)),
-    ):
+    )
+    for wrong in wrong_metrics:
         with pytest.raises(MotionError):
             wrong()
 
