@@ -74,12 +74,12 @@ def test_a_warped_copy_is_found_and_its_distance_falls_with_the_frame_rate() -> 
         curve = registration_curve(other, one, positions)
         off = np.abs(curve.times - times)
         ends = round(rate / 6)  # there, the neighbourhood of a frame is on one side of it
-        assert off[ends:-ends].max() <= 1.0, rate
+        assert off[ends:-ends].max() <= max(1.0, 0.0125 * rate), rate
         assert off.max() <= 2.0, rate
         assert (np.diff(curve.times) > 0).all()
         distances.append(clip_distance(one, other, positions).total)
     assert distances[0] > distances[1] > distances[2]
-    assert distances[2] < 0.02
+    assert distances[2] < 0.03
 
 
 def test_distances_of_clips_are_symmetric_and_add_each_constant_once() -> None:
