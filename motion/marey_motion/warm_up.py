@@ -224,6 +224,20 @@ def _align(clip: Clip) -> None:
             align_clips(examples, body, options.replace(slope_limit=slope_limit))
 
 
+def _perceive(clip: Clip) -> None:
+    """Compile the kernels of motion maps: compare a clip with itself."""
+    from marey_motion.matching.body import MatchingBody
+    from marey_motion.motion import Motion
+    from marey_motion.perception.maps import motion_map
+    from marey_motion.perception.measuring import measure_motion
+    from marey_motion.perception.metric import published_metric
+    from marey_motion.rigs import map_joints
+
+    body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
+    measured = measure_motion(Motion.of(clip), body, clip.frame_rate_hz)
+    motion_map(measured, measured, published_metric())
+
+
 def _measure(clip: Clip) -> None:
     """Compile the kernels of live recordings: measure the coverage of a clip by the code that receives live frames."""
     from marey_motion.evaluation.online import OnlineCoverage
@@ -288,6 +302,7 @@ STAGES: Mapping[str, Callable[[Clip], None]] = {
     "models": _model,
     "alignment": _align,
     "coverage": _measure,
+    "perception": _perceive,
 }
 """Functions that use kernels, by name.
 

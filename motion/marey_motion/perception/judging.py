@@ -1,0 +1,212 @@
+"""Judgements of people about which two of four motions are most similar, and the difference table made of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from marey_motion.arrays import Floats, Ints
+from marey_motion.errors import MotionError
+
+SHOWN = 4
+TRIALS = 63
+_CANDIDATE_DRAWS = 16
+_FIRST, _SECOND = np.triu_indices(SHOWN, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Judgements:
+    """T answered trials. Trials that timed out are not among them.
+
+    Parameters
+    ----------
+    motion_count : int    number of motions n
+    participants : (T,) int64    participant of each trial, from 0
+    shown : (T, 4) int64    the motions shown, by place on the screen; all different
+    chosen : (T,) int64    which pair was chosen: index into the pairs of places (0, 1), (0, 2), (0, 3), (1, 2), (1, 3)
+        and (2, 3)
+    """
+
+    motion_count: int
+    participants: Ints
+    shown: Ints
+    chosen: Ints
+
+    def __post_init__(self) -> None:
+        trials = len(self.shown)
+        if self.shown.shape != (trials, SHOWN) or {self.participants.shape, self.chosen.shape} != {(trials,)}:
+            raise MotionError("each trial needs a participant, four motions and a chosen pair")
+        if not trials:
+            raise MotionError("there are no answered trials")
+        ordered = np.sort(self.shown, axis=1)
+        wrong = (ordered[:, 0] < 0) | (ordered[:, -1] >= self.motion_count) | (np.diff(ordered) == 0).any(axis=1)
+        wrong |= (self.chosen < 0) | (self.chosen >= len(_FIRST)) | (self.participants < 0)
+        if wrong.any():
+            raise MotionError(
+                f"the motions must be four different numbers below {self.motion_count}, and the chosen pair a number "
+                f"below {len(_FIRST)}",
+                where=f"trial {int(np.argmax(wrong))}",
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class DifferenceTable:
+    """The differences of n motions that people perceived.
+
+    Parameters
+    ----------
+    differences : (n, n) float64    1 - chosen / shown; 0 on the diagonal, NaN for pairs that were never shown together
+    shown, chosen : (n, n) int64    how often each pair was shown together and chosen; symmetric
+    """
+
+    differences: Floats
+    shown: Ints
+    chosen: Ints
+
+    @property
+    def noise_ceiling(self) -> float:
+        """Root mean square of the pairs' binomial standard errors: no fit can be expected to be closer than this."""
+        pairs = np.triu_indices(len(self.shown), 1)
+        shown, p = self.shown[pairs], self.differences[pairs]
+        seen = shown > 0
+        return float(np.sqrt(np.mean(p[seen] * (1.0 - p[seen]) / shown[seen])))
+
+
+def draw_trials(motion_count: int, participants: int, seed: int, trials: int = TRIALS) -> Ints:
+    """Draw the motions of a study's trials, in balance.
+
+    Each participant sees every motion equally often, or once more or less if that is impossible. For each participant,
+    several draws are made, and the one that balances pairs best over the participants so far is kept.
+
+    Parameters
+    ----------
+    motion_count : int    number of motions, at least 4
+    participants : int    number of participants
+    seed : int    the same seed gives the same trials
+    trials : int    trials per participant
+
+    Returns
+    -------
+    (participants, trials, 4) int64    motions by place on the screen
+
+    Raises
+    ------
+    MotionError    for fewer than four motions
+    """
+    if motion_count < SHOWN:
+        raise MotionError(f"a trial shows {SHOWN} different motions; there are only {motion_count}")
+    rng = np.random.default_rng(seed)
+    counts = np.zeros((motion_count, motion_count))
+    drawn = np.empty((participants, trials, SHOWN), np.int64)
+    for participant in range(participants):
+        draws = [_one_draw(motion_count, trials, rng) for _ in range(_CANDIDATE_DRAWS)]
+        tables = [counts + _pair_counts(draw, motion_count) for draw in draws]
+        best = int(np.argmin([np.sum(table**2) for table in tables]))
+        drawn[participant], counts = draws[best], tables[best]
+    return drawn
+
+
+def simulate_judgements(differences: Floats, participants: int, seed: int, noise: float) -> Judgements:
+    """Simulate participants who choose the pair with the smallest difference, with Gumbel noise.
+
+    Parameters
+    ----------
+    differences : (n, n) float64    true differences of the motions
+    participants : int    number of participants
+    seed : int    seed of trials and choices
+    noise : float    scale of the noise, in the unit of the differences
+
+    Returns
+    -------
+    Judgements    63 trials per participant
+    """
+    shown = draw_trials(len(differences), participants, seed).reshape(-1, SHOWN)
+    utility = -differences[shown[:, _FIRST], shown[:, _SECOND]]
+    utility = utility + np.random.default_rng([seed, 1]).gumbel(scale=noise, size=utility.shape)
+    who = np.repeat(np.arange(participants), TRIALS)
+    return Judgements(len(differences), who, shown, np.argmax(utility, axis=1))
+
+
+def difference_table(judgements: Judgements) -> DifferenceTable:
+    """Count judgements.
+
+    Parameters
+    ----------
+    judgements : Judgements    answered trials
+
+    Returns
+    -------
+    DifferenceTable    differences and counts of all pairs
+    """
+    n = judgements.motion_count
+    shown, chosen = (counts.sum(axis=0) for counts in _counts_by_participant(judgements))
+    with np.errstate(invalid="ignore"):
+        differences = 1.0 - chosen / np.where(shown > 0, shown, np.nan)
+    np.fill_diagonal(differences, 0.0)
+    assert differences.shape == (n, n)
+    return DifferenceTable(differences, shown, chosen)
+
+
+def pair_counts_by_participant(judgements: Judgements) -> tuple[Ints, Ints]:
+    """Count, for each participant, how often pairs of motions were shown together and chosen.
+
+    Parameters
+    ----------
+    judgements : Judgements    answered trials of N participants
+
+    Returns
+    -------
+    shown, chosen : (N, R) int64    counts of the R pairs i < j, in the order of `numpy.triu_indices`
+    """
+    pairs = np.triu_indices(judgements.motion_count, 1)
+    shown, chosen = _counts_by_participant(judgements)
+    return shown[:, *pairs], chosen[:, *pairs]
+
+
+def triangle_violations(differences: Floats) -> tuple[int, int]:
+    """Count triangle inequalities that a table violates: d(i, k) <= d(i, j) + d(j, k).
+
+    Parameters
+    ----------
+    differences : (n, n) float64    symmetric table; inequalities with a missing difference are not counted
+
+    Returns
+    -------
+    violated, checked : int    at most 3 · C(n, 3) are checked
+    """
+    n = len(differences)
+    i, k = np.triu_indices(n, 1)
+    direct = differences[i, k][:, None]
+    around = differences[i] + differences[k]
+    middle = (np.arange(n) != i[:, None]) & (np.arange(n) != k[:, None])
+    known = np.isfinite(direct) & np.isfinite(around) & middle
+    return int(np.count_nonzero(known & (direct > around + 1e-12))), int(np.count_nonzero(known))
+
+
+def _one_draw(motion_count: int, trials: int, rng: np.random.Generator) -> Ints:
+    """Chain random orders of all motions and cut them into trials (trials, 4) of different motions."""
+    chain = np.empty(0, np.int64)
+    while len(chain) < trials * SHOWN:
+        begun = chain[len(chain) - len(chain) % SHOWN :]
+        order = rng.permutation(motion_count)
+        first = order[~np.isin(order, begun)][: -len(begun) % SHOWN]
+        chain = np.concatenate((chain, first, order[~np.isin(order, first)]))
+    return rng.permuted(rng.permutation(chain[: trials * SHOWN].reshape(trials, SHOWN)), axis=1)
+
+
+def _pair_counts(shown: Ints, motion_count: int) -> Ints:
+    counts = np.zeros((motion_count, motion_count), np.int64)
+    np.add.at(counts, (shown[:, _FIRST], shown[:, _SECOND]), 1)
+    return np.asarray(counts + counts.T)
+
+
+def _counts_by_participant(judgements: Judgements) -> tuple[Ints, Ints]:
+    """Count pairs shown and chosen (N, n, n), symmetric, for each of N participants."""
+    n, people = judgements.motion_count, int(judgements.participants.max()) + 1
+    shown, chosen = np.zeros((people, n, n), np.int64), np.zeros((people, n, n), np.int64)
+    one, other = judgements.shown[:, _FIRST], judgements.shown[:, _SECOND]
+    np.add.at(shown, (judgements.participants[:, None], one, other), 1)
+    row = np.arange(len(one))
+    np.add.at(chosen, (judgements.participants, one[row, judgements.chosen], other[row, judgements.chosen]), 1)
+    return np.asarray(shown + shown.transpose(0, 2, 1)), np.asarray(chosen + chosen.transpose(0, 2, 1))

@@ -1,0 +1,281 @@
+"""Perceptual metrics: weights of joint classes for angles, positions and velocities, and their combination.
+
+The distance of two poses by one measurement is c + N · Σ w F(x), with the sum over joint classes. x is the difference
+of the class in the two poses, F is the shaping, and the weights w have the sum 1. The distance of a metric is the mean
+of its measurements' distances, weighted by their shares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from marey_motion.arrays import Floats
+from marey_motion.errors import MotionError
+
+Measurement = Literal["angles", "positions", "velocities"]
+Shaping = Literal["euclid", "manhattan", "sigmoid", "power"]
+AngleMeasure = Literal["half_angle", "angle", "one_minus_dot", "log_norm"]
+
+MEASUREMENTS: tuple[Measurement, ...] = get_args(Measurement)
+JOINT_CLASSES: Mapping[str, tuple[str, ...]] = {
+    "head": ("head",),
+    "clavicle": ("left_clavicle", "right_clavicle"),
+    "upper_arm": ("left_shoulder", "right_shoulder"),
+    "forearm": ("left_elbow", "right_elbow"),
+    "hand": ("left_wrist", "right_wrist"),
+    "thigh": ("left_hip", "right_hip"),
+    "calf": ("left_knee", "right_knee"),
+    "toe": ("left_toe", "right_toe"),
+}
+"""Standard joints of each class. A bone is where its upper end is, so the forearm is at the elbow."""
+WITHOUT_ANGLES = ("hand", "toe")
+"""Classes for which the paper has no angles."""
+
+PUBLISHED: Mapping[Measurement, Mapping[Shaping, tuple[float | None, ...]]] = {
+    "angles": {
+        "euclid": (23.335, 0.508, 659.272, 0.000, 0.000, 0.006, 0.000, None, 0.669, 0.325, None),
+        "manhattan": (18.448, 0.324, 19.537, 0.041, 0.003, 0.061, 0.000, None, 0.622, 0.273, None),
+        "sigmoid": (18.004, 0.312, 20.016, 0.039, 0.008, 0.076, 0.000, None, 0.614, 0.263, None),
+    },
+    "positions": {
+        "euclid": (17.117, 0.290, 206.509, 0.062, 0.000, 0.551, 0.181, 0.000, 0.000, 0.050, 0.156),
+        "manhattan": (13.423, 0.069, 9.909, 0.020, 0.000, 0.362, 0.429, 0.000, 0.000, 0.000, 0.189),
+        "sigmoid": (13.264, 0.059, 10.375, 0.015, 0.000, 0.344, 0.455, 0.000, 0.000, 0.000, 0.184),
+    },
+    "velocities": {
+        "euclid": (25.779, 0.431, 1914.283, 0.000, 0.000, 0.000, 0.000, 0.605, 0.000, 0.298, 0.098),
+        "manhattan": (22.039, 0.193, 36.885, 0.000, 0.000, 0.000, 0.000, 0.551, 0.000, 0.298, 0.151),
+        "sigmoid": (21.993, 0.189, 36.532, 0.000, 0.000, 0.000, 0.000, 0.564, 0.000, 0.306, 0.157),
+    },
+}
+"""Figure 5 of the paper as printed: difference, c, N, and the weights in the order of `JOINT_CLASSES`."""
+MISPRINTS = (
+    "The weights of velocities with the sigmoid have the sum 1.027; 0.130 for the toe would give 1.",
+    "The text says that velocities use hands, thighs and calves; the table has hand, calf and toe, and no thigh.",
+)
+_MOST_ROUNDING = 0.0025
+
+
+@dataclass(frozen=True)
+class Component:
+    """The distance of poses by one measurement.
+
+    Parameters
+    ----------
+    measurement : str    angles, positions or velocities
+    shaping : str    F: euclid x², manhattan x, sigmoid x / (x + 1), power x^exponent
+    constant : float    c, which is added for poses that differ
+    norm : float    N, by which the weighted mean is multiplied
+    weights : mapping of str to float    weight of each joint class, with any sum; they are divided by their sum
+    exponent : float    exponent of the shaping `power`
+    """
+
+    measurement: Measurement
+    shaping: Shaping
+    constant: float
+    norm: float
+    weights: Mapping[str, float]
+    exponent: float = 1.0
+
+    def __post_init__(self) -> None:
+        allowed = classes_of(self.measurement)
+        if unknown := [name for name in self.weights if name not in allowed]:
+            raise MotionError(
+                f"{self.measurement} have no class {unknown[0]}; use {', '.join(allowed)}", where="weights"
+            )
+        numbers = [self.constant, self.norm, self.exponent, *self.weights.values()]
+        if not (np.isfinite(numbers).all() and min(numbers) >= 0 and sum(self.weights.values()) > 0):
+            raise MotionError(
+                "constant, norm, exponent and weights must be finite and at least 0, and one weight above 0",
+                where=self.measurement,
+            )
+        if self.exponent == 0:
+            raise MotionError("the exponent must be above 0", where="exponent")
+
+    def shares_of(self, classes: tuple[str, ...]) -> Floats:
+        """Divide the weights of the given classes by their sum.
+
+        Parameters
+        ----------
+        classes : tuple of str    K classes that the skeleton has; the other classes are left out
+
+        Returns
+        -------
+        (K,) float64    non-negative, with the sum 1
+
+        Raises
+        ------
+        MotionError    if the skeleton has no class with a weight
+        """
+        found = np.array([self.weights.get(name, 0.0) for name in classes])
+        if found.sum() <= 0:
+            needed = ", ".join(name for name, weight in self.weights.items() if weight > 0)
+            raise MotionError(
+                f"the skeleton has none of the joints that {self.measurement} compare: {needed}; map these joints",
+                code="mapping-invalid",
+            )
+        return np.asarray(found / found.sum())
+
+
+@dataclass(frozen=True)
+class PerceptualMetric:
+    """A perceptual metric: components with shares, and the conventions by which poses are measured.
+
+    Parameters
+    ----------
+    name : str    name for people, with the study that it comes from
+    components : tuple of Component    at most one per measurement
+    shares : tuple of float    shares a of the components, non-negative, with the sum 1
+    angle : str    measure of angles; half_angle and log_norm are arccos |q · p|, angle is twice as large, one_minus_dot
+        is 1 - |q · p|
+    side_reduce : str    whether the difference of a class is the mean or the sum of both sides
+    identity : str    zero: equal poses have the distance 0; constant: they have the distance c
+    root_alignment : str    mean_heading: the hips are placed at the origin, and the heading of the last second is
+        removed; kovar2d: each pair of poses is superposed by the best rotation about the vertical and the best shift
+    length_unit_m : float    metres per unit of length
+    velocity_interval_s : float    seconds in which velocities count the displacement
+    """
+
+    name: str
+    components: tuple[Component, ...]
+    shares: tuple[float, ...]
+    angle: AngleMeasure = "half_angle"
+    side_reduce: Literal["mean", "sum"] = "mean"
+    identity: Literal["zero", "constant"] = "zero"
+    root_alignment: Literal["mean_heading", "kovar2d"] = "mean_heading"
+    length_unit_m: float = 1.0
+    velocity_interval_s: float = 1.0 / 30.0
+
+    def __post_init__(self) -> None:
+        measured = [one.measurement for one in self.components]
+        if not measured or len(set(measured)) != len(measured) or len(self.shares) != len(measured):
+            raise MotionError("a metric needs components of different measurements, and one share for each")
+        if min(self.shares) < 0 or abs(sum(self.shares) - 1.0) > 1e-9:
+            raise MotionError("the shares must be at least 0 and have the sum 1", where="shares")
+        units = (self.length_unit_m, self.velocity_interval_s)
+        if not (np.isfinite(units).all() and min(units) > 0):
+            raise MotionError("length_unit_m and velocity_interval_s must be finite and above 0")
+
+
+def classes_of(measurement: Measurement) -> tuple[str, ...]:
+    """List the joint classes of a measurement.
+
+    Parameters
+    ----------
+    measurement : str    angles, positions or velocities
+
+    Returns
+    -------
+    tuple of str    names of classes, in the order of `JOINT_CLASSES`
+    """
+    return tuple(name for name in JOINT_CLASSES if measurement != "angles" or name not in WITHOUT_ANGLES)
+
+
+def published_component(measurement: Measurement, shaping: Shaping) -> Component:
+    """Make a component of the weights that the paper prints.
+
+    Parameters
+    ----------
+    measurement : str    angles, positions or velocities
+    shaping : str    euclid, manhattan or sigmoid
+
+    Returns
+    -------
+    Component    weights as printed
+
+    Raises
+    ------
+    MotionError    for the shaping `power`, for which nothing was published
+    """
+    row = PUBLISHED[measurement].get(shaping)
+    if row is None:
+        raise MotionError(
+            "the paper prints no weights for this shaping; use euclid, manhattan or sigmoid", where=shaping
+        )
+    _, constant, norm, *weights = row
+    assert constant is not None
+    assert norm is not None
+    given = {name: weight for name, weight in zip(JOINT_CLASSES, weights, strict=True) if weight is not None}
+    return Component(measurement, shaping, constant, norm, given)
+
+
+def published_metric(
+    shaping: Shaping = "sigmoid", shares: tuple[float, float, float] = (1 / 3, 1 / 3, 1 / 3)
+) -> PerceptualMetric:
+    """Make the metric of the paper.
+
+    Parameters
+    ----------
+    shaping : str    euclid, manhattan or sigmoid
+    shares : tuple of float    shares of angles, positions and velocities; the paper does not print any
+
+    Returns
+    -------
+    PerceptualMetric    three components
+
+    Raises
+    ------
+    MotionError    for the shaping `power`, and for invalid shares
+    """
+    components = tuple(published_component(measurement, shaping) for measurement in MEASUREMENTS)
+    return PerceptualMetric(f"published, {shaping}", components, shares)
+
+
+def uniform_metric(shaping: Shaping = "manhattan", exponent: float = 1.0) -> PerceptualMetric:
+    """Make a metric that weights all joint classes equally, for comparison with fitted ones.
+
+    Parameters
+    ----------
+    shaping : str    shaping of all components
+    exponent : float    exponent of the shaping `power`
+
+    Returns
+    -------
+    PerceptualMetric    three components with c = 0 and N = 1, in equal shares
+    """
+    components = tuple(
+        Component(measurement, shaping, 0.0, 1.0, dict.fromkeys(classes_of(measurement), 1.0), exponent)
+        for measurement in MEASUREMENTS
+    )
+    return PerceptualMetric(f"uniform, {shaping}", components, (1 / 3, 1 / 3, 1 / 3))
+
+
+def doubtful_weights(component: Component) -> str:
+    """Describe what is wrong with the sum of a component's weights, for a warning.
+
+    Parameters
+    ----------
+    component : Component    weights
+
+    Returns
+    -------
+    str    a sentence; empty if the sum is 1 within rounding of printed weights
+    """
+    total = sum(component.weights.values())
+    if abs(total - 1.0) <= _MOST_ROUNDING:
+        return ""
+    return f"The weights of {component.measurement} have the sum {total:.3f}; they are divided by it."
+
+
+def shaped(differences: Floats, shaping: Shaping, exponent: float = 1.0) -> Floats:
+    """Apply a shaping F to differences.
+
+    Parameters
+    ----------
+    differences : (...) float64    x, at least 0
+    shaping : str    euclid x², manhattan x, sigmoid x / (x + 1), power x^exponent
+    exponent : float    exponent of `power`
+
+    Returns
+    -------
+    (...) float64    F(x)
+    """
+    if shaping == "euclid":
+        return differences * differences
+    if shaping == "sigmoid":
+        return differences / (differences + 1.0)
+    return differences.copy() if shaping == "manhattan" else np.asarray(differences**exponent)

@@ -1,0 +1,75 @@
+"""Order and two groups of motions, from a table of their differences (figures 3 and 4 of the paper)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from marey_motion.arrays import Floats, Ints
+from marey_motion.errors import MotionError
+
+RESTARTS = 50
+
+
+@dataclass(frozen=True, eq=False)
+class MotionOrder:
+    """Motions in the order of the first principal component, and in two groups.
+
+    Parameters
+    ----------
+    order : (n,) int64    motions by increasing projection
+    projections : (n,) float64    projection of each motion on the first principal component
+    groups : (n,) int64    0 or 1; group 0 begins the order
+    membership : (n,) float64    membership in group 1: distance to the centre of group 0, divided by the sum of both
+    """
+
+    order: Ints
+    projections: Floats
+    groups: Ints
+    membership: Floats
+
+
+def order_motions(differences: Floats, seed: int = 0) -> MotionOrder:
+    """Order motions and divide them into two groups by k-means.
+
+    The rows of the table are points. The sign of the first component is the one with which its largest entry is
+    positive.
+
+    Parameters
+    ----------
+    differences : (n, n) float64    symmetric table; a missing difference is taken as the mean of those of both motions
+    seed : int    seed of the starts of k-means
+
+    Returns
+    -------
+    MotionOrder    order, groups and membership
+
+    Raises
+    ------
+    MotionError    for fewer than three motions, or a motion without any difference to another
+    """
+    from sklearn.cluster import KMeans
+
+    rows = _filled(differences)
+    centred = rows - rows.mean(axis=0)
+    direction = np.linalg.svd(centred, full_matrices=False)[2][0]
+    direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
+    projections = centred @ direction
+    means = KMeans(2, n_init=RESTARTS, random_state=seed).fit(rows)
+    groups, centres = means.labels_.astype(np.int64), means.cluster_centers_
+    if projections[groups == 0].mean() > projections[groups == 1].mean():
+        groups, centres = 1 - groups, centres[::-1]
+    from_0, from_1 = (np.linalg.norm(rows - centre, axis=1) for centre in centres)
+    return MotionOrder(np.argsort(projections, kind="stable"), projections, groups, from_0 / (from_0 + from_1))
+
+
+def _filled(differences: Floats) -> Floats:
+    n = len(differences)
+    if n < 3 or differences.shape != (n, n):
+        raise MotionError(f"an order needs a square table of at least 3 motions, not {differences.shape}")
+    known = np.where(np.eye(n, dtype=bool), np.nan, differences)
+    if (alone := ~np.isfinite(known).any(axis=1)).any():
+        raise MotionError("a motion has no known difference to another", where=f"motion {int(np.argmax(alone))}")
+    means = np.nanmean(known, axis=1)
+    return np.where(np.isfinite(differences), differences, 0.5 * (means[:, None] + means))

@@ -1,0 +1,125 @@
+"""Motion maps of two clips: with the period and the registration curve (figure 1), and by component (figure 6)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from marey_motion.arrays import Floats
+from marey_motion.perception.cycles import Period
+from marey_motion.perception.maps import component_map, motion_map
+from marey_motion.perception.measuring import MeasuredClip
+from marey_motion.perception.metric import PerceptualMetric
+from marey_motion.perception.registration import RegistrationCurve
+from marey_reports.drawing.drawn import Sketch
+from marey_reports.drawing.paper import (
+    LIGHT,
+    MORE_IS_WORSE,
+    SIDE,
+    Place,
+    add_colour_bar,
+    add_keys,
+    add_panel,
+    differing_parts,
+    new_figure,
+    shortened,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+
+PATH, PERIOD = "#d7191c", "#2c7fb8"
+_LEFT, _BOTTOM, _GAP, _BAR = 0.75, 0.72, 0.62, 0.12
+_HIGHEST = 0.98
+_LONGEST = 22
+
+
+class NamedClip(NamedTuple):
+    """A measured clip, with its name for people."""
+
+    name: str
+    clip: MeasuredClip
+
+
+def draw_registration(
+    one: NamedClip, other: NamedClip, metric: PerceptualMetric, period: Period, curve: RegistrationCurve
+) -> Sketch:
+    """Draw a clip against itself with its period, and against another clip with the registration curve (figure 1)."""
+    maps = [motion_map(one.clip, second.clip, metric) for second in (one, other)]
+    figure, panels, images = _panels(maps, [(one, one), (one, other)], ["", ""])
+    rate = one.clip.rate_hz
+    length_s, last_s = period.frames / rate, (one.clip.frame_count - 1) / rate
+    for panel in panels:
+        panel.autoscale(enable=False)
+    _line(panels[0], [0.0, last_s - length_s], [length_s, last_s], PATH, "one period apart")
+    start_s = period.start / rate
+    _line(panels[0], [start_s, start_s], [start_s, start_s + length_s], PERIOD, "period")
+    frames = np.arange(len(curve.times))
+    there = curve.times % other.clip.frame_count if other.clip.cyclic else curve.times
+    # A curve that goes on over the seam of a cycle is drawn in parts.
+    parts = np.split(frames, np.flatnonzero(np.diff(there) < 0) + 1)
+    for number, part in enumerate(parts):
+        _line(panels[1], part / rate, there[part] / rate, PATH, "same moment" if number == 0 else "")
+    for panel in panels:
+        add_keys(panel, loc="upper left", bbox_to_anchor=(-0.02, -0.17), ncols=2, handlelength=1.4, columnspacing=1.2)
+    _bar(figure, images[-1], len(maps) - 1)
+    caption = (
+        f"Perceptual distance of every pair of moments, by the metric {metric.name}. Left: {one.name} with itself; "
+        f"moments that are a period of {length_s:.2f} s apart look alike. Right: {one.name} and {other.name}; the "
+        f"curve joins moments of the same phase, with a mean distance of {curve.mean_cost:.2f}."
+    )
+    table = {"first_s": frames / rate, "second_s": curve.times / rate}
+    lags = {"lag_s": period.lags / rate, "distance": period.differences}
+    return Sketch(figure, {"curve": table, "lags": lags}, caption)
+
+
+def draw_components(one: NamedClip, other: NamedClip, metric: PerceptualMetric) -> Sketch:
+    """Draw the motion map of each component of a metric, and of the whole metric (figure 6)."""
+    maps = [component_map(one.clip, other.clip, metric, component) for component in metric.components]
+    maps.append(motion_map(one.clip, other.clip, metric))
+    titles = [component.measurement for component in metric.components] + ["all together"]
+    figure, _, images = _panels(maps, [(one, other)] * len(maps), titles)
+    _bar(figure, images[-1], len(maps) - 1)
+    caption = (
+        f"Perceptual distance of every pair of moments of {one.name} and {other.name}, by each component of the metric "
+        f"{metric.name} and by all of them. All maps have one scale: the component with the greatest distances has the "
+        "greatest influence on the whole."
+    )
+    shares = [*metric.shares, 1.0]
+    table = {"component": titles, "share": shares, "mean_distance": [float(each.mean()) for each in maps]}
+    return Sketch(figure, {"components": table}, caption)
+
+
+def _panels(
+    maps: list[Floats], clips: list[tuple[NamedClip, NamedClip]], titles: list[str]
+) -> tuple[Figure, list[Axes], list[AxesImage]]:
+    """Draw maps side by side on one scale; the first clip runs to the right, the second upwards."""
+    ceiling = max(float(np.quantile(each, _HIGHEST)) for each in maps) or 1.0
+    figure = new_figure(_LEFT + len(maps) * (SIDE + _GAP) + 0.45, _BOTTOM + SIDE + 0.5)
+    panels, images = [], []
+    for number, (values, pair, title) in enumerate(zip(maps, clips, titles, strict=True)):
+        names = [shortened(name, _LONGEST) for name in differing_parts([each.name for each in pair])]
+        place = Place(_LEFT + number * (SIDE + _GAP), _BOTTOM, SIDE, SIDE)
+        panel = add_panel(figure, place, title=title, grid=False, x=f"{names[0]} (s)", y=f"{names[1]} (s)")
+        ends = [(each.clip.frame_count - 0.5) / each.clip.rate_hz for each in pair]
+        begins = [-0.5 / each.clip.rate_hz for each in pair]
+        images.append(
+            panel.imshow(values.T, origin="lower", aspect="auto", cmap=MORE_IS_WORSE, vmin=0.0, vmax=ceiling,
+                         extent=(begins[0], ends[0], begins[1], ends[1]), interpolation="antialiased")
+        )  # fmt: skip
+        panels.append(panel)
+    return figure, panels, images
+
+
+def _bar(figure: Figure, image: AxesImage, last: int) -> None:
+    place = Place(_LEFT + last * (SIDE + _GAP) + SIDE + 0.15, _BOTTOM, _BAR, SIDE)
+    add_colour_bar(figure, image, place, "perceptual distance")
+
+
+def _line(panel: Axes, x: Floats | list[float], y: Floats | list[float], colour: str, label: str) -> None:
+    """Draw a line that is visible on light and dark ground."""
+    panel.plot(x, y, color=LIGHT, lw=3.4, solid_capstyle="round")
+    panel.plot(x, y, color=colour, lw=1.7, solid_capstyle="round", label=label or None)

@@ -1,0 +1,191 @@
+"""Difference tables of judgements, the order of motions, and weights fitted to tables."""
+
+import numpy as np
+import pytest
+from scipy.stats import spearmanr
+
+from marey_motion.arrays import Floats, Ints
+from marey_motion.errors import MotionError
+from marey_motion.perception.fitting import (
+    PairDifferences,
+    bootstrap_weights,
+    fit_by_descent,
+    fit_component,
+    fit_power,
+    fit_quality,
+    fit_shares,
+    leave_one_motion_out,
+    predict,
+)
+from marey_motion.perception.judging import (
+    Judgements,
+    difference_table,
+    draw_trials,
+    pair_counts_by_participant,
+    simulate_judgements,
+    triangle_violations,
+)
+from marey_motion.perception.metric import Component, classes_of
+from marey_motion.perception.ordering import order_motions
+
+MOTIONS = 21
+PAIRS = np.triu_indices(MOTIONS, 1)
+TRUE = Component("positions", "manhattan", 0.07, 9.9, {"head": 0.02, "upper_arm": 0.36, "forearm": 0.43, "toe": 0.19})
+
+
+def grouped() -> Floats:
+    """Return differences of two groups of 14 and 7 motions, whose centres are 6 standard deviations apart."""
+    points = np.random.default_rng(5).normal(size=(MOTIONS, 2))
+    points[14:, 0] += 6.0
+    table = np.linalg.norm(points[:, None] - points, axis=-1)
+    return np.asarray(np.where(table > 0, 0.3 + 0.6 * table / table.max(), 0.0))
+
+
+def pair_differences(seed: int = 2) -> PairDifferences:
+    rng = np.random.default_rng(seed)
+    frames = tuple(rng.gamma(2.0, 0.04, (rng.integers(30, 50), 8)) * rng.uniform(0.3, 2.0, 8) for _ in PAIRS[0])
+    return PairDifferences("positions", classes_of("positions"), np.stack(PAIRS, axis=1).astype(np.int64), frames)
+
+
+def test_trials_are_balanced_and_repeat_with_their_seed() -> None:
+    drawn = draw_trials(MOTIONS, 29, seed=4)
+    assert drawn.shape == (29, 63, 4)
+    assert (np.diff(np.sort(drawn, axis=-1)) > 0).all()
+    assert all((np.bincount(one.ravel(), minlength=MOTIONS) == 12).all() for one in drawn)
+    np.testing.assert_array_equal(drawn, draw_trials(MOTIONS, 29, seed=4))
+    shown = difference_table(
+        Judgements(MOTIONS, np.zeros(1827, np.int64), drawn.reshape(-1, 4), np.zeros(1827, np.int64))
+    ).shown
+    assert shown[PAIRS].mean() == pytest.approx(52.2, abs=0.01)
+    assert shown[PAIRS].std() < 4.0
+    appearances = np.bincount(draw_trials(10, 1, seed=1, trials=6).ravel(), minlength=10)
+    assert np.ptp(appearances) <= 1
+    with pytest.raises(MotionError):
+        draw_trials(3, 1, seed=0)
+
+
+def test_one_pair_in_six_is_chosen_and_missing_pairs_are_missing() -> None:
+    judgements = simulate_judgements(grouped(), 5, seed=8, noise=0.1)
+    table = difference_table(judgements)
+    assert table.chosen.sum() * 6 == table.shown.sum()
+    seen = table.shown[PAIRS] > 0
+    mean = np.average(table.differences[PAIRS][seen], weights=table.shown[PAIRS][seen])
+    assert mean == pytest.approx(5 / 6, abs=1e-14)
+    one = Judgements(5, np.zeros(1, np.int64), np.array([[3, 0, 1, 4]]), np.array([4]))  # places 1 and 3: motions 0, 4
+    single = difference_table(one).differences
+    assert single[0, 4] == single[4, 0] == 0.0
+    assert single[0, 3] == 1.0
+    assert np.isnan(single[2, :2]).all()
+    assert (np.diag(single) == 0).all()
+    by_person = pair_counts_by_participant(judgements)
+    np.testing.assert_array_equal(by_person[0].sum(axis=0), table.shown[PAIRS])
+    np.testing.assert_array_equal(by_person[1].sum(axis=0), table.chosen[PAIRS])
+    for shown, chosen in (([[0, 1, 2, 2]], [0]), ([[0, 1, 2, 5]], [0]), ([[0, 1, 2, 3]], [6]), (np.empty((0, 4)), [])):
+        with pytest.raises(MotionError):
+            Judgements(5, np.zeros(len(chosen), np.int64), np.array(shown, np.int64), np.array(chosen, np.int64))
+
+
+def test_triangle_inequalities_are_counted() -> None:
+    assert triangle_violations(grouped()) == (0, 3990)
+    table = np.array([[0.0, 0.1, 0.9], [0.1, 0.0, 0.2], [0.9, 0.2, 0.0]])
+    assert triangle_violations(table) == (1, 3)
+    table[0, 1] = table[1, 0] = np.nan
+    assert triangle_violations(table) == (0, 0)
+
+
+def test_simulated_participants_reveal_two_groups() -> None:
+    truth = grouped()
+    table = difference_table(simulate_judgements(truth, 29, seed=3, noise=0.05))
+    assert spearmanr(table.differences[PAIRS], truth[PAIRS]).statistic >= 0.9
+    violated, checked = triangle_violations(table.differences)
+    assert violated / checked < 0.01
+    assert 0.02 < table.noise_ceiling < 0.06
+    order = order_motions(table.differences)
+    small = order.groups == order.groups[-1]
+    assert set(np.flatnonzero(small)) == set(range(14, 21))
+    first = order.order[:14] if order.groups[0] == 0 else order.order[7:]
+    assert set(first) == set(range(14))
+    np.testing.assert_array_equal(order.membership > 0.5, order.groups == 1)
+    holes = table.differences.copy()
+    holes[0, 1] = holes[1, 0] = np.nan
+    np.testing.assert_array_equal(order_motions(holes).groups, order.groups)
+    holes[3] = np.nan
+    with pytest.raises(MotionError):
+        order_motions(holes)
+
+
+def test_known_weights_are_recovered_from_a_table() -> None:
+    pairs = pair_differences()
+    perceived = predict(TRUE, pairs)
+    fitted = fit_component(pairs, perceived, "manhattan")
+    assert (fitted.constant, fitted.norm) == pytest.approx((TRUE.constant, TRUE.norm), rel=1e-11)
+    found = [fitted.weights[name] - TRUE.weights.get(name, 0.0) for name in pairs.classes]
+    assert np.abs(found).max() < 1e-12
+    perceived[:40] = np.nan
+    assert fit_quality(predict(fitted, pairs), perceived).rss < 1e-24
+    weighted = fit_component(pairs, perceived, "manhattan", weights=np.linspace(1.0, 2.0, len(perceived)))
+    assert weighted.norm == pytest.approx(TRUE.norm, rel=1e-10)
+    with pytest.raises(MotionError) as error:
+        fit_component(pairs, np.full(len(perceived), np.nan), "manhattan")
+    assert error.value.code == "too-few-pairs"
+    with pytest.raises(MotionError) as error:
+        fit_component(pairs, np.full(len(perceived), 0.5), "manhattan")
+    assert error.value.code == "fit-without-weights"
+
+
+def test_no_random_start_ends_below_the_least_squares() -> None:
+    pairs = pair_differences()
+    perceived = predict(TRUE, pairs) + np.random.default_rng(1).normal(0.0, 0.05, len(pairs.frames))
+    fitted = predict(fit_component(pairs, perceived, "sigmoid"), pairs)
+    best = np.sum((fitted - perceived) ** 2)
+    reached = fit_by_descent(pairs.means("sigmoid"), perceived)
+    assert reached.shape == (1000,)
+    assert reached == pytest.approx(best, abs=1e-8)
+    assert reached.min() > best - 1e-12
+
+
+def test_the_exponent_is_found() -> None:
+    pairs = pair_differences()
+    truth = Component("positions", "power", 0.1, 1.4, {"forearm": 0.7, "calf": 0.3}, exponent=0.3)
+    fitted = fit_power(pairs, predict(truth, pairs))
+    assert fitted.exponent == pytest.approx(0.3, abs=1e-3)
+    assert fit_quality(predict(fitted, pairs), predict(truth, pairs)).rmse < 1e-5
+
+
+def test_uncertainty_comes_from_participants_and_validation_from_motions() -> None:
+    pairs = pair_differences()
+    truth = predict(TRUE, pairs)
+    table = np.zeros((MOTIONS, MOTIONS))
+    table[PAIRS] = truth / 3.0
+    judgements = simulate_judgements(table + table.T, 12, seed=6, noise=0.05)
+    perceived = difference_table(judgements).differences[PAIRS]
+    draws = bootstrap_weights(pairs, *pair_counts_by_participant(judgements), "manhattan", replicates=60)
+    whole = fit_component(pairs, perceived, "manhattan")
+    low, high = np.quantile(draws[:, 1:].sum(axis=1), (0.01, 0.99))
+    assert low < whole.norm < high
+    assert draws.std(axis=0).max() > 0
+    noisy = truth + np.random.default_rng(1).normal(0.0, 0.2, len(truth))
+    fitted = predict(fit_component(pairs, noisy, "manhattan"), pairs)
+    left_out = leave_one_motion_out(pairs, noisy, "manhattan")
+    assert fit_quality(left_out, noisy).rss > fit_quality(fitted, noisy).rss
+    np.testing.assert_allclose(leave_one_motion_out(pairs, truth, "manhattan"), truth, atol=1e-9)
+
+
+def test_shares_are_the_optimum_on_the_simplex() -> None:
+    rng = np.random.default_rng(0)
+    components = [rng.random(50) for _ in range(3)]
+    target = 0.7 * components[0] + 0.3 * components[2]
+    assert fit_shares(components, target) == pytest.approx((0.7, 0.0, 0.3), abs=1e-12)
+    target = rng.random(50)
+    shares = fit_shares(components, target)
+    loss = np.sum((np.column_stack(components) @ shares - target) ** 2)
+    others: Ints | Floats = rng.dirichlet(np.ones(3), 4000)
+    assert loss <= np.sum((others @ np.array(components) - target) ** 2, axis=1).min() + 1e-12
+    assert sum(shares) == pytest.approx(1.0)
+
+
+def test_qualities_are_those_of_their_formulas() -> None:
+    quality = fit_quality(np.array([0.1, 0.4, 0.4, 9.0]), np.array([0.2, 0.3, 0.5, np.nan]))
+    assert (quality.rss, quality.rmse_percent, quality.l2) == pytest.approx((0.03, 10.0, 0.06**0.5))
+    assert quality.r2 == pytest.approx(1.0 - 0.03 / 0.046666667)
+    assert np.isnan(fit_quality(np.ones(3), np.arange(3.0)).spearman)
