@@ -25,8 +25,8 @@ FLOORS = {
 }
 """Minimum coverage in percent, by package: 2 to 3 percentage points below the coverage of a whole run of `make check`.
 
-The worker, and the limits and the fork server in `marey_schemas.processes`, mostly run in child processes, which are not
-measured.
+The worker, and the limits and the fork server in `marey_schemas.processes`, mostly run in child processes, which are
+not measured.
 """
 
 

@@ -18,7 +18,7 @@ from marey_schemas.tracing.export import Tracer
 from marey_schemas.tracing.spans import AttributeValue, Span
 from marey_server.access.principal import Principal
 from marey_server.errors import ApiProblem
-from marey_server.process.trace_settings import TraceCallers
+from marey_server.process.setting_groups.trace_settings import TraceCallers
 from marey_server.store.transaction import Transaction
 
 T = TypeVar("T")

@@ -36,8 +36,8 @@ from marey_server.access.id_tokens import (
 )
 from marey_server.access.network_addresses import is_protected
 from marey_server.errors import ForbiddenProblem, UnauthenticatedProblem, UnavailableProblem
-from marey_server.process.identity_settings import IdentitySettings
 from marey_server.process.secret_files import read_secret
+from marey_server.process.setting_groups.identity_settings import IdentitySettings
 
 PROVIDER_TIMEOUT_S = 10.0
 MOST_ANSWER_BYTES = 256 * KIB

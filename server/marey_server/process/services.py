@@ -65,6 +65,14 @@ class Description:
     tag: str
 
 
+def _answer_cache(most_bytes: int) -> LruCache[tuple[str, str], bytes]:
+    return LruCache(
+        max_bytes=most_bytes,
+        largest_bytes=most_bytes // LARGEST_ANSWER_SHARE,
+        size_of=lambda body: len(body) + ANSWER_ENTRY_BYTES,
+    )
+
+
 class Services:
     """Shared parts of a server process: database, threads, metrics, and whether the server is draining."""
 
@@ -85,11 +93,7 @@ class Services:
         self.description = description
         self.tracer = settings.open_tracer()
         self.metrics = Metrics()
-        self.answers: LruCache[tuple[str, str], bytes] = LruCache(
-            max_bytes=settings.answer_cache_bytes,
-            largest_bytes=settings.answer_cache_bytes // LARGEST_ANSWER_SHARE,
-            size_of=lambda body: len(body) + ANSWER_ENTRY_BYTES,
-        )
+        self.answers = _answer_cache(settings.answer_cache_bytes)
         self.models: LruCache[SearchableKey, bytes] = LruCache(max_bytes=MODEL_CACHE_BYTES, size_of=len)
         """Packed models for child processes: documents and, for searches, search trees and joint mappings."""
         self.admitted: LruCache[Hashable, float] = LruCache(max_entries=ADMISSIONS_REMEMBERED)

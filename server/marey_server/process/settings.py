@@ -15,11 +15,11 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
 from marey_schemas.sizes import KIB, MIB
-from marey_server.process.blob_settings import BlobSettings
-from marey_server.process.identity_settings import IdentitySettings
-from marey_server.process.process_settings import ProcessSettings
 from marey_server.process.secret_files import read_secret
-from marey_server.process.trace_settings import TraceSettings
+from marey_server.process.setting_groups.blob_settings import BlobSettings
+from marey_server.process.setting_groups.identity_settings import IdentitySettings
+from marey_server.process.setting_groups.process_settings import ProcessSettings
+from marey_server.process.setting_groups.trace_settings import TraceSettings
 from marey_server.process.worker_pools import OwnPods, WorkerPools
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.monitoring.workers import ALIVE_S, MOST_OF_USER, MOST_REMEMBERED

@@ -12,9 +12,9 @@ from marey_schemas.queue.jobs import JobState
 from marey_schemas.queue.own_pods import OWN_POD_LABEL
 from marey_schemas.queue.scripts import SCRIPT
 from marey_server.access.labels import labels_key, labels_of
-from marey_server.store.quotas.running_jobs import count_leased
 from marey_server.store.jobs.claiming.turns import claim_order
 from marey_server.store.jobs.fencing import QUEUED, RUNNING
+from marey_server.store.quotas.running_jobs import count_leased
 from marey_server.store.tables import job, project, queue_share
 from marey_server.store.transaction import Transaction, in_lists
 

@@ -6,8 +6,8 @@ On Postgres, the tables of the queue are vacuumed after changes of 2 % of their 
 import sqlalchemy as sa
 from alembic import op
 
-revision = "0035"
-down_revision = "0031"
+revision = "0033"
+down_revision = "0032"
 branch_labels = None
 depends_on = None
 phase = "before"

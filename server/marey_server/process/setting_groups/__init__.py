@@ -1,0 +1,1 @@
+"""Groups of settings, which `marey_server.process.settings` joins."""
