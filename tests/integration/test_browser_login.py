@@ -167,17 +167,19 @@ def test_the_settings_of_the_page_are_valid_and_doctor_checks_them(
     written |= {"oidc_client_secret_file": secret, "oidc_issuer": provider.url}
     settings = Settings(data=tmp_path, **written)
 
-    def finding() -> tuple[str, str]:
+    def finding(check: str = "identity provider") -> tuple[str, str]:
         every = {one.check: one for one in examine(settings, {}, connect_database)}
-        return every["identity provider"].state, every["identity provider"].detail
+        return every[check].state, every[check].detail
 
     state, detail = finding()
     assert state == "ok"
     [uri] = re.findall(r"```\n(https\S+)\n```", TEXT)
     assert uri in detail
     secret.chmod(0o604)
-    assert finding()[0] == "warning"
+    state, detail = finding("secrets")
+    assert (state, str(secret) in detail) == ("warning", True)
     secret.chmod(0o600)
+    assert finding("secrets")[0] == "ok"
     provider.fault = "issuer"
     assert finding() == ("fault", mock.ANY)
     host = urlsplit(uri).netloc
