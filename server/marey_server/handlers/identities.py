@@ -158,6 +158,7 @@ class OpenedSignIn(BrowserResource):
         answer_types=("text/html",),
         also=((303, None),),
         reserved=True,
+        for_browsers=True,
     )
     async def get(self, sign_in: str) -> Reply:
         """Send the browser to the identity provider. Only one browser can open a sign-in, and only once."""
@@ -202,6 +203,7 @@ class SignInCallback(BrowserResource):
         answer_types=("text/html",),
         also=((303, None),),
         reserved=True,
+        for_browsers=True,
     )
     async def get(self, query: CallbackQuery) -> Reply:
         """Check the answer of the identity provider, and give the browser a code for the program that waits."""

@@ -111,6 +111,8 @@ class Operation:
     """Whether members who have the declared role only in some folders may use the operation in these folders."""
     names: bool = False
     """Whether a change answers with names of the project's content, such as those of conflicts of a merge."""
+    for_browsers: bool = False
+    """Whether people open the address in a browser, so that errors are pages, too."""
 
     @property
     def required_role(self) -> RequiredRole:
@@ -158,6 +160,7 @@ def reads(
     stream: bool = False,
     reserved: bool = False,
     attempts: bool = False,
+    for_browsers: bool = False,
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes nothing.
 
@@ -172,11 +175,12 @@ def reads(
     stream : whether the answer is also available as server-sent events
     reserved : whether the method runs in threads that are kept free for such methods
     attempts : whether running attempts of jobs may use the method
+    for_browsers : whether errors are answered with pages, because people open the address in a browser
     """
     return _declare(
         access=access, scope=scope, query=query, body=body, answer=answer, paged=paged, etag=etag, status=status,
         answer_types=answer_types, also=also, public=public, headers=headers, stream=stream, reserved=reserved,
-        attempts=attempts,
+        attempts=attempts, for_browsers=for_browsers,
     )  # fmt: skip
 
 
@@ -244,6 +248,7 @@ def _declare(
     replays: bool = False,
     in_folders: bool = False,
     names: bool = False,
+    for_browsers: bool = False,
 ) -> Callable[[Method], Declared]:
     def attach(method: Method) -> Declared:
         @wraps(method)
@@ -255,7 +260,7 @@ def _declare(
         perform.operation = Operation(  # type: ignore[attr-defined]
             method.__name__.upper(), summary.rstrip("."), description.strip(), access, scope, query, taken, answer,
             status, paged, etag, precondition, idempotency, answer_types, also, public, headers, stream, reserved,
-            attempts, replays, in_folders, names,
+            attempts, replays, in_folders, names, for_browsers,
         )  # fmt: skip
         return perform
 

@@ -101,7 +101,7 @@ def build_document(routes: Iterable[Route], version: str) -> Schema:
         "components": {
             "schemas": models.components,
             "securitySchemes": {"bearer": {"type": "http", "scheme": "bearer", "description": "A token of Marey."}},
-            "responses": {"Problem": _problem_response()},
+            "responses": {"Problem": _problem_response(), "ProblemPage": _problem_response("text/html")},
         },
     }
 
@@ -249,6 +249,7 @@ def _responses(operation: Operation, models: _Models) -> Schema:
                 "schema": {"type": "string"},
             }
         }
+    problem = {"$ref": f"#/components/responses/{'ProblemPage' if operation.for_browsers else 'Problem'}"}
     found: Schema = {str(operation.status): success}
     if operation.etag and operation.method == "GET":
         found["304"] = {"description": "The copy that you have is current."}
@@ -260,10 +261,10 @@ def _responses(operation: Operation, models: _Models) -> Schema:
             schema = models.writing(model)
             found[str(status)]["content"] = {name: {"schema": schema} for name in MEDIA_TYPES}
         elif status >= 400:
-            found[str(status)] = {"$ref": "#/components/responses/Problem"}
+            found[str(status)] = problem
     for status in _refusals(operation):
-        found.setdefault(str(status), {"$ref": "#/components/responses/Problem"})
-    found["default"] = {"$ref": "#/components/responses/Problem"}
+        found.setdefault(str(status), problem)
+    found["default"] = problem
     return found
 
 
@@ -313,9 +314,10 @@ def _refusals(operation: Operation) -> list[int]:
     return sorted(found)
 
 
-def _problem_response() -> Schema:
+def _problem_response(*others: str) -> Schema:
+    """Return the response for an error, which may also have one of the media types `others`."""
     return {
         "description": "Reason why the request was refused.",
         "headers": {"X-Request-Id": {"description": "Quote it when asking for help.", "schema": {"type": "string"}}},
-        "content": {PROBLEM_TYPE: {"schema": {"$ref": _REF.format(model="Problem")}}},
+        "content": {PROBLEM_TYPE: {"schema": {"$ref": _REF.format(model="Problem")}}, **{name: {} for name in others}},
     }
