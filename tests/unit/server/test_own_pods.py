@@ -25,6 +25,8 @@ from marey_server.store.credentials import tokens
 from marey_server.store.jobs import queue
 from marey_server.store.jobs.claiming import own_pods, rights
 from marey_server.store.jobs.claiming.own_pods import WaitingJob
+from marey_server.store.jobs.reaper import StartGrace
+from marey_server.store.monitoring.workers import WorkerMemory, claim_and_remember
 from marey_server.store.scripts import registry, runs
 
 RULES = PodRules(4096, 60, frozenset({"gpu=a100"}), ("registry.example.org/motion/",))
@@ -160,6 +162,15 @@ def test_the_token_of_a_pod_is_bound_to_its_job(desk: Desk) -> None:
         with pytest.raises(UnauthenticatedProblem):
             desk.database.read(SYSTEM, tokens.resolve_token, text)
     assert pod_of(desk, large).scopes == ("work",)
+
+
+def test_pods_do_not_count_as_workers_of_one_user(desk: Desk) -> None:
+    memory, grace = WorkerMemory(most_of_user=1), StartGrace(desk.policy)
+    for number in range(3):
+        job = desk.submit(resources=LARGE)
+        request = ClaimRequest(worker=f"pod-{number}", kinds=tuple(KINDS), labels=YES, job=job)
+        leases = desk.database.write(pod_of(desk, job), claim_and_remember, request, memory, grace, desk.policy)
+        assert [lease.job for lease in leases] == [job]
 
 
 def test_the_pods_of_tasks_claim_the_task_at_their_index(desk: Desk) -> None:
