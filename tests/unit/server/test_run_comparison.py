@@ -84,15 +84,21 @@ def test_a_setting_has_no_mean_if_a_replicate_gave_no_number(trained: Desk) -> N
 def test_curves_are_read_only_if_they_are_curves(trained: Desk) -> None:
     curve = Curve(steps=(0, 1), values=(1.5, None), logged=2)
     content = Curves(curves={"loss": curve, "other": curve}).model_dump_json().encode()
-    for seed, file in enumerate(
-        (content, b'{"curves": {"loss": {"steps": [1], "values": [], "logged": 1}}}', b" " * MOST_CURVE_BYTES + content)
-    ):
+    unsound = (
+        '{"loss": {"steps": [1], "values": [], "logged": 1}}',
+        '{"loss": {"steps": [1], "values": [1e999], "logged": 1}}',
+        '{"loss": {"steps": [2, 1], "values": [1, 2], "logged": 2}}',
+        '{"loss": {"steps": [1], "values": [1], "logged": -1}}',
+        '{"' + "n" * 64 + '": {"steps": [1], "values": [1], "logged": 1}}',
+    )
+    files = [content, b" " * MOST_CURVE_BYTES + content, *(f'{{"curves": {one}}}'.encode() for one in unsound)]
+    for seed, file in enumerate(files):
         run(trained, 1, seed, {"fields": {"loss": 1}}, curves=file)
     for made_up in ({"size_bytes": 1}, [1], "text", {"blob": 7}):
         run(trained, 1, 9, {"fields": {"loss": 1}, "curves": made_up})
     found = compared(trained, curves=True, fields=("loss",))
     assert found.curves == ("loss",)
-    assert [one.curves for one in found.runs] == [{"loss": curve}, *[{}] * 6]
+    assert [one.curves for one in found.runs] == [{"loss": curve}, *[{}] * 10]
     assert compared(trained, curves=True).curves == ("loss", "other")
     assert compared(trained).curves == ()
 
