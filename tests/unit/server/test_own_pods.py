@@ -164,6 +164,14 @@ def test_the_token_of_a_pod_is_bound_to_its_job(desk: Desk) -> None:
     assert pod_of(desk, large).scopes == ("work",)
 
 
+def test_a_label_that_only_looks_like_that_of_pods_starts_no_pod(desk: Desk) -> None:
+    forged = {f"x{OWN_POD_LABEL}": "yes"}
+    desk.submit(labels={**forged, "site": "lyon"})
+    desk.submit(labels={OWN_POD_LABEL.upper(): "yes", "site": f",{OWN_POD_LABEL}=yes"})
+    own = [desk.submit(labels=YES), desk.submit(labels={"gpu": "a100"}, resources=LARGE)]
+    assert [one.id for one in desk.database.read(SYSTEM, own_pods.read_waiting, 10)] == own
+
+
 def test_pods_do_not_count_as_workers_of_one_user(desk: Desk) -> None:
     memory, grace = WorkerMemory(most_of_user=1), StartGrace(desk.policy)
     for number in range(3):

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Row, exists, or_, select
+from sqlalchemy import Row, exists, func, literal, or_, select
 
 from marey_schemas.queue.jobs import JobState
 from marey_schemas.queue.own_pods import OWN_POD_LABEL
@@ -17,6 +17,10 @@ from marey_server.store.jobs.fencing import QUEUED, RUNNING
 from marey_server.store.quotas.running_jobs import count_leased
 from marey_server.store.tables import job, project, queue_share
 from marey_server.store.transaction import Transaction, in_lists
+
+_LABELS = literal(",") + job.c.labels_key
+_OWN_POD = f",{labels_key({OWN_POD_LABEL: ''})}"
+"""Comma and name of the label; without the comma, a longer name would match. SQLite's LIKE would ignore the case."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,7 @@ def read_waiting(
         .where(
             job.c.state == QUEUED,
             job.c.run_at_us <= tx.now_us,
-            job.c.labels_key.contains(labels_key({OWN_POD_LABEL: ""}), autoescape=True),
+            func.replace(_LABELS, _OWN_POD, "") != _LABELS,
             project.c.deleted_us.is_(None),
             or_(queue_share.c.most_running.is_(None), queue_share.c.most_running > running),
             or_(job.c.concurrency_key.is_(None), ~rival_runs),
