@@ -235,6 +235,24 @@ def test_jobs_that_cannot_start_now_do_not_wait_for_a_pod(desk: Desk) -> None:
     assert desk.database.read(SYSTEM, own_pods.read_unfinished, [first, second, "job_gone"]) == {second}
 
 
+def test_no_pod_is_started_for_a_job_that_must_wait_for_another_pod(desk: Desk) -> None:
+    first, second = (desk.submit(resources=LARGE, concurrency_key="k") for _ in range(2))
+    third = desk.submit(resources=LARGE)
+
+    def waiting(*served: str) -> list[str]:
+        return [one.id for one in desk.database.read(SYSTEM, own_pods.read_waiting, 10, served)]
+
+    assert waiting(first) == [third], "the pod of the first has not claimed it yet"
+    assert waiting(first, third) == []
+    desk.limit_running(1)
+    assert waiting(first) == []
+    desk.limit_running(2)
+    (lease,) = claim(desk, pod_of(desk, first), job=first)
+    assert waiting(first) == [third]
+    desk.complete(lease)
+    assert waiting(first, third) == [second]
+
+
 # -- which pods are started -------------------------------------------------------------------------------------------
 
 POOL = Pool("OWN-PODS", "http://marey:8460", ClusterOptions(image=OWN_IMAGE))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -85,7 +86,7 @@ def read_waiting(
         .order_by(*claim_order(job))
         .limit(limit)
     )  # fmt: skip
-    return [_waiting(row) for row in _one_of_each_key(tx.execute(statement).all())]
+    return [_waiting(row) for row in _one_of_each_key(tx.execute(statement).all(), _unclaimed(tx, served))]
 
 
 def read_unfinished(tx: Transaction, ids: Collection[str]) -> set[str]:
@@ -97,20 +98,28 @@ def read_unfinished(tx: Transaction, ids: Collection[str]) -> set[str]:
     return found
 
 
-def _one_of_each_key(rows: Collection[Row[Any]]) -> list[Row[Any]]:
-    """Return the rows without those that cannot run beside an earlier one, or beyond the limit of their project."""
+def _unclaimed(tx: Transaction, served: Collection[str]) -> list[Row[Any]]:
+    """Return the projects and concurrency keys of the served jobs that their pods have not claimed yet."""
+    statement = select(job.c.project_id, job.c.concurrency_key).where(job.c.state == QUEUED)
+    return [row for some in in_lists(served) for row in tx.execute(statement.where(job.c.id.in_(some)))]
+
+
+def _one_of_each_key(rows: Collection[Row[Any]], unclaimed: Collection[Row[Any]]) -> list[Row[Any]]:
+    """Return the rows without those that cannot run beside an earlier one, or beyond the limit of their project.
+
+    Jobs whose pods have not claimed them yet count as earlier ones; otherwise, pods would start that can only wait.
+    """
     kept: list[Row[Any]] = []
-    keys: set[tuple[str, str]] = set()
-    chosen: dict[str, int] = {}
+    keys = {(row.project_id, row.concurrency_key) for row in unclaimed if row.concurrency_key is not None}
+    chosen = Counter(row.project_id for row in unclaimed)
     for row in rows:
-        many = chosen.get(row.project_id, 0)
-        if row.most_running is not None and row.running + many >= row.most_running:
+        if row.most_running is not None and row.running + chosen[row.project_id] >= row.most_running:
             continue
         if row.concurrency_key is not None:
             if (row.project_id, row.concurrency_key) in keys:
                 continue
             keys.add((row.project_id, row.concurrency_key))
-        chosen[row.project_id] = many + 1
+        chosen[row.project_id] += 1
         kept.append(row)
     return kept
 
