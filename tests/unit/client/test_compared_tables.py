@@ -12,6 +12,7 @@ from tests.support.compared_runs import a_run, compared_of
 from tests.support.scripted_server import ScriptedServer
 
 from marey_client.cli.queue.compared_tables import shown_columns, table_of_means, table_of_runs, texts_of_means
+from marey_client.cli.terminal.output import print_table
 from marey_schemas.queue.comparisons import RunComparison
 
 
@@ -54,6 +55,15 @@ def test_texts_that_a_spreadsheet_would_run_begin_with_an_apostrophe() -> None:
     rows = list(csv.DictReader(io.StringIO(table_of_runs(found, shown_columns(found, every=False)).csv())))
     assert [row["text"] for row in rows] == [f"'{text}" for text in texts[:5]] + texts[5:]
     assert [row["a"] for row in rows] == [str(-number) for number in range(7)], "negative numbers stay numbers"
+    named = compared_of([a_run(number, {}, {"=1+1": number}) for number in range(2)])
+    assert table_of_runs(named, shown_columns(named, every=False)).csv().splitlines()[0] == "job,'=1+1"
+
+
+def test_the_name_of_a_field_can_neither_control_the_terminal_nor_style_the_table(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    print_table(("[/x]", "[red]a", "b\x1b]0;title\x07"), [(1, 2, 3)])
+    assert capsys.readouterr().out.split()[:3] == ["[/x]", "[red]a", r"b\x1b]0;title\x07"]
 
 
 def test_columns_with_one_name_are_told_apart() -> None:

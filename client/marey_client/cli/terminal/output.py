@@ -32,8 +32,9 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for column in columns:
+        head = Text(_shown(column))  # some are names that other users wrote
         table.add_column(
-            column, justify="right" if column in right else "left", overflow="fold", no_wrap=column in COPIED
+            head, justify="right" if column in right else "left", overflow="fold", no_wrap=column in COPIED
         )
     for row in rows:
         table.add_row(*(Text(_shown(cell)) for cell in row))
