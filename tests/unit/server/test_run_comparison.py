@@ -113,3 +113,8 @@ def test_results_that_a_worker_made_up_give_a_comparison_of_what_is_sound(traine
     assert found.runs[0].fields == {"largest": 1.7e308, "b": True, "<b>": "<script>"}
     assert found.settings[0].fields["largest"].mean == 1.7e308
     assert RunComparison.model_validate_json(found.model_dump_json()) == found
+    many = {f"f{number}": number for number in range(30)}
+    run(trained, 3, 0, {"fields": {"\x1b]0;title": 1, **many}})
+    with pytest.raises(BadRequestProblem, match=r"the fields are .*, f0, .*f17 and 12 more\.$") as refused:
+        compared(trained, fields=("unknown",))
+    assert refused.value.detail.isprintable()
