@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from contextlib import nullcontext
 
 import httpx
 import pytest
@@ -11,8 +12,9 @@ from tests.support.command_line import run_here
 from tests.support.compared_runs import a_run, compared_of
 from tests.support.scripted_server import ScriptedServer
 
+from marey_client.cli.queue import comparing
 from marey_client.cli.queue.compared_tables import shown_columns, table_of_means, table_of_runs, texts_of_means
-from marey_client.cli.terminal.output import print_table
+from marey_client.cli.terminal.output import print_message, print_table
 from marey_schemas.queue.comparisons import RunComparison
 
 
@@ -99,3 +101,23 @@ WRONG = [
 def test_options_that_contradict_each_other_are_refused_before_any_request(options: list[str], reason: str) -> None:
     done = run_here(["script", "compare", "lab", "train", *options])
     assert (done.returncode, reason in " ".join(done.stderr.split())) == (2, True), done.stderr
+
+
+def test_the_detail_of_a_refusal_cannot_control_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem = {
+        "type": "t",
+        "title": "t",
+        "status": 400,
+        "code": "no-field",
+        "detail": "the fields are b\x1b]0;title\x07",
+    }
+    server = ScriptedServer()
+    headers = {"Content-Type": "application/problem+json"}
+    server.answers.append(httpx.Response(400, headers=headers, json=problem | {"instance": "i"}))
+    monkeypatch.setattr(comparing, "connect", lambda _: nullcontext(server.marey()))
+    told = run_here(["script", "compare", "lab", "train"]).stderr
+    assert told == "marey: the fields are b\\x1b]0;title\\x07 (no-field, request i)\n"
+    print_message("b\x1b]0;title\x07")
+    assert capsys.readouterr().err == "b\\x1b]0;title\\x07\n"
