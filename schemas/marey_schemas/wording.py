@@ -24,3 +24,11 @@ def one_of(names: Sequence[str]) -> str:
 def without_prefix(message: str) -> str:
     """Return a message of pydantic without the prefix "Value error, ", which marks the text of a `ValueError`."""
     return message.removeprefix("Value error, ")
+
+
+def printable(text: str) -> str:
+    """Return a text whose control characters are escaped, except ends of lines.
+
+    Other users wrote parts of many texts, and must not control the terminal of who reads them.
+    """
+    return "".join(one if one.isprintable() or one == "\n" else ascii(one)[1:-1] for one in text)

@@ -12,17 +12,19 @@ from typing import Any
 
 import pytest
 from sqlalchemy import true
-from tests.support.cluster.dispatching import ENDS, LARGE, REFUSED, WAITS, DispatchBench, name_of
+from tests.support.cluster.dispatching import ENDS, LARGE, OWN_IMAGE, REFUSED, WAITS, DispatchBench, name_of
 from tests.support.cluster.stub import IMAGE, StubCluster, running_cluster
 from tests.support.queue_desk import Desk
 
 from marey_schemas.backoff import Backoff
+from marey_schemas.queue.scripts import ScriptCreate, ScriptRunCreate
 from marey_schemas.queue.worker_protocol import Lease
 from marey_server.errors import LeaseLostProblem
 from marey_server.launchers.kubernetes import view
 from marey_server.launchers.kubernetes.worker_jobs import WorkerJobs
 from marey_server.launchers.launcher import EngineError
 from marey_server.store.jobs import fencing
+from marey_server.store.scripts import registry, runs
 
 
 @pytest.fixture
@@ -170,6 +172,23 @@ def test_a_pod_that_the_server_refuses_is_not_started_again_at_once(
         bench.round(0.5)
     assert bench.jobs() == [name_of(job, 1)]
     bench.rounds_until(lambda: name_of(job, 2) in bench.jobs(), step_s=1)
+
+
+def test_jobs_whose_images_are_no_longer_allowed_keep_no_other_job_waiting(bench: DispatchBench) -> None:
+    desk = bench.desk
+    given = {
+        "name": "train", "repository": "https://git.invalid/motion", "commit": "a" * 40, "image": OWN_IMAGE,
+        "argv": ["python", "train.py", "{output:fields}"], "outputs": {"fields": {"kind": "fields"}},
+    }  # fmt: skip
+    script = ScriptCreate.model_validate(given)
+    desk.database.write(desk.user, registry.register_script, "lab", script, ("https://git.invalid/",))
+    for seed in range(3):
+        desk.database.write(desk.user, runs.run_script, "lab", "train", ScriptRunCreate(seed=seed))
+    job = desk.submit("sum", resources=LARGE)
+    bench.open(most=1, images=[])
+    for _ in range(4):
+        bench.round()
+    assert bench.jobs() == [name_of(job, 1)]
 
 
 def test_a_server_that_dies_before_it_has_created_the_token_is_replaced(

@@ -236,7 +236,7 @@ def test_unknown_people_become_users_only_if_the_operator_wants_it(
     allowed = {"oidc_allowed_claim": "groups", "oidc_allowed_values": ("mocap",)}
     with serving(database, tmp_path, provider, oidc_creates_users=True, **allowed) as server:
         assert Person(server).finish().status_code == 403
-        provider.claims |= {"groups": ["staff", "mocap"], "name": "Ada <b>L</b>"}
+        provider.claims |= {"groups": ["staff", "mocap"], "name": "Ada\0 \ud83d<b>L</b>"}
         person = Person(server)
         me = server.client(person.redeem(code_on(person.finish())).json()["secret"]).get("/me").json()
         assert (me["user"]["name"], me["user"]["display_name"]) == ("ada", "Ada <b>L</b>")

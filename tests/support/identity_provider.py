@@ -16,7 +16,7 @@ from functools import cache
 from typing import Any
 from urllib.parse import urlencode
 
-from joserfc import jwt
+from joserfc import jws
 from joserfc.jwk import ECKey, RSAKey
 from tornado.httpserver import HTTPServer
 from tornado.testing import bind_unused_port
@@ -65,7 +65,8 @@ class FakeProvider:
         now_s = int(time.time())
         claims = {"iss": self.url, "aud": CLIENT, "iat": now_s, "exp": now_s + 300, "nonce": nonce, **self.claims}
         header = {"alg": "RS256" if isinstance(self.key, RSAKey) else "ES256", "kid": self.key.kid}
-        return jwt.encode(header, claims | changed, self.key)
+        payload = json.dumps(claims | changed).encode()  # in ASCII, so that claims may contain halves of surrogates
+        return jws.serialize_compact(header, payload, self.key)
 
 
 class _Handler(RequestHandler):

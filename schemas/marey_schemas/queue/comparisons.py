@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import datetime
+from itertools import pairwise
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, StringConstraints, model_validator
 
 from marey_schemas.base import Answer
-from marey_schemas.queue.scripts import Value
+from marey_schemas.queue.scripts import LONGEST_NAME, Value
 from marey_schemas.sizes import KIB
 
 MOST_COMPARED = 100
@@ -36,22 +37,28 @@ class Curve(Answer):
     steps: tuple[Annotated[int, Field(ge=-LAST_STEP, le=LAST_STEP)], ...] = Field(
         max_length=MOST_POINTS, description="Steps in ascending order."
     )
-    values: tuple[float | None, ...] = Field(
+    values: tuple[Annotated[float, Field(allow_inf_nan=False)] | None, ...] = Field(
         max_length=MOST_POINTS, description="The value at each step; null where it is not a finite number."
     )
-    logged: int = Field(description="Number of values that the script logged; the curve contains some of them.")
+    logged: int = Field(
+        ge=0,
+        le=LAST_STEP,
+        description="Number of values that the script logged; the curve contains some of them.",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if len(self.steps) != len(self.values):
             raise ValueError("a curve has one value for each step")
+        if any(one >= following for one, following in pairwise(self.steps)):
+            raise ValueError("the steps of a curve ascend")
         return self
 
 
 class Curves(Answer):
     """Curves of a run by field."""
 
-    curves: dict[str, Curve] = Field(max_length=MOST_CURVES)
+    curves: dict[Annotated[str, StringConstraints(max_length=LONGEST_NAME)], Curve] = Field(max_length=MOST_CURVES)
 
 
 class ComparedColumn(Answer):

@@ -24,6 +24,9 @@ from marey_server.store.scripts import comparing
 from marey_server.store.scripts.comparing import RunToCompare
 from marey_server.store.transaction import Transaction
 
+MOST_NAMED = 20
+"""Greatest number of fields that an error names."""
+
 
 @dataclass(frozen=True, slots=True)
 class Compared:
@@ -67,8 +70,12 @@ def compare_read(
     goals = _goals(wanted)
     logged = dict.fromkeys(field for run in found for field in run.fields)
     if found and (unknown := [field for field in (*wanted.fields, *goals) if field not in logged]):
-        detail = f"No compared run logged the field {unknown[0]!r}; the fields are {', '.join(logged) or 'none'}."
-        raise BadRequestProblem(detail, code="no-field")
+        plain = [field for field in logged if field.isidentifier()]  # a worker may have made up others
+        shown = ", ".join(plain[:MOST_NAMED]) or "none"
+        more = f" and {len(plain) - MOST_NAMED} more" if len(plain) > MOST_NAMED else ""
+        raise BadRequestProblem(
+            f"No compared run logged the field {unknown[0]!r}; the fields are {shown}{more}.", code="no-field"
+        )
     drawn = _drawn(found, curves, wanted)
     fields = wanted.fields or tuple(logged)
     settings = {key: place for place, key in enumerate(dict.fromkeys(run.setting for run in found))}

@@ -178,7 +178,7 @@ class IdentityProvider:
             self.issuer,
             claims["sub"],
             name if isinstance(name, str) else None,
-            shown[:255] if isinstance(shown, str) and shown and "\0" not in shown else None,
+            _storable(shown)[:255] or None if isinstance(shown, str) else None,
         )
 
     # -- requests -----------------------------------------------------------------------------------------------------
@@ -273,6 +273,11 @@ async def _read(what: str, answer: httpx.Response) -> bytes:
         if len(body) > MOST_ANSWER_BYTES:
             _fail(what, f"it is longer than {MOST_ANSWER_BYTES} bytes")
     return bytes(body)
+
+
+def _storable(text: str) -> str:
+    """Return a text without the characters that no database stores: NUL, and halves of surrogate pairs."""
+    return text.encode(errors="ignore").decode().replace("\0", "")
 
 
 def _secret_in(file: Any) -> str:

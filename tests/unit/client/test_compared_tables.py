@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from contextlib import nullcontext
 
 import httpx
 import pytest
@@ -11,7 +12,9 @@ from tests.support.command_line import run_here
 from tests.support.compared_runs import a_run, compared_of
 from tests.support.scripted_server import ScriptedServer
 
+from marey_client.cli.queue import comparing
 from marey_client.cli.queue.compared_tables import shown_columns, table_of_means, table_of_runs, texts_of_means
+from marey_client.cli.terminal.output import print_message, print_table
 from marey_schemas.queue.comparisons import RunComparison
 
 
@@ -54,6 +57,15 @@ def test_texts_that_a_spreadsheet_would_run_begin_with_an_apostrophe() -> None:
     rows = list(csv.DictReader(io.StringIO(table_of_runs(found, shown_columns(found, every=False)).csv())))
     assert [row["text"] for row in rows] == [f"'{text}" for text in texts[:5]] + texts[5:]
     assert [row["a"] for row in rows] == [str(-number) for number in range(7)], "negative numbers stay numbers"
+    named = compared_of([a_run(number, {}, {"=1+1": number}) for number in range(2)])
+    assert table_of_runs(named, shown_columns(named, every=False)).csv().splitlines()[0] == "job,'=1+1"
+
+
+def test_the_name_of_a_field_can_neither_control_the_terminal_nor_style_the_table(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    print_table(("[/x]", "[red]a", "b\x1b]0;title\x07"), [(1, 2, 3)])
+    assert capsys.readouterr().out.split()[:3] == ["[/x]", "[red]a", r"b\x1b]0;title\x07"]
 
 
 def test_columns_with_one_name_are_told_apart() -> None:
@@ -89,3 +101,23 @@ WRONG = [
 def test_options_that_contradict_each_other_are_refused_before_any_request(options: list[str], reason: str) -> None:
     done = run_here(["script", "compare", "lab", "train", *options])
     assert (done.returncode, reason in " ".join(done.stderr.split())) == (2, True), done.stderr
+
+
+def test_the_detail_of_a_refusal_cannot_control_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem = {
+        "type": "t",
+        "title": "t",
+        "status": 400,
+        "code": "no-field",
+        "detail": "the fields are b\x1b]0;title\x07",
+    }
+    server = ScriptedServer()
+    headers = {"Content-Type": "application/problem+json"}
+    server.answers.append(httpx.Response(400, headers=headers, json=problem | {"instance": "i"}))
+    monkeypatch.setattr(comparing, "connect", lambda _: nullcontext(server.marey()))
+    told = run_here(["script", "compare", "lab", "train"]).stderr
+    assert told == "marey: the fields are b\\x1b]0;title\\x07 (no-field, request i)\n"
+    print_message("b\x1b]0;title\x07")
+    assert capsys.readouterr().err == "b\\x1b]0;title\\x07\n"

@@ -25,6 +25,8 @@ from marey_server.store.credentials import tokens
 from marey_server.store.jobs import queue
 from marey_server.store.jobs.claiming import own_pods, rights
 from marey_server.store.jobs.claiming.own_pods import WaitingJob
+from marey_server.store.jobs.reaper import StartGrace
+from marey_server.store.monitoring.workers import WorkerMemory, claim_and_remember
 from marey_server.store.scripts import registry, runs
 
 RULES = PodRules(4096, 60, frozenset({"gpu=a100"}), ("registry.example.org/motion/",))
@@ -162,6 +164,23 @@ def test_the_token_of_a_pod_is_bound_to_its_job(desk: Desk) -> None:
     assert pod_of(desk, large).scopes == ("work",)
 
 
+def test_a_label_that_only_looks_like_that_of_pods_starts_no_pod(desk: Desk) -> None:
+    forged = {f"x{OWN_POD_LABEL}": "yes"}
+    desk.submit(labels={**forged, "site": "lyon"})
+    desk.submit(labels={OWN_POD_LABEL.upper(): "yes", "site": f",{OWN_POD_LABEL}=yes"})
+    own = [desk.submit(labels=YES), desk.submit(labels={"gpu": "a100"}, resources=LARGE)]
+    assert [one.id for one in desk.database.read(SYSTEM, own_pods.read_waiting, 10)] == own
+
+
+def test_pods_do_not_count_as_workers_of_one_user(desk: Desk) -> None:
+    memory, grace = WorkerMemory(most_of_user=1), StartGrace(desk.policy)
+    for number in range(3):
+        job = desk.submit(resources=LARGE)
+        request = ClaimRequest(worker=f"pod-{number}", kinds=tuple(KINDS), labels=YES, job=job)
+        leases = desk.database.write(pod_of(desk, job), claim_and_remember, request, memory, grace, desk.policy)
+        assert [lease.job for lease in leases] == [job]
+
+
 def test_the_pods_of_tasks_claim_the_task_at_their_index(desk: Desk) -> None:
     given = {"things": [{"item": desk.things(1)[0]}]}
     parent = desk.submit("survey", params={"number": 3}, inputs=given, resources=LARGE)
@@ -214,6 +233,24 @@ def test_jobs_that_cannot_start_now_do_not_wait_for_a_pod(desk: Desk) -> None:
     assert waiting() == [second]
     assert after not in waiting()
     assert desk.database.read(SYSTEM, own_pods.read_unfinished, [first, second, "job_gone"]) == {second}
+
+
+def test_no_pod_is_started_for_a_job_that_must_wait_for_another_pod(desk: Desk) -> None:
+    first, second = (desk.submit(resources=LARGE, concurrency_key="k") for _ in range(2))
+    third = desk.submit(resources=LARGE)
+
+    def waiting(*served: str) -> list[str]:
+        return [one.id for one in desk.database.read(SYSTEM, own_pods.read_waiting, 10, served)]
+
+    assert waiting(first) == [third], "the pod of the first has not claimed it yet"
+    assert waiting(first, third) == []
+    desk.limit_running(1)
+    assert waiting(first) == []
+    desk.limit_running(2)
+    (lease,) = claim(desk, pod_of(desk, first), job=first)
+    assert waiting(first) == [third]
+    desk.complete(lease)
+    assert waiting(first, third) == [second]
 
 
 # -- which pods are started -------------------------------------------------------------------------------------------

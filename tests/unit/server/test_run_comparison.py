@@ -84,15 +84,21 @@ def test_a_setting_has_no_mean_if_a_replicate_gave_no_number(trained: Desk) -> N
 def test_curves_are_read_only_if_they_are_curves(trained: Desk) -> None:
     curve = Curve(steps=(0, 1), values=(1.5, None), logged=2)
     content = Curves(curves={"loss": curve, "other": curve}).model_dump_json().encode()
-    for seed, file in enumerate(
-        (content, b'{"curves": {"loss": {"steps": [1], "values": [], "logged": 1}}}', b" " * MOST_CURVE_BYTES + content)
-    ):
+    unsound = (
+        '{"loss": {"steps": [1], "values": [], "logged": 1}}',
+        '{"loss": {"steps": [1], "values": [1e999], "logged": 1}}',
+        '{"loss": {"steps": [2, 1], "values": [1, 2], "logged": 2}}',
+        '{"loss": {"steps": [1], "values": [1], "logged": -1}}',
+        '{"' + "n" * 64 + '": {"steps": [1], "values": [1], "logged": 1}}',
+    )
+    files = [content, b" " * MOST_CURVE_BYTES + content, *(f'{{"curves": {one}}}'.encode() for one in unsound)]
+    for seed, file in enumerate(files):
         run(trained, 1, seed, {"fields": {"loss": 1}}, curves=file)
     for made_up in ({"size_bytes": 1}, [1], "text", {"blob": 7}):
         run(trained, 1, 9, {"fields": {"loss": 1}, "curves": made_up})
     found = compared(trained, curves=True, fields=("loss",))
     assert found.curves == ("loss",)
-    assert [one.curves for one in found.runs] == [{"loss": curve}, *[{}] * 6]
+    assert [one.curves for one in found.runs] == [{"loss": curve}, *[{}] * 10]
     assert compared(trained, curves=True).curves == ("loss", "other")
     assert compared(trained).curves == ()
 
@@ -107,3 +113,8 @@ def test_results_that_a_worker_made_up_give_a_comparison_of_what_is_sound(traine
     assert found.runs[0].fields == {"largest": 1.7e308, "b": True, "<b>": "<script>"}
     assert found.settings[0].fields["largest"].mean == 1.7e308
     assert RunComparison.model_validate_json(found.model_dump_json()) == found
+    many = {f"f{number}": number for number in range(30)}
+    run(trained, 3, 0, {"fields": {"\x1b]0;title": 1, **many}})
+    with pytest.raises(BadRequestProblem, match=r"the fields are .*, f0, .*f17 and 12 more\.$") as refused:
+        compared(trained, fields=("unknown",))
+    assert refused.value.detail.isprintable()

@@ -36,7 +36,7 @@ class RunTable(NamedTuple):
         """Return the table as CSV with exact numbers; texts that would be formulas begin with an apostrophe."""
         buffer = io.StringIO()
         writer = csv.writer(buffer, lineterminator="\n")
-        writer.writerow(self.heads)
+        writer.writerow(map(_safe, self.heads))
         writer.writerows([[_safe(cell) for cell in row] for row in self.rows])
         return buffer.getvalue()
 

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from marey_schemas.wording import without_prefix
+from marey_schemas.wording import printable, without_prefix
 
 FAILED, WRONG_USAGE = 1, 2
 INTERRUPTED = 130
@@ -98,5 +98,5 @@ def _exit(status: int, text: str, verbose: bool) -> None:
         import traceback
 
         traceback.print_exc()
-    print(f"marey: {text}", file=sys.stderr)  # noqa: T201 - the error line itself
+    print(f"marey: {printable(text)}", file=sys.stderr)  # noqa: T201 - the error line itself
     sys.exit(status)

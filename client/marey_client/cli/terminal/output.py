@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from marey_schemas.wording import printable
+
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
@@ -32,8 +34,9 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for column in columns:
+        head = Text(_shown(column))  # some are names that other users wrote
         table.add_column(
-            column, justify="right" if column in right else "left", overflow="fold", no_wrap=column in COPIED
+            head, justify="right" if column in right else "left", overflow="fold", no_wrap=column in COPIED
         )
     for row in rows:
         table.add_row(*(Text(_shown(cell)) for cell in row))
@@ -42,16 +45,12 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
 
 
 def _shown(cell: object) -> str:
-    """Return a cell as text; times are in UTC, to the second.
-
-    Control characters are escaped, because other users wrote some texts, and must not control the terminal.
-    """
+    """Return a cell as text; times are in UTC, to the second, and control characters are escaped."""
     from datetime import datetime
 
     if isinstance(cell, datetime):
         return cell.strftime("%Y-%m-%d %H:%M:%SZ")
-    text = "" if cell is None else str(cell)
-    return "".join(one if one.isprintable() or one == "\n" else ascii(one)[1:-1] for one in text)
+    return printable("" if cell is None else str(cell))
 
 
 def print_rows(rows: Iterable[tuple[str, str, str]]) -> None:
@@ -72,7 +71,7 @@ def print_pairs(pairs: Iterable[tuple[str, object]]) -> None:
 
 def print_message(text: str) -> None:
     """Print a message that is not a result to standard error."""
-    typer.echo(text, err=True)
+    typer.echo(printable(text), err=True)
 
 
 def print_refused(refused: Sequence[Mapping[str, Any]], *, most: int | None = None) -> None:

@@ -114,7 +114,7 @@ class Dispatcher:
         jobs = self._jobs.view.jobs
         served = [place.job for job in jobs.values() if not is_split(job) for place in places_of(job)]
         split = {job_of(job) for job in jobs.values() if is_split(job) and not is_over(job)}
-        limit = self._rules.most + len(jobs)
+        limit = self._rules.most + len(jobs) + len(self._refused)  # so that refused jobs keep none of the others out
         waiting = await self._read(lambda tx: read_waiting(tx, limit, served, sorted(split)))
         starts = self._plan.decide(self._clock_s(), list(filter(self._is_allowed, waiting)), jobs)
         if starts:

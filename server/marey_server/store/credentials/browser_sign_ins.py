@@ -114,7 +114,9 @@ def confirm(tx: Transaction, sign_in_id: str, code: str, person: Person, *, crea
         found = identities.insert_identity(tx, str(user.user_id), user.require_user_name(), person)
     else:
         user = users.active_principal(tx, found.user_id)
-    tx.execute(update(identity).where(identity.c.id == found.id).values(last_used_us=tx.now_us))
+    used = update(identity).where(identity.c.id == found.id).values(last_used_us=tx.now_us)
+    if tx.execute(used).rowcount != 1:  # the link has ended since it was read
+        raise invalid_sign_in()
     which = browser_sign_in.c.id == sign_in_id, browser_sign_in.c.code_hash.is_(None)
     values = {"code_hash": hash_secret(code), "identity_id": found.id}
     if tx.execute(update(browser_sign_in).where(*which).values(**values)).rowcount != 1:

@@ -157,10 +157,12 @@ def claim_and_remember(
 ) -> list[Lease]:
     """Claim jobs as `claim_after_reaping` does, and remember the worker.
 
-    Raises `TooManyRequestsProblem` if too many workers of the caller are alive.
+    Raises `TooManyRequestsProblem` if too many workers of the caller are alive. Pods of a job's own belong to no user,
+    and the setting `own_pods` limits their number.
     """
     caller = tx.principal
-    memory.require_place(caller.user_id, caller.token_id, request.worker)
+    if caller.kind != "pod":
+        memory.require_place(caller.user_id, caller.token_id, request.worker)
     leases = claim_after_reaping(tx, request, grace, policy)
     memory.hear(caller.user_id, caller.token_id, request)
     return leases

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Row, exists, or_, select
+from sqlalchemy import Row, exists, func, literal, or_, select
 
 from marey_schemas.queue.jobs import JobState
 from marey_schemas.queue.own_pods import OWN_POD_LABEL
@@ -17,6 +18,10 @@ from marey_server.store.jobs.fencing import QUEUED, RUNNING
 from marey_server.store.quotas.running_jobs import count_leased
 from marey_server.store.tables import job, project, queue_share
 from marey_server.store.transaction import Transaction, in_lists
+
+_LABELS = literal(",") + job.c.labels_key
+_OWN_POD = f",{labels_key({OWN_POD_LABEL: ''})}"
+"""Comma and name of the label; without the comma, a longer name would match. SQLite's LIKE would ignore the case."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +76,7 @@ def read_waiting(
         .where(
             job.c.state == QUEUED,
             job.c.run_at_us <= tx.now_us,
-            job.c.labels_key.contains(labels_key({OWN_POD_LABEL: ""}), autoescape=True),
+            func.replace(_LABELS, _OWN_POD, "") != _LABELS,
             project.c.deleted_us.is_(None),
             or_(queue_share.c.most_running.is_(None), queue_share.c.most_running > running),
             or_(job.c.concurrency_key.is_(None), ~rival_runs),
@@ -81,7 +86,7 @@ def read_waiting(
         .order_by(*claim_order(job))
         .limit(limit)
     )  # fmt: skip
-    return [_waiting(row) for row in _one_of_each_key(tx.execute(statement).all())]
+    return [_waiting(row) for row in _one_of_each_key(tx.execute(statement).all(), _unclaimed(tx, served))]
 
 
 def read_unfinished(tx: Transaction, ids: Collection[str]) -> set[str]:
@@ -93,20 +98,28 @@ def read_unfinished(tx: Transaction, ids: Collection[str]) -> set[str]:
     return found
 
 
-def _one_of_each_key(rows: Collection[Row[Any]]) -> list[Row[Any]]:
-    """Return the rows without those that cannot run beside an earlier one, or beyond the limit of their project."""
+def _unclaimed(tx: Transaction, served: Collection[str]) -> list[Row[Any]]:
+    """Return the projects and concurrency keys of the served jobs that their pods have not claimed yet."""
+    statement = select(job.c.project_id, job.c.concurrency_key).where(job.c.state == QUEUED)
+    return [row for some in in_lists(served) for row in tx.execute(statement.where(job.c.id.in_(some)))]
+
+
+def _one_of_each_key(rows: Collection[Row[Any]], unclaimed: Collection[Row[Any]]) -> list[Row[Any]]:
+    """Return the rows without those that cannot run beside an earlier one, or beyond the limit of their project.
+
+    Jobs whose pods have not claimed them yet count as earlier ones; otherwise, pods would start that can only wait.
+    """
     kept: list[Row[Any]] = []
-    keys: set[tuple[str, str]] = set()
-    chosen: dict[str, int] = {}
+    keys = {(row.project_id, row.concurrency_key) for row in unclaimed if row.concurrency_key is not None}
+    chosen = Counter(row.project_id for row in unclaimed)
     for row in rows:
-        many = chosen.get(row.project_id, 0)
-        if row.most_running is not None and row.running + many >= row.most_running:
+        if row.most_running is not None and row.running + chosen[row.project_id] >= row.most_running:
             continue
         if row.concurrency_key is not None:
             if (row.project_id, row.concurrency_key) in keys:
                 continue
             keys.add((row.project_id, row.concurrency_key))
-        chosen[row.project_id] = many + 1
+        chosen[row.project_id] += 1
         kept.append(row)
     return kept
 
