@@ -26,7 +26,7 @@ class MeanInterval(NamedTuple):
 
 
 def mean_interval(values: Sequence[float]) -> MeanInterval:
-    """Compute the mean of measurements, and its 95 % confidence interval after Student.
+    """Compute the mean of measurements, and its 95 % confidence interval by Student's t distribution.
 
     The interval assumes that the measurements are independent and roughly normally distributed.
 
