@@ -167,16 +167,16 @@ def test_the_settings_of_the_page_are_valid_and_doctor_checks_them(
     written |= {"oidc_client_secret_file": secret, "oidc_issuer": provider.url}
     settings = Settings(data=tmp_path, **written)
 
-    def finding() -> tuple[str, str]:
+    def finding(check: str = "identity provider") -> tuple[str, str]:
         every = {one.check: one for one in examine(settings, {}, connect_database)}
-        return every["identity provider"].state, every["identity provider"].detail
+        return every[check].state, every[check].detail
 
     state, detail = finding()
     assert state == "ok"
     [uri] = re.findall(r"```\n(https\S+)\n```", TEXT)
     assert uri in detail
     secret.chmod(0o604)
-    assert finding()[0] == "warning"
+    assert finding("secrets") == ("warning", f"all users can open {secret}; run `chmod o-rwx {secret}`.")
     secret.chmod(0o600)
     provider.fault = "issuer"
     assert finding() == ("fault", mock.ANY)
