@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from marey_motion.arrays import Floats
-from marey_motion.replicates import mean_interval
 from marey_reports.comparisons.axes import add_chart, axis_title, set_logarithmic, spread
 from marey_reports.comparisons.subjects import LARGEST, ComparedSubject
 from marey_reports.drawing.drawn import Sketch, Tables
@@ -23,6 +22,7 @@ from marey_reports.drawing.paper import (
     tick_whole_numbers,
 )
 from marey_schemas.queue.comparisons import Curve
+from marey_schemas.replicates import mean_interval
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
