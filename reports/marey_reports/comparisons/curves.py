@@ -22,7 +22,7 @@ from marey_reports.drawing.paper import (
     tick_whole_numbers,
 )
 from marey_schemas.queue.comparisons import Curve
-from marey_schemas.replicates import mean_interval
+from marey_schemas.queue.replicates import mean_interval
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from marey_schemas.queue.comparisons import (
     Source,
     number_of,
 )
-from marey_schemas.replicates import mean_interval
+from marey_schemas.queue.replicates import mean_interval
 from marey_server.errors import BadRequestProblem
 from marey_server.store.scripts import comparing
 from marey_server.store.scripts.comparing import RunToCompare
