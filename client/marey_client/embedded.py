@@ -97,7 +97,8 @@ def draw_lineage(graph: LineageGraph, file_type: str) -> bytes:
 
 
 def draw_comparison(comparison: RunComparison, **options: Any) -> bytes:
-    """Return a page or a picture of a comparison of runs; `options` are those of `marey_reports.comparisons.charts`.
+    """Return a page or a picture of a comparison of runs; `options` are those of
+    `marey_reports.comparisons.page.draw_comparison`.
 
     Raises `MareyError` if the runs have no values for the wanted chart.
     """

@@ -98,7 +98,10 @@ class Transport:
         return self._auth is None
 
     def with_token(self, token: str, *, retries: Retries | None = None) -> Transport:
-        """Return a transport that sends another token over the same connections, which close with either transport."""
+        """Return a transport that sends another token over the same connections.
+
+        Closing one of the two transports closes the connections of both.
+        """
         other = self.with_retries(retries or self.retries)
         other._auth = BearerToken(token)
         return other

@@ -9,6 +9,9 @@ from pydantic import Field, SecretStr, StringConstraints
 from marey_schemas.base import Answer, Request
 from marey_schemas.names import ProjectName, UserName
 
+DAY_S = 86400
+LOGIN_DAYS, LONGEST_LOGIN_DAYS = 7, 90
+"""Default and greatest number of days for which the token of a login is valid."""
 MOST_RUNNING = 1_000_000
 """Greatest limit of running jobs that a project can have."""
 
@@ -49,6 +52,7 @@ class EndTokens(StrEnum):
 
 DisplayName = Annotated[str, StringConstraints(min_length=1, max_length=255)]
 Password = Annotated[SecretStr, Field(min_length=10, max_length=1024)]
+LoginSeconds = Annotated[int, Field(ge=60, le=LONGEST_LOGIN_DAYS * DAY_S)]
 ScopeText = Annotated[str, StringConstraints(pattern=rf"^(?:{'|'.join(Scope)})(?:!project=[a-z0-9_-]{{1,64}})?$")]
 """Scope, optionally bound to one project, as in `write!project=walk`."""
 
@@ -112,9 +116,9 @@ class TokenCreate(Request):
     name: DisplayName
     scopes: tuple[ScopeText, ...] = Field(("read", "write", "jobs"), min_length=1, max_length=32)
     expires_in_s: int | None = Field(
-        90 * 86400,
+        90 * DAY_S,
         ge=60,
-        le=10 * 365 * 86400,
+        le=10 * 365 * DAY_S,
         description="Seconds until the token ends; null: it never ends. A token cannot end later than the token that "
         "creates it. If absent, the token ends after 90 days, or when the token that creates it ends, whichever is "
         "sooner.",
@@ -138,7 +142,7 @@ class TokenRotation(Request):
     grace_s: int = Field(
         3600,
         ge=60,
-        le=7 * 86400,
+        le=7 * DAY_S,
         description="Seconds for which the replaced token remains valid, but never beyond its expiry.",
     )
 
@@ -177,7 +181,7 @@ class Login(Request):
 
     name: UserName
     password: SecretStr
-    expires_in_s: int = Field(7 * 86400, ge=60, le=90 * 86400)
+    expires_in_s: LoginSeconds = LOGIN_DAYS * DAY_S
 
 
 class ProjectCreate(Request):

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field, SecretStr, StringConstraints, model_validator
 
-from marey_schemas.access import DisplayName, NewToken, Password, Role
+from marey_schemas.access import DAY_S, LOGIN_DAYS, DisplayName, LoginSeconds, NewToken, Password, Role
 from marey_schemas.base import Answer, Request
 from marey_schemas.names import ProjectName, UserName
 
@@ -24,7 +24,7 @@ class InvitationTerms(Request):
     """Limits of a new invitation."""
 
     note: Note = Field("", description="For whom or what the invitation is; only those who may withdraw it see this.")
-    expires_in_s: int = Field(7 * 86_400, ge=60, le=MAX_DAYS * 86_400, description="Seconds until the invitation ends.")
+    expires_in_s: int = Field(7 * DAY_S, ge=60, le=MAX_DAYS * DAY_S, description="Seconds until the invitation ends.")
     uses: int = Field(1, ge=1, le=MAX_USES, description="Number of people who can use the invitation.")
 
 
@@ -95,7 +95,7 @@ class SignUp(Request):
     name: UserName
     password: Password
     display_name: DisplayName | None = None
-    expires_in_s: int = Field(7 * 86_400, ge=60, le=90 * 86_400, description="Seconds until the returned token ends.")
+    expires_in_s: LoginSeconds = Field(LOGIN_DAYS * DAY_S, description="Seconds until the returned token ends.")
 
 
 class SignedUp(NewToken):

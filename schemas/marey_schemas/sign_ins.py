@@ -5,6 +5,7 @@ from typing import Annotated
 
 from pydantic import Field, SecretStr, StringConstraints
 
+from marey_schemas.access import DAY_S, LOGIN_DAYS, LoginSeconds
 from marey_schemas.base import Answer, Request
 
 VERIFIER_PATTERN = r"^[A-Za-z0-9_-]{43,128}$"
@@ -29,11 +30,8 @@ class BrowserSignInCreate(Request):
         description="Port of this machine at which the program waits for the code: the server sends the browser to "
         "http://127.0.0.1:<port>/. Null: the browser shows the code, and the person copies it into the program.",
     )
-    expires_in_s: int = Field(
-        7 * 86400,
-        ge=60,
-        le=90 * 86400,
-        description="Seconds for which the new token is valid; the server may allow fewer.",
+    expires_in_s: LoginSeconds = Field(
+        LOGIN_DAYS * DAY_S, description="Seconds for which the new token is valid; the server may allow fewer."
     )
 
 

@@ -8,6 +8,7 @@ from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field, StringConstraints
 
+from marey_schemas.access import DAY_S
 from marey_schemas.base import Answer, Request
 from marey_schemas.event_kinds import DEFAULT_WEBHOOK_KINDS, PROJECT_EVENT_KINDS, ProjectEventKind
 from marey_schemas.names import Message
@@ -15,7 +16,6 @@ from marey_schemas.names import Message
 MAX_URL_LENGTH = 2048
 KEY_PREFIX = "whsec_"
 """Prefix of the secrets of webhooks, as the specification Standard Webhooks requires."""
-DAY_S = 86400
 
 
 def _is_web_address(url: str) -> str:

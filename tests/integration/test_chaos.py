@@ -1,4 +1,4 @@
-"""Test of a server by faults: what it finds on a sound server, and that it finds what is wrong."""
+"""Fault injection into a server: what it finds on a sound server, and that it finds what is wrong."""
 
 import random
 from collections.abc import Iterator

@@ -1,1 +1,1 @@
-"""Test of a running server by faults: killed workers, lost answers and repeated requests, in a scratch project."""
+"""Fault injection into a running server: killed workers, lost answers and repeated requests, in a scratch project."""

@@ -1,4 +1,4 @@
-"""Run of the test by faults: jobs, faults in a drawn order, and the check that each job has one visible result."""
+"""Run of a fault injection: jobs, faults in a random order, and the check that each job has one visible result."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def doctor(
         bool,
         typer.Option(
             "--chaos",
-            help="Test the running server by faults instead: in a scratch project, which is removed at the end.",
+            help="Inject faults into the running server instead, in a scratch project that is removed at the end.",
         ),
     ] = False,
     seed: Annotated[
@@ -62,7 +62,7 @@ def doctor(
     findings: list[Finding] = []
     if chaos:
         refuse_ignored(context, "with --chaos", "local", "remote", "data", "database_url")
-        return _print(_test_by_faults(context, seed, faults), as_json)
+        return _print(_inject_faults(context, seed, faults), as_json)
     refuse_ignored(context, "without --chaos", "seed", "faults")
     if not local:
         refuse_ignored(context, "with --no-local", "data", "database_url")
@@ -90,8 +90,8 @@ def _print(findings: list[Finding], as_json: bool) -> None:
         raise typer.Exit(1)
 
 
-def _test_by_faults(context: typer.Context, seed: int | None, faults: int) -> list[Finding]:
-    """Test the running server by faults; the seed is printed first, so that it is known after a crash, too."""
+def _inject_faults(context: typer.Context, seed: int | None, faults: int) -> list[Finding]:
+    """Inject faults into the running server; the seed is printed first, so that it is known even after a crash."""
     import secrets
 
     from marey_client.chaos.running import run_chaos

@@ -230,9 +230,9 @@ def _checked_limit(among: VersionRange, evaluations: VersionEvaluations, limit: 
             raise CannotBisect(f"{values}, so no value is half-way between them")
         limit = Limit((good + bad) / 2, above=bad > good)
     if limit.exceeded_by(good):
-        raise CannotBisect(f"{values}; values {limit} are bad, so the good version is bad, too")
+        raise CannotBisect(f"{values}; values {limit} are bad, so both versions are bad")
     if not limit.exceeded_by(bad):
-        raise CannotBisect(f"{values}; only values {limit} are bad, so the bad version is good")
+        raise CannotBisect(f"{values}; values {limit} are bad, so both versions are good")
     return limit
 
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 
 from marey_client.errors import MareyError
 from marey_client.transport import Transport
+from marey_schemas.queue.replicates import student_quantile
 
 PERCENTILES = (50, 95, 99)
-T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
-"""The 0.975 quantiles of Student's t distribution with 1 to 9 degrees of freedom."""
-MOST_REPLICATES = len(T_975) + 1
+MOST_REPLICATES = 10
+"""Greatest number of replicates at one rate."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Estimate:
         """Return the estimate from one value of each replicate, of which there must be 1 to `MOST_REPLICATES`."""
         if len(values) == 1:
             return cls(values[0], None)
-        margin = T_975[len(values) - 2] * statistics.stdev(values) / math.sqrt(len(values))
+        margin = student_quantile(len(values) - 1) * statistics.stdev(values) / math.sqrt(len(values))
         return cls(statistics.fmean(values), margin)
 
     def shown(self, digits: int = 1) -> str:

@@ -107,7 +107,11 @@ def cut_loop(motion: Motion, body: MatchingBody, period: Period) -> tuple[Motion
     """
     start, length = period.start, period.frames
     if motion.frame_count <= start + 2 * length:
-        raise MotionError(f"two periods from frame {start} need {start + 2 * length + 1} frames", code="no-period")
+        raise MotionError(
+            f"the motion has {motion.frame_count} frames; two periods of {length} frames from frame {start} need "
+            f"{start + 2 * length + 1}",
+            code="no-period",
+        )
     canonical, _ = to_canonical(motion.sliced(start, start + 2 * length + 1), body)
     facing = np.unwrap(headings(forward_directions(canonical.positions(body.skeleton), body.lefts, body.rights)))
     early, late = (slice(first, first + length + 1) for first in (0, length))

@@ -144,40 +144,6 @@ def fit_power(differences: PairDifferences, perceived: Floats) -> Component:
     return fit_component(differences, perceived, "power", exponent)
 
 
-def fit_by_descent(means: Floats, perceived: Floats, starts: int = 1000, seed: int = 0) -> Floats:
-    """Minimise the sum of squares by projected descent from random starts, as the paper did.
-
-    Parameters
-    ----------
-    means : (R, K) float64    mean F(x)
-    perceived : (R,) float64    perceived differences, all known
-    starts : int    number of starts
-    seed : int    seed of the starts
-
-    Returns
-    -------
-    (starts,) float64    sum of squares that each start reaches
-    """
-    table = np.column_stack((np.ones(len(means)), means))
-    scale = np.linalg.norm(table, axis=0)
-    table = table / np.where(scale > 0, scale, 1.0)
-    square, target = table.T @ table, table.T @ perceived
-    step = 1.0 / np.linalg.eigvalsh(square)[-1]
-    points = np.random.default_rng(seed).uniform(0.0, 2.0 * np.linalg.norm(perceived), (starts, len(square)))
-    ahead, speed = points, np.ones((starts, 1))
-    for _ in range(20_000):
-        new = np.maximum(ahead - step * (ahead @ square - target), 0.0)
-        # A start that moves uphill loses its momentum.
-        uphill = np.sum((ahead - new) * (new - points), axis=1, keepdims=True) > 0
-        faster = np.where(uphill, 1.0, 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * speed**2)))
-        moved = np.abs(new - points).max()
-        ahead = new + np.where(uphill, 0.0, (speed - 1.0) / faster) * (new - points)
-        points, speed = new, faster
-        if moved < 1e-13:
-            break
-    return np.asarray(np.sum((points @ table.T - perceived) ** 2, axis=1))
-
-
 def predict(component: Component, differences: PairDifferences) -> Floats:
     """Compute the differences that a component gives pairs of motions.
 
@@ -254,7 +220,7 @@ def fit_quality(fitted: Floats, perceived: Floats) -> FitQuality:
 
 
 def bootstrap_weights(
-    differences: PairDifferences, shown: Ints, chosen: Ints, shaping: Shaping, *, replicates: int = 1000, seed: int = 0
+    differences: PairDifferences, shown: Ints, chosen: Ints, shaping: Shaping, *, draws: int = 1000, seed: int = 0
 ) -> Floats:
     """Draw participants with replacement, and fit again: how much the weights depend on who took part.
 
@@ -263,7 +229,7 @@ def bootstrap_weights(
     differences : PairDifferences    R pairs i < j, in the order of `numpy.triu_indices`
     shown, chosen : (N, R) int64    counts of N participants, from `judging.pair_counts_by_participant`
     shaping : str    F
-    replicates : int    number of draws B
+    draws : int    number of draws B
     seed : int    seed of the draws
 
     Returns
@@ -272,7 +238,7 @@ def bootstrap_weights(
     """
     people = len(shown)
     means = differences.means(shaping)
-    times = np.random.default_rng(seed).multinomial(people, np.full(people, 1.0 / people), replicates)
+    times = np.random.default_rng(seed).multinomial(people, np.full(people, 1.0 / people), draws)
     seen, picked = times @ shown, times @ chosen
     perceived = np.where(seen > 0, 1.0 - picked / np.maximum(seen, 1), np.nan)
     return np.stack([_solve(means, each, None) for each in perceived])

@@ -18,7 +18,7 @@ from marey_motion.errors import MotionError
 
 Measurement = Literal["angles", "positions", "velocities"]
 Shaping = Literal["euclid", "manhattan", "sigmoid", "power"]
-AngleMeasure = Literal["half_angle", "angle", "one_minus_dot", "log_norm"]
+AngleMeasure = Literal["half_angle", "angle", "one_minus_dot"]
 
 MEASUREMENTS: tuple[Measurement, ...] = get_args(Measurement)
 JOINT_CLASSES: Mapping[str, tuple[str, ...]] = {
@@ -130,11 +130,11 @@ class PerceptualMetric:
     name : str    name for people, with the study that it comes from
     components : tuple of Component    at most one per measurement
     shares : tuple of float    shares a of the components, non-negative, with the sum 1
-    angle : str    measure of angles; half_angle and log_norm are arccos |q · p|, angle is twice as large, one_minus_dot
-        is 1 - |q · p|
+    angle : str    measure of angles; half_angle is arccos |q · p|, angle is twice as large, one_minus_dot is
+        1 - |q · p|
     side_reduce : str    whether the difference of a class is the mean or the sum of both sides
     identity : str    zero: equal poses have the distance 0; constant: they have the distance c
-    root_alignment : str    mean_heading: the hips are placed at the origin, and the heading of the last second is
+    root_alignment : str    mean_heading: the hips are placed at the origin, and the mean heading of one second is
         removed; kovar2d: each pair of poses is superposed by the best rotation about the vertical and the best shift
     length_unit_m : float    metres per unit of length
     velocity_interval_s : float    seconds in which velocities count the displacement

@@ -10,6 +10,7 @@ from marey_reports.comparisons.axes import add_chart, axis_title, beside, set_lo
 from marey_reports.comparisons.subjects import (
     ComparedSubject,
     Point,
+    interval_words,
     missing_words,
     short,
 )
@@ -112,7 +113,7 @@ def _caption(subject: ComparedSubject, column: ComparedColumn, shown: list[Point
     if replicated:
         parts.append("dots are runs with different seeds, and a short black line is their mean")
     if any(one.summary.low is not None for one in shown):
-        parts.append("horizontal lines are 95 % confidence intervals of the means (from n = 3)")
+        parts.append(f"horizontal lines are {interval_words()}")
     if (number := len(subject.points(column.name))) > len(shown):
         parts.append(f"the first {len(shown)} of {number} settings are drawn")
     return f"{'; '.join([*parts, *missing_words(subject.left_out(column.name))])}."

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from marey_motion.arrays import Floats
-from marey_motion.replicates import mean_interval
 from marey_reports.comparisons.axes import add_chart, axis_title, set_logarithmic, spread
-from marey_reports.comparisons.subjects import LARGEST, ComparedSubject
+from marey_reports.comparisons.subjects import LARGEST, ComparedSubject, interval_words
 from marey_reports.drawing.drawn import Sketch, Tables
 from marey_reports.drawing.paper import (
     COLOURS,
@@ -23,6 +22,7 @@ from marey_reports.drawing.paper import (
     tick_whole_numbers,
 )
 from marey_schemas.queue.comparisons import Curve
+from marey_schemas.queue.replicates import mean_interval
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ def _caption(field: str, groups: dict[int, list[Curve]], means: dict[int, _MeanC
             "a number"
         )
     if any(np.isfinite(mean.low).any() for mean in means.values()):
-        parts.append("areas are 95 % confidence intervals of the means (from n = 3), cut off where they are much wider")
+        parts.append(f"areas are {interval_words()}, cut off where they are much wider")
     curves = [curve for group in groups.values() for curve in group]
     if any(np.isnan(_values(curve)).any() for curve in curves):
         parts.append("a cross is the last number before one that is not finite, or too large to be drawn")

@@ -18,6 +18,7 @@ from marey_reports.drawing.page import Section, page, shown
 from marey_reports.drawing.paper import QUIET, SMALL, plain
 from marey_reports.drawing.tables import Cell, Number, facts, table
 from marey_schemas.queue.comparisons import MOST_DRAWN, ComparedColumn, ComparedRun, RunComparison, number_of
+from marey_schemas.queue.replicates import LEAST_REPLICATES
 from marey_schemas.wording import counted
 
 FileType = Literal["html", "svg", "png"]
@@ -158,14 +159,14 @@ def _verdict(subject: ComparedSubject) -> str:
     points = subject.points(column.name)
     best = next(one for one in points if one.summary.mean == column.best_mean)
     text = (
-        f"The {column.goal} {axis_title(column.name)} has {subject.labels[best.setting]}: "
+        f"{subject.labels[best.setting]} has the {column.goal} {axis_title(column.name)}: "
         f"{short(best.summary.mean)} (n = {best.summary.n})."
     )
     others = [one for one in points if one is not best]
     if not others:
         return text
     if any(one.summary.low is None or one.summary.high is None for one in points):
-        return f"{text} With fewer than 3 seeds, chance may explain the difference."
+        return f"{text} With fewer than {LEAST_REPLICATES} seeds, chance may explain the difference."
     low, high = best.summary.low or 0.0, best.summary.high or 0.0
     apart = all((one.summary.high or 0.0) < low or (one.summary.low or 0.0) > high for one in others)
     return text if apart else f"{text} Its 95 % interval overlaps that of another setting."

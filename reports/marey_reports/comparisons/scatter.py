@@ -11,6 +11,7 @@ from marey_reports.comparisons.subjects import (
     SMALLEST,
     ComparedSubject,
     Point,
+    interval_words,
     missing_words,
     written,
 )
@@ -157,7 +158,7 @@ def _caption(
     if any(one.summary.n > 1 for one in points):
         parts.append("small dots are runs with different seeds, and large marks are the means of n runs")
     if any(one.summary.low is not None for one in points):
-        parts.append("vertical lines are 95 % confidence intervals of the means (from n = 3)")
+        parts.append(f"vertical lines are {interval_words()}")
     others = [one.name for one in subject.varied if one != parameter]
     if len(others) > 1:
         parts.append(f"{counted(len(others), 'other value')} differ, too: {', '.join(others[:5])}")

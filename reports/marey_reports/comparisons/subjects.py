@@ -9,7 +9,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 from marey_reports.drawing.paper import shortened
+from marey_schemas.documents.evaluations import CONFIDENCE
 from marey_schemas.queue.comparisons import ComparedColumn, ComparedRun, FieldSummary, RunComparison, number_of
+from marey_schemas.queue.replicates import LEAST_REPLICATES
 
 LONGEST_LABEL, LONGEST_VALUE = 46, 24
 COMMIT_SIGNS = 8
@@ -127,6 +129,11 @@ def written(column: ComparedColumn, run: ComparedRun) -> str:
 def short(number: float) -> str:
     """Write a number with at most five digits."""
     return f"{number:.5g}"
+
+
+def interval_words() -> str:
+    """Return the part of a caption that says what the drawn intervals are."""
+    return f"{CONFIDENCE:.0%} confidence intervals of the means (from n = {LEAST_REPLICATES})".replace("%", " %")
 
 
 def missing_words(names: Sequence[str]) -> list[str]:

@@ -14,7 +14,7 @@ COSTS = ("match_cost", "continuing_cost", "pose_cost")
 """Costs that the part `records` contains for each tick."""
 
 CONFIDENCE = 0.95
-"""Confidence level of the intervals that are computed for changes between two evaluations."""
+"""Confidence level of intervals: of changes between two evaluations, and of means of replicates."""
 
 RESAMPLES = 9_999
 """Number of bootstrap samples from which each confidence interval is computed; the trials are resampled."""

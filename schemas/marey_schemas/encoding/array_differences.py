@@ -121,7 +121,7 @@ class ArrayDifference:
         leaf = {"dtype": spec.dtype, "shape": spec.shape, "encoding": "blocks", "data": data}
         array = array_from_leaf(leaf)
         if array_digest(array) != self.digest:
-            raise ArrayError("bad-array", "with this base and difference, the array does not have its digest")
+            raise ArrayError("bad-array", "base and difference give an array with another digest than was sent")
         return with_blocks(leaf, array)
 
     def _checked(self, spec: ArraySpec) -> tuple[NDArray[np.intp], NDArray[Any]]:

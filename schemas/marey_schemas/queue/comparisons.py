@@ -10,6 +10,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, StringConstraints, model_validator
 
 from marey_schemas.base import Answer
+from marey_schemas.queue.replicates import LEAST_REPLICATES
 from marey_schemas.queue.scripts import LONGEST_NAME, Value
 from marey_schemas.sizes import KIB
 
@@ -104,8 +105,12 @@ class FieldSummary(Answer):
 
     n: int = Field(description="Number of runs with different seeds.")
     mean: float
-    low: float | None = Field(None, description="Lower end of the interval; absent: fewer than 3 runs.")
-    high: float | None = Field(None, description="Upper end of the interval; absent: fewer than 3 runs.")
+    low: float | None = Field(
+        None, description=f"Lower end of the interval; absent: fewer than {LEAST_REPLICATES} runs."
+    )
+    high: float | None = Field(
+        None, description=f"Upper end of the interval; absent: fewer than {LEAST_REPLICATES} runs."
+    )
 
 
 class ComparedSetting(Answer):

@@ -137,7 +137,8 @@ class Resources(Request):
         None,
         ge=1,
         le=7 * 86400,
-        description="Expected duration of the job. On a server with own pods, a long job gets one.",
+        description="Expected duration of the job. With the setting `own_pods`, the server gives a long job a pod of "
+        "its own.",
     )
 
 

@@ -16,7 +16,7 @@ GPUS_LABEL = "marey/gpus"
 MOST_GPUS = 64
 
 REFUSED_STATUS = 42
-"""Exit status of a worker in a pod of a job's own that the server refuses; to start it again would not help."""
+"""Exit status of a worker in a pod for a single job that the server refuses; to start it again would not help."""
 
 IMAGE_VARIABLE = "MAREY_SCRIPT_IMAGE"
 """Environment variable with the image in which a worker runs; the launcher sets it for scripts with an own image."""

@@ -199,7 +199,7 @@ class ScriptDeclaration(Request):
     image: Image | None = Field(
         None,
         description="Container image in which the script runs, named by its digest; it contains a worker of Marey. The "
-        "server must allow it, and start pods of a job's own. null: the image of the worker.",
+        "server must allow it, and start pods for single jobs. null: the image of the worker.",
     )
 
     @field_validator("commit", mode="before")

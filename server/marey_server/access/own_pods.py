@@ -44,7 +44,7 @@ def labels_of_job(request: JobCreate, image: str | None, rules: PodRules | None,
     ----------
     request : request at the place `at` of a document
     image : image that the script of the job names, if any
-    rules : None if the server starts no pods of a job's own
+    rules : None if the server starts no pods for single jobs
 
     Raises `InvalidProblem` if the number of processors is not valid, or if the job needs an image that it cannot get.
     """
@@ -81,7 +81,7 @@ def _require_number(text: str | None, at: str) -> None:
 def _require_image(image: str, rules: PodRules | None, beyond: list[str], at: str) -> None:
     if rules is None:
         detail = (
-            "The script names an image, but this server starts no pods of a job's own; its operator can turn them on "
+            "The script names an image, but this server starts no pods for single jobs; its operator can change this "
             "with the setting `own_pods`."
         )
         raise _invalid(f"{at}/params/script", "no-own-pods", detail)

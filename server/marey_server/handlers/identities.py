@@ -15,7 +15,7 @@ from urllib.parse import urlencode, urlsplit
 from markupsafe import Markup
 from pydantic import ConfigDict, Field
 
-from marey_schemas.access import NewToken
+from marey_schemas.access import DAY_S, NewToken
 from marey_schemas.base import Request
 from marey_schemas.sign_ins import (
     CALLBACK_PATH,
@@ -38,10 +38,9 @@ from marey_server.process.password_lanes import limited_address
 from marey_server.store.credentials import browser_sign_ins, identities, sign_ins
 from marey_server.store.credentials.browser_sign_ins import LIFETIME_US, invalid_sign_in
 from marey_server.store.credentials.sign_ins import SignInTry
-from marey_server.store.database.clock import DAY_US, datetime_of
+from marey_server.store.database.clock import datetime_of
 from marey_server.store.transaction import Transaction
 
-DAY_S = DAY_US // 1_000_000
 BROWSER = "text/html; charset=utf-8"
 _PAGE = Markup(
     """<!doctype html>
@@ -72,11 +71,6 @@ class ProviderResource(PasswordResource):
                 "This server has no identity provider; sign in with a password.", code="no-identity-provider"
             )
         return found
-
-    def count_address(self, sign_in: str) -> SignInTry:
-        """Return the try to redeem the code of a sign-in, which counts like a try to use a password."""
-        address, per_minute = limited_address(self.client_address), self.services.settings.login_tries_per_minute
-        return SignInTry(f"sign-in {sign_in}", address, per_minute)
 
 
 class BrowserResource(ProviderResource):
@@ -252,7 +246,8 @@ class RedeemedSignIn(ProviderResource):
     )
     async def post(self, sign_in: str, body: BrowserSignInCode) -> Reply:
         """Return the token of a sign-in for its code and its verifier; the code works once."""
-        attempt = self.count_address(sign_in)
+        address, per_minute = limited_address(self.client_address), self.services.settings.login_tries_per_minute
+        attempt = SignInTry(f"sign-in {sign_in}", address, per_minute)
         self.services.refused_tries.check(attempt)
         await self.count(sign_ins.count, attempt)
         made = await self.change(browser_sign_ins.redeem, sign_in, body, attempt)

@@ -118,7 +118,9 @@ def require_access(operation: Operation, principal: Principal) -> None:
         _require_attempt_access(operation, principal)
         return
     if principal.kind == "pod" and access is not Access.WORKER:
-        raise ForbiddenProblem("The token of a pod of a job's own can only claim this job.", code="not-for-pods")
+        raise ForbiddenProblem(
+            "The token of a pod can claim only the job for which the pod was started.", code="not-for-pods"
+        )
     if access is Access.ATTEMPT:
         raise ForbiddenProblem(
             "This request needs the token that a worker gets for a running job.", code="attempt-only"

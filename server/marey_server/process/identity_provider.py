@@ -139,7 +139,7 @@ class IdentityProvider:
         in, and `UnavailableProblem`.
         """
         if self._places.locked():
-            raise provider_unavailable("Too many people sign in at the moment; try again in some seconds.")
+            raise provider_unavailable("Too many people sign in at the moment; try again in a few seconds.")
         async with self._places:
             endpoints = await self._endpoints.get()
             if issuer != self.issuer and (issuer is not None or endpoints.names_issuer):

@@ -203,8 +203,8 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
         MOST_OF_USER,
         ge=1,
         le=MOST_REMEMBERED,
-        description="Greatest number of workers of a user, by their names, that have claimed jobs in the last "
-        f"{ALIVE_S:.0f} seconds.",
+        description="Greatest number of workers of a user, by their names, that have claimed jobs from one server "
+        f"process in the last {ALIVE_S:.0f} seconds.",
     )
     user_items: int = Field(
         Quotas.user_items, ge=0, description="Greatest number of existing items that a user has created."

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from marey_schemas.queue.own_pods import GPUS_LABEL
+from marey_schemas.queue.own_pods import GPUS_LABEL, MOST_GPUS
 from marey_schemas.sizes import MIB
 from marey_server.access.labels import MOST_LABELS
 from marey_server.access.own_pods import PodRules
@@ -40,7 +40,7 @@ class WorkerPool(BaseModel):
     memory_mb: int | None = Field(
         None, ge=64, le=4_194_304, description="Memory of a worker in MiB. Absent: as the engine decides."
     )
-    gpus: int = Field(0, ge=0, le=64, description="Graphics processors of a worker.")
+    gpus: int = Field(0, ge=0, le=MOST_GPUS, description="Graphics processors of a worker.")
     deadline_s: int | None = Field(
         None,
         ge=SHORTEST_DEADLINE_S,

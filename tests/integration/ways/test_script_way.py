@@ -81,7 +81,7 @@ def check_comparisons(printed: dict[str, str], folder: Path) -> None:
     head, *rows = exact.splitlines()
     assert (head, len(rows)) == ("job,seed,rate,loss", 4)
     text = (folder / "runs.html").read_text()
-    assert "The lowest loss has rate=0.05" in text
+    assert "rate=0.05 has the lowest loss" in text
     assert "thin lines are runs with different seeds" in text
     assert (folder / "loss.png").read_bytes().startswith(b"\x89PNG")
 

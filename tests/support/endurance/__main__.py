@@ -1,7 +1,7 @@
 """Long trials of an installation with Postgres and S3: `python -m tests.support.endurance faults` or `load`.
 
-`faults` runs mixed jobs once in peace and once while processes are killed; `load` sends requests at a stated rate. The
-exit status is 1 if a rule was broken.
+`faults` runs mixed jobs once undisturbed and once while processes are killed; `load` sends requests at a stated rate.
+The exit status is 1 if a rule was broken.
 """
 
 from __future__ import annotations

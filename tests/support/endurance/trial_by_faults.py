@@ -1,4 +1,4 @@
-"""Trial by faults: mixed jobs run once in peace and once under faults, and the results must be the same bytes."""
+"""Trial by faults: mixed jobs run once undisturbed and once under faults, with equal results."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def _differences(peace: Ends, fire: Ends) -> Iterator[str]:
     for what, one, other in (("job", peace.jobs, fire.jobs), ("item", peace.contents, fire.contents)):
         for name in sorted(one.keys() | other.keys()):
             if one.get(name) != other.get(name):
-                yield f"the {what} {name} is {other.get(name)} under faults, and {one.get(name)} in peace"
+                yield f"the {what} {name} is {other.get(name)} under faults, and {one.get(name)} without"
 
 
 def _summary(name: str, work: Workload, ends: Ends, seconds: float) -> str:

@@ -10,13 +10,9 @@ import scipy.stats
 from marey_client.cli.operation.bench import _plan
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.errors import MareyError
-from marey_client.load.figures import T_975, Estimate, RateFigures, Replicate, percentile, read_samples
+from marey_client.load.figures import Estimate, RateFigures, Replicate, percentile, read_samples
 from marey_client.load.measuring import LoadPlan
 from marey_client.load.offering import arrival_times
-
-
-def test_the_table_of_t_quantiles_agrees_with_scipy() -> None:
-    assert [round(scipy.stats.t.ppf(0.975, degrees), 3) for degrees in range(1, len(T_975) + 1)] == list(T_975)
 
 
 def test_an_interval_is_that_of_student_and_one_value_has_none() -> None:

@@ -148,7 +148,7 @@ def test_the_page_says_whether_the_best_setting_is_apart_from_the_others() -> No
             for seed in range(3)
         ]
         text = draw_comparison(compared_of(runs, sort="-fields.score"), "html", plot="bars").decode()
-        assert "The highest score has size=1" in text
+        assert "size=1 has the highest score" in text
         assert ("overlaps that of another setting" in text) == says
 
 

@@ -9,7 +9,6 @@ from marey_motion.errors import MotionError
 from marey_motion.perception.fitting import (
     PairDifferences,
     bootstrap_weights,
-    fit_by_descent,
     fit_component,
     fit_power,
     fit_quality,
@@ -133,6 +132,28 @@ def test_known_weights_are_recovered_from_a_table() -> None:
     assert error.value.code == "fit-without-weights"
 
 
+def fit_by_descent(means: Floats, perceived: Floats) -> Floats:
+    """Return the sums of squares that projected descent reaches from 1,000 random starts, as in the paper."""
+    table = np.column_stack((np.ones(len(means)), means))
+    scale = np.linalg.norm(table, axis=0)
+    table = table / np.where(scale > 0, scale, 1.0)
+    square, target = table.T @ table, table.T @ perceived
+    step = 1.0 / np.linalg.eigvalsh(square)[-1]
+    points = np.random.default_rng(0).uniform(0.0, 2.0 * np.linalg.norm(perceived), (1000, len(square)))
+    ahead, speed = points, np.ones((1000, 1))
+    for _ in range(20_000):
+        new = np.maximum(ahead - step * (ahead @ square - target), 0.0)
+        # A start that moves uphill loses its momentum.
+        uphill = np.sum((ahead - new) * (new - points), axis=1, keepdims=True) > 0
+        faster = np.where(uphill, 1.0, 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * speed**2)))
+        moved = np.abs(new - points).max()
+        ahead = new + np.where(uphill, 0.0, (speed - 1.0) / faster) * (new - points)
+        points, speed = new, faster
+        if moved < 1e-13:
+            break
+    return np.asarray(np.sum((points @ table.T - perceived) ** 2, axis=1))
+
+
 def test_no_random_start_ends_below_the_least_squares() -> None:
     pairs = pair_differences()
     perceived = predict(TRUE, pairs) + np.random.default_rng(1).normal(0.0, 0.05, len(pairs.frames))
@@ -159,7 +180,7 @@ def test_uncertainty_comes_from_participants_and_validation_from_motions() -> No
     table[PAIRS] = truth / 3.0
     judgements = simulate_judgements(table + table.T, 12, seed=6, noise=0.05)
     perceived = difference_table(judgements).differences[PAIRS]
-    draws = bootstrap_weights(pairs, *pair_counts_by_participant(judgements), "manhattan", replicates=60)
+    draws = bootstrap_weights(pairs, *pair_counts_by_participant(judgements), "manhattan", draws=60)
     whole = fit_component(pairs, perceived, "manhattan")
     low, high = np.quantile(draws[:, 1:].sum(axis=1), (0.01, 0.99))
     assert low < whole.norm < high

@@ -1,1 +1,1 @@
-"""Commands that measure and test a server as a whole: load tests, computed capacity, and tests by faults."""
+"""Commands that measure and test a server as a whole: load tests, computed capacity, and fault injection."""

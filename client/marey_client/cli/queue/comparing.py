@@ -53,7 +53,10 @@ def compare(
     ] = "-created_at",
     limit: Annotated[int, typer.Option(min=1, max=100, help="Greatest number of runs.")] = 100,
     means: Annotated[
-        bool, typer.Option("--means", help="One row for each setting, with the means of runs with different seeds.")
+        bool,
+        typer.Option(
+            "--means", help="Print one row for all runs that differ only by their seeds, with the means of fields."
+        ),
     ] = False,
     every_column: Annotated[bool, typer.Option("--all-columns", help="Show columns with equal values, too.")] = False,
     as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV with exact numbers.")] = False,
@@ -66,8 +69,8 @@ def compare(
     plot: Annotated[
         Literal["lines", "scatter", "bars"] | None,
         typer.Option(
-            help="Chart in a .svg or .png: lines over steps, a field over a parameter, or bars. Default: the first of "
-            "these that the runs have values for."
+            help="Chart of a .svg or .png, and the only kind of chart of a page: lines over steps, a field over a "
+            "parameter, or bars. Default: a page has all kinds, a picture the first one for which there are values."
         ),
     ] = None,
     parameter: Annotated[

@@ -94,7 +94,7 @@ class ClusterView:
         return listed.version
 
     async def _follow(self, kind: Kind) -> None:
-        """List and watch until this task is cancelled; a failure is logged and followed by a pause."""
+        """Keep the copies of a kind current until this task is cancelled; log each failure, and pause after it."""
         failures = 0
         while True:
             began = time.monotonic()

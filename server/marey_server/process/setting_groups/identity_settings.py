@@ -8,6 +8,7 @@ from urllib.parse import urlsplit
 from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings
 
+from marey_schemas.access import LOGIN_DAYS, LONGEST_LOGIN_DAYS
 from marey_server.access.network_addresses import is_protected
 from marey_server.process.secret_files import read_secret
 
@@ -64,9 +65,9 @@ class IdentitySettings(BaseSettings):
         "administrator links each person.",
     )
     oidc_longest_days: int = Field(
-        7,
+        LOGIN_DAYS,
         ge=1,
-        le=90,
+        le=LONGEST_LOGIN_DAYS,
         description="Greatest number of days for which a sign-in is valid. Until then, the identity provider is not "
         "asked again.",
     )

@@ -50,7 +50,7 @@ def begin(tx: Transaction, request: BrowserSignInCreate, address: str, per_minut
             headers={"Retry-After": str(wait_s)},
         )
     if tx.execute(select(func.count()).select_from(browser_sign_in)).scalar_one() >= MOST_WAITING:
-        raise UnavailableProblem("Too many sign-ins are under way; try again in some minutes.", code="busy")
+        raise UnavailableProblem("Too many sign-ins are under way; try again in a few minutes.", code="busy")
     row = {
         "id": new_id("sign_in"), "challenge": request.challenge, "port": request.port,
         "lifetime_s": min(request.expires_in_s, longest_s), "created_us": tx.now_us,

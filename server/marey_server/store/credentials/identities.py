@@ -91,7 +91,7 @@ def insert_identity(tx: Transaction, user_id: str, name: str, person: Person) ->
 
 
 def _linked_already() -> ConflictProblem:
-    return ConflictProblem("This person is linked with another user; unlink that first.", code="identity-linked")
+    return ConflictProblem("This person is linked with another user; end that link first.", code="identity-linked")
 
 
 def unlink_identity(tx: Transaction, name: str, identity_id: str) -> None:

@@ -55,9 +55,9 @@ class Carried:
 
 
 class BytesAwaited(BaseException):
-    """Raised in a transaction that cannot go on before bytes were moved.
+    """Raised to end a transaction that needs bytes from outside; it is run again after `move`.
 
-    This is no `Exception`, because it must not be handled as an error of what the transaction does.
+    This is no `Exception`, because handlers of errors in the transaction must not catch it.
     """
 
     def move(self, carried: Carried) -> None:
@@ -73,7 +73,7 @@ class LookAgain(BytesAwaited):
 
 
 class ProbeAwaited(BytesAwaited):
-    """Raised to check whether objects can be stored."""
+    """Raised to end a transaction until a check has shown whether the bucket accepts objects."""
 
     def __init__(self, storage: ObjectStorage) -> None:
         super().__init__()

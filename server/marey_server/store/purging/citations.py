@@ -63,7 +63,7 @@ def delete_uncited_ref(
 
 
 def _has_tag(tx: Transaction, ref: Row[Any]) -> bool:
-    """Return whether a tag names the version of a deleted branch or tag."""
+    """Return whether a tag still names the version of `ref`, a branch or tag that this transaction has deleted."""
     same = (dataset_ref.c.dataset_id == ref.dataset_id, dataset_ref.c.digest == ref.digest)
     named = select(dataset_ref.c.name).where(*same, dataset_ref.c.kind == RefKind.TAG.value)
     return tx.execute(named.limit(1)).first() is not None
@@ -92,7 +92,7 @@ def _with_retries(tx: Transaction, citing: Iterable[str]) -> set[str]:
 
 
 def holders_of(tx: Transaction, citing: Collection[str]) -> FoundHolders:
-    """Return what holds versions that jobs have read: those of the jobs that have not ended, and items that they made.
+    """Return what holds the versions that jobs have read: jobs that have not ended, and items that the jobs made.
 
     `citing` are the ids of the jobs; their retries and tasks count, too. Purged items hold nothing.
     """

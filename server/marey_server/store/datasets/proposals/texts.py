@@ -1,4 +1,4 @@
-"""Room for the texts of proposals: descriptions, comments, reviews and checks.
+"""Limits of the texts of proposals: descriptions, comments, reviews and checks.
 
 Each text counts with its bytes in UTF-8 and with `BYTES_OF_ROW`, so that many short or empty texts are limited, too. A
 quarter of each limit is reserved for maintainers. Otherwise, others could prevent a review by filling a proposal.
@@ -31,10 +31,10 @@ _TEXTS: tuple[tuple[Table, ColumnElement[Any], ColumnElement[int]], ...] = (
 
 
 def require_room(tx: Transaction, project_row: ProjectRow, dataset_id: str, number: int, text: str) -> None:
-    """Check that a proposal, which may be a new one, can get a further text from the caller.
+    """Check that the caller may add a text to a proposal, which may be a new one.
 
-    Concurrent checks of one project run one after another. Raises `ConflictProblem` if the texts of the proposal would
-    be too long together, and `QuotaExceededProblem` if those of all proposals of the project would be.
+    Concurrent checks of one project run one after another. Raises `ConflictProblem` if the text would exceed the limit
+    of the proposal, and `QuotaExceededProblem` if it would exceed the limit of all proposals of the project.
     """
     more = len(text.encode()) + BYTES_OF_ROW
     tx.lock(f"texts of proposals {project_row.id}")
@@ -46,7 +46,7 @@ def require_room(tx: Transaction, project_row: ProjectRow, dataset_id: str, numb
     if used + more > limit:
         raise ConflictProblem(
             f"You can add texts to a proposal up to {limit:,} bytes in total. The texts of this one have {used:,}, and "
-            f"this needs {more:,} more. Close the proposal and open another, or write a shorter text.",
+            f"the new text needs {more:,} more. Close the proposal and open another, or write a shorter text.",
             code="long-proposal",
             context={"used": used, "limit": limit},
         )
@@ -66,9 +66,9 @@ def _require_room_in_project(tx: Transaction, project_row: ProjectRow, more: int
     limit = _limit_for(project_row.role, tx.quotas.project_proposal_bytes)
     if used + more > limit:
         raise QuotaExceededProblem(
-            f"The texts of the project's proposals have {used:,} bytes, your limit is {limit:,}, and this needs "
-            f"{more:,} more. Purge deleted datasets, whose proposals count, or ask the operator to raise the setting "
-            "`project_proposal_bytes`.",
+            f"The texts of the project's proposals have {used:,} bytes, your limit is {limit:,}, and the new text "
+            f"needs {more:,} more. Purge deleted datasets, whose proposals count, or ask the operator to raise the "
+            "setting `project_proposal_bytes`.",
             context={"quota": "project_proposal_bytes", "used": used, "limit": limit},
         )
 

@@ -57,7 +57,9 @@ def require_worker(caller: Principal, request: ClaimRequest) -> list[str]:
         raise ForbiddenProblem("Claiming jobs needs a user's token with the scope `work`.", code="insufficient-scope")
     if caller.kind == "pod":
         if request.job != caller.job_id:
-            raise ForbiddenProblem("The token of this pod can claim only the job of the pod.", code="not-for-pods")
+            raise ForbiddenProblem(
+                "The token of a pod can claim only the job for which the pod was started.", code="not-for-pods"
+            )
         return scopes
     if OWN_POD_LABEL in request.labels:
         raise ForbiddenProblem(

@@ -1,6 +1,7 @@
 """Means of replicates, which are measurements that differ only by chance, with confidence intervals.
 
-The module uses no arrays, because the server loads it, and because replicates are few.
+The server, the reports, and the load tests of the client use it, so it belongs to what all components share. It uses no
+arrays, because replicates are few.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class MeanInterval(NamedTuple):
 
 
 def mean_interval(values: Sequence[float]) -> MeanInterval:
-    """Compute the mean of measurements, and its 95 % confidence interval after Student.
+    """Compute the mean of measurements, and its 95 % confidence interval by Student's t distribution.
 
     The interval assumes that the measurements are independent and roughly normally distributed.
 
@@ -37,13 +38,6 @@ def mean_interval(values: Sequence[float]) -> MeanInterval:
     Returns
     -------
     MeanInterval    in the unit of the measurements; an end that is too large for a float is None
-
-    Examples
-    --------
-    >>> mean_interval([2.0, 4.0])
-    MeanInterval(n=2, mean=3.0, low=None, high=None)
-    >>> round(mean_interval([2.0, 4.0, 6.0]).high, 3)
-    8.968
     """
     count, largest = len(values), max(map(abs, values)) or 1.0
     # Divided by the largest, so that sums and squares of huge values stay finite.
