@@ -16,7 +16,7 @@ from marey_motion.perception.metric import Component, PerceptualMetric, shaped
 MOST_CELLS = 50_000_000
 """Greatest number of cells of a map that is kept whole; greater maps are computed in blocks of rows."""
 _SHAPINGS = {"euclid": 0, "manhattan": 1, "sigmoid": 2, "power": 3}
-_ANGLES = {"half_angle": 0, "angle": 1, "one_minus_dot": 2}
+_ANGLES = {"half_angle": 0, "log_norm": 0, "angle": 1, "one_minus_dot": 2}
 _BLOCK_CELLS = 4_000_000
 _NO_POINTS = np.empty((1, 0, 2))
 

@@ -18,7 +18,7 @@ from marey_motion.errors import MotionError
 
 Measurement = Literal["angles", "positions", "velocities"]
 Shaping = Literal["euclid", "manhattan", "sigmoid", "power"]
-AngleMeasure = Literal["half_angle", "angle", "one_minus_dot"]
+AngleMeasure = Literal["half_angle", "angle", "one_minus_dot", "log_norm"]
 
 MEASUREMENTS: tuple[Measurement, ...] = get_args(Measurement)
 JOINT_CLASSES: Mapping[str, tuple[str, ...]] = {
@@ -131,7 +131,7 @@ class PerceptualMetric:
     components : tuple of Component    at most one per measurement
     shares : tuple of float    shares a of the components, non-negative, with the sum 1
     angle : str    measure of angles; half_angle is arccos |q · p|, angle is twice as large, one_minus_dot is
-        1 - |q · p|
+        1 - |q · p|, and log_norm, the norm of the logarithm of the rotation from q to p, equals half_angle
     side_reduce : str    whether the difference of a class is the mean or the sum of both sides
     identity : str    zero: equal poses have the distance 0; constant: they have the distance c
     root_alignment : str    mean_heading: the hips are placed at the origin, and the mean heading of one second is

@@ -108,7 +108,7 @@ def joint_difference(
         angle = (Rotation.from_quat(a.rotations[i, p, [1, 2, 3, 0]]).inv()
                  * Rotation.from_quat(b.rotations[j, p, [1, 2, 3, 0]])).magnitude()  # fmt: skip
         dot = abs(float(a.rotations[i, p] @ b.rotations[j, p]))
-        by_kind = {"half_angle": angle / 2, "angle": angle, "one_minus_dot": 1 - dot}
+        by_kind = {"half_angle": angle / 2, "angle": angle, "one_minus_dot": 1 - dot, "log_norm": angle / 2}
         return float(by_kind[metric.angle])
     if component.measurement == "velocities":
         return float(np.linalg.norm(a.velocities[i, p] - b.velocities[j, p])) / 30.0
