@@ -29,7 +29,7 @@ from marey_server.handlers.queue import leases
 from marey_server.process import feed
 from marey_server.store import events
 from marey_server.store.database.connections import Database
-from marey_server.store.jobs import reaper
+from marey_server.store.monitoring import workers
 
 FOLLOWERS = 4
 
@@ -112,7 +112,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
     count(events, "list_events")
     count(events, "read_news")
-    count(reaper, "claim_after_reaping")
+    count(workers, "claim_after_reaping")
     return counted
 
 
