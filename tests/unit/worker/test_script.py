@@ -230,7 +230,8 @@ DENIED = {
     "read outside": "open('{outside}/secret').read()",
     "list outside": "__import__('os').listdir('{outside}')",
     "environment of others": "open('/proc/{parent}/environ', 'rb').read()",
-    "one huge file": "open('huge', 'wb').write(bytes(9_000_000))",
+    # Beyond the limit of one file, without using up the limit of all files. 65: for writing, created if missing.
+    "one huge file": "__import__('os').pwrite(__import__('os').open('huge', 65), b'x', 9_000_000)",
     "one huge allocation": "bytearray(1_000_000_000)",
     "network": "__import__('socket').create_connection(('127.0.0.1', {port}), 5)",
     "Unix socket": "__import__('socket').socket(1).connect('{outside}/socket')",
