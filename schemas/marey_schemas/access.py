@@ -8,10 +8,8 @@ from pydantic import Field, SecretStr, StringConstraints
 
 from marey_schemas.base import Answer, Request
 from marey_schemas.names import ProjectName, UserName
+from marey_schemas.sizes import DAY_S, LOGIN_DAYS, LONGEST_LOGIN_DAYS
 
-DAY_S = 86400
-LOGIN_DAYS, LONGEST_LOGIN_DAYS = 7, 90
-"""Default and greatest number of days for which the token of a login is valid."""
 MOST_RUNNING = 1_000_000
 """Greatest limit of running jobs that a project can have."""
 

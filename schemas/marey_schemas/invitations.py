@@ -7,9 +7,10 @@ from typing import Annotated
 
 from pydantic import Field, SecretStr, StringConstraints, model_validator
 
-from marey_schemas.access import DAY_S, LOGIN_DAYS, DisplayName, LoginSeconds, NewToken, Password, Role
+from marey_schemas.access import DisplayName, LoginSeconds, NewToken, Password, Role
 from marey_schemas.base import Answer, Request
 from marey_schemas.names import ProjectName, UserName
+from marey_schemas.sizes import DAY_S, LOGIN_DAYS
 
 MAX_DAYS = 30
 MAX_USES = 100

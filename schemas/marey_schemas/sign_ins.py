@@ -5,8 +5,9 @@ from typing import Annotated
 
 from pydantic import Field, SecretStr, StringConstraints
 
-from marey_schemas.access import DAY_S, LOGIN_DAYS, LoginSeconds
+from marey_schemas.access import LoginSeconds
 from marey_schemas.base import Answer, Request
+from marey_schemas.sizes import DAY_S, LOGIN_DAYS
 
 VERIFIER_PATTERN = r"^[A-Za-z0-9_-]{43,128}$"
 CALLBACK_PATH = "/sign-ins/callback"

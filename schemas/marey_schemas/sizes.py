@@ -1,4 +1,4 @@
-"""Units of sizes in bytes, and division of long lists into lists of limited size."""
+"""Units of sizes in bytes and of times, durations of logins, and division of long lists into short ones."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ T = TypeVar("T")
 KIB = 1024
 MIB = 1024 * KIB
 GIB = 1024 * MIB
+DAY_S = 86400
+LOGIN_DAYS, LONGEST_LOGIN_DAYS = 7, 90
+"""Default and greatest number of days for which the token of a login is valid."""
 
 
 def batched(values: Iterable[T], size: int) -> Iterator[list[T]]:

@@ -8,10 +8,10 @@ from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field, StringConstraints
 
-from marey_schemas.access import DAY_S
 from marey_schemas.base import Answer, Request
 from marey_schemas.event_kinds import DEFAULT_WEBHOOK_KINDS, PROJECT_EVENT_KINDS, ProjectEventKind
 from marey_schemas.names import Message
+from marey_schemas.sizes import DAY_S
 
 MAX_URL_LENGTH = 2048
 KEY_PREFIX = "whsec_"

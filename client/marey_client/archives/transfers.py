@@ -15,6 +15,7 @@ from marey_client.archives.writing import DatasetReader, short_name, write_trans
 from marey_client.errors import DifferencesRefused
 from marey_client.progress import OnProgress
 from marey_schemas.datasets.commits import Commit
+from marey_schemas.sizes import DAY_S
 from marey_versions.archive.reading import Archive
 
 T = TypeVar("T")
@@ -108,7 +109,7 @@ def transfers_folder() -> Path:
     """
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "marey" / "transfers"
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    oldest = time.time() - MOST_DAYS_KEPT * 86_400
+    oldest = time.time() - MOST_DAYS_KEPT * DAY_S
     for path in folder.iterdir():
         with suppress(FileNotFoundError):  # another copy may delete the same files
             found = path.lstat()

@@ -14,13 +14,12 @@ from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, UserName, connect, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 from marey_client.cli.terminal.secrets import ask_secret
+from marey_schemas.sizes import DAY_S, LOGIN_DAYS, LONGEST_LOGIN_DAYS
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
 
 user = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage users (for administrators).")
-
-SECONDS_PER_DAY = 86_400
 
 
 def add_to(app: typer.Typer) -> None:
@@ -61,10 +60,10 @@ def login(
         int,
         typer.Option(
             min=1,
-            max=90,
+            max=LONGEST_LOGIN_DAYS,
             help="Number of days for which the login is valid; with --browser, the server may allow fewer.",
         ),
-    ] = 7,
+    ] = LOGIN_DAYS,
 ) -> None:
     """Log in to a server, and store the server's address and a token in a file that only you can read."""
     from marey_client.credentials import logins_path, store_login
@@ -82,13 +81,13 @@ def login(
         if with_token:
             secret = typer.get_text_stream("stdin").read().strip()
         elif browser:
-            secret = sign_in_in_browser(marey, days * SECONDS_PER_DAY, paste=paste)
+            secret = sign_in_in_browser(marey, days * DAY_S, paste=paste)
         elif invitation:
             secret = _sign_up(marey, name, days)
         else:
             who = name or _ask_name()
             password = ask_secret(f"Password of {who} at {url}")
-            secret = marey.sign_in(Login(name=who, password=password, expires_in_s=days * SECONDS_PER_DAY)).secret
+            secret = marey.sign_in(Login(name=who, password=password, expires_in_s=days * DAY_S)).secret
     with Marey(url, secret) as marey:
         me = marey.me()
     path = logins_path(os.environ)
@@ -105,7 +104,7 @@ def _sign_up(marey: Marey, name: str | None, days: int) -> str:
     code = ask_secret(f"Invitation code for {url}")
     who = name or _ask_name()
     password = ask_secret(f"New password for {who} at {url}", twice=True)
-    made = marey.sign_up(SignUp(code=code, name=who, password=password, expires_in_s=days * SECONDS_PER_DAY))
+    made = marey.sign_up(SignUp(code=code, name=who, password=password, expires_in_s=days * DAY_S))
     print_message(f"user {who} is created" + (f", as {made.role} of {made.project}" if made.project else ""))
     return made.secret
 

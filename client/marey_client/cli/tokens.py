@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.accounts import SECONDS_PER_DAY
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, connect, credential_of, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, print_table
+from marey_schemas.sizes import DAY_S
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def create_token(
 
     given: dict[str, Any] = {"scopes": tuple(scope)} if scope else {}
     if days is not None:
-        given["expires_in_s"] = days * SECONDS_PER_DAY or None
+        given["expires_in_s"] = days * DAY_S or None
     if label:
         given["labels"] = dict(map(assignment, label))
     wanted = TokenCreate(name=name, **given)
@@ -122,7 +122,7 @@ def list_tokens(
     """
     if everybody:
         refuse_ignored(context, "with --everybody", "user")
-    within_s = None if expiring is None else expiring * SECONDS_PER_DAY
+    within_s = None if expiring is None else expiring * DAY_S
     with connect(context) as marey:
         tokens = list(marey.tokens.list(user=user, everybody=everybody, prefix=prefix, ends_within_s=within_s))
     if as_json:

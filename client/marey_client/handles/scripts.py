@@ -88,21 +88,22 @@ class ScriptHandle:
         self,
         *,
         sort: str = "-created_at",
-        limit: int = MOST_COMPARED,
+        limit: int | None = None,
         fields: Sequence[str] = (),
         goals: Mapping[str, Goal] | None = None,
         curves: bool = False,
     ) -> RunComparison:
         """Compare the succeeded runs, the first `limit` in an order: their settings, logged fields and curves.
 
-        `fields` are the logged fields to compare, by default all, and `goals` say which value of a field is the best.
-        The result contains `curves` of at most 6 fields if they are requested. Raises `BadRequest` for a field that no
-        run has logged.
+        Without `limit`, as many as possible are compared. `fields` are the logged fields to compare, by default
+        all, and `goals` say which value of a field is the best. The result contains `curves` of at most 6 fields if
+        they are requested. Raises `BadRequest` for a field that no run has logged.
         """
         named: dict[str, str] = {
             goal: ",".join(name for name, own in (goals or {}).items() if own == goal) for goal in GOALS
         }
-        wanted: dict[str, Any] = {"sort": sort, "limit": limit, "fields": ",".join(fields), **named}
+        most = MOST_COMPARED if limit is None else limit
+        wanted: dict[str, Any] = {"sort": sort, "limit": most, "fields": ",".join(fields), **named}
         if curves:
             wanted["curves"] = True
         given = {name: value for name, value in wanted.items() if value != ""}

@@ -123,7 +123,7 @@ def _draw_setting(panel: Axes, number: int, label: str, curves: list[Curve], mea
     if len(curves) > 1 and np.isfinite(mean.low).any():
         panel.fill_between(mean.steps, mean.low, mean.high, color=colour, alpha=0.16, lw=0)
     steps, values = (mean.steps, mean.mean) if len(curves) > 1 else (curves[0].steps, _values(curves[0]))
-    # Marks at different places, so that lines are told apart without colours.
+    # Markers of each line at other steps, so that readers can distinguish the lines without colours.
     every = max(len(steps) // 7, 1)
     panel.plot(steps, values, lw=1.8, ms=5.5, markevery=(number * every // len(COLOURS), every), **look)
 

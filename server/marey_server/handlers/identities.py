@@ -15,7 +15,7 @@ from urllib.parse import urlencode, urlsplit
 from markupsafe import Markup
 from pydantic import ConfigDict, Field
 
-from marey_schemas.access import DAY_S, NewToken
+from marey_schemas.access import NewToken
 from marey_schemas.base import Request
 from marey_schemas.sign_ins import (
     CALLBACK_PATH,
@@ -25,6 +25,7 @@ from marey_schemas.sign_ins import (
     Identity,
     IdentityLink,
 )
+from marey_schemas.sizes import DAY_S
 from marey_server.access.secret_tokens import derive_from_cookie
 from marey_server.errors import ApiProblem, NotFoundProblem, UnauthenticatedProblem
 from marey_server.handlers.access import MAX_LOGIN_BYTES, PasswordResource

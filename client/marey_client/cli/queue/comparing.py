@@ -51,7 +51,9 @@ def compare(
             "a field in this order is the best, unless another option says which.",
         ),
     ] = "-created_at",
-    limit: Annotated[int, typer.Option(min=1, max=100, help="Greatest number of runs.")] = 100,
+    limit: Annotated[
+        int | None, typer.Option(min=1, help="Greatest number of runs. Default: as many as possible.")
+    ] = None,
     means: Annotated[
         bool,
         typer.Option(

@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings
 
-from marey_schemas.access import LOGIN_DAYS, LONGEST_LOGIN_DAYS
+from marey_schemas.sizes import LOGIN_DAYS, LONGEST_LOGIN_DAYS
 from marey_server.access.network_addresses import is_protected
 from marey_server.process.secret_files import read_secret
 
