@@ -18,6 +18,7 @@ from sqlalchemy import insert, update
 from benchmarks.local_server import PROJECT
 from marey_schemas.datasets.commits import CommitCreate
 from marey_schemas.datasets.naming import MAIN, DatasetCreate
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM
 from marey_server.store import datasets, users
@@ -30,7 +31,6 @@ from marey_server.store.projects import require
 from marey_server.store.tables import collection, document, item, job, revision, revision_part
 from marey_server.store.transaction import Transaction
 from marey_versions.records import revision_content
-from marey_versions.tree.chunks import digest_of
 
 TASKS = 1000
 DATASET = "made"

@@ -27,6 +27,7 @@ from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
 from marey_motion.formats import write_bvh
 from marey_schemas.datasets.naming import DatasetCreate
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.imports import ImportEntry
 from marey_schemas.options.imports import ImportOptions
 from marey_server.access.principal import SYSTEM
@@ -37,7 +38,6 @@ from marey_server.store.projects import require
 from marey_server.store.tables import collection, item, revision, revision_part
 from marey_server.store.transaction import Transaction
 from marey_versions.records import DatasetEntry
-from marey_versions.tree.chunks import digest_of
 
 CLIPS, FEW = 142_220, 1_000
 """Number of clips of the collection, and of the small one with which checkouts are compared."""

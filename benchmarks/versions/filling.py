@@ -10,6 +10,7 @@ from sqlalchemy import insert, update
 from benchmarks.local_server import PROJECT
 from benchmarks.seeding import fill
 from marey_schemas.datasets.naming import MAIN, DatasetCreate
+from marey_schemas.encoding.digests import digest_of
 from marey_server.access.principal import SYSTEM
 from marey_server.app import open_database
 from marey_server.process.settings import Settings
@@ -19,7 +20,6 @@ from marey_server.store.tables import dataset_commit, dataset_ref
 from marey_server.store.transaction import Transaction
 from marey_versions.records import CommitRecord, DatasetEntry
 from marey_versions.tree.building import build
-from marey_versions.tree.chunks import digest_of
 
 LARGE = "large"
 """Name of the dataset with many entries."""

@@ -15,6 +15,7 @@ from marey_client.downloads import saved_atomically
 from marey_client.errors import BlobTooLarge, Conflict, DigestMismatch, FileChanged, Unreachable
 from marey_client.one_or_several import several
 from marey_client.transport import Transport, as_json, read_model
+from marey_schemas.encoding.digests import digest_of, digest_of_file, digest_of_hash
 from marey_schemas.formats import OCTETS
 from marey_schemas.items import BlobsMissing, BlobsQuery, Upload, UploadCreate
 from marey_schemas.sizes import batched
@@ -24,17 +25,6 @@ DIGESTS_PER_QUESTION = 10_000
 RESUMABLE_FROM_BYTES = 64 << 20
 PIECE_BYTES = 16 << 20
 TRIES_PER_PIECE = 5
-
-
-def digest_of(data: bytes) -> str:
-    """Return the digest of bytes: `sha256:` and 64 hexadecimal digits."""
-    return f"sha256:{hashlib.sha256(data).hexdigest()}"
-
-
-def digest_of_file(path: Path) -> str:
-    """Return the digest of a file's bytes, read in pieces."""
-    with path.open("rb") as file:
-        return f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
 
 
 @dataclass(frozen=True)
@@ -119,7 +109,7 @@ class Blobs:
 
         self.transport.repeat(once, repeatable=True, what=f"GET /blobs/{digest}")
         file.seek(0)
-        arrived = f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
+        arrived = digest_of_hash(hashlib.file_digest(file, "sha256"))
         if arrived != digest:
             raise DigestMismatch(
                 f"the downloaded blob has the digest {arrived} instead of {digest}: it was damaged on "

@@ -13,13 +13,13 @@ from sqlalchemy import Connection
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.store_fixtures import Lab
 
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import InvalidProblem, NotFoundProblem, StorageFullProblem
 from marey_server.store import blob_backings, blobs, garbage, items
 from marey_server.store.blob_backings import CHUNK_BYTES, DatabaseBlobs, DirectoryBlobs, Spool
-from marey_server.store.blobs import digest_of
 from marey_server.store.database.connections import Database
 from marey_server.store.object_storage.awaiting import Carried
 from marey_server.store.object_storage.backing import ObjectBlobs

@@ -15,6 +15,7 @@ from tests.support.store_fixtures import Lab
 from tests.support.store_writer import FILES, StoreWriter
 
 from marey_schemas.access import ProjectCreate
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.sizes import MIB
@@ -22,7 +23,6 @@ from marey_server.access.principal import SYSTEM
 from marey_server.errors import DamagedProblem
 from marey_server.store import blobs, fsck, garbage, items, projects
 from marey_server.store.blob_backings import DatabaseBlobs, Spool
-from marey_server.store.blobs import digest_of
 from marey_server.store.database.lanes import Client
 from marey_server.store.monitoring.readiness import find_faults
 from marey_server.store.object_storage.backing import ObjectBlobs

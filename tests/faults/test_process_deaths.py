@@ -18,7 +18,6 @@ from tests.support.tcp_proxy import TcpProxy
 from tests.support.tiers import is_soak
 
 from marey_client import Marey
-from marey_client.blobs import digest_of
 from marey_client.errors import MareyError
 from marey_client.imports import LocalFile, find_files
 from marey_client.project import ProjectHandle
@@ -26,6 +25,7 @@ from marey_motion.clip import Clip
 from marey_motion.formats import write_motion
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_schemas.access import ProjectCreate
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.imports import ImportEntry
 from marey_schemas.queue.jobs import Job, JobCreate, JobState
 

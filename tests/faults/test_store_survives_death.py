@@ -7,10 +7,10 @@ import pytest
 from tests.support.store_fixtures import Lab
 from tests.support.store_writer import ALL_US, FILES, LARGE_FILES, StoreWriter
 
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import Principal
 from marey_server.store import blobs, fsck, garbage, items
-from marey_server.store.blobs import digest_of
 
 in_rows_and_in_files = pytest.mark.parametrize("backing", ["rows", "files"])
 

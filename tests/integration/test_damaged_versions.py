@@ -16,6 +16,7 @@ from tests.support.rest_server import Server
 
 from marey_client import Marey
 from marey_client.errors import RequestFailed
+from marey_schemas.encoding.digests import digest_of
 from marey_server.access.principal import SYSTEM
 from marey_server.store.database.connections import Database
 from marey_server.store.datasets.chunks import chunk_in
@@ -24,7 +25,7 @@ from marey_server.store.fsck import check_store
 from marey_server.store.tables import dataset, dataset_commit, dataset_ref, tree_chunk
 from marey_server.store.transaction import Transaction
 from marey_versions.records import CommitRecord
-from marey_versions.tree.chunks import Branch, Child, Leaf, decode, digest_of, encode
+from marey_versions.tree.chunks import Branch, Child, Leaf, decode, encode
 
 DAMAGED = "dataset-damaged"
 

@@ -13,9 +13,9 @@ from tests.support.rest_server import Server
 from tests.support.store_fixtures import skeleton_tree
 
 from marey_schemas.access import Role
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.formats import EXPORT_FORMATS
 from marey_versions.records import revision_content
-from marey_versions.tree.chunks import digest_of
 
 LAB = "/projects/lab"
 ALLOWED = {"allow_expired_consent": "true", "consent_reason": "The estate has agreed by letter."}

@@ -14,9 +14,9 @@ from sqlalchemy import update
 from tests.support.rest_server import PATIENCE_S, Server, running
 
 from marey_schemas.encoding.codecs import encode_tree
+from marey_schemas.encoding.digests import digest_of
 from marey_server.access.principal import SYSTEM
 from marey_server.process.refusal_brake import FREE_REFUSALS
-from marey_server.store.blobs import digest_of
 from marey_server.store.credentials import tokens
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import Client

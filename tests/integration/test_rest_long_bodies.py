@@ -9,10 +9,10 @@ import pytest
 from sqlalchemy import func, select
 from tests.support.rest_server import running
 
+from marey_schemas.encoding.digests import digest_of
 from marey_server.access.principal import SYSTEM
 from marey_server.handlers.uploads import LONG_BODY_BYTES
 from marey_server.store import garbage
-from marey_server.store.blobs import digest_of
 from marey_server.store.database.connections import Database
 from marey_server.store.fsck import check_store
 from marey_server.store.tables import blob, blob_chunk, upload, upload_chunk

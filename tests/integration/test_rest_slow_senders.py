@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 from tests.support.rest_server import PATIENCE_S, Server, running
 
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.sizes import KIB, MIB
 from marey_server.handlers.blobs import Blob
 from marey_server.handlers.imports import MAX_FORM_BYTES
 from marey_server.store.blob_backings import SPOOLED_BYTES
-from marey_server.store.blobs import digest_of
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import Client
 

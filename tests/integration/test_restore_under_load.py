@@ -20,7 +20,7 @@ from tests.support.database_fixtures import database_address, empty_postgres_dat
 from tests.support.rest_server import Server, running
 from tests.support.s3_servers import SECRET_KEY, S3Server
 
-from marey_client.blobs import digest_of
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.formats import OCTETS
 from marey_server import commands
 from marey_server.app import connect_database

@@ -27,6 +27,7 @@ from tests.support.tcp_proxy import TcpProxy
 
 from marey_client import Marey, blobs
 from marey_schemas.access import ProjectCreate
+from marey_schemas.encoding.digests import digest_of_file
 from marey_schemas.queue import job_kinds
 from marey_schemas.queue.jobs import JobCreate
 from marey_server import commands
@@ -211,7 +212,7 @@ class Visitors:
 
     def _upload(self) -> None:
         with Marey(self._url, self._token) as marey:
-            blobs.send_in_pieces(marey.transport, self._file, blobs.digest_of_file(self._file))
+            blobs.send_in_pieces(marey.transport, self._file, digest_of_file(self._file))
 
 
 def test_no_client_with_retries_sees_a_failure_while_servers_are_replaced(
@@ -255,6 +256,6 @@ def test_no_client_with_retries_sees_a_failure_while_servers_are_replaced(
             ended = marey.jobs.wait(job.id, timeout_s=PATIENCE_S)
             visitors.stop()
             assert [one.outcome for one in marey.jobs.attempts(ended.id)] == ["succeeded"]
-            assert marey.blobs.fetch(blobs.digest_of_file(file)) == file.read_bytes()
+            assert marey.blobs.fetch(digest_of_file(file)) == file.read_bytes()
             assert len(list(lab.skeletons.list())) == visitors.written + 1
     new.check_database()

@@ -9,6 +9,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import PurgeRequest
 from marey_schemas.queue.worker_protocol import CompleteRequest
@@ -37,7 +38,7 @@ FILES = [f"file {number}".encode() * 1000 for number in range(3)]
 def publish(tx: Transaction) -> Any:
     """Publish three small items of the kind `study` that refer to the blobs of `FILES`."""
     row = projects.require(tx, "lab")
-    trees = [{"n": n, "blob": blobs.digest_of(data)} for n, data in enumerate(FILES)]
+    trees = [{"n": n, "blob": digest_of(data)} for n, data in enumerate(FILES)]
     drafts = [items.Draft(f"d{n}", Kind.STUDY, f"study {n}", {"study": tree}, "a/b") for n, tree in enumerate(trees)]
     return items.publish(tx, row, drafts, author_id=tx.principal.user_id, rights=rights_of_caller(tx, row))
 

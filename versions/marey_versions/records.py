@@ -16,9 +16,10 @@ import orjson
 
 from marey_schemas.documents.blob_references import is_array_reference
 from marey_schemas.encoding.canonical import canonical_json
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.kinds import Kind
 from marey_schemas.names import is_digest
-from marey_versions.tree.chunks import DamagedChunk, Value, digest_of
+from marey_versions.tree.chunks import DamagedChunk, Value
 
 COMMIT_SCHEMA = "marey/commit@1"
 

@@ -17,11 +17,11 @@ from marey_schemas.documents.blob_references import references_of
 from marey_schemas.encoding.array_differences import ArrayDifference, detach_differences
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import canonical_json, detach_arrays
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.sizes import batched
 from marey_versions.archive.members import ArchiveMember, MemberKind, differences_member
 from marey_versions.archive.writing import ArchiveWriter
 from marey_versions.records import contents_in
-from marey_versions.tree.chunks import digest_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

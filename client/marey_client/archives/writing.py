@@ -22,13 +22,13 @@ from marey_schemas.datasets.contents import (
     PartOfContent,
 )
 from marey_schemas.encoding.canonical import canonical_json
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.sizes import batched
 from marey_versions.archive.checking import check_archive
 from marey_versions.archive.members import ArchiveMember, BadArchive, MemberKind
 from marey_versions.archive.reading import Archive
 from marey_versions.archive.writing import ArchiveWriter
 from marey_versions.records import CommitRecord, revision_content
-from marey_versions.tree.chunks import digest_of
 
 if TYPE_CHECKING:
     from marey_client.transport import Transport

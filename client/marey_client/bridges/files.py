@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from marey_client.blobs import digest_of_file
 from marey_client.bridges.folders import file_names, new_folder, require_free
 from marey_client.bridges.sidecars import RECORDS, SidecarWriter
 from marey_client.bridges.version import (
@@ -23,6 +22,7 @@ from marey_client.downloads import download_to
 from marey_client.errors import CannotExport, RequestFailed
 from marey_schemas.datasets.exports import SIDECAR, ExportedClip
 from marey_schemas.datasets.layouts import Layout
+from marey_schemas.encoding.digests import digest_of_file
 from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, WHOLE_FORMATS, format_named
 
 if TYPE_CHECKING:

@@ -16,6 +16,7 @@ from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 from marey_motion.version import code_version
 from marey_schemas.base import Options
+from marey_schemas.encoding.digests import digest_of, digest_of_hash
 from marey_schemas.options.evaluation import EvaluationOptions
 
 
@@ -90,12 +91,12 @@ def _rows_digest(database: MatchingDatabase, clip: DatabaseClip) -> str:
     ):
         digest.update(f"{array.dtype.str} {list(array.shape)}\n".encode())
         digest.update(np.ascontiguousarray(array).data)
-    return f"sha256:{digest.hexdigest()}"
+    return digest_of_hash(digest)
 
 
 def _digest(value: Any) -> str:
     text = json.dumps(_canonical(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return f"sha256:{hashlib.sha256(text.encode()).hexdigest()}"
+    return digest_of(text.encode())
 
 
 def _canonical(value: Any) -> Any:

@@ -20,6 +20,7 @@ from marey_motion.matching.features import FeatureLayout, feature_layout
 from marey_motion.matching.normaliser import Normaliser, fit_normaliser
 from marey_motion.matching.preparing import PreparedClip, mirror_prepared, prepare_clip
 from marey_motion.matching.rows import ClipRows, clip_rows
+from marey_schemas.encoding.digests import digest_of_hash
 from marey_schemas.options.matching import DatabaseOptions
 from marey_schemas.wording import counted
 
@@ -168,7 +169,7 @@ def _digest_of(arrays: Sequence[NDArray[Any]], text: str = "") -> str:
     for array in arrays:
         content.update(f"{array.dtype.str} {array.shape}\n".encode())
         content.update(np.ascontiguousarray(array).data)
-    return f"sha256:{content.hexdigest()}"
+    return digest_of_hash(content)
 
 
 def _ordered(clips: Sequence[SourceClip]) -> list[SourceClip]:

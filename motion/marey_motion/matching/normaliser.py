@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.matching.features import FeatureLayout
+from marey_schemas.encoding.digests import digest_of_hash
 
 LEAST_SCALE = 1e-3
 """Least scale of a feature: smaller scales are raised, so that a feature without variation does not dominate."""
@@ -60,7 +61,7 @@ class Normaliser:
         content = hashlib.sha256(json.dumps(self.names).encode())
         for values in (self.offset, self.scale):
             content.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
-        return f"sha256:{content.hexdigest()}"
+        return digest_of_hash(content)
 
     def require_fit(self, layout: FeatureLayout) -> None:
         """Check that this normaliser fits the dimensions of a layout.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.arrayspec import ArraySpec, little_endian
+from marey_schemas.encoding.digests import digest_of_hash
 
 
 def array_digest(array: NDArray[Any] | EncodedArray) -> str:
@@ -99,4 +100,4 @@ def _name(*parts: bytes | memoryview) -> str:
     digest = hashlib.sha256()
     for part in parts:
         digest.update(part)
-    return f"sha256:{digest.hexdigest()}"
+    return digest_of_hash(digest)

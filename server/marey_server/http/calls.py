@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 from tornado.httputil import HTTPServerRequest
 
+from marey_schemas.encoding.digests import digest_of_hash
 from marey_server.access import scopes
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.access.secret_tokens import hash_secret
@@ -266,4 +267,4 @@ def _fingerprint_of(request: HTTPServerRequest, body: bytes | bytearray) -> str:
     digest = hashlib.sha256(f"{request.method} {request.uri}\n".encode())
     digest.update(request.headers.get("Content-Type", "").encode() + b"\n")
     digest.update(body)
-    return f"sha256:{digest.hexdigest()}"
+    return digest_of_hash(digest)

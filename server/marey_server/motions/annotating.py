@@ -11,7 +11,7 @@ from marey_schemas.names import MAX_NAME_LENGTH
 from marey_schemas.problems import FieldError
 from marey_server.errors import ApiProblem, InvalidProblem, TooLargeProblem
 from marey_server.motions.loading import LOADING
-from marey_server.store.documents import PreparedDocument
+from marey_server.prepared_documents import PreparedDocument
 from marey_server.store.items import prepare_part, prepare_parts
 from marey_server.store.items.annotating import AnnotatedClip, ChangedAnnotation, FoundAnnotation
 from marey_server.store.revs import ExpectedRev, is_expected, moved_on

@@ -6,8 +6,8 @@ Messages between server and child are MessagePack that the receiver validates; n
 
 The first arguments are the pipe's file descriptor, and the memory in bytes that orders may use. Then follows
 `FORK_SERVER` if the process forks children that carry out the orders, or `SINGLE` if it carries them out itself. The
-other arguments are functions to call at the start, which load modules. The parent kills a child if an order takes too
-long, or if the client that waits for its result has closed the connection.
+other arguments name what to load at the start: a module, or `module:function` with a function to call. The parent kills
+a child if an order takes too long, or if the client that waits for its result has closed the connection.
 """
 
 from __future__ import annotations
@@ -126,11 +126,11 @@ class ChildAnswer(Message):
 def main() -> None:
     """Load modules; then carry out orders from the pipe until it closes, or fork children that carry out orders."""
     pipe = connect_to_parent()
-    memory_bytes, forks, functions = int(sys.argv[2]), sys.argv[3] == FORK_SERVER, sys.argv[4:]
+    memory_bytes, forks, loaded_first = int(sys.argv[2]), sys.argv[3] == FORK_SERVER, sys.argv[4:]
     keep_freed_memory()
     with loading_modules():
-        for name in functions:
-            _function(name)()
+        for name in loaded_first:
+            _load(name)
     try:
         pipe.send_bytes(READY)
     except BrokenPipeError:  # the server ended while this loaded
@@ -174,6 +174,14 @@ def _answer(order: ChildOrder) -> ChildAnswer:
         return ChildAnswer(refusal=refusal)
     except Exception as error:  # noqa: BLE001 - whatever a file causes ends its order, not the process
         return ChildAnswer(traceback="".join(traceback.format_exception(error)))
+
+
+def _load(name: str) -> None:
+    """Import a module, and call the function if one is named."""
+    module, _, function = name.partition(":")
+    loaded = import_module(module)
+    if function:
+        getattr(loaded, function)()
 
 
 def _function(name: str) -> Callable[..., bytes]:

@@ -28,6 +28,7 @@ from marey_schemas.coverage_streams import (
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
+from marey_schemas.encoding.digests import digest_of_hash
 from marey_schemas.kinds import Kind
 from marey_schemas.options.evaluation import MOST_FRAME_RATE_HZ
 from marey_schemas.problems import FieldError
@@ -189,7 +190,7 @@ def _digest_of(frames: CoverageFrames) -> str:
         if given is not None:
             hashed.update(f" {name} {given.dtype.str} {given.shape} ".encode())
             hashed.update(given.tobytes())
-    return f"sha256:{hashed.hexdigest()}"
+    return digest_of_hash(hashed)
 
 
 # -- in the child ------------------------------------------------------------------------------------------------------

@@ -15,9 +15,9 @@ from marey_schemas.options.imports import ImportOptions
 from marey_server.access.folder_rights import FolderRoleProblem
 from marey_server.errors import ApiProblem, InvalidProblem
 from marey_server.motions.loading import LOADING
+from marey_server.prepared_documents import PreparedDocument, prepare_document
 from marey_server.store import blobs, items, projects
 from marey_server.store.blob_backings import Spool
-from marey_server.store.documents import PreparedDocument, prepare_document
 from marey_server.store.folder_roles.rights import rights_of_caller, rights_shown
 from marey_server.store.items import Draft, ItemFilters, Published
 from marey_server.store.projects import ProjectRow

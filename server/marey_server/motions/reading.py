@@ -19,7 +19,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
 from marey_schemas.options.imports import ImportOptions
 from marey_server.motions.child import Message
-from marey_server.store.documents import PreparedDocument, decoded_tree, document_of_bytes, prepare_document
+from marey_server.prepared_documents import PreparedDocument, decoded_tree, document_of_bytes, prepare_document
 
 _SKELETONS_KEPT = 64
 
@@ -149,8 +149,8 @@ class MappingOrder(Message):
 # -- in the child ------------------------------------------------------------------------------------------------------
 
 
-def load() -> None:
-    """Load the modules and kernels that child processes need.
+def load_kernels() -> None:
+    """Load the kernels that child processes need.
 
     The kernels are loaded in advance, because compiling missing kernels takes far longer than reading a file.
     """

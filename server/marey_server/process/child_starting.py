@@ -13,8 +13,10 @@ from marey_schemas.processes.forking import ForkServer
 from marey_server.motions.child import FORK_SERVER, SINGLE
 
 CHILD_MODULE = "marey_server.motions.child"
-LOADED_FIRST = ("marey_server.motions.reading:load",)
+LOADED_FIRST = ("marey_server.motions.reading:load_kernels",)
 """Functions that load modules and kernels in advance, so that a child's first task need not wait for them."""
+MODULES_FIRST = ("marey_server.motions.reading",)
+"""Modules that are loaded in advance if each child loads the kernels when it needs them."""
 
 Loading = TypeVar("Loading", ChildProcess, ForkServer)
 

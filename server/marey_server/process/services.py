@@ -20,6 +20,7 @@ from marey_server.access.principal import SYSTEM, Principal
 from marey_server.access.secret_tokens import is_sealed, token_hash
 from marey_server.errors import ApiProblem, AuthorLostProblem, UnavailableProblem
 from marey_server.motions.searching import SearchableKey
+from marey_server.process.child_starting import LOADED_FIRST, MODULES_FIRST
 from marey_server.process.children import Children
 from marey_server.process.computing import ComputeThreads
 from marey_server.process.disk_space import DiskSpace
@@ -111,7 +112,7 @@ class Services:
         self.refusal_brake = RefusalBrake()
         self.turns = Turns()
         self.compute_threads = ComputeThreads()
-        self.children = children or Children(settings.child_limits)
+        self.children = children or Children(settings.child_limits, LOADED_FIRST if settings.warm_up else MODULES_FIRST)
         self.disk = DiskSpace(settings.data, settings.min_free_bytes)
         self.memory = RequestMemory(settings.request_memory_bytes)
         self.upload_hashes = UploadHashes(database)

@@ -7,6 +7,7 @@ import os
 import threading
 from pathlib import Path
 
+from marey_schemas.encoding.digests import digest_of_hash
 from marey_schemas.lru import LruCache
 from marey_server.access.principal import Principal
 from marey_server.store import uploads
@@ -43,7 +44,7 @@ class _RunningHash:
         if self.copy is not None:
             with open(self.copy, "rb") as file:
                 os.fsync(file.fileno())
-        return f"sha256:{self._hash.hexdigest()}"
+        return digest_of_hash(self._hash)
 
 
 class UploadHashes:

@@ -19,6 +19,7 @@ from typing import Any, Protocol, Self
 
 from sqlalchemy import Connection, bindparam, delete, insert, select
 
+from marey_schemas.encoding.digests import digest_of_hash
 from marey_schemas.sizes import KIB
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.tables import blob, blob_chunk, upload_chunk
@@ -52,7 +53,7 @@ class Spool:
     @property
     def digest(self) -> str:
         """Return the digest of the bytes written so far."""
-        return f"sha256:{self._hash.hexdigest()}"
+        return digest_of_hash(self._hash)
 
     def chunks(self) -> Iterator[bytes]:
         """Yield all bytes written so far in pieces of 1 MiB."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from operator import itemgetter
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Select, Table, and_, or_, select, update
 
 from marey_schemas.access import Scope
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.problems import FieldError
 from marey_server import faults
 from marey_server.access import scopes
@@ -45,11 +45,6 @@ GRACE_US = 24 * 3600 * 1_000_000
 
 RENEW_US = GRACE_US // 2
 """Age after which an unreferenced blob must be sent again, so that it is not deleted while a client relies on it."""
-
-
-def digest_of(data: bytes) -> str:
-    """Return the digest `sha256:<hex>` of bytes."""
-    return f"sha256:{hashlib.sha256(data).hexdigest()}"
 
 
 def put_blob(

@@ -6,157 +6,25 @@ records which blob belongs to which place in a document.
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from numpy.typing import NDArray
-from pydantic import ValidationError
 from sqlalchemy import bindparam, insert, select
 
-from marey_schemas.documents.blob_references import is_array_reference, members_of, references_of
-from marey_schemas.documents.registry import SCHEMAS
-from marey_schemas.encoding import blocks
+from marey_schemas.documents.blob_references import is_array_reference
 from marey_schemas.encoding.arrays import EncodedArray
-from marey_schemas.encoding.canonical import canonical_json, detach_arrays
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import FieldError
-from marey_server.errors import InvalidProblem, NotFoundProblem
-from marey_server.field_errors import field_errors
+from marey_server.errors import NotFoundProblem
+from marey_server.prepared_documents import PreparedDocument, Tree, digest_of_body, place_of, prepared
 from marey_server.store import blobs
 from marey_server.store.database.prepared import Prepared, padded
 from marey_server.store.tables import blob, document, document_blob, document_item
 from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.records import references_in
 
-OPEN_SCHEMA = "marey/document@1"
-
-_NUL = re.compile(rb"(?<!\\)(?:\\\\)*\\u0000")
-_POINTER_LENGTH = 512
 _ID_LENGTH = 40
 EDIT_SCHEMA = PARTS[Kind.EDIT]["edit"].schema
-
-Tree = dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class PreparedDocument:
-    """Checked and encoded document; checking and encoding take longer than storing it, and need no database."""
-
-    digest: str
-    schema: str
-    body: Tree
-    size_bytes: int
-    arrays: dict[str, tuple[str, bytes]]
-    """Digest and bytes of each array's blob, by JSON Pointer."""
-    files: dict[str, str]
-    """Digests of the blobs that the document refers to, by JSON Pointer."""
-
-
-def prepare_document(tree: Any, *, schema: str | None = None) -> PreparedDocument:
-    """Check a document against `schema`, by default the schema that the document names, and encode its arrays.
-
-    Raises `InvalidProblem` with one entry for each fault.
-    """
-    name = _check(tree, schema)
-    tree = {**tree, "schema": name}
-    encoded: dict[str, bytes] = {}
-
-    def keep(content: str, array: NDArray[Any] | EncodedArray) -> None:
-        if content not in encoded:
-            encoded[content] = array.data if isinstance(array, EncodedArray) else blocks.encode(array)
-
-    try:
-        canonical = canonical_json(detach_arrays(tree, keep))
-    except (ValueError, TypeError, RecursionError) as error:
-        raise InvalidProblem(f"The body cannot be stored as a document: {error}", code="bad-document") from error
-    if _NUL.search(canonical):
-        raise InvalidProblem("Text in documents must not contain the character U+0000.", code="bad-text")
-    return _of_canonical(name, canonical, lambda _, leaf: encoded[leaf["content"]])
-
-
-def document_of_bytes(schema: str, canonical: bytes, arrays: Mapping[str, bytes]) -> PreparedDocument:
-    """Return a document that another process of this server has checked and encoded.
-
-    `canonical` is its canonical JSON with references in place of arrays; `arrays` maps JSON Pointers to encoded arrays.
-    """
-    return _of_canonical(schema, canonical, lambda pointer, _: arrays[pointer])
-
-
-def _of_canonical(schema: str, canonical: bytes, array_of: Callable[[str, Tree], bytes]) -> PreparedDocument:
-    body = json.loads(canonical)
-    leaves, files = references_of(schema, body)
-    encoded = {pointer: array_of(pointer, leaf) for pointer, leaf in leaves.items()}
-    _check_pointers([*encoded, *files])
-    arrays = {pointer: (blobs.digest_of(data), data) for pointer, data in encoded.items()}
-    size_bytes = len(canonical) + sum(map(len, {leaf["content"]: encoded[at] for at, leaf in leaves.items()}.values()))
-    return PreparedDocument(blobs.digest_of(canonical), schema, body, size_bytes, arrays, files)
-
-
-def decoded_tree(content: PreparedDocument) -> Tree:
-    """Return the tree that a document was prepared from."""
-    tree: Tree = json.loads(canonical_json(content.body))
-    for pointer, (_, data) in content.arrays.items():
-        holder, key = _place(tree, pointer)
-        leaf = holder[key]
-        holder[key] = EncodedArray(leaf["dtype"], tuple(leaf["shape"]), data).decode()
-    return tree
-
-
-def prepared(content: Any, *, schema: str | None = None) -> PreparedDocument:
-    """Return `content` as a document prepared for `schema`; a prepared document is returned unchanged."""
-    if not isinstance(content, PreparedDocument):
-        return prepare_document(content, schema=schema)
-    if schema not in (None, OPEN_SCHEMA, content.schema):
-        raise InvalidProblem(f"This part must have the schema {schema}, not {content.schema}.", code="bad-schema")
-    return content
-
-
-def with_body(content: PreparedDocument, body: Tree) -> PreparedDocument:
-    """Return the document with another JSON body and the same arrays and files."""
-    return replace(content, digest=digest_of_body(body), body=body)
-
-
-def digest_of_body(body: Tree) -> str:
-    """Return the digest of a document, given as JSON text with references in place of arrays."""
-    return blobs.digest_of(canonical_json(body))
-
-
-def _check(tree: Any, schema: str | None) -> str:
-    if not isinstance(tree, Mapping):
-        raise InvalidProblem("A document must be an object, not a list or a single value.", code="bad-document")
-    named = tree.get("schema", schema)
-    if schema is not None and schema != OPEN_SCHEMA and named != schema:
-        raise InvalidProblem(f"This part must have the schema {schema}, not {named!r}.", code="bad-schema")
-    for pointer, leaf in members_of(tree):
-        if is_array_reference(leaf):
-            detail = (
-                "Send the array itself (dtype, shape, data); a document cannot refer to the content of another one."
-            )
-            raise InvalidProblem(detail, errors=[FieldError(pointer=pointer, code="array-reference", detail=detail)])
-    model = SCHEMAS.get(str(named)) or SCHEMAS[OPEN_SCHEMA]
-    try:
-        model.model_validate(tree)
-    except ValidationError as error:
-        errors = field_errors(error, tree)
-        raise InvalidProblem(
-            f"The document is not a valid {named}: {errors[0].pointer}: {errors[0].detail}", errors=errors
-        ) from error
-    return str(named or OPEN_SCHEMA)
-
-
-def _check_pointers(pointers: list[str]) -> None:
-    for pointer in pointers:
-        if len(pointer) > _POINTER_LENGTH:
-            detail = f"The JSON Pointer of an array or file must have at most {_POINTER_LENGTH} characters."
-            raise InvalidProblem(
-                detail, errors=[FieldError(pointer=pointer[:_POINTER_LENGTH], code="too-deep", detail=detail)]
-            )
-
-
-# -- storing ----------------------------------------------------------------------------------------------------------
 
 
 def store_document(tx: Transaction, content: Any, *, schema: str | None = None) -> str:
@@ -362,7 +230,7 @@ def _attach_stored(
     """
     loaded: dict[str, Any] = {}
     named = tx.run(_BLOBS_OF_DOCUMENTS, {"digests": padded(bodies)})
-    places = [(row, *_place(bodies[row.document_digest], row.pointer)) for row in named]
+    places = [(row, *place_of(bodies[row.document_digest], row.pointer)) for row in named]
     arrays = [
         (row, holder, key) for row, holder, key in places if is_array_reference(holder[key])
     ]  # not names of files
@@ -374,11 +242,3 @@ def _attach_stored(
             stored = EncodedArray(leaf["dtype"], tuple(leaf["shape"]), data)
             loaded[leaf["content"]] = convert(stored) if convert else stored
         holder[key] = loaded[leaf["content"]]
-
-
-def _place(tree: Any, pointer: str) -> tuple[Any, str | int]:
-    """Return the object or list that contains the member named by a JSON Pointer, and the member's key in it."""
-    steps = [step.replace("~1", "/").replace("~0", "~") for step in pointer.split("/")[1:]]
-    for step in steps[:-1]:
-        tree = tree[int(step) if isinstance(tree, list) else step]
-    return tree, int(steps[-1]) if isinstance(tree, list) else steps[-1]

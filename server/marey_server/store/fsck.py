@@ -17,10 +17,11 @@ from marey_schemas.datasets.proposal_states import ProposalState
 from marey_schemas.documents.blob_references import references_of
 from marey_schemas.encoding.arrays import ArrayError, EncodedArray
 from marey_schemas.encoding.canonical import array_digest, canonical_json
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.kinds import PARTS, Kind
 from marey_server.access.principal import SYSTEM
 from marey_server.access.webhook_signatures import is_secret
-from marey_server.store.blobs import digest_of, read_blob
+from marey_server.store.blobs import read_blob
 from marey_server.store.database.connections import Database
 from marey_server.store.datasets.chunks import StoredChunks, chunk_in
 from marey_server.store.datasets.history import revisions_with

@@ -9,7 +9,6 @@ the server looks up the key of a refused request, too, before it answers.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Row, delete, select, update
 
 from marey_schemas.encoding.canonical import canonical_json
+from marey_schemas.encoding.digests import digest_of
 from marey_server.access.principal import Principal
 from marey_server.errors import InvalidProblem
 from marey_server.store.database.clock import DAY_US
@@ -89,7 +89,7 @@ def principal_key(principal: Principal) -> str:
 
 def _with_reach(fingerprint: str, principal: Principal) -> str:
     reach = canonical_json([fingerprint, principal.kind, sorted(principal.scopes)])
-    return f"sha256:{hashlib.sha256(reach).hexdigest()}"
+    return digest_of(reach)
 
 
 def _mine(principal: Principal, key: str) -> tuple[ColumnElement[bool], ColumnElement[bool]]:

@@ -16,7 +16,6 @@ import pytest
 from tests.support.command_line import CommandLine
 from tests.support.version_in_memory import tree
 
-from marey_client.blobs import digest_of_file
 from marey_client.errors import CannotExport, Conflict, FolderNotEmpty
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.versions import DatasetHandle
@@ -26,6 +25,7 @@ from marey_client.project import ProjectHandle
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
 from marey_schemas.datasets.exports import ExportedFolder
+from marey_schemas.encoding.digests import digest_of_file
 from marey_schemas.kinds import Kind
 from marey_versions.records import revision_content
 

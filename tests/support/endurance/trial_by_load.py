@@ -25,11 +25,11 @@ from tests.support.process_cost import ProcessCost
 from tests.support.rest_server import People
 from tests.support.store_fixtures import skeleton_tree
 
-from marey_client.blobs import digest_of
 from marey_client.load.figures import percentile
 from marey_client.load.offering import arrival_times
 from marey_schemas.access import ProjectCreate
 from marey_schemas.address import API
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.formats import OCTETS
 from marey_server.store.database.connections import Database
 

@@ -10,9 +10,9 @@ from tests.support.teams.contents import Content, Info, Labels, Motion, document
 from tests.support.teams.model import Model, ModelItem
 from tests.support.teams.operations import Clients, Operation, Outcome, Refused, accepted, refuse
 
-from marey_client.blobs import digest_of
 from marey_client.items import ItemHandle
 from marey_schemas.access import Role
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.items import ItemChange
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import PurgeAnswer

@@ -9,7 +9,8 @@ import pytest
 from tests.support.scripted_server import ScriptedServer
 
 from marey_client import errors
-from marey_client.blobs import Blobs, digest_of
+from marey_client.blobs import Blobs
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.items import BlobsQuery
 
 DATA = bytes(range(256)) * 4096

@@ -6,10 +6,10 @@ import httpx
 import pytest
 from tests.support.scripted_server import ScriptedServer
 
-from marey_client.blobs import digest_of
 from marey_client.cli.improvements import OPTIMISE, _print_comparison
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.handles.evaluations import EvaluationHandle
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.items import Item
 
 NOW = "2026-01-01T00:00:00Z"

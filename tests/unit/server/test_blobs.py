@@ -9,6 +9,7 @@ from tests.support.database_fixtures import AdjustableClock
 from tests.support.store_fixtures import Lab
 
 from marey_schemas.access import ProjectCreate
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.sizes import MIB
@@ -16,7 +17,7 @@ from marey_server.access.principal import Principal
 from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem, UnauthenticatedProblem
 from marey_server.store import blobs, items, projects
 from marey_server.store.blob_backings import SPOOLED_BYTES, Spool
-from marey_server.store.blobs import GRACE_US, digest_of
+from marey_server.store.blobs import GRACE_US
 
 FILE = b"HIERARCHY ROOT hips"
 DIGEST = digest_of(FILE)

@@ -10,7 +10,7 @@ from marey_schemas.editing.edits import EditDocument
 from marey_schemas.problems import FieldError
 from marey_server.errors import InvalidProblem
 from marey_server.field_errors import MAX_ERRORS, field_errors, json_pointer
-from marey_server.store import documents
+from marey_server.prepared_documents import prepare_document
 
 BACKWARDS = {"command": "trim", "start": 5, "stop": 2}
 
@@ -34,7 +34,7 @@ def test_a_rule_of_ours_is_told_in_its_own_words() -> None:
 def test_a_fault_of_a_document_is_told_as_one_of_a_body() -> None:
     tree = {"schema": "marey/edit@1", "commands": [BACKWARDS | {"name/of~it": 1}]}
     with pytest.raises(InvalidProblem) as refused:
-        documents.prepare_document(tree)
+        prepare_document(tree)
     assert list(refused.value.errors) == told(EditDocument, tree)
     first = refused.value.errors[0]
     assert (first.pointer, first.code) == ("/commands/0/name~1of~0it", "extra-forbidden")

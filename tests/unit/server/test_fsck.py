@@ -9,10 +9,10 @@ from sqlalchemy import ScalarSelect
 from tests.support.store_fixtures import Lab
 
 from marey_schemas.encoding import blocks
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.store import blobs, fsck, items, uploads
-from marey_server.store.blobs import digest_of
 from marey_server.store.database.connections import Database
 from marey_server.store.tables import (
     blob,

@@ -10,12 +10,13 @@ from sqlalchemy import Table
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.store_fixtures import Lab
 
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ConflictProblem
 from marey_server.store import blobs, documents, fsck, garbage, items
-from marey_server.store.blobs import GRACE_US, digest_of
+from marey_server.store.blobs import GRACE_US
 from marey_server.store.tables import (
     attempt,
     attempt_blob,

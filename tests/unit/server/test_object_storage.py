@@ -14,6 +14,7 @@ from tests.support.database_fixtures import AdjustableClock
 from tests.support.store_fixtures import Lab
 from tests.support.tiers import examples
 
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.sizes import MIB
@@ -21,7 +22,7 @@ from marey_server.access.principal import SYSTEM
 from marey_server.process.settings import Settings
 from marey_server.store import blobs, documents, fsck, garbage, items, uploads
 from marey_server.store.blob_backings import CHUNK_BYTES, DatabaseBlobs, DirectoryBlobs
-from marey_server.store.blobs import GRACE_US, digest_of
+from marey_server.store.blobs import GRACE_US
 from marey_server.store.object_storage import awaiting, backing
 from marey_server.store.object_storage.awaiting import BytesAwaited, Carried
 from marey_server.store.object_storage.backing import COMMIT_WITHIN_US, ObjectBlobs

@@ -10,6 +10,7 @@ from tests.support.committing_desk import CommittingDesk
 from tests.support.queue_desk import document
 
 from marey_schemas.datasets.commits import PutEntry
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM
 from marey_server.store import datasets, fsck
@@ -18,7 +19,6 @@ from marey_server.store.datasets.chunks import chunk_in
 from marey_server.store.items.drafts import Draft
 from marey_server.store.tables import commit_parent, dataset_commit, tree_chunk
 from marey_server.store.transaction import Transaction
-from marey_versions.tree.chunks import digest_of
 
 ALLOWED = {
     "sqlite_schema": 1,  # the first page of the file, where SQLite counts pages

@@ -18,6 +18,7 @@ from tests.support.store_fixtures import ALL_RIGHTS, WRITE, motion_tree, requiri
 from marey_schemas.datasets.commits import PutEntry, RemoveEntry
 from marey_schemas.datasets.naming import RefCreate, RefKind
 from marey_schemas.datasets.proposals import ProposalCreate
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.items import Event, ItemChange
 from marey_schemas.kinds import Kind
 from marey_schemas.lineage import LineageRequest, grouped, remarks_on, title_of
@@ -719,9 +720,9 @@ def test_chunks_are_read_once_however_many_versions_share_them(house: House, mon
 def test_blobs_of_jobs_are_not_counted_as_freed(house: House) -> None:
     data = b"x" * 5000
     house.write(blobs.put_blob, data)
-    one = house.add("one", study=document(blob=blobs.digest_of(data)))
+    one = house.add("one", study=document(blob=digest_of(data)))
     job = house.desk.submit("errand")
-    house.write(blobs.keep_for_job, job, [blobs.digest_of(data)])
+    house.write(blobs.keep_for_job, job, [digest_of(data)])
     house.delete(one)
     assert house.purge(item=one).freed_bytes < 1000
 
@@ -732,17 +733,17 @@ def test_files_that_jobs_imported_or_made_of_a_purged_item_are_released(house: H
     made = house.desk.submit("sum")
     lease = house.desk.claim()
     house.desk.database.write(house.desk.attempt(lease), blobs.put_blob, source)
-    house.desk.stage(lease, "take", facts={"blob": blobs.digest_of(source)})
-    house.desk.complete(lease, result={"source": {"blob": blobs.digest_of(source)}})
+    house.desk.stage(lease, "take", facts={"blob": digest_of(source)})
+    house.desk.complete(lease, result={"source": {"blob": digest_of(source)}})
     (take,) = house.desk.outputs(made)
     export = house.desk.submit("square", inputs={"things": ({"item": take.item},)})
     lease = house.desk.claim()
     house.desk.database.write(house.desk.attempt(lease), blobs.put_blob, archive)
-    house.desk.complete(lease, result={"archive": {"blob": blobs.digest_of(archive)}})
+    house.desk.complete(lease, result={"archive": {"blob": digest_of(archive)}})
     house.delete(take.item)
     assert house.purge(item=take.item, preview=True).freed_bytes > 3000
     assert house.purge(item=take.item).freed_bytes > 3000
     assert house.collect().blobs == 2
-    assert (house.desk.job(export).result or {})["archive"] == {"blob": blobs.digest_of(archive)}
-    assert house.read(blobs.readable, [blobs.digest_of(data) for data in (source, archive)]) == set()
+    assert (house.desk.job(export).result or {})["archive"] == {"blob": digest_of(archive)}
+    assert house.read(blobs.readable, [digest_of(data) for data in (source, archive)]) == set()
     assert house.faults() == []

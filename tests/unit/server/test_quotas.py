@@ -14,18 +14,18 @@ from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import Lab, skeleton_tree
 
 from marey_schemas.access import ProjectCreate, TokenCreate
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.jobs import ItemInput, JobCreate
 from marey_server.errors import QuotaExceededProblem
 from marey_server.motions import importing
 from marey_server.motions.importing import PreparedImport, SourceFile
+from marey_server.prepared_documents import prepare_document
 from marey_server.process.settings import Settings
 from marey_server.store import blobs, items, projects, uploads
-from marey_server.store.blobs import digest_of
 from marey_server.store.credentials import tokens
 from marey_server.store.database import connections
-from marey_server.store.documents import prepare_document
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.items import Draft
 from marey_server.store.jobs import reading

@@ -9,6 +9,7 @@ from sqlalchemy import event, func, select
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.store_fixtures import Lab
 
+from marey_schemas.encoding.digests import digest_of
 from marey_server import faults
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import (
@@ -21,7 +22,6 @@ from marey_server.errors import (
 from marey_server.process.upload_hashes import UploadHashes
 from marey_server.store import blobs, garbage, uploads
 from marey_server.store.blob_backings import DirectoryBlobs
-from marey_server.store.blobs import digest_of
 from marey_server.store.fsck import check_store
 from marey_server.store.tables import upload as upload_table
 from marey_server.store.tables import upload_chunk

@@ -17,13 +17,14 @@ from hypothesis import strategies as st
 from marey_schemas.encoding.array_differences import ArrayDifference
 from marey_schemas.encoding.arrays import ArrayError, EncodedArray
 from marey_schemas.encoding.canonical import array_digest, canonical_json
+from marey_schemas.encoding.digests import digest_of
 from marey_versions.archive.checking import check_archive
 from marey_versions.archive.members import MANIFEST, ArchiveMember, BadArchive, MemberKind, differences_member
 from marey_versions.archive.reading import Archive, Versions
 from marey_versions.archive.writing import ArchiveWriter
 from marey_versions.records import CommitRecord, key_of, revision_content
 from marey_versions.tree.building import build
-from marey_versions.tree.chunks import ChunksInMemory, Value, digest_of
+from marey_versions.tree.chunks import ChunksInMemory, Value
 
 POSES = np.arange(12, dtype=np.float32).reshape(4, 3)
 ORIGINAL = b"HIERARCHY\n"

@@ -12,13 +12,14 @@ from tests.support.tiers import examples
 from marey_schemas.datasets.differences import ChangeKind
 from marey_schemas.datasets.merges import Side
 from marey_schemas.encoding.canonical import canonical_json
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.names import MOST_TAGS
 from marey_versions.annotations import ADDED_TWICE, AnnotationClash
 from marey_versions.choices import Choice
 from marey_versions.compared import ComparedEntry, compare_entries
 from marey_versions.merging import ChangedPart, MergedEntries, merge_entries
 from marey_versions.records import DatasetEntry, key_of, revision_content
-from marey_versions.tree.chunks import Value, digest_of
+from marey_versions.tree.chunks import Value
 from marey_versions.tree.difference import Changed
 
 State = dict[str, Value]

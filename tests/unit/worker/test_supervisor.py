@@ -10,8 +10,8 @@ import pytest
 from tests.support.attached_worker import StartWorker
 from tests.support.fake_server import FakeServer
 
-from marey_client.blobs import digest_of
 from marey_client.credentials import write_private
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.queue.jobs import Progress
 from marey_schemas.queue.worker_protocol import FailRequest
 from marey_worker.commands import main

@@ -15,8 +15,8 @@ from marey_schemas.encoding.arrays import MAX_ARRAY_BYTES, ArrayError, EncodedAr
 from marey_schemas.encoding.blocks import BlockError, read_spec
 from marey_schemas.encoding.canonical import array_digest, canonical_json
 from marey_schemas.encoding.codecs import MSGPACK, CodecError, decode_tree, encode_tree
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.sizes import MIB
-from marey_versions.tree.chunks import digest_of
 
 SCHEMA = "marey/archive@1"
 SCHEMA_WITH_FACETS = "marey/archive@2"

@@ -11,6 +11,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 from marey_schemas.encoding.array_differences import ArrayDifference
 from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.encoding.digests import digest_of_hash
 from marey_schemas.names import is_digest
 from marey_schemas.queue.facets import is_facet_name
 from marey_versions.archive.members import (
@@ -126,7 +127,7 @@ class Archive:
             hashed.update(piece)
             position, left = position + len(piece), left - len(piece)
             yield piece
-        require_digest(member, f"sha256:{hashed.hexdigest()}")
+        require_digest(member, digest_of_hash(hashed))
 
     def commit(self, digest: str) -> CommitRecord:
         """Return the commit with this digest. Raises `BadArchive` if the archive has no valid commit of this digest."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import orjson
+
+from marey_schemas.encoding.digests import digest_of
 
 Value = dict[str, Any]
 Entry = tuple[str, Value]
@@ -108,11 +109,6 @@ def encode(chunk: Chunk) -> tuple[str, bytes]:
         content["children"] = [tuple(child) for child in chunk.children]
     data = orjson.dumps(content, option=orjson.OPT_SORT_KEYS)
     return digest_of(data), data
-
-
-def digest_of(data: bytes) -> str:
-    """Return the SHA-256 digest of bytes, as `sha256:` and 64 hexadecimal digits."""
-    return f"sha256:{hashlib.sha256(data).hexdigest()}"
 
 
 def decode(digest: str, data: bytes) -> Chunk:

@@ -7,10 +7,10 @@ from typing import Any
 
 from marey_schemas.kinds import Kind
 from marey_schemas.sizes import batched
+from marey_server.prepared_documents import PreparedDocument
 from marey_server.store import documents, items
 from marey_server.store.datasets.contents import Contents, find_contents_of
 from marey_server.store.datasets.history import revisions_with
-from marey_server.store.documents import PreparedDocument
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.transaction import Transaction
 from marey_versions.annotations import ADDED_TWICE, AnnotationClash, AnnotationVersion, merge_annotations

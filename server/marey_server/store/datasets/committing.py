@@ -25,6 +25,7 @@ from marey_schemas.datasets.naming import RefKind
 from marey_schemas.wording import counted
 from marey_server import faults
 from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
+from marey_server.prepared_documents import PreparedDocument
 from marey_server.store import projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.datasets.chunks import StoredChunks, store_chunks
@@ -35,7 +36,6 @@ from marey_server.store.datasets.manifests import FolderManifest, read_manifest,
 from marey_server.store.datasets.naming import branch_moved, find_dataset, find_ref, is_tag
 from marey_server.store.datasets.protection import Mover, require_move
 from marey_server.store.datasets.revisions import store_combined
-from marey_server.store.documents import PreparedDocument
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges, last_purge, require_no_purge_since
 from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, fast_forward, item, user

@@ -14,11 +14,11 @@ from sqlalchemy import select
 
 from marey_schemas.queue.commits import MOST_LISTED, CommitConflict
 from marey_schemas.wording import counted
+from marey_server.prepared_documents import PreparedDocument
 from marey_server.store.datasets.annotations import MOST_MERGED_BY_JOB, AnnotationMerger
 from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.history import tree_of
 from marey_server.store.datasets.revisions import MOST_COMBINED
-from marey_server.store.documents import PreparedDocument
 from marey_server.store.tables import collection, dataset, item
 from marey_server.store.transaction import Transaction, in_lists
 from marey_versions.compared import ComparedEntry

@@ -18,6 +18,7 @@ from marey_schemas.datasets.contents import (
 from marey_schemas.documents.blob_references import members_of, references_of
 from marey_schemas.encoding.arrays import MAX_ARRAY_BYTES, EncodedArray
 from marey_schemas.encoding.partial_arrays import tile_digests
+from marey_server.prepared_documents import Tree
 from marey_server.store import documents, projects
 from marey_server.store.datasets.contents import Contents, find_contents_of
 from marey_server.store.datasets.history import revisions_with
@@ -61,9 +62,9 @@ def check_export(tx: Transaction, project: str, name: str, request: ExportCheck)
 class _LoadedDocument:
     """Document that was loaded for an answer, and the document of which the reader has the arrays."""
 
-    tree: documents.Tree | None
+    tree: Tree | None
     """None if the project does not have the document."""
-    base: documents.Tree | None = None
+    base: Tree | None = None
     base_content: str = ""
     """Content digest of the revision with the document `base`."""
     arrays: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -172,7 +173,7 @@ def _portable(tx: Transaction, project_id: str, loaded: Sequence[_LoadedDocument
     ]
 
 
-def _tiles_of(tree: documents.Tree | None) -> dict[str, list[str]] | None:
+def _tiles_of(tree: Tree | None) -> dict[str, list[str]] | None:
     """Return the digests of the tiles of each array in a document, by JSON Pointer."""
     if tree is None:
         return None

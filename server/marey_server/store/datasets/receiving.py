@@ -16,6 +16,7 @@ from sqlalchemy import Row, select
 from marey_schemas.datasets.commits import Commit
 from marey_schemas.datasets.contents import ReceivedCommit, ReceivedRevision, StoredRevisions
 from marey_server.errors import ConflictProblem, InvalidProblem
+from marey_server.prepared_documents import PreparedDocument
 from marey_server.store import items, projects
 from marey_server.store.datasets.chunks import StoredChunks, store_chunks
 from marey_server.store.datasets.committing import (
@@ -30,7 +31,6 @@ from marey_server.store.datasets.naming import dataset_replaced, find_dataset, f
 from marey_server.store.datasets.partial_contents import Bases, bases_named_in, load_bases, restored
 from marey_server.store.datasets.protection import Mover
 from marey_server.store.datasets.revisions import item_name, publish_contents, require_contents
-from marey_server.store.documents import PreparedDocument
 from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.items import Draft, StoredDocument
 from marey_server.store.items.facets import fill_facets

@@ -12,10 +12,10 @@ from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted
 from marey_server.access.folder_rights import FolderRights
 from marey_server.errors import ConflictProblem, InvalidProblem
+from marey_server.prepared_documents import PreparedDocument
 from marey_server.store import items
 from marey_server.store.datasets.contents import find_contents_of, store_contents
 from marey_server.store.datasets.history import revisions_with
-from marey_server.store.documents import PreparedDocument
 from marey_server.store.items import Draft, StoredDocument
 from marey_server.store.items.drafts import PartContent
 from marey_server.store.items.revisions import read_part_digests

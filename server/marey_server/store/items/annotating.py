@@ -9,8 +9,8 @@ from marey_schemas.documents.references import RevisionRef
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_server.errors import ApiProblem, InvalidProblem, NotFoundProblem
+from marey_server.prepared_documents import PreparedDocument
 from marey_server.store import projects
-from marey_server.store.documents import PreparedDocument
 from marey_server.store.items.changing import put_part
 from marey_server.store.items.reading import read_item, read_part
 from marey_server.store.transaction import Transaction

@@ -12,9 +12,9 @@ from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import FieldError
 from marey_server.errors import ConflictProblem, InvalidProblem
+from marey_server.prepared_documents import PreparedDocument, prepared
 from marey_server.store import collections, documents, projects
 from marey_server.store.database.violations import taken
-from marey_server.store.documents import PreparedDocument
 from marey_server.store.folder_roles.rights import rights_of_caller
 from marey_server.store.items.drafts import Draft
 from marey_server.store.items.facets import repeat_facets
@@ -56,7 +56,7 @@ def prepare_part(kind: Kind, part: str, tree: Any) -> PreparedDocument:
             detail, code="no-part", errors=[FieldError(pointer=f"/{part}", code="no-part", detail=detail)]
         )
     try:
-        return documents.prepared(tree, schema=spec.schema)
+        return prepared(tree, schema=spec.schema)
     except InvalidProblem as error:
         moved = [found.model_copy(update={"pointer": f"/{part}{found.pointer}"}) for found in error.errors]
         raise InvalidProblem(error.detail, code=error.error_code, errors=moved, context=error.context) from error

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from marey_schemas.kinds import Kind
-from marey_server.store.documents import PreparedDocument
+from marey_server.prepared_documents import PreparedDocument
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ from marey_schemas.sizes import batched
 from marey_server import faults
 from marey_server.access.folder_rights import FolderRights
 from marey_server.errors import ConflictProblem, InvalidProblem
+from marey_server.prepared_documents import PreparedDocument, digest_of_body, prepared, with_body
 from marey_server.store import collections, documents
-from marey_server.store.documents import PreparedDocument
 from marey_server.store.ids import new_id
 from marey_server.store.items import references
 from marey_server.store.items.drafts import Draft, Published, StoredDocument
@@ -121,7 +121,7 @@ def _contents(draft: Draft) -> dict[str, PreparedDocument | StoredDocument]:
         )
     given = {part: draft.parts[part] for part in specs if part in draft.parts}
     return {
-        part: content if isinstance(content, StoredDocument) else documents.prepared(content, schema=specs[part].schema)
+        part: content if isinstance(content, StoredDocument) else prepared(content, schema=specs[part].schema)
         for part, content in given.items()
     }
 
@@ -243,11 +243,11 @@ class _Publication:
                 changed = body != one.bodies[part]
                 digest = content.digest
                 if isinstance(content, PreparedDocument):
-                    fresh.append(documents.with_body(content, body) if changed else content)
+                    fresh.append(with_body(content, body) if changed else content)
                     digest = fresh[-1].digest
                 elif changed:
                     variants.append((content.digest, body))
-                    digest = documents.digest_of_body(body)
+                    digest = digest_of_body(body)
                 digests[part], bodies[part] = digest, body
             stored.append((one.draft, digests, bodies))
         sizes = documents.store_documents(self.tx, fresh)
@@ -394,7 +394,7 @@ class _Publication:
         if body == one.bodies["info"]:
             return one
         documents.store_variants(self.tx, [(digest, body)])
-        kept = {**one.digests, "info": documents.digest_of_body(body)}
+        kept = {**one.digests, "info": digest_of_body(body)}
         return replace(one, digests=kept, bodies={**one.bodies, "info": body})
 
     def _add(self, creator_id: str | None, more: Held) -> None:

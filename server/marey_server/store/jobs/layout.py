@@ -9,7 +9,6 @@ no cache key.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 from sqlalchemy import Row, select
 
 from marey_schemas.encoding.canonical import canonical_json
+from marey_schemas.encoding.digests import digest_of
 from marey_schemas.queue.jobs import JobCreate, Resources, commits_of
 from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_schemas.sizes import batched
@@ -288,7 +288,7 @@ def _cache_key(one: NewJob, parts: Mapping[tuple[str, int], dict[str, str]], new
         tree["into"] = submission.request.into
     if kind.newest_of:
         tree["newest"] = [[item, newest.get(item)] for item in _named_items(kind, params)]
-    return f"sha256:{hashlib.sha256(canonical_json(tree)).hexdigest()}"
+    return digest_of(canonical_json(tree))
 
 
 def _newest_revisions(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, int]:

@@ -17,9 +17,9 @@ from marey_schemas.queue.jobs import ItemInput
 from marey_schemas.queue.worker_protocol import StagedOutput
 from marey_server import faults
 from marey_server.errors import ConflictProblem, InvalidProblem
+from marey_server.prepared_documents import PreparedDocument, prepare_document
 from marey_server.store import blobs, documents
 from marey_server.store.database.prepared import Prepared
-from marey_server.store.documents import PreparedDocument
 from marey_server.store.folder_roles.rights import rights_of_author
 from marey_server.store.items.drafts import Draft, StoredDocument
 from marey_server.store.items.facets import StoredFacets, publish_facets, stored_facets, with_revisions
@@ -56,7 +56,7 @@ def prepare_output(output: StagedOutput) -> PreparedOutput:
         raise InvalidProblem(
             detail, code="no-part", errors=[FieldError(pointer=f"/{unknown[0]}", code="no-part", detail=detail)]
         )
-    parts = {part: documents.prepare_document(tree, schema=specs[part].schema) for part, tree in output.parts.items()}
+    parts = {part: prepare_document(tree, schema=specs[part].schema) for part, tree in output.parts.items()}
     return PreparedOutput(output, parts)
 
 

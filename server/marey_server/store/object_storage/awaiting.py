@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar, TypeVarTuple
 
+from marey_schemas.encoding.digests import digest_of_hash
 from marey_server import faults
 from marey_server.errors import DamagedProblem
 from marey_server.store.object_storage.client import ObjectStorage, ObjectStorageProblem, StoredObject
@@ -149,4 +150,4 @@ def digest_of_chunks(chunks: Iterable[bytes]) -> tuple[str, int]:
     for chunk in chunks:
         hashed.update(chunk)
         size_bytes += len(chunk)
-    return f"sha256:{hashed.hexdigest()}", size_bytes
+    return digest_of_hash(hashed), size_bytes

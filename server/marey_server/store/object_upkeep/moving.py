@@ -16,6 +16,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Row, and_, delete, exists, or_, select, update
 
+from marey_schemas.encoding.digests import digest_of_hash
 from marey_schemas.sizes import MIB
 from marey_schemas.wording import counted
 from marey_server import faults
@@ -149,7 +150,7 @@ def _hashed(chunks: Iterator[bytes], found: list[tuple[str, int]]) -> Iterator[b
         hashed.update(chunk)
         size_bytes += len(chunk)
         yield chunk
-    found.append((f"sha256:{hashed.hexdigest()}", size_bytes))
+    found.append((digest_of_hash(hashed), size_bytes))
 
 
 def _chunks(database: Database, row: Row[Any]) -> Iterator[bytes]:
