@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 from benchmarks.pipeline_under_fire import run_pipeline, write_takes
 
-pytestmark = pytest.mark.timeout(600)
+# test_pipeline_deaths.py kills at each chosen place, and test_endurance.py at random, in the tier `test`.
+pytestmark = [pytest.mark.soak, pytest.mark.timeout(600)]
 
 WALKS = 6
 STEPS_OF_WALKS: dict[str, Any] = {

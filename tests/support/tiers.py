@@ -7,6 +7,7 @@ the end of a run, the tests that the tier left out are counted by reason.
 from __future__ import annotations
 
 import functools
+import gc
 import os
 import shutil
 import zlib
@@ -100,16 +101,20 @@ def _needs_cluster(item: pytest.Item) -> bool:
     return item.get_closest_marker("cluster") is not None
 
 
+def _rest(item: pytest.Item) -> bool:
+    return _folder(item).startswith("integration/")
+
+
 def _on_other_database(item: pytest.Item) -> bool:
     """Return whether the tier `test` runs this test only on the other database.
 
-    This concerns fault cases and workflows. A hash of the name of the fault case, or of the workflow's module, chooses
-    the database, so about half of these tests run on each.
+    This concerns fault cases, REST tests and workflows; tests of the store itself run on both databases. A hash of the
+    name of the test, or of the workflow's module, chooses the database, so about half of these tests run on each.
     """
     backend = backend_of(item)
-    if backend is None or item.get_closest_marker("every_database") or not (_fault(item) or _whole_way(item)):
+    if backend is None or item.get_closest_marker("every_database") or not (_fault(item) or _rest(item)):
         return False
-    name = item.nodeid.replace(backend, "") if _fault(item) else _folder(item)
+    name = _folder(item) if _whole_way(item) else item.nodeid.replace(backend, "")
     return BACKENDS[zlib.crc32(name.encode()) % len(BACKENDS)] != backend
 
 
@@ -128,7 +133,7 @@ TIERS = {
         1,
         {
             "for the tier soak": _soak_only,
-            "fault cases and whole ways on the other database": _on_other_database,
+            "fault cases, REST tests and whole ways on the other database": _on_other_database,
         },
     ),
     "soak": Tier(SOAK_EFFORT, {}),
@@ -222,9 +227,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Stop if pytest-xdist has not read the groups: each process would then create all shared data."""
+    """Stop if pytest-xdist has not read the groups: each process would then create all shared data.
+
+    Python's garbage collector ignores the collected tests from now on: they stay until the end, and searching them
+    again and again takes a twentieth of the time.
+    """
     if session.config.getoption("loadgroup", False) and not all("@" in item.nodeid for item in session.items):
         raise pytest.UsageError("pytest-xdist has not seen the groups of tests, see tests/support/tiers.py")
+    gc.collect()
+    gc.freeze()
 
 
 def _group(item: pytest.Item) -> str:
