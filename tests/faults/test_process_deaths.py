@@ -57,7 +57,7 @@ def start_worker(tmp_path: Path, server: ServerProcess) -> Iterator[Callable[...
         url = f"http://127.0.0.1:{port}" if port else server.url
         worker = WorkerProcess(tmp_path / f"{name}.log")
         workers.append(worker)
-        return worker.start(url, server.token, tmp_path, name=name, fault=fault)
+        return worker.start(url, server.token, tmp_path, name=name, fault=fault, kinds=["retarget"])
 
     yield start
     for worker in workers:

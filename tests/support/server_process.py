@@ -9,7 +9,7 @@ import signal
 import socket
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Self
@@ -135,13 +135,17 @@ class WorkerProcess(MareyProcess):
         super().__init__(log)
         self.environment = environment
 
-    def start(self, url: str, token: str, folder: Path, *, name: str, fault: str | None = None) -> Self:
+    def start(
+        self, url: str, token: str, folder: Path, *, name: str, fault: str | None = None, kinds: Sequence[str] = ()
+    ) -> Self:
         """Start the worker, and return this object.
 
-        The worker connects to the server without further help of the test.
+        The worker connects to the server without further help of the test. It runs and loads only jobs of `kinds`, if
+        any are given.
         """
         environment = self.environment | ({"MAREY_FAULT": fault} if fault else {})
         arguments = ["marey_worker", "--attached", "--server", url, "--name", name, "--cache", str(folder / "cache")]
+        arguments += [word for kind in kinds for word in ("--kind", kind)]
         self.spawn(arguments, environment, stdin=f"{token}\n".encode())
         return self
 
