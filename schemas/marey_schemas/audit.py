@@ -48,6 +48,8 @@ AUDIT_WORDS: Mapping[AuditKind, str] = {
     "schedule.deleted": "deleted the schedule",
     "script.registered": "registered the script",
     "script.deleted": "deleted the script",
+    "study.invited": "created links for participants of the study",
+    "study.withdrawn": "deleted the records of a participant of the study",
     "user.created": "created the user",
     "user.changed": "changed the user",
     "user.limited": "changed the quotas of the user",
