@@ -114,6 +114,13 @@ class AttemptApi:
         with _dead_token_is_lost_lease():
             return [one.result or {} for one in pages(self._transport, TaskResult, f"/jobs/{self._job}/results")]
 
+    def read_judgements(self, study: str, revision: int) -> list[dict[str, Any]]:
+        """Return what the participants who saw a revision of a study answered, as one tree for each of them."""
+        path = f"/projects/{self._project}/{Kind.STUDY.plural}/{study}/judgements"
+        with _dead_token_is_lost_lease():
+            people = pages(self._transport, JudgingParticipant, path, {"revision": revision})
+            return [one.model_dump(mode="json") for one in people]
+
     def read_blob(self, digest: str, most_bytes: int) -> bytes:
         """Return a blob's bytes by its digest. Raises `BlobTooLarge` before the download of more than `most_bytes`."""
         with _dead_token_is_lost_lease():
