@@ -28,6 +28,7 @@ from marey_schemas.queue.worker_protocol import (
     LeaseList,
     LogAnswer,
 )
+from marey_schemas.studies.conducting import JudgingParticipant
 
 PATIENT = Retries(tries=100, longest_s=10.0, total_s=600.0)
 """Retries, for up to 10 minutes, of requests without which computed results would be lost."""

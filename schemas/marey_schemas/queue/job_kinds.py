@@ -290,6 +290,7 @@ TREE = KindDeclaration(
     unclear_place=job_params.TreeParams.unclear_place,
 )
 
+
 def _reads_answers(_params: Mapping[str, Any]) -> bool:
     """Return that answers of participants, which are read while the job runs, may change between two jobs."""
     return True

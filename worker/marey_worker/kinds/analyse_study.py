@@ -123,9 +123,7 @@ def _measure(context: Context, ref: RevisionRef) -> MeasuredClip:
 def _names(context: Context, study: StudyDocument) -> list[str]:
     """Return a name of each motion for people: its label, or the name of the clip."""
     refs = [RevisionRef.model_validate(one.clip.model_dump()) for one in study.motions]
-    return [
-        one.label or context.item(Kind.CLIP, ref.item).name for one, ref in zip(study.motions, refs, strict=True)
-    ]
+    return [one.label or context.item(Kind.CLIP, ref.item).name for one, ref in zip(study.motions, refs, strict=True)]
 
 
 def _headline(analysis: StudyAnalysis) -> dict[str, Any]:

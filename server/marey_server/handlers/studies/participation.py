@@ -95,9 +95,7 @@ class OwnParticipation(LinkResource):
         A repeated request with the same key gets the same token. With another key, the link is not valid any more.
         """
         attempt = await self.count_code(body.code)
-        return await self.answer_with(
-            lambda made: Reply(made, headers=WITH_SECRET), participants.begin, body, attempt
-        )
+        return await self.answer_with(lambda made: Reply(made, headers=WITH_SECRET), participants.begin, body, attempt)
 
     @reads(access=Access.PARTICIPANT, scope=None, answer=Participation)
     async def get(self) -> Rendered:

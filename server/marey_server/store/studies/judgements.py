@@ -37,7 +37,9 @@ def list_judgements(
     statement = select(study_participant).where(*of_revision, *began)
     rows, following = listing.read_page(tx, statement, order, ["judgements", row.id, revision], cursor, limit)
     trials: dict[str, list[JudgedTrial]] = {one.id: [] for one in rows}
-    ended = select(study_trial).where(study_trial.c.participant_id.in_(list(trials)), study_trial.c.ended_us.is_not(None))
+    ended = select(study_trial).where(
+        study_trial.c.participant_id.in_(list(trials)), study_trial.c.ended_us.is_not(None)
+    )
     for trial in tx.execute(ended.order_by(study_trial.c.participant_id, study_trial.c.number)):
         trials[trial.participant_id].append(_shown(trial, seed))
     people = (

@@ -126,9 +126,7 @@ def find_caller(tx: Transaction, *, lock: bool = False) -> Row[Any]:
     """
     row = _caller(tx, lock=lock)
     if row.withdrawn_us is not None:
-        raise GoneProblem(
-            "This participation has ended, and its answers were deleted.", code="participation-withdrawn"
-        )
+        raise GoneProblem("This participation has ended, and its answers were deleted.", code="participation-withdrawn")
     if not row.study_exists:
         raise GoneProblem("The study was deleted.", code="study-gone")
     return row
