@@ -41,7 +41,7 @@ class Findings:
         return self.save_file("report", path)
 
     def save_file(self, name: str, path: str | Path) -> Path:
-        """Write a file of the result, such as `report`, and return its path. Raises `LookupError` without such a file."""
+        """Write a file of the result, such as `report`; return its path. Raises `LookupError` without such a file."""
         return Blobs(self.transport).fetch_to(self._blob(name), Path(path))
 
     def _blob(self, name: str) -> str:

@@ -239,8 +239,8 @@ def _shares_table(analysis: StudyAnalysis) -> Content:
 
 def _reading() -> Content:
     texts = (
-        "A difference is a share of trials, between 0 and 1; a trial shows six pairs, and one of them is chosen, so the "
-        "mean difference is five sixths.",
+        "A difference is a share of trials, between 0 and 1; a trial shows six pairs, and one of them is chosen, so "
+        "the mean difference is five sixths.",
         "The noise is the standard error of the differences that follows from the number of trials. A fit with a "
         "smaller error describes the noise.",
         "Left out: the error for motions that were left out of the fit, one at a time. If it is much greater than the "

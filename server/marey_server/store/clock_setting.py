@@ -17,7 +17,8 @@ from marey_server.store.tables import invitation, job, metadata, schedule, study
 PAST = frozenset(
     {
         "at_us", "cancel_requested_us", "created_us", "deleted_us", "delivered_us", "ended_us", "failing_since_us",
-        "finished_us", "fired_us", "last_used_us", "purged_us", "served_us", "since_us", "started_us", "updated_us", "withdrawn_us",
+        "finished_us", "fired_us", "last_used_us", "purged_us", "served_us", "since_us", "started_us", "updated_us",
+        "withdrawn_us",
     }
 )  # fmt: skip
 """Columns of times in the past; no value may lie in the future."""

@@ -87,7 +87,7 @@ def analyse(
         request = handle.analyse_request(**params).model_copy(update=job)
         ended = follow(marey, marey.project(handle.project).submit(request), wait=wait, as_json=as_json)
         if ended is None:
-            return
+            return None
         found = Findings(marey.transport, ended)
         if out is not None:
             found.save_report(out)

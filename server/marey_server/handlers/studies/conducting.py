@@ -41,7 +41,7 @@ class StudyParticipants(Resource):
 
     @reads(access=Access.MAINTAINER, query=PageQuery, answer=StudyParticipant, paged=True, public=False)
     async def get(self, project: str, kind: str, item: str, query: PageQuery) -> Rendered:
-        """List the participants of a study (kind `studies`) under their pseudonyms, without the codes of their links."""
+        """List the participants of a study (kind `studies`) under pseudonyms, without the codes of their links."""
         return await self.answer(
             conducting.list_participants, project, kind_of(kind), item, cursor=query.cursor, limit=query.limit
         )
@@ -106,7 +106,7 @@ class StudyJudgementsResource(Resource):
         attempts=True,
     )
     async def get(self, project: str, kind: str, item: str, query: JudgementsQuery) -> Rendered:
-        """List the participants who saw a revision of a study, each with all trials, under pseudonyms and without dates.
+        """List the participants who saw a revision of a study, each with all trials, under pseudonyms, without dates.
 
         A running attempt of a job can read the judgements of a study that is an input of its job, if the author of the
         job is a maintainer of the project.

@@ -78,6 +78,6 @@ def _require_reader(tx: Transaction, project: str, item_id: str, revision: int) 
     author = tx.execute(role).one_or_none()
     if author is None or not (author.administrator or author.role in at_least(Role.MAINTAINER)):
         raise ForbiddenProblem(
-            "Only maintainers of the project may analyse a study, because the analysis reads what participants answered.",
+            "Only maintainers of the project may analyse a study: the analysis reads what participants answered.",
             code="insufficient-role",
         )
