@@ -25,8 +25,8 @@ from marey_server.store.transaction import Transaction
 
 REFUSALS = {
     "unauthenticated", "bad-token", "no-project", "insufficient-role", "insufficient-scope",
-    "administrators-only", "attempt-only", "not-for-attempts", "not-for-participants", "participants-only", "users-only", "forbidden", "no-user", "no-job",
-    "no-blob", "no-attempt", "not-yours", "lease-lost",
+    "administrators-only", "attempt-only", "not-for-attempts", "not-for-participants", "participants-only",
+    "users-only", "forbidden", "no-user", "no-job", "no-blob", "no-attempt", "not-yours", "lease-lost",
 }  # fmt: skip
 """Codes of problems which mean that the caller may not do something, or may not know about it."""
 GUESSES = 3
