@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from itertools import chain
+from itertools import chain, combinations
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
+from scipy.stats import spearmanr
 from tests.support.rest_server import Server
-from tests.support.studying import Participant, make_links, make_study
+from tests.support.studying import Participant, choice_by, grouped_differences, make_links, make_study
 
+from marey_motion.perception.judging import Judgements, difference_table, triangle_violations
+from marey_motion.perception.ordering import order_motions
 from marey_schemas.access import Role
 
 NEVER = "mareystudy_" + "0" * 12 + "_" + "0" * 64
@@ -65,7 +69,7 @@ def test_the_same_seed_draws_the_same_trials_however_the_links_are_made(server: 
     codes = [*make_links(owner, study, 2), *make_links(owner, study, 1)]
     together = make_links(owner, copy_of(owner, study), 3)
     for one, other in zip(codes, together, strict=True):
-        first, second = (Participant.begin(server, code).open() for code in (one, other))
+        first, second = (Participant.begin(server.client, code).open() for code in (one, other))
         assert first["trial"]["clips"] == second["trial"]["clips"]
 
 
@@ -77,7 +81,7 @@ def copy_of(owner: httpx.Client, study: str) -> str:
 
 def test_a_participant_reads_the_motions_of_the_study_and_nothing_else(server: Server, owner: httpx.Client) -> None:
     study = make_study(owner, 4, trials=1)
-    someone = Participant.begin(server, make_links(owner, study)[0])
+    someone = Participant.begin(server.client, make_links(owner, study)[0])
     motions = owner.get(f"/projects/lab/studies/{study}/parts/study").json()["motions"]
     for number, motion in enumerate(motions):
         for accept in ("application/json", "application/msgpack; arrays=blocks"):
@@ -99,7 +103,7 @@ def test_a_participant_reads_the_motions_of_the_study_and_nothing_else(server: S
 def test_only_people_of_the_study_see_participants_and_readers_see_numbers(server: Server, owner: httpx.Client) -> None:
     study = make_study(owner, 5, trials=2)
     codes = make_links(owner, study, 3)
-    Participant.begin(server, codes[0]).answer_all(lambda _shown: (0, 1))
+    Participant.begin(server.client, codes[0]).answer_all(lambda _shown: (0, 1))
     reader, maintainer = (server.client(server.make_user(name)) for name in ("rita", "mia"))
     for name, role in (("rita", Role.READER), ("mia", Role.MAINTAINER)):
         assert owner.put(f"/projects/lab/members/{name}", json={"role": role}).is_success
@@ -121,7 +125,7 @@ def test_withdrawal_deletes_what_is_stored_and_ends_the_link(server: Server, own
     study = make_study(owner, 5, trials=2)
     base = f"/projects/lab/studies/{study}"
     codes = make_links(owner, study, 2)
-    people = [Participant.begin(server, code) for code in codes]
+    people = [Participant.begin(server.client, code) for code in codes]
     for person in people:
         person.answer_all(lambda _shown: (0, 1))
     assert [people[0].client.delete("/participation").status_code for _ in range(2)] == [204, 204]
@@ -145,7 +149,7 @@ def test_withdrawal_deletes_what_is_stored_and_ends_the_link(server: Server, own
 def test_a_deleted_study_lets_nobody_in(server: Server, owner: httpx.Client) -> None:
     study = make_study(owner, 4, trials=1)
     begun, unused = make_links(owner, study, 2)
-    someone = Participant.begin(server, begun)
+    someone = Participant.begin(server.client, begun)
     assert owner.delete(f"/projects/lab/studies/{study}", headers={"If-Match": "*"}).is_success
     assert refusal(someone.client.post("/participation/trials"))[:2] == (410, "study-gone")
     assert server.client().post("/participation/link", json={"code": unused}).status_code == 404
@@ -161,7 +165,7 @@ def test_a_deleted_study_lets_nobody_in(server: Server, owner: httpx.Client) -> 
     ],
 )  # fmt: skip
 def test_a_wrong_answer_changes_nothing(server: Server, owner: httpx.Client, body: dict[str, Any]) -> None:
-    someone = Participant.begin(server, make_links(owner, make_study(owner, 4, trials=1))[0])
+    someone = Participant.begin(server.client, make_links(owner, make_study(owner, 4, trials=1))[0])
     someone.open()
     assert someone.client.put("/participation/trials/1", json=body).status_code == 422
     assert refusal(someone.client.put("/participation/trials/2", json={"chosen": [0, 1]}))[:2] == (404, "no-trial")
@@ -194,7 +198,7 @@ def test_logs_contain_no_codes_tokens_or_participants(
 ) -> None:
     with caplog.at_level(logging.DEBUG):
         [code] = make_links(owner, make_study(owner, 4, trials=1))
-        someone = Participant.begin(server, code)
+        someone = Participant.begin(server.client, code)
         someone.answer_all(lambda _shown: (0, 1))
         someone.client.delete("/participation")
     token = someone.client.headers["Authorization"].removeprefix("Bearer ")
@@ -202,6 +206,35 @@ def test_logs_contain_no_codes_tokens_or_participants(
     assert "/participation/trials" in written
     assert not [part for text in (code, token) for part in text.split("_")[1:] if part in written]
     assert "participant_" not in written
+
+
+@pytest.mark.parametrize("people", [pytest.param(29, marks=pytest.mark.soak), 6])
+def test_a_simulated_study_recovers_the_groups(server: Server, owner: httpx.Client, people: int) -> None:
+    """The true differences have two groups of 14 and 7 motions; 29 participants are as many as in the paper."""
+    true = grouped_differences((14, 7), seed=4)
+    study = make_study(owner, 21)
+    for number, code in enumerate(make_links(owner, study, people)):
+        Participant.begin(server.client, code).answer_all(choice_by(true, 0.05, seed=number))
+    answer = owner.get(f"/projects/lab/studies/{study}/judgements", params={"revision": 1}).json()
+    trials = [(who, trial) for who, one in enumerate(answer["items"]) for trial in one["trials"]]
+    assert len(trials) == 63 * people
+    pairs = list(combinations(range(4), 2))
+    judgements = Judgements(
+        21,
+        np.array([who for who, _ in trials]),
+        np.array([trial["shown"] for _, trial in trials]),
+        np.array([pairs.index(tuple(trial["chosen"])) for _, trial in trials]),
+    )
+    assert set(np.bincount(judgements.shown.ravel())) == {12 * people}, "each motion equally often"
+    table = difference_table(judgements)
+    assert 6 * table.chosen.sum() == table.shown.sum()
+    assert list(order_motions(table.differences).groups[[0, 20]]) in ([0, 1], [1, 0])
+    assert len(set(order_motions(table.differences).groups[:14])) == 1
+    assert len(set(order_motions(table.differences).groups[14:])) == 1
+    known = np.triu(table.shown, 1) > 0
+    assert spearmanr(table.differences[known], true[known]).statistic >= (0.9 if people == 29 else 0.8)
+    violated, checked = triangle_violations(table.differences)
+    assert violated <= 0.05 * checked
 
 
 def test_guesses_of_links_are_limited(server: Server, owner: httpx.Client) -> None:

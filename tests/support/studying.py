@@ -9,7 +9,6 @@ from typing import Any
 
 import httpx
 import numpy as np
-from tests.support.rest_server import People
 
 from marey_motion.arrays import Floats
 
@@ -54,12 +53,12 @@ class Participant:
     client: httpx.Client
 
     @classmethod
-    def begin(cls, people: People, code: str) -> Participant:
-        """Consent, and exchange the code of a link for a token."""
+    def begin(cls, connect: Callable[[str | None], httpx.Client], code: str) -> Participant:
+        """Consent, and exchange the code of a link for a token; `connect` returns a client that sends a token."""
         body = {"code": code, "key": secrets.token_hex(32), "consent": True}
-        made = people.client().post("/participation", json=body)
+        made = connect(None).post("/participation", json=body)
         assert made.status_code == 201, made.text
-        return cls(people.client(made.json()["token"]))
+        return cls(connect(made.json()["token"]))
 
     def open(self) -> dict[str, Any]:
         """Return the step of the participant, with the open trial."""
