@@ -159,6 +159,7 @@ _QUERIES = {
     "{item}/export": "?format=original",
     "{item}/difference": "?from=1&to=1",
     "{item}/judgements": "?revision=1",
+    "judgements/{item}": "?revision=1",
     "explanations/{kind}": "?query=has%20tag",
     "{dataset}/blame": f"?entry={CANARY}&kind=graph",
 }

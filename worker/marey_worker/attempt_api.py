@@ -117,8 +117,8 @@ class AttemptApi:
 
     def read_judgements(self, study: str, revision: int) -> list[dict[str, Any]]:
         """Return what the participants who saw a revision of a study answered, as one tree for each of them."""
-        path = f"/projects/{self._project}/{Kind.STUDY.plural}/{study}/judgements"
         with _dead_token_is_lost_lease():
+            path = f"{self._url}/judgements/{study}"
             people = pages(self._transport, JudgingParticipant, path, {"revision": revision})
             return [one.model_dump(mode="json") for one in people]
 

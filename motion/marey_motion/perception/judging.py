@@ -8,10 +8,10 @@ import numpy as np
 
 from marey_motion.arrays import Floats, Ints
 from marey_motion.errors import MotionError
+from marey_schemas.documents.studies import SHOWN
 
-SHOWN = 4
 TRIALS = 63
-_CANDIDATE_DRAWS = 16
+_CANDIDATE_DRAWS = 24
 _FIRST, _SECOND = np.triu_indices(SHOWN, 1)
 
 

@@ -9,7 +9,7 @@ from pydantic import Field, StringConstraints, model_validator
 from marey_schemas.base import Request
 from marey_schemas.documents.references import OutputRef, RevisionRef
 
-SHOWN = 4
+SHOWN: Literal[4] = 4
 """Number of motions that a trial shows."""
 MOST_MOTIONS = 100
 MOST_TRIALS = 200

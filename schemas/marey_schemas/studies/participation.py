@@ -111,7 +111,7 @@ class TrialAnswer(Request):
 
 
 class TrialOutcome(Answer):
-    """What the server recorded about a trial, and the progress of the participant."""
+    """Record of a trial, and the progress of the participant."""
 
     number: int
     outcome: Literal["answered", "timed_out"]

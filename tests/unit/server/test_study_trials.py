@@ -182,12 +182,13 @@ def reopened(database: Database) -> Any:
     return reopen
 
 
-def test_only_attempts_of_maintainers_whose_input_is_the_study_read_judgements(lab: Lab) -> None:
+def test_only_an_attempt_whose_input_is_the_study_reads_judgements(lab: Lab) -> None:
     study = design(lab)
     take_part(lab, study)
-    stranger = Principal("attempt", scopes=("read",), job_id="job_of_nobody", fence=1, project_id=None)
+    other = Principal("attempt", scopes=("read",), job_id="job_of_nobody", fence=1)
     place = {"revision": 1, "cursor": None, "limit": 50}
-    with pytest.raises(NotFoundProblem):
-        lab.read(judgements.list_judgements, "lab", Kind.STUDY, study, **place, who=stranger, required=JUDGEMENTS)
+    for job, fence in (("job_of_nobody", 1), ("job_of_somebody", 1)):
+        with pytest.raises(NotFoundProblem):
+            lab.database.read(other, judgements.list_for_attempt, job, fence, study, **place)
     with pytest.raises(ForbiddenProblem):
         lab.read(judgements.list_judgements, "lab", Kind.STUDY, study, **place, who=lab.reader, required=JUDGEMENTS)

@@ -97,24 +97,33 @@ class StudyJudgementsResource(Resource):
     path = "/projects/{project}/{kind}/{item}/judgements"
     tag = TAG
 
-    @reads(
-        access=Access.MAINTAINER,
-        query=JudgementsQuery,
-        answer=JudgingParticipant,
-        paged=True,
-        public=False,
-        attempts=True,
-    )
+    @reads(access=Access.MAINTAINER, query=JudgementsQuery, answer=JudgingParticipant, paged=True, public=False)
     async def get(self, project: str, kind: str, item: str, query: JudgementsQuery) -> Rendered:
-        """List the participants who saw a revision of a study, each with all trials, under pseudonyms, without dates.
-
-        A running attempt of a job can read the judgements of a study that is an input of its job, if the author of the
-        job is a maintainer of the project.
-        """
+        """List the participants who saw a revision of a study, each with all trials, under pseudonyms, without dates."""
         return await self.answer(
             judgements.list_judgements,
             project,
             kind_of(kind),
+            item,
+            revision=query.revision,
+            cursor=query.cursor,
+            limit=query.limit,
+        )
+
+
+class AttemptJudgements(Resource):
+    """Judgements of a study that is the input of a job."""
+
+    path = "/jobs/{job}/attempts/{fence:int}/judgements/{item}"
+    tag = "Work"
+
+    @reads(access=Access.ATTEMPT, scope=None, query=JudgementsQuery, answer=JudgingParticipant, paged=True)
+    async def get(self, job: str, fence: int, item: str, query: JudgementsQuery) -> Rendered:
+        """List what participants of a study answered, for an attempt of a job whose author is a maintainer."""
+        return await self.answer(
+            judgements.list_for_attempt,
+            job,
+            fence,
             item,
             revision=query.revision,
             cursor=query.cursor,
@@ -127,4 +136,5 @@ RESOURCES: tuple[type[Resource], ...] = (
     OneStudyParticipant,
     StudyProgressResource,
     StudyJudgementsResource,
+    AttemptJudgements,
 )

@@ -54,7 +54,7 @@ class LinkResource(PasswordResource):
 
 
 class StudyLinkWelcome(LinkResource):
-    """What a link of a study leads to."""
+    """Study to which a link leads."""
 
     path = "/participation/link"
     tag = TAG

@@ -36,7 +36,7 @@ Plan = list[list[int]]
 
 @dataclass(frozen=True, slots=True)
 class PlannedDraw:
-    """What must be known to draw the trials of new participants: the design, and the trials of all earlier ones."""
+    """Basis for the draw of trials for new participants: the design, and the trials of all earlier participants."""
 
     revision: int
     design: StudyDocument
@@ -49,7 +49,7 @@ def pseudonym(number: int) -> str:
 
 
 def plan_links(tx: Transaction, project: str, kind: Kind, item_id: str, request: StudyLinksCreate) -> PlannedDraw:
-    """Return what must be known to draw the trials for new links; the draw itself runs outside of transactions.
+    """Return the basis for the draw of trials for new links; the draw itself runs outside of transactions.
 
     Raises `NotFoundProblem`, or `QuotaExceededProblem` if the project has too many participants.
     """
