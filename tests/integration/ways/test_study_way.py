@@ -91,5 +91,5 @@ def test_a_study_without_answers_cannot_be_analysed(lab: ProjectHandle, marey: M
     study = lab.studies.design("small", list(lab.clips.list())[:4], consent_text="Yes.", trials=1)
     job = lab.submit(study.analyse_request())
     ended = marey.jobs.wait(job.id, timeout_s=300, require_success=False)
-    assert ended.error is not None
-    assert "nobody has answered" in str(ended.error)
+    assert ended.failure is not None
+    assert "nobody has answered" in str(ended.failure)

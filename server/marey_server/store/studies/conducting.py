@@ -132,7 +132,7 @@ def list_participants(
 ) -> Page:
     """Return a page of the participants of a study under their pseudonyms, in the order of their links."""
     _, row = require_study(tx, project, kind, item_id)
-    order = listing.parse_order("id", {"id": study_participant.c.id})
+    order = listing.parse_order("number", {"number": study_participant.c.number, "id": study_participant.c.id})
     statement = select(study_participant).where(study_participant.c.item_id == row.id)
     rows, following = listing.read_page(tx, statement, order, ["participants", row.id], cursor, limit)
     return Page(items=tuple(_shown(one) for one in rows), next_cursor=following)

@@ -49,7 +49,7 @@ def list_for_attempt(
 
 def _page(tx: Transaction, item_id: str, revision: int, cursor: str | None, limit: int) -> Page:
     seed = load_design(tx, item_id, revision).seed
-    order = listing.parse_order("id", {"id": study_participant.c.id})
+    order = listing.parse_order("number", {"number": study_participant.c.number, "id": study_participant.c.id})
     began = (study_participant.c.withdrawn_us.is_(None), study_participant.c.token_hash.is_not(None))
     of_revision = (study_participant.c.item_id == item_id, study_participant.c.revision == revision)
     statement = select(study_participant).where(*of_revision, *began)
