@@ -138,7 +138,7 @@ def test_withdrawal_deletes_what_is_stored_and_ends_the_link(server: Server, own
     assert owner.get(f"{base}/judgements?revision=1").json()["items"] == []
     assert owner.get(f"{base}/progress").json()["withdrawn"] == 2
     log = owner.get("/projects/lab/audit").json()["items"]
-    entries = [(one["kind"], one["actor"], one["details"]) for one in log if one["kind"].startswith("study")]
+    entries = [(one["kind"], one["actor"], one["body"]) for one in log if one["kind"].startswith("study")]
     assert entries == [
         ("study.withdrawn", "olga", {"by": "conductor"}),
         ("study.withdrawn", None, {"by": "participant"}),

@@ -101,9 +101,10 @@ class Studies(Items[StudyHandle]):
         """
         if labels is not None and len(labels) != len(clips):
             raise ValueError(f"there are {len(labels)} labels for {len(clips)} clips; give one label for each clip")
+        named: Sequence[str | None] = [None] * len(clips) if labels is None else labels
         motions = tuple(
             StudyMotion(clip=RevisionRef(item=clip.id, revision=clip.item.revision), label=label)
-            for clip, label in zip(clips, labels or [None] * len(clips), strict=True)
+            for clip, label in zip(clips, named, strict=True)
         )
         study = StudyDocument(title=title or name, consent_text=consent_text, motions=motions, **design)
         return self.create(name, {"study": study.model_dump(mode="json", by_alias=True)}, collection=collection)

@@ -99,7 +99,7 @@ class StudyJudgementsResource(Resource):
 
     @reads(access=Access.MAINTAINER, query=JudgementsQuery, answer=JudgingParticipant, paged=True, public=False)
     async def get(self, project: str, kind: str, item: str, query: JudgementsQuery) -> Rendered:
-        """List the participants who saw a revision of a study, each with all trials, under pseudonyms, without dates."""
+        """List what the participants who saw a revision of a study answered, under pseudonyms and without dates."""
         return await self.answer(
             judgements.list_judgements,
             project,
