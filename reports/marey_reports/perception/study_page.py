@@ -226,7 +226,7 @@ def _weights_row(analysis: StudyAnalysis, fit: MetricFit, at: int) -> Sequence[C
 
 
 def _shares_table(analysis: StudyAnalysis) -> Content:
-    rows = []
+    rows: list[Sequence[Cell]] = []
     for fit in analysis.fits:
         shares = dict(zip((part.component.measurement for part in fit.parts), fit.metric.shares, strict=True))
         cells = [number(shares.get(each), 3) for each in ("angles", "positions", "velocities")]
