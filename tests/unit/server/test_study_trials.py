@@ -186,7 +186,7 @@ def test_only_an_attempt_whose_input_is_the_study_reads_judgements(lab: Lab) -> 
     study = design(lab)
     take_part(lab, study)
     other = Principal("attempt", scopes=("read",), job_id="job_of_nobody", fence=1)
-    place = {"revision": 1, "cursor": None, "limit": 50}
+    place: dict[str, Any] = {"revision": 1, "cursor": None, "limit": 50}
     for job, fence in (("job_of_nobody", 1), ("job_of_somebody", 1)):
         with pytest.raises(NotFoundProblem):
             lab.database.read(other, judgements.list_for_attempt, job, fence, study, **place)
