@@ -188,9 +188,10 @@ def test_wrong_designs_and_requests_say_what_to_do(server: Server, owner: httpx.
     for body in ({"count": 0}, {"count": 101}, {"expires_in_s": 1}):
         assert owner.post(f"/projects/lab/studies/{study}/participants", json=body).status_code == 422
     [code] = make_links(owner, study)
-    for change in ({"consent": False}, {"key": "A" * 64}, {"key": "a"}, {"code": "x" * 201}):
-        body = {"code": code, "key": "a" * 64, "consent": True, **change}
-        assert server.client().post("/participation", json=body).status_code == 422
+    refused: list[dict[str, Any]] = [{"consent": False}, {"key": "A" * 64}, {"key": "a"}, {"code": "x" * 201}]
+    for change in refused:
+        request = {"code": code, "key": "a" * 64, "consent": True, **change}
+        assert server.client().post("/participation", json=request).status_code == 422
 
 
 def test_logs_contain_no_codes_tokens_or_participants(
