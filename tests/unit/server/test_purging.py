@@ -458,7 +458,7 @@ def test_lineage_and_jobs_stay_readable_and_say_that_an_item_was_purged(house: H
         assert house.desk.job(one).inputs == {"things": [pin]}
     with pytest.raises(ConflictProblem, match=f"its input {source} was purged"):
         house.desk.database.write(house.desk.user, retrying.retry_job, failed)
-    with pytest.raises(InvalidProblem, match="There is no study"):
+    with pytest.raises(InvalidProblem, match="There is no character"):
         house.desk.submit("square", inputs={"things": ({"item": source},)})
 
     house.delete(result)

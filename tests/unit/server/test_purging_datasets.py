@@ -128,7 +128,7 @@ def test_an_item_that_a_job_made_from_a_version_holds_the_dataset(gaits: Committ
     gaits.work("square")
     (made,) = gaits.desk.outputs(job)
     holder = ItemHolder(item=made.item, kind=Kind.CHARACTER, path="made/square")
-    with pytest.raises(ConflictProblem, match=r"cited by the study made/square") as raised:
+    with pytest.raises(ConflictProblem, match=r"cited by the character made/square") as raised:
         purge(gaits)
     assert raised.value.error_code == "still-held"
     assert DatasetPurgeAnswer.model_validate(raised.value.context).holders == (holder,)
