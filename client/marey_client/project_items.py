@@ -16,6 +16,7 @@ from marey_client.handles.models import ModelHandle
 from marey_client.handles.processed import ProcessedHandle
 from marey_client.handles.purges import purge_items
 from marey_client.handles.skeletons import SkeletonHandle
+from marey_client.handles.studies import Studies, StudyHandle
 from marey_client.imports import Imports
 from marey_client.items import ItemHandle, Items
 from marey_client.jobs import Jobs
@@ -74,10 +75,16 @@ class ProjectItems:
         """The evaluations of the project."""
         return Items(self.transport, self.name, Kind.EVALUATION, EvaluationHandle)
 
+    @cached_property
+    def studies(self) -> Studies:
+        """The perceptual studies of the project."""
+        return Studies(self.transport, self.name, Kind.STUDY, StudyHandle)
+
     def items(self, kind: Kind) -> Items[Any]:
         """The items of the project, of any kind."""
         known: tuple[Items[Any], ...] = (
             self.clips, self.skeletons, self.annotations, self.processed, self.edits, self.models, self.evaluations,
+            self.studies,
         )  # fmt: skip
         return next((one for one in known if one.kind is kind), Items(self.transport, self.name, kind, ItemHandle))
 

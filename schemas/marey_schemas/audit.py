@@ -48,6 +48,8 @@ AUDIT_WORDS: Mapping[AuditKind, str] = {
     "schedule.deleted": "deleted the schedule",
     "script.registered": "registered the script",
     "script.deleted": "deleted the script",
+    "study.invited": "created links for participants of the study",
+    "study.withdrawn": "deleted the records of a participant of the study",
     "user.created": "created the user",
     "user.changed": "changed the user",
     "user.limited": "changed the quotas of the user",
@@ -71,7 +73,7 @@ class AuditEntry(Answer):
     kind: str
     project: str | None = Field(description="Present name of the project; null: the entry concerns the whole server.")
     actor: str | None = Field(
-        description="Name of the user who made the change, or `job:<id>`; null: the server itself."
+        description="Name of the user who made the change, or `job:<id>`; null: the server, or a study's participant."
     )
     token: str | None = Field(None, description="Id of the token that the actor used; null: none, as in a sign-in.")
     about: str = Field(

@@ -44,6 +44,8 @@ ProjectAuditKind = Literal[
     "schedule.deleted",
     "script.registered",
     "script.deleted",
+    "study.invited",
+    "study.withdrawn",
 ]
 """Kinds of audit entries in a project."""
 

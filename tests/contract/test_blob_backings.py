@@ -249,8 +249,8 @@ class TestObjectBlobs(BlobBackingContract):
         self, store: Lab, backing: ObjectBlobs, clock: AdjustableClock
     ) -> None:
         kept = store.write(blobs.put_blob, b"kept")
-        study = ItemCreate(name="s", parts={"study": {"schema": "marey/document@1", "blob": kept}})
-        store.write(items.create_item, "lab", Kind.STUDY, study)
+        study = ItemCreate(name="s", parts={"character": {"schema": "marey/document@1", "blob": kept}})
+        store.write(items.create_item, "lab", Kind.CHARACTER, study)
 
         def fail(tx: Transaction) -> None:
             blobs.put_blob(tx, b"stray")

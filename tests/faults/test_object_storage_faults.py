@@ -70,7 +70,7 @@ def object_of(lab: Lab, digest: str) -> StoredObject:
 def publish(lab: Lab, digest: str) -> None:
     """Let an item refer to a blob, so that the blob is kept."""
     tree = {"schema": "marey/document@1", "blob": digest}
-    lab.write(items.create_item, "lab", Kind.STUDY, ItemCreate(name=digest[-12:], parts={"study": tree}))
+    lab.write(items.create_item, "lab", Kind.CHARACTER, ItemCreate(name=digest[-12:], parts={"character": tree}))
 
 
 def objects_in(lab: Lab) -> set[StoredObject]:

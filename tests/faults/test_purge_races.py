@@ -65,7 +65,7 @@ class Scene:
 
     def add(self, name: str, **facts: Any) -> str:
         """Create a study, and return its id."""
-        draft = Draft("d", Kind.STUDY, name, {"study": document(name=name, **facts)}, "raw")
+        draft = Draft("d", Kind.CHARACTER, name, {"character": document(name=name, **facts)}, "raw")
         return self.desk.publish(draft)[0].item
 
     def write(self, function: Any, *args: Any, **kwargs: Any) -> Any:
@@ -223,7 +223,7 @@ def require_purged(purged: Any, item: str) -> None:
 def test_an_item_is_restored_or_purged(scene: Scene, order: str) -> None:
     thing = scene.add("thing")
     scene.delete(thing)
-    restore = scene.of_user(items.restore_item, "lab", Kind.STUDY, thing)
+    restore = scene.of_user(items.restore_item, "lab", Kind.CHARACTER, thing)
     done, purged = scene.race(order, restore, scene.purge_of(thing))
     if order == "purge first":
         assert isinstance(done, GoneProblem)
@@ -262,7 +262,7 @@ def test_a_folder_that_is_deleted_during_a_purge_keeps_its_items_and_roles(scene
     assert done is None
     require_purged(purged, thing)
     scene.write(collections.restore_collection, "lab", again)
-    found = scene.desk.database.read(scene.desk.user, items.read_item, "lab", Kind.STUDY, kept)
+    found = scene.desk.database.read(scene.desk.user, items.read_item, "lab", Kind.CHARACTER, kept)
     assert found.collection == "raw"
     roles = scene.desk.database.read(scene.desk.user, managing.list_folder_roles, "lab").items
     assert [(one.folder, one.role) for one in roles] == [("raw", "reader")]
@@ -326,7 +326,7 @@ def test_an_import_does_not_share_a_skeleton_that_is_being_purged(scene: Scene, 
 
 def test_a_new_revision_of_an_item_that_is_deleted_meanwhile_goes_with_it(scene: Scene) -> None:
     thing = scene.add("thing")
-    revise = scene.of_user(items.put_part, "lab", Kind.STUDY, thing, "study", document(n=2), expected_rev=None)
+    revise = scene.of_user(items.put_part, "lab", Kind.CHARACTER, thing, "character", document(n=2), expected_rev=None)
     scene.write(revise)
     scene.delete(thing)
     revised, purged = scene.race("purge first", revise, scene.purge_of(thing))
@@ -418,7 +418,10 @@ def test_a_cached_result_is_shared_or_its_item_is_purged(scene: Scene, order: st
     assert scene.desk.job(job.id).cached_from == (None if order == "purge first" else first)
     if order == "purge second":
         (copy,) = scene.desk.outputs(job.id)
-        assert scene.desk.database.read(scene.desk.user, items.read_item, "lab", Kind.STUDY, copy.item).name == "square"
+        assert (
+            scene.desk.database.read(scene.desk.user, items.read_item, "lab", Kind.CHARACTER, copy.item).name
+            == "square"
+        )
     scene.assert_sound()
 
 

@@ -40,7 +40,7 @@ def stored(lab: Lab) -> list[bool]:
 
 
 def published(lab: Lab) -> list[str]:
-    return [one.name for one in lab.read(items.list_items, "lab", Kind.STUDY, sort="name").items]
+    return [one.name for one in lab.read(items.list_items, "lab", Kind.CHARACTER, sort="name").items]
 
 
 def assert_sound(lab: Lab) -> None:
@@ -77,7 +77,7 @@ def test_a_publisher_that_dies_leaves_everything_or_nothing(
     assert_sound(lab)
     assert writer.run("publish") == 0
     assert published(lab) == ["study 0", "study 1", "study 2"]
-    assert all(one.revision == 1 for one in lab.read(items.list_items, "lab", Kind.STUDY).items)
+    assert all(one.revision == 1 for one in lab.read(items.list_items, "lab", Kind.CHARACTER).items)
     assert_sound(lab)
 
 
@@ -93,7 +93,7 @@ def test_a_collector_that_dies_deletes_nothing_it_did_not_finish(lab: Lab, write
 
 
 def left_deleted(lab: Lab) -> int:
-    return len(lab.read(items.list_items, "lab", Kind.STUDY, items.ItemFilters(deleted=True)).items)
+    return len(lab.read(items.list_items, "lab", Kind.CHARACTER, items.ItemFilters(deleted=True)).items)
 
 
 def purged(lab: Lab) -> list[str]:
@@ -107,16 +107,16 @@ def test_a_purger_that_dies_leaves_each_item_whole_or_purged(
 ) -> None:
     writer.run("send")
     writer.run("publish")
-    ids = [one.id for one in lab.read(items.list_items, "lab", Kind.STUDY).items]
+    ids = [one.id for one in lab.read(items.list_items, "lab", Kind.CHARACTER).items]
     for one in ids:
-        lab.write(items.delete_item, "lab", Kind.STUDY, one, expected_rev=None)
+        lab.write(items.delete_item, "lab", Kind.CHARACTER, one, expected_rev=None)
     assert writer.run("purge", fault) == -signal.SIGKILL
     assert (left_deleted(lab), len(purged(lab))) == (3 - gone, gone)
     garbage.collect_garbage(lab.database, grace_us=ALL_US)
     assert_sound(lab)
     for one in set(ids) - set(purged(lab)):
-        assert lab.write(items.restore_item, "lab", Kind.STUDY, one).parts["study"].size_bytes > 0
-        lab.write(items.delete_item, "lab", Kind.STUDY, one, expected_rev=None)
+        assert lab.write(items.restore_item, "lab", Kind.CHARACTER, one).parts["character"].size_bytes > 0
+        lab.write(items.delete_item, "lab", Kind.CHARACTER, one, expected_rev=None)
     assert writer.run("purge") == 0
     assert sorted(purged(lab)) == sorted(ids)
     garbage.collect_garbage(lab.database, grace_us=ALL_US)

@@ -14,6 +14,7 @@ import pytest
 from sqlalchemy import select
 from tests.support.furnished_house import BODIES
 from tests.support.rest_server import ALL_SCOPES, Server
+from tests.support.studying import make_study
 
 from marey_schemas.access import Role
 from marey_schemas.audit import AUDIT_WORDS
@@ -167,6 +168,16 @@ def invite(story: Story) -> None:
     story.send(ben, "POST", "/invitations/accept", {"code": created["code"]}, *accepted)
 
 
+def conduct_study(story: Story) -> None:
+    owner = story.owner
+    study = make_study(owner, 4)
+    path, named = f"{LAB}/studies/{study}/participants", ("olga", "walks", "lab")
+    made = story.send(owner, "POST", path, {}, ("study.invited", *named))
+    story.secrets += [made["links"][0]["code"]]
+    [one] = owner.get(path).json()["items"]
+    story.send(owner, "DELETE", f"{path}/{one['id']}", None, ("study.withdrawn", *named))
+
+
 def change_folder_roles(story: Story) -> None:
     owner, everybody = story.owner, ("olga", "*", "lab")
     [folder] = [one for one in owner.get(f"{LAB}/collections").json()["items"] if one["path"] == "raw"]
@@ -235,7 +246,7 @@ def _stored_secrets(story: Story) -> list[str]:
 
 CHAPTERS = (
     change_users_and_tokens, change_projects_and_members, delete_and_restore, purge, invite, change_folder_roles,
-    change_datasets, change_webhooks, change_schedules, change_scripts,
+    change_datasets, change_webhooks, change_schedules, change_scripts, conduct_study,
 )  # fmt: skip
 
 

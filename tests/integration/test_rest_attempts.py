@@ -59,7 +59,7 @@ class Desk:
         return answer.json()["documents"][0]
 
     def stage(self, blob: bytes) -> httpx.Response:
-        output = {"name": "made", "kind": "study", "item_name": "made", "parts": {"study": study(blob)}}
+        output = {"name": "made", "kind": "character", "item_name": "made", "parts": {"character": study(blob)}}
         return self.attempt.post(f"{self.place}/outputs", json={"outputs": [output]})
 
     def submit(self) -> tuple[httpx.Client, str, str]:
@@ -87,7 +87,7 @@ def desk(server: Server) -> Desk:
     assert author.post("/projects", json={"name": "other"}).status_code == 201
     for data in (ORIGINAL, SECRET):
         assert put(author, data).is_success
-    add(author, "other", "studies", "secret", study=study(SECRET))
+    add(author, "other", "characters", "secret", character=study(SECRET))
     skeleton = add(author, "lab", "skeletons", "rig", hierarchy=CHAIN)
     motion = {
         "schema": "marey/motion@1", "skeleton": {"item": skeleton, "revision": 1}, "frame_rate_hz": 30,
@@ -227,7 +227,7 @@ def test_an_attempt_dies_when_its_author_may_no_longer_run_the_job(desk: Desk, w
     assert desk.attempt.post(f"{desk.place}/complete", json=LAST).status_code == 409
     job = desk.ended_job()
     assert (job["state"], job["failure"]["code"]) == ("failed", "author-lost-access")
-    assert admin.get("/projects/lab/studies").json()["items"] == []
+    assert admin.get("/projects/lab/characters").json()["items"] == []
 
 
 def test_a_batch_of_completions_publishes_nothing_of_an_author_who_was_disabled(desk: Desk) -> None:
@@ -285,8 +285,8 @@ def test_a_bound_token_learns_reads_and_publishes_nothing_of_another_project(des
         unknown = f"/blobs/{digest(b'that nobody has')}"
         theirs, nobodys = bound.get(f"/blobs/{digest(data)}").json(), bound.get(unknown).json()
         assert theirs["detail"].replace(digest(data), "") == nobodys["detail"].replace(unknown[7:], "")
-        body = {"name": "copy", "parts": {"study": study(data)}}
-        assert bound.post("/projects/lab/studies", json=body).json()["code"] == "missing-blobs"
+        body = {"name": "copy", "parts": {"character": study(data)}}
+        assert bound.post("/projects/lab/characters", json=body).json()["code"] == "missing-blobs"
         files = {"files": [{"name": "walk.bvh", "blob": digest(data)}]}
         assert bound.post("/projects/lab/imports", json=files).status_code == 404
         job = {"kind": "import", "params": files}
@@ -300,7 +300,7 @@ def test_a_bound_token_uses_what_it_sent_and_what_its_project_refers_to(desk: De
     assert bound.post("/blobs/missing", json={"digests": [digest(b"mine")]}).json()["missing"] == []
     for data in (b"mine", ORIGINAL):
         assert bound.get(f"/blobs/{digest(data)}").content == data
-        add(bound, "lab", "studies", f"of {len(data)}", study=study(data))
+        add(bound, "lab", "characters", f"of {len(data)}", character=study(data))
     upload = bound.post("/uploads", json={"length": 5}).json()["id"]
     assert bound.get(f"/uploads/{upload}").is_success
     sent = bound.patch(f"/uploads/{upload}", content=b"12345", headers={"Upload-Offset": "0"})
@@ -309,7 +309,7 @@ def test_a_bound_token_uses_what_it_sent_and_what_its_project_refers_to(desk: De
 
 
 def test_an_author_who_may_read_both_projects_copies_between_them(desk: Desk) -> None:
-    add(desk.author, "lab", "studies", "copy", study=study(SECRET))
+    add(desk.author, "lab", "characters", "copy", character=study(SECRET))
     assert desk.author.get(f"/blobs/{digest(SECRET)}").content == SECRET
 
 

@@ -50,8 +50,8 @@ def attempt(server: Server, lease: dict[str, Any]) -> httpx.Client:
 
 
 def thing(name: str, value: object = 1) -> dict[str, Any]:
-    parts = {"study": {"schema": "marey/document@1", "value": value}}
-    return {"name": name, "kind": "study", "item_name": name, "parts": parts}
+    parts = {"character": {"schema": "marey/document@1", "value": value}}
+    return {"name": name, "kind": "character", "item_name": name, "parts": parts}
 
 
 def test_staged_arrays_are_stored_as_they_came_if_their_blocks_are_predicted(
@@ -73,7 +73,7 @@ def test_staged_arrays_are_stored_as_they_came_if_their_blocks_are_predicted(
     kept, encoded_again = ok(mine.post("complete", json={"write_id": "the-only-one"}))["outputs"]
 
     def stored(output: Any) -> bytes:
-        place = f"/projects/lab/studies/{output['item']}/parts/study"
+        place = f"/projects/lab/characters/{output['item']}/parts/character"
         leaf = msgpack.unpackb(owner.get(place, headers={"Accept": BLOCKS}).content)["value"]
         return bytes(leaf["data"])
 
@@ -106,7 +106,7 @@ def test_a_job_goes_from_its_submission_to_its_outputs(
     assert (tried["worker"], tried["outcome"]) == ("w", "succeeded")
     told = [one["kind"] for one in ok(owner.get(f"/jobs/{job['id']}/events"))["items"]]
     assert told == ["job.submitted", "job.started", "job.succeeded"]
-    made = ok(owner.get("/projects/lab/studies", params={"collection": "made"}))["items"]
+    made = ok(owner.get("/projects/lab/characters", params={"collection": "made"}))["items"]
     assert sorted(one["name"] for one in made) == ["a", "b"]
 
 

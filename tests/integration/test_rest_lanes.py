@@ -194,11 +194,11 @@ def test_documents_are_rendered_after_their_transactions(
         threads.append(threading.current_thread().name)
         return encode_tree(*args, **options)
 
-    made = owner.post("/projects/lab/studies", json={"name": "s", "parts": {"study": STUDY}}).json()
+    made = owner.post("/projects/lab/characters", json={"name": "s", "parts": {"character": STUDY}}).json()
     monkeypatch.setattr("marey_server.http.reply.encode_tree", noting)
-    place = {"kind": "study", "item": made["id"], "revision": 1, "part": "study"}
+    place = {"kind": "character", "item": made["id"], "revision": 1, "part": "character"}
     answers = [
-        owner.get(f"/projects/lab/studies/{made['id']}/parts/study"),
+        owner.get(f"/projects/lab/characters/{made['id']}/parts/character"),
         owner.post("/projects/lab/parts", json={"parts": [place]}),
     ]
     assert [answer.status_code for answer in answers] == [200, 200]

@@ -31,9 +31,9 @@ def owner(server: Server, reader: httpx.Client) -> httpx.Client:
 @pytest.fixture
 def study(owner: httpx.Client) -> str:
     """The path of an item with one document."""
-    made = owner.post("/projects/lab/studies", json={"name": "s", "parts": {"study": STUDY}})
+    made = owner.post("/projects/lab/characters", json={"name": "s", "parts": {"character": STUDY}})
     assert made.status_code == 201, made.text
-    return f"/projects/lab/studies/{made.json()['id']}"
+    return f"/projects/lab/characters/{made.json()['id']}"
 
 
 def ok(response: httpx.Response) -> Any:
@@ -42,17 +42,17 @@ def ok(response: httpx.Response) -> Any:
 
 
 def test_each_form_is_sent_again_as_it_was(owner: httpx.Client, study: str) -> None:
-    first = {form: owner.get(f"{study}/parts/study", headers={"Accept": form}) for form in FORMS}
+    first = {form: owner.get(f"{study}/parts/character", headers={"Accept": form}) for form in FORMS}
     assert len({response.content for response in first.values()}) >= 3
     for form, response in first.items():
-        again = owner.get(f"{study}/parts/study", headers={"Accept": form})
+        again = owner.get(f"{study}/parts/character", headers={"Accept": form})
         assert (again.status_code, again.content) == (200, response.content)
         assert again.headers["ETag"] == response.headers["ETag"]
         assert again.headers["Content-Type"] == response.headers["Content-Type"] == form
 
 
 def test_a_document_read_before_is_read_as_it_is_now(owner: httpx.Client, study: str) -> None:
-    part = f"{study}/parts/study"
+    part = f"{study}/parts/character"
     assert ok(owner.get(part))["answer"] == 42
     assert owner.put(part, json={**STUDY, "answer": 43}, headers={"If-Match": "*"}).is_success
     assert ok(owner.get(part))["answer"] == 43
@@ -62,7 +62,7 @@ def test_a_document_read_before_is_read_as_it_is_now(owner: httpx.Client, study:
 def test_who_may_read_no_more_does_not_get_what_he_read_before(
     owner: httpx.Client, reader: httpx.Client, study: str
 ) -> None:
-    part = f"{study}/parts/study"
+    part = f"{study}/parts/character"
     assert ok(reader.get(part)) == ok(reader.get(part)) == STUDY
     etag = reader.get(part).headers["ETag"]
     assert owner.delete("/projects/lab/members/rita", headers={"If-Match": "*"}).is_success
@@ -72,7 +72,7 @@ def test_who_may_read_no_more_does_not_get_what_he_read_before(
 
 
 def test_a_revoked_token_does_not_get_what_it_read_before(server: Server, reader: httpx.Client, study: str) -> None:
-    part = f"{study}/parts/study"
+    part = f"{study}/parts/character"
     made = ok(reader.post("/tokens", json={"name": "short", "scopes": ["read"]}))
     holder = server.client(made["secret"])
     assert ok(holder.get(part)) == STUDY
@@ -81,7 +81,7 @@ def test_a_revoked_token_does_not_get_what_it_read_before(server: Server, reader
 
 
 def test_a_deleted_item_is_gone_for_who_read_it_before(owner: httpx.Client, reader: httpx.Client, study: str) -> None:
-    part = f"{study}/parts/study"
+    part = f"{study}/parts/character"
     assert ok(reader.get(part)) == STUDY
     assert owner.delete(study, headers={"If-Match": "*"}).is_success
     assert reader.get(part).status_code == 404
@@ -90,12 +90,12 @@ def test_a_deleted_item_is_gone_for_who_read_it_before(owner: httpx.Client, read
 @pytest.mark.parametrize("form", FORMS)
 def test_documents_of_several_items_are_read_in_one_request(owner: httpx.Client, study: str, form: str) -> None:
     item = study.rpartition("/")[2]
-    assert owner.put(f"{study}/parts/study", json={**STUDY, "answer": 43}, headers={"If-Match": "*"}).is_success
+    assert owner.put(f"{study}/parts/character", json={**STUDY, "answer": 43}, headers={"If-Match": "*"}).is_success
     places = [
-        {"kind": "study", "item": item, "revision": 2, "part": "study"},
-        {"kind": "study", "item": "nobody", "revision": 1, "part": "study"},
-        {"kind": "clip", "item": item, "revision": 1, "part": "study"},
-        {"kind": "study", "item": item, "revision": 1, "part": "study"},
+        {"kind": "character", "item": item, "revision": 2, "part": "character"},
+        {"kind": "character", "item": "nobody", "revision": 1, "part": "character"},
+        {"kind": "clip", "item": item, "revision": 1, "part": "character"},
+        {"kind": "character", "item": item, "revision": 1, "part": "character"},
     ]
     answer = owner.post("/projects/lab/parts", json={"parts": places}, headers={"Accept": form})
     assert answer.headers["Content-Type"] == form
@@ -107,7 +107,7 @@ def test_documents_of_several_items_are_read_in_one_request(owner: httpx.Client,
 def test_several_documents_are_read_by_those_who_may_read_the_project(
     owner: httpx.Client, reader: httpx.Client, study: str
 ) -> None:
-    place = {"kind": "study", "item": study.rpartition("/")[2], "revision": 1, "part": "study"}
+    place = {"kind": "character", "item": study.rpartition("/")[2], "revision": 1, "part": "character"}
     assert ok(reader.post("/projects/lab/parts", json={"parts": [place]}))["documents"] == [STUDY]
     assert owner.delete("/projects/lab/members/rita", headers={"If-Match": "*"}).is_success
     assert reader.post("/projects/lab/parts", json={"parts": [place]}).status_code == 404
@@ -117,5 +117,5 @@ def test_documents_that_are_large_together_are_left_out_at_the_end(
     owner: httpx.Client, study: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reading, "MOST_BYTES_AT_ONCE", 10)
-    place = {"kind": "study", "item": study.rpartition("/")[2], "revision": 1, "part": "study"}
+    place = {"kind": "character", "item": study.rpartition("/")[2], "revision": 1, "part": "character"}
     assert ok(owner.post("/projects/lab/parts", json={"parts": [place, place]}))["documents"] == [STUDY]

@@ -37,9 +37,9 @@ def do_next(server: Server, worker: httpx.Client, *names: str) -> Any:
     outputs = [
         {
             "name": name,
-            "kind": "study",
+            "kind": "character",
             "item_name": name,
-            "parts": {"study": {"schema": "marey/document@1", "name": name}},
+            "parts": {"character": {"schema": "marey/document@1", "name": name}},
         }
         for name in names
     ]

@@ -48,10 +48,10 @@ def reading(server: Server, path: str, token: str, body: bytes = b"") -> Iterato
 def add_long_document(server: Server, token: str) -> str:
     """Create an item with a document of `DOCUMENT_BYTES`; return its path."""
     array = np.random.default_rng(1).random(DOCUMENT_BYTES // 8)
-    body = encode_tree({"name": "s", "parts": {"study": {"schema": "marey/document@1", "x": array}}}, MSGPACK)
-    made = server.client(token).post("/projects/lab/studies", content=body, headers={"Content-Type": MSGPACK})
+    body = encode_tree({"name": "s", "parts": {"character": {"schema": "marey/document@1", "x": array}}}, MSGPACK)
+    made = server.client(token).post("/projects/lab/characters", content=body, headers={"Content-Type": MSGPACK})
     assert made.status_code == 201, made.text
-    return f"/projects/lab/studies/{made.json()['id']}/parts/study"
+    return f"/projects/lab/characters/{made.json()['id']}/parts/character"
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
@@ -113,7 +113,7 @@ def test_documents_that_wait_for_a_thread_that_renders_them_count_as_memory(
         open_until.callback(go_on.set)
         for number in range(RENDERING_THREADS):
             services.compute_threads.rendering.submit(Client(f"busy-{number}"), go_on.wait)
-        place = {"kind": "study", "item": path.split("/")[4], "revision": 1, "part": "study"}
+        place = {"kind": "character", "item": path.split("/")[4], "revision": 1, "part": "character"}
         body = json.dumps({"parts": [place]}).encode() if several else b""
         for _ in range(2):
             open_until.enter_context(reading(server, "/projects/lab/parts" if several else path, token, body))
@@ -129,7 +129,7 @@ def test_the_documents_of_an_export_count_as_memory_before_they_are_packed(
     monkeypatch.setattr(exporting, "export_order", lambda *_: b"an order, which counts as memory itself")
     with running(database, tmp_path, request_memory_bytes=DOCUMENT_BYTES) as server:
         token = server.make_project()
-        path = add_long_document(server, token).replace("parts/study", "export?format=json")
+        path = add_long_document(server, token).replace("parts/character", "export?format=json")
         server.app.services.memory.take(Client("somebody else"), 0, DOCUMENT_BYTES // 2, reserved=False)
         refused = server.client(token).get(path)
         assert (refused.status_code, refused.json()["code"]) == (503, "memory")

@@ -89,7 +89,7 @@ def store_study(client: httpx.Client, name: str, data: bytes) -> str:
     digest = digest_of(data)
     client.put(f"/blobs/{digest}", content=data, headers={"Content-Type": OCTETS}).raise_for_status()
     study = {"schema": "marey/document@1", "blob": digest}
-    made = client.post("/projects/lab/studies", json={"name": name, "parts": {"study": study}})
+    made = client.post("/projects/lab/characters", json={"name": name, "parts": {"character": study}})
     return str(made.raise_for_status().json()["id"])
 
 
@@ -184,7 +184,7 @@ def findings(settings: dict[str, Any]) -> list[str]:
 def assert_serves(owner: httpx.Client, studies: dict[str, bytes], jobs: set[str]) -> None:
     """Check that all studies and jobs are there, and that further writes work."""
     for study, data in studies.items():
-        found = owner.get(f"/projects/lab/studies/{study}/parts/study").raise_for_status().json()["blob"]
+        found = owner.get(f"/projects/lab/characters/{study}/parts/character").raise_for_status().json()["blob"]
         assert owner.get(f"/blobs/{found}").raise_for_status().content == data
     for job in jobs:
         assert owner.get(f"/jobs/{job}").raise_for_status().json()["state"] == "queued"

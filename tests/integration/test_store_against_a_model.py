@@ -71,7 +71,7 @@ class ItemsMachine(RuleBasedStateMachine):
         self.world = World()
 
     def write(self, function: Callable[..., Any], item_id: str, *args: Any, **kwargs: Any) -> Item | None:
-        return self.lab.write(function, self.lab.name, Kind.STUDY, item_id, *args, **kwargs)
+        return self.lab.write(function, self.lab.name, Kind.CHARACTER, item_id, *args, **kwargs)
 
     def attempt(self, item_id: str, expected: str, change: Callable[..., Any], *, blocked: bool = False) -> bool:
         """Run `change(expected_rev)`, and return whether it succeeds; fail if the model expects another outcome.
@@ -94,9 +94,9 @@ class ItemsMachine(RuleBasedStateMachine):
 
     @rule(target=ids, name=NAMES, place=PLACES, tags=TAGS, text=TEXTS)
     def create(self, name: str, place: str, tags: tuple[Any, ...], text: str) -> Any:
-        request = ItemCreate(name=name, collection=place, tags=tags, parts={"study": {"text": text}})
+        request = ItemCreate(name=name, collection=place, tags=tags, parts={"character": {"text": text}})
         try:
-            made = self.lab.write(items.create_item, self.lab.name, Kind.STUDY, request)
+            made = self.lab.write(items.create_item, self.lab.name, Kind.CHARACTER, request)
         except ConflictProblem:
             assert self.world.occupied(name, place)
             return multiple()
@@ -110,7 +110,7 @@ class ItemsMachine(RuleBasedStateMachine):
     @rule(item_id=ids, text=TEXTS, expected=expectations)
     def put_part(self, item_id: str, text: str, expected: str) -> None:
         tree = {"text": text}
-        put = lambda rev: self.write(items.put_part, item_id, "study", tree, expected_rev=rev)  # noqa: E731
+        put = lambda rev: self.write(items.put_part, item_id, "character", tree, expected_rev=rev)  # noqa: E731
         if self.attempt(item_id, expected, put):
             model = self.world.items[item_id]
             if model.history[-1] != text:
@@ -155,7 +155,7 @@ class ItemsMachine(RuleBasedStateMachine):
     def lists_agree(self) -> None:
         for deleted in (False, True):
             filters = items.ItemFilters(deleted=deleted)
-            page = self.lab.read(items.list_items, self.lab.name, Kind.STUDY, filters, limit=1000, count=True)
+            page = self.lab.read(items.list_items, self.lab.name, Kind.CHARACTER, filters, limit=1000, count=True)
             found = {one.id: (one.name, one.collection, one.tags, one.revision, one.rev) for one in page.items}
             assert found == {
                 item_id: (one.name, one.place, one.tags, len(one.history), one.rev)
@@ -168,7 +168,9 @@ class ItemsMachine(RuleBasedStateMachine):
         for item_id, model in self.world.items.items():
             if not model.deleted:
                 for number, text in enumerate(model.history, 1):
-                    part = self.lab.read(items.read_part, self.lab.name, Kind.STUDY, item_id, "study", revision=number)
+                    part = self.lab.read(
+                        items.read_part, self.lab.name, Kind.CHARACTER, item_id, "character", revision=number
+                    )
                     assert part.tree["text"] == text
         assert list(fsck.check_store(self.lab.database)) == []
 

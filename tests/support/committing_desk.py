@@ -94,7 +94,9 @@ class CommittingDesk:
 
     def put(self, path: str, *, number: int, branch: str = MAIN) -> str:
         """Commit a new item at a path as a user, not as a job; return its id."""
-        (made,) = self.desk.publish(Draft("d", Kind.STUDY, f"own{number}", {"study": document(number=number)}, "own"))
+        (made,) = self.desk.publish(
+            Draft("d", Kind.CHARACTER, f"own{number}", {"character": document(number=number)}, "own")
+        )
         self.change(PutEntry(path=path, item=made.item), branch=branch)
         return made.item
 

@@ -23,6 +23,7 @@ from marey_versions.tree.chunks import ChunksInMemory
 
 CANARY = "canary-5e0f2b"
 ROUTES = tuple(RouteTable(None, RESOURCES))
+UNKNOWN_LINK = "mareystudy_aaaaaaaaaaaa_" + "b" * 64
 UNKNOWN_CODE = "mareyinvite_aaaaaaaaaaaa_" + "b" * 64
 INVENTED = "marey_aaaaaaaaaaaa_" + "b" * 64
 
@@ -133,6 +134,10 @@ BODIES: dict[str, Any] = {
     "AnnotationChange": {"commands": [{"command": "clear"}]},
     "AnnotationImport": {"document": {"sections": [{"start_idx": 0, "end_idx": 0}]}},
     "EditPreviewRequest": {"commands": [{"command": "trim", "start": 0, "stop": 1}]},
+    "StudyLink": {"code": UNKNOWN_LINK},
+    "ParticipationCreate": {"code": UNKNOWN_LINK, "key": "a" * 64, "consent": True},
+    "TrialAnswer": {"chosen": [0, 1]},
+    "StudyLinksCreate": {"count": 1},
     "SearchRequest": {"constraints": [{"type": "root_heading", "at": "end", "heading_deg": 0}]},
 }
 """A body for every request model of the routes. A route with a new model fails in tests until a body is added here."""
@@ -143,12 +148,18 @@ _OTHER_THINGS = {
     "/walk-graph": {"kind": "evaluations", "item": "evaluation_of_nobody"},
     "/samples": {"kind": "models", "item": "model_of_nobody"},
     "/search": {"kind": "models", "item": "model_of_nobody"},
+    "{item}/participants": {"kind": "studies", "item": "{study}"},
+    "{item}/progress": {"kind": "studies", "item": "{study}"},
+    "{item}/judgements": {"kind": "studies", "item": "{study}"},
+    "/participation/clips": {"part": "motion"},
     "{project}/restore": {"project": "gone"},
 }
 """Path variables of routes that are not about the clip, by a part of the path."""
 _QUERIES = {
     "{item}/export": "?format=original",
     "{item}/difference": "?from=1&to=1",
+    "{item}/judgements": "?revision=1",
+    "judgements/{item}": "?revision=1",
     "explanations/{kind}": "?query=has%20tag",
     "{dataset}/blame": f"?entry={CANARY}&kind=graph",
 }
@@ -210,6 +221,7 @@ def build_house(people: People) -> House:
     stream = contributor.post("/projects/lab/coverage-streams", json=BODIES["CoverageStreamCreate"])
     ended, running = (start_attempt(people, tokens, variables["item"]) for _ in range(2))
     tokens |= {"attempt": running["attempt_token"], "ended": ended["attempt_token"]}
+    tokens["participant"] = _participant_of(people, owner, variables["study"])
     # The running attempt sends no heartbeats, and requests about it may take longer than a lease.
     tomorrow = (
         update(job).where(job.c.id == running["job"]).values(lease_expires_us=job.c.lease_expires_us + 86_400 * 10**6)
@@ -229,6 +241,15 @@ def build_house(people: People) -> House:
         "identity": "identity_of_nobody", "upload": "upload_of_nobody",
     }  # fmt: skip
     return House(people, tokens, variables)
+
+
+def _participant_of(people: People, owner: Any, study: str) -> str:
+    """Return the token of a participant of a study, who was shown one trial."""
+    made = owner.post(f"/projects/lab/studies/{study}/participants", json=BODIES["StudyLinksCreate"])
+    body = BODIES["ParticipationCreate"] | {"code": made.json()["links"][0]["code"]}
+    token: str = people.client().post("/participation", json=body).json()["token"]
+    assert people.client(token).post("/participation/trials").is_success
+    return token
 
 
 def start_attempt(people: People, tokens: Mapping[str, str | None], clip: str) -> dict[str, Any]:
@@ -290,10 +311,18 @@ def _furnish(owner: Any) -> dict[str, str]:
     schedule = {"name": "nightly", "cron": "0 0 29 2 *", "job": job_of_schedule, "description": CANARY}
     assert owner.post("/projects/lab/schedules", json=schedule).status_code == 201
     assert owner.post("/projects/lab/scripts", json=BODIES["ScriptCreate"] | {"name": "measure"}).status_code == 201
+    motions = [
+        {"clip": {"item": owner.post("/projects/lab/clips", json=body).json()["id"], "revision": 1}, "label": CANARY}
+        for body in ({"name": f"{CANARY} {number}", "parts": {"motion": motion}} for number in range(4))
+    ]
+    design = {"schema": "marey/study@1", "title": CANARY, "consent_text": CANARY, "motions": motions}
+    study = owner.post("/projects/lab/studies", json={"name": CANARY, "parts": {"study": design}})
+    assert study.status_code == 201, study.text
     invitation = owner.post("/projects/lab/invitations", json=BODIES["InvitationCreate"]).json()["id"]
     return {
         "invitation": invitation, "webhook": hook, "delivery": delivery, "schedule": "nightly",
-        "script": "measure",
+        "script": "measure", "study": study.json()["id"], "participant": "participant_of_nobody", "trial": "1",
+        "clip": "0",
         "collection": collection, "item": made.json()["id"], "annotation": annotation.json()["id"], "dataset": CANARY,
         "ref": "spare", "version": "spare", "proposal": "1",
     }  # fmt: skip

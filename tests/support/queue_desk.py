@@ -61,7 +61,7 @@ SUM = KindDeclaration(
     params=Params,
     implementation="tests:sum",
     version=1,
-    outputs={"sums": Kind.STUDY},
+    outputs={"sums": Kind.CHARACTER},
 )
 SQUARE = KindDeclaration(
     name="square",
@@ -70,10 +70,10 @@ SQUARE = KindDeclaration(
     implementation="tests:square",
     version=1,
     inputs={
-        "things": InputSpec(kind=Kind.STUDY, many=True),
-        "ruler": InputSpec(kind=Kind.STUDY, required=False),
+        "things": InputSpec(kind=Kind.CHARACTER, many=True),
+        "ruler": InputSpec(kind=Kind.CHARACTER, required=False),
     },
-    outputs={"squares": Kind.STUDY},
+    outputs={"squares": Kind.CHARACTER},
     fan_out="things",
     batch_size=2,
 )
@@ -83,8 +83,8 @@ SURVEY = KindDeclaration(
     params=Params,
     implementation="tests:survey",
     version=1,
-    inputs={"things": InputSpec(kind=Kind.STUDY, many=True)},
-    outputs={"survey": Kind.STUDY},
+    inputs={"things": InputSpec(kind=Kind.CHARACTER, many=True)},
+    outputs={"survey": Kind.CHARACTER},
     task_count=lambda params: params.number,
     gathering="tests:gather",
 )
@@ -94,8 +94,8 @@ MEASURE = KindDeclaration(
     params=Params,
     implementation="tests:measure",
     version=1,
-    inputs={"things": InputSpec(kind=Kind.STUDY, many=True)},
-    outputs={"measurement": Kind.STUDY},
+    inputs={"things": InputSpec(kind=Kind.CHARACTER, many=True)},
+    outputs={"measurement": Kind.CHARACTER},
     facets={"usage": "Use of the thing.", "used_frames": "Frames of the thing that are used."},
 )
 RIG = KindDeclaration(
@@ -169,7 +169,8 @@ class Desk:
     def things(self, count: int, collection: str = "raw") -> list[str]:
         """Create `count` items for use as inputs of jobs; return their ids."""
         drafts = [
-            Draft(f"thing{n}", Kind.STUDY, f"thing{n}", {"study": document(number=n)}, collection) for n in range(count)
+            Draft(f"thing{n}", Kind.CHARACTER, f"thing{n}", {"character": document(number=n)}, collection)
+            for n in range(count)
         ]
         return [one.item for one in self.publish(*drafts)]
 
@@ -265,8 +266,8 @@ def output(
     name: str, *, collection: str = "", facts: Mapping[str, Any] = MappingProxyType({}), **fields: Any
 ) -> StagedOutput:
     """Return a small document as an output that can be staged."""
-    parts = {"study": document(name=name, **facts)}
-    return StagedOutput(name=name, kind=Kind.STUDY, item_name=name, collection=collection, parts=parts, **fields)
+    parts = {"character": document(name=name, **facts)}
+    return StagedOutput(name=name, kind=Kind.CHARACTER, item_name=name, collection=collection, parts=parts, **fields)
 
 
 @pytest.fixture

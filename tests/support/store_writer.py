@@ -39,13 +39,15 @@ def publish(tx: Transaction) -> Any:
     """Publish three small items of the kind `study` that refer to the blobs of `FILES`."""
     row = projects.require(tx, "lab")
     trees = [{"n": n, "blob": digest_of(data)} for n, data in enumerate(FILES)]
-    drafts = [items.Draft(f"d{n}", Kind.STUDY, f"study {n}", {"study": tree}, "a/b") for n, tree in enumerate(trees)]
+    drafts = [
+        items.Draft(f"d{n}", Kind.CHARACTER, f"study {n}", {"character": tree}, "a/b") for n, tree in enumerate(trees)
+    ]
     return items.publish(tx, row, drafts, author_id=tx.principal.user_id, rights=rights_of_caller(tx, row))
 
 
 def purge(database: Database, who: Principal) -> None:
     """Purge all deleted studies of `lab`, each in a transaction of its own."""
-    deleted = database.read(who, items.list_items, "lab", Kind.STUDY, items.ItemFilters(deleted=True))
+    deleted = database.read(who, items.list_items, "lab", Kind.CHARACTER, items.ItemFilters(deleted=True))
     for one in deleted.items:
         request = PurgeRequest(item=one.id)
         prepared = database.read(who, purging.prepare_purge, "lab", request)

@@ -27,11 +27,12 @@ class Person:
     """Kind of caller of the project `lab`.
 
     `standing` is the kind of the credential: no credential (`none`), one that the server refuses (`refused`), that of a
-    user (`user`), or that of an attempt in `lab` that is running (`attempt`) or has ended (`ended`).
+    user (`user`), that of an attempt in `lab` that is running (`attempt`) or has ended (`ended`), or that of a
+    participant of a study in `lab` (`participant`).
     """
 
     name: str
-    standing: Literal["none", "refused", "user", "attempt", "ended"]
+    standing: Literal["none", "refused", "user", "attempt", "ended", "participant"]
     role: Role | None = None
     administrator: bool = False
     scopes: tuple[str, ...] = USER_SCOPES
@@ -70,6 +71,7 @@ PEOPLE = {
         Person("worker", "user", administrator=True, scopes=("work",)),
         Person("attempt", "attempt", scopes=("read",)),
         Person("ended", "ended", scopes=()),
+        Person("participant", "participant", scopes=()),
     )
 }
 """Every kind of caller. `bound`: an owner's token for another project. `worker`: a token that only claims jobs."""
@@ -84,6 +86,8 @@ def verdict(person: Person, operation: Operation, *, public: bool = False) -> fr
         return SIGN_IN
     if person.standing == "none":
         return _of_guest(operation, public=public)
+    if person.standing == "participant" or access is Access.PARTICIPANT:
+        return _of_participant(person, operation)
     if person.standing in ("attempt", "ended"):
         return _of_attempt(person, operation)
     return _of_user(person, operation, public=public)
@@ -93,6 +97,14 @@ def _of_guest(operation: Operation, *, public: bool) -> frozenset[int]:
     if operation.access is not Access.READER or not operation.public:
         return SIGN_IN
     return LET_THROUGH if public else HIDDEN
+
+
+def _of_participant(person: Person, operation: Operation) -> frozenset[int]:
+    """Return the statuses with which an operation refuses a participant, or refuses others who want to take part."""
+    if person.standing == "ended":
+        return OVER
+    both = person.standing == "participant" and operation.access is Access.PARTICIPANT
+    return LET_THROUGH if both else FORBIDDEN
 
 
 def _of_attempt(person: Person, operation: Operation) -> frozenset[int]:
@@ -138,7 +150,7 @@ def table() -> str:
     return "\n".join(lines)
 
 
-_SCOPES = {Access.ADMINISTRATOR: "admin", Access.WORKER: "work", Access.ATTEMPT: None}
+_SCOPES = {Access.ADMINISTRATOR: "admin", Access.WORKER: "work", Access.ATTEMPT: None, Access.PARTICIPANT: None}
 
 
 def _sample(access: Access) -> Operation:

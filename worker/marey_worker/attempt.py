@@ -63,6 +63,7 @@ from marey_worker.messages import (
     PutFile,
     ReadBlob,
     ReadItem,
+    ReadJudgements,
     ReadParts,
     ReadResults,
     Request,
@@ -250,6 +251,8 @@ class RunningAttempt:
                 return self._api.find_items(kind, name, collection)
             case ReadBlob(_, digest):
                 return self._read_blob(digest)
+            case ReadJudgements(_, item, revision):
+                return self._api.read_judgements(item, revision)
             case ReadResults():
                 return self._api.read_results()
             case PutFile(_, path):

@@ -28,6 +28,7 @@ from marey_schemas.queue.worker_protocol import (
     LeaseList,
     LogAnswer,
 )
+from marey_schemas.studies.conducting import JudgingParticipant
 
 PATIENT = Retries(tries=100, longest_s=10.0, total_s=600.0)
 """Retries, for up to 10 minutes, of requests without which computed results would be lost."""
@@ -113,6 +114,13 @@ class AttemptApi:
         """Return the results of the job's tasks, in order."""
         with _dead_token_is_lost_lease():
             return [one.result or {} for one in pages(self._transport, TaskResult, f"/jobs/{self._job}/results")]
+
+    def read_judgements(self, study: str, revision: int) -> list[dict[str, Any]]:
+        """Return what the participants who saw a revision of a study answered, as one tree for each of them."""
+        with _dead_token_is_lost_lease():
+            path = f"{self._url}/judgements/{study}"
+            people = pages(self._transport, JudgingParticipant, path, {"revision": revision})
+            return [one.model_dump(mode="json") for one in people]
 
     def read_blob(self, digest: str, most_bytes: int) -> bytes:
         """Return a blob's bytes by its digest. Raises `BlobTooLarge` before the download of more than `most_bytes`."""

@@ -16,6 +16,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.queue.facets import ItemFacets
 from marey_schemas.queue.jobs import LONGEST_NOTE, Progress
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput, StageRequest
+from marey_schemas.studies.conducting import JudgingParticipant
 from marey_worker.messages import (
     ChildReply,
     FindItems,
@@ -23,6 +24,7 @@ from marey_worker.messages import (
     PutFile,
     ReadBlob,
     ReadItem,
+    ReadJudgements,
     ReadParts,
     ReadResults,
     Request,
@@ -165,6 +167,14 @@ class Context:
         """Return the items with this name that are directly in a collection, or anywhere if `collection` is None."""
         found = self._ask(lambda request: FindItems(request, kind, name, collection))
         return [Item.model_validate(item) for item in found]
+
+    def judgements(self, study: PinnedInput) -> list[JudgingParticipant]:
+        """Return what the participants who saw the revision of a study answered, under pseudonyms.
+
+        Raises `Unreadable` if the author of the job may not read this.
+        """
+        asked = self._send(lambda request: ReadJudgements(request, study.item, study.revision))
+        return [JudgingParticipant.model_validate(one) for one in self._value(asked, "no-study")]
 
     def task_results(self) -> list[dict[str, Any]]:
         """Return the results of the tasks that this job gathers, in order."""

@@ -107,6 +107,15 @@ class ReadResults:
 
 
 @dataclass(frozen=True)
+class ReadJudgements:
+    """Request for what the participants of a revision of a study answered; the answer contains one tree for each."""
+
+    request: int
+    item: str
+    revision: int
+
+
+@dataclass(frozen=True)
 class PutFile:
     """Request to send a file to the server; the answer is the digest of the file."""
 
@@ -154,14 +163,14 @@ class Failed:
     retryable: bool
 
 
-Request = ReadParts | ReadItem | FindItems | ReadBlob | ReadResults | PutFile | Stage
+Request = ReadParts | ReadItem | FindItems | ReadBlob | ReadResults | ReadJudgements | PutFile | Stage
 End = Done | Failed
 
 _FORMS = {
     one.__name__: TypeAdapter(one)
     for one in (
-        Run, ChildReply, ReadParts, ReadItem, FindItems, ReadBlob, ReadResults, PutFile, Stage, ProgressMade,
-        Done, Failed,
+        Run, ChildReply, ReadParts, ReadItem, FindItems, ReadBlob, ReadResults, ReadJudgements, PutFile, Stage,
+        ProgressMade, Done, Failed,
     )
 }  # fmt: skip
 

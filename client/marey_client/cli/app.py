@@ -33,6 +33,7 @@ from marey_client.cli.difference import diff
 from marey_client.cli.files import downloading, listing, records, uploading
 from marey_client.cli.operation import bench, capacity, costs
 from marey_client.cli.queue import jobs, pipelines, schedules, scripts
+from marey_client.cli.studies import conducting, results
 from marey_client.cli.terminal.invocation import Invocation
 
 app = typer.Typer(
@@ -113,6 +114,8 @@ for register in (
     pipelines,
     schedules,
     scripts,
+    conducting,
+    results,
     webhooks,
     audit,
 ):

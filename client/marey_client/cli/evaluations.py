@@ -111,7 +111,7 @@ def add_clip_options(marey: Marey, params: Chosen, loop: Sequence[str] | None, t
     """
     if loop:
         params.setdefault("database", {}).setdefault("end_policy", "loop")
-        params["loops"] = [one.id for place in loop for one in _clips_in(marey, Address.parse(place))]
+        params["loops"] = [one.id for place in loop for one in clips_in(marey, Address.parse(place))]
     if trim:
         params["trims"] = dict(_trim(marey, text) for text in trim)
 
@@ -169,7 +169,7 @@ def report(
         webbrowser.open(out.absolute().as_uri())
 
 
-def _clips_in(marey: Marey, address: Address) -> list[Any]:
+def clips_in(marey: Marey, address: Address) -> list[Any]:
     """Return the clip at an address, or all clips in a folder and below it."""
     from marey_schemas.kinds import Kind
 

@@ -22,7 +22,11 @@ class Findings:
     @property
     def summary(self) -> dict[str, Any]:
         """The main numbers of the result."""
-        return {name: value for name, value in (self.job.result or {}).items() if name not in ("document", "report")}
+        return {
+            name: value
+            for name, value in (self.job.result or {}).items()
+            if name not in ("document", "report", "metric")
+        }
 
     def document(self) -> dict[str, Any]:
         """Return all results; arrays are numpy arrays."""
@@ -34,7 +38,11 @@ class Findings:
 
     def save_report(self, path: str | Path) -> Path:
         """Write the report to a file, and return the path of the file."""
-        return Blobs(self.transport).fetch_to(self._blob("report"), Path(path))
+        return self.save_file("report", path)
+
+    def save_file(self, name: str, path: str | Path) -> Path:
+        """Write a file of the result, such as `report`; return its path. Raises `LookupError` without such a file."""
+        return Blobs(self.transport).fetch_to(self._blob(name), Path(path))
 
     def _blob(self, name: str) -> str:
         result = self.job.result or {}

@@ -8,10 +8,10 @@ import numpy as np
 
 from marey_motion.arrays import Floats, Ints
 from marey_motion.errors import MotionError
+from marey_schemas.documents.studies import SHOWN
 
-SHOWN = 4
 TRIALS = 63
-_CANDIDATE_DRAWS = 16
+_CANDIDATE_DRAWS = 24
 _FIRST, _SECOND = np.triu_indices(SHOWN, 1)
 
 
@@ -73,7 +73,9 @@ class DifferenceTable:
         return float(np.sqrt(np.mean(p[seen] * (1.0 - p[seen]) / shown[seen])))
 
 
-def draw_trials(motion_count: int, participants: int, seed: int, trials: int = TRIALS) -> Ints:
+def draw_trials(
+    motion_count: int, participants: int, seed: int, trials: int = TRIALS, *, earlier: Ints | None = None
+) -> Ints:
     """Draw the motions of a study's trials, in balance.
 
     Each participant sees every motion equally often, or once more or less if that is impossible. For each participant,
@@ -85,6 +87,8 @@ def draw_trials(motion_count: int, participants: int, seed: int, trials: int = T
     participants : int    number of participants
     seed : int    the same seed gives the same trials
     trials : int    trials per participant
+    earlier : (M, trials, 4) int64, optional    trials of the M first participants of this study, as drawn before; the
+        result contains those of the next participants, the same as if all were drawn together
 
     Returns
     -------
@@ -96,10 +100,13 @@ def draw_trials(motion_count: int, participants: int, seed: int, trials: int = T
     """
     if motion_count < SHOWN:
         raise MotionError(f"a trial shows {SHOWN} different motions; there are only {motion_count}")
-    rng = np.random.default_rng(seed)
-    counts = np.zeros((motion_count, motion_count))
+    first = 0 if earlier is None else len(earlier)
+    counts = np.zeros((motion_count, motion_count), np.int64)
+    if earlier is not None:
+        counts = _pair_counts(earlier.reshape(-1, SHOWN), motion_count)
     drawn = np.empty((participants, trials, SHOWN), np.int64)
     for participant in range(participants):
+        rng = np.random.default_rng([seed, first + participant])
         draws = [_one_draw(motion_count, trials, rng) for _ in range(_CANDIDATE_DRAWS)]
         tables = [counts + _pair_counts(draw, motion_count) for draw in draws]
         best = int(np.argmin([np.sum(table**2) for table in tables]))

@@ -18,6 +18,7 @@ from marey_schemas.documents.references import RevisionRef as RevisionRef
 from marey_schemas.documents.reports import EvaluationReport, ModelReport
 from marey_schemas.documents.sample_trees import SampleTreeDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
+from marey_schemas.documents.studies import StudyDocument
 from marey_schemas.editing.edits import EditDocument
 
 
@@ -48,6 +49,7 @@ SCHEMAS: dict[str, type[Request]] = {
         SampleTreeDocument,
         ModelReport,
         ModelGraph,
+        StudyDocument,
         OpenDocument,
     )
 }

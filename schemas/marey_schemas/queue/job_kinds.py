@@ -290,6 +290,24 @@ TREE = KindDeclaration(
     unclear_place=job_params.TreeParams.unclear_place,
 )
 
+
+def _reads_answers(_params: Mapping[str, Any]) -> bool:
+    """Return that answers of participants, which are read while the job runs, may change between two jobs."""
+    return True
+
+
+ANALYSE_STUDY = KindDeclaration(
+    name="analyse_study",
+    description="Computes the differences that the participants of a study perceived, the order and the groups of its "
+    "motions, and metrics that are fitted to these differences. Only maintainers may submit it.",
+    params=job_params.AnalyseStudyParams,
+    implementation="marey_worker.kinds.analyse_study:run",
+    version=1,
+    inputs={"study": InputSpec(kind=Kind.STUDY, description="The study, at the revision that its participants saw.")},
+    outputs={"document": "file", "report": "file", "metric": "file"},
+    never_cached_for=_reads_answers,
+)
+
 RUN_SCRIPT = KindDeclaration(
     name=SCRIPT,
     description="Runs a registered script: a command of a pinned Git commit. The script declares the inputs and "
@@ -320,7 +338,7 @@ def kind_of_job(name: str, params: Mapping[str, Any]) -> KindDeclaration:
 
 BUILT_IN = (
     IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN, MODEL, TREE,
-    RUN_SCRIPT,
+    ANALYSE_STUDY, RUN_SCRIPT,
 )  # fmt: skip
 
 

@@ -196,6 +196,19 @@ class CompareParams(Request):
     report: bool = Field(True, description="Write the report, a self-contained HTML page.")
 
 
+class AnalyseStudyParams(Request):
+    """Parameters of jobs of the kind `analyse_study`."""
+
+    title: str = Field("", max_length=200, description="Title of the report; default: the title of the study.")
+    report: bool = Field(True, description="Write the report, a self-contained HTML page.")
+    draws: int = Field(
+        1000,
+        ge=0,
+        le=10_000,
+        description="Number of times that participants are drawn with replacement, for intervals of the weights.",
+    )
+
+
 class SuggestParams(SuggestionOptions):
     """Parameters of jobs of the kind `suggest`."""
 

@@ -17,10 +17,11 @@ class Principal:
     worker does not have the rights of a user, not even those of the job's author. It may read the inputs of the job and
     the documents to which these inputs refer. It may write only data of its attempt. After the end of the attempt
     (`ended`), the worker may only repeat the request that ended the attempt. The kind `pod` is a pod that was started
-    for the job `job_id`; it may only claim this job.
+    for the job `job_id`; it may only claim this job. The kind `participant` is a participant of a study, who has no
+    account; such a caller may only take part in this study.
     """
 
-    kind: Literal["anonymous", "user", "attempt", "pod", "system"]
+    kind: Literal["anonymous", "user", "attempt", "pod", "participant", "system"]
     user_id: str | None = None
     user_name: str | None = None
     administrator: bool = False
@@ -30,6 +31,7 @@ class Principal:
     job_id: str | None = None
     fence: int | None = None
     project_id: str | None = None
+    participant_id: str | None = None
     token_key: bytes = field(default=b"", repr=False)
     """Key from which attempt tokens and the successor of the user's token are derived; empty without a user's token."""
     ended: bool = False

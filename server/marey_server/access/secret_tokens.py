@@ -2,8 +2,9 @@
 
 `marey_<prefix>_<secret>` belongs to a user; the prefix identifies the token's row in the database.
 `mareyjob_<secret>_<seal>` belongs to an attempt of a job; the seal shows that a server issued it (see `is_sealed`).
-`mareyinvite_<prefix>_<secret>` is the code of an invitation. The database stores the SHA-256 of the secret. A secret
-has 256 random bits, so a slow hash is not needed.
+`mareyinvite_<prefix>_<secret>` is the code of an invitation, `mareystudy_<prefix>_<secret>` that of a link to a study,
+and `mareyparticipant_<prefix>_<secret>` belongs to a participant of a study. The database stores the SHA-256 of the
+secret. A secret has 256 random bits, so a slow hash is not needed.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import secrets
 from typing import NamedTuple
 
 from marey_schemas.invitations import CODE_PREFIX
+from marey_schemas.studies.participation import LINK_PREFIX, PARTICIPANT_PREFIX
 
 _USER = "marey_"
 _ATTEMPT = "mareyjob_"
@@ -45,8 +47,27 @@ def issue_attempt_token() -> IssuedToken:
 
 def issue_invitation() -> IssuedToken:
     """Return the code of a new invitation, with a random secret."""
+    return _issue(CODE_PREFIX)
+
+
+def issue_study_link() -> IssuedToken:
+    """Return the code of a new link for one participant of a study, with a random secret."""
+    return _issue(LINK_PREFIX)
+
+
+def derive_participant_token(link_secret: str, key: str, prefix: str) -> IssuedToken:
+    """Derive the token of a participant of a study; the same arguments always give the same token.
+
+    `link_secret` is the secret of the link's code, and `key` was made by the participant's browser. So a repeated
+    exchange of the link by the same browser returns the same token, and nobody with the link alone gets it.
+    """
+    secret = hmac.digest(link_secret.encode("utf-8", "surrogatepass"), f"participant {key}".encode(), "sha256").hex()
+    return IssuedToken(f"{PARTICIPANT_PREFIX}{prefix}_{secret}", prefix, hash_secret(secret))
+
+
+def _issue(start: str) -> IssuedToken:
     prefix, secret = issue_prefix(), secrets.token_hex(32)
-    return IssuedToken(f"{CODE_PREFIX}{prefix}_{secret}", prefix, hash_secret(secret))
+    return IssuedToken(f"{start}{prefix}_{secret}", prefix, hash_secret(secret))
 
 
 def derive_token_key(secret: str) -> bytes:
@@ -130,6 +151,16 @@ def split_user_token(text: str) -> tuple[str, str] | None:
 def split_invitation(text: str) -> tuple[str, str] | None:
     """Return prefix and secret of the code of an invitation, or None if `text` is no such code."""
     return _split(text, CODE_PREFIX)
+
+
+def split_study_link(text: str) -> tuple[str, str] | None:
+    """Return prefix and secret of the code of a link to a study, or None if `text` is no such code."""
+    return _split(text, LINK_PREFIX)
+
+
+def split_participant_token(text: str) -> tuple[str, str] | None:
+    """Return prefix and secret of the token of a participant, or None if `text` is no such token."""
+    return _split(text, PARTICIPANT_PREFIX)
 
 
 def _split(text: str, start: str) -> tuple[str, str] | None:

@@ -27,6 +27,7 @@ from marey_server.handlers import (
     webhooks,
 )
 from marey_server.handlers.queue import jobs, leases, pipelines, schedules, scripts
+from marey_server.handlers.studies import conducting, participation
 from marey_server.handlers.versions import contents, datasets, differences, proposals
 from marey_server.http.resource import Resource
 
@@ -51,6 +52,8 @@ RESOURCES: tuple[type[Resource], ...] = (
     *samples.RESOURCES,
     *searches.RESOURCES,
     *coverage_streams.RESOURCES,
+    *conducting.RESOURCES,
+    *participation.RESOURCES,
     *imports.RESOURCES,
     *jobs.RESOURCES,
     *pipelines.RESOURCES,

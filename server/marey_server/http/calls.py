@@ -122,6 +122,9 @@ def require_access(operation: Operation, principal: Principal) -> None:
         raise ForbiddenProblem(
             "The token of a pod can claim only the job for which the pod was started.", code="not-for-pods"
         )
+    if principal.kind == "participant" or access is Access.PARTICIPANT:
+        _require_participation(access, principal)
+        return
     if access is Access.ATTEMPT:
         raise ForbiddenProblem(
             "This request needs the token that a worker gets for a running job.", code="attempt-only"
@@ -149,6 +152,18 @@ def _require_attempt_access(operation: Operation, principal: Principal) -> None:
     if operation.access is not Access.ATTEMPT and not operation.attempts:
         raise ForbiddenProblem(
             "The token that a worker gets for a running job may not do this.", code="not-for-attempts"
+        )
+
+
+def _require_participation(access: Access, principal: Principal) -> None:
+    """Refuse a participant of a study everything but taking part, and all others who want to take part."""
+    if access is Access.ANYONE:
+        return
+    if access is not Access.PARTICIPANT:
+        raise ForbiddenProblem("The token of a participant of a study may not do this.", code="not-for-participants")
+    if principal.kind != "participant":
+        raise ForbiddenProblem(
+            "This request needs the token that a participant of a study gets for a link.", code="participants-only"
         )
 
 

@@ -41,6 +41,7 @@ class Access(StrEnum):
     OWNER = "owner"
     WORKER = "worker"
     ATTEMPT = "attempt"
+    PARTICIPANT = "participant"
 
     @property
     def role(self) -> Role | None:

@@ -51,6 +51,9 @@ PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
     "job": ("Id of the job.", _NAME),
     "job_kind": ("Name of the kind of job.", _NAME),
     "stream": ("Id of the coverage stream.", _NAME),
+    "participant": ("Id of the participant of a study.", _NAME),
+    "trial": ("Number of the trial.", {"type": "integer", "minimum": 0, "maximum": 999_999_999}),
+    "clip": ("Number of a motion of the study, from 0.", {"type": "integer", "minimum": 0, "maximum": 999_999_999}),
     "fence": ("Fence of the attempt.", {"type": "integer", "minimum": 0, "maximum": 999_999_999}),
 }  # fmt: skip
 _OFFSET = {"type": "integer", "minimum": 0, "maximum": 10**12 - 1}

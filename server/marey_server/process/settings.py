@@ -238,6 +238,11 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
     project_invitations: int = Field(
         Quotas.project_invitations, ge=0, description="Greatest number of open invitations to a project."
     )
+    project_participants: int = Field(
+        Quotas.project_participants,
+        ge=0,
+        description="Greatest number of participants of a project's studies, with those who have withdrawn.",
+    )
     user_invitations: int = Field(
         Quotas.user_invitations, ge=0, description="Greatest number of open invitations that a user has created."
     )

@@ -12,12 +12,13 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, update
 
 from marey_server.store.database.clock import datetime_of, set_high_water, stored_high_water_us, wall_clock_us
-from marey_server.store.tables import invitation, job, metadata, schedule, token
+from marey_server.store.tables import invitation, job, metadata, schedule, study_participant, study_trial, token
 
 PAST = frozenset(
     {
         "at_us", "cancel_requested_us", "created_us", "deleted_us", "delivered_us", "ended_us", "failing_since_us",
         "finished_us", "fired_us", "last_used_us", "purged_us", "served_us", "since_us", "started_us", "updated_us",
+        "withdrawn_us",
     }
 )  # fmt: skip
 """Columns of times in the past; no value may lie in the future."""
@@ -30,6 +31,8 @@ MOVED = {
     token.c.expires_us: token.c.created_us,
     invitation.c.expires_us: invitation.c.created_us,
     job.c.deadline_us: job.c.started_us,
+    study_participant.c.expires_us: study_participant.c.created_us,
+    study_trial.c.deadline_us: study_trial.c.started_us,
 }
 """Columns of end times, each with the column of the start time.
 

@@ -66,6 +66,7 @@ class Quotas:
     project_schedules: int = 100
     project_scripts: int = 100
     project_invitations: int = 100
+    project_participants: int = 2000
     user_invitations: int = 1000
     project_proposal_bytes: int = 64 * 2**20
 

@@ -157,7 +157,7 @@ class Visitors:
         return client.get(f"/projects/load/skeletons/{random.choice(self._rigs)}/parts/hierarchy")
 
     def _list(self, client: httpx.Client) -> httpx.Response:
-        return client.get("/projects/load/studies", params={"limit": 50, "sort": "-created_at"})
+        return client.get("/projects/load/characters", params={"limit": 50, "sort": "-created_at"})
 
     def _upload(self, client: httpx.Client) -> httpx.Response:
         data = os.urandom(UPLOAD_BYTES)
@@ -166,7 +166,7 @@ class Visitors:
             return sent
         study = {"schema": "marey/document@1", "blob": digest_of(data)}
         name = f"study {next(self._numbers)}"
-        return client.post("/projects/load/studies", json={"name": name, "parts": {"study": study}})
+        return client.post("/projects/load/characters", json={"name": name, "parts": {"character": study}})
 
     def _job(self, client: httpx.Client) -> httpx.Response:
         job = {"kind": "add", "params": {"a": next(self._numbers), "b": 1}, "cache": "off"}

@@ -24,8 +24,8 @@ DIGEST = digest_of(FILE)
 
 
 def study(lab: Lab, who: Principal, name: str = "s", **body: Any) -> Item:
-    request = ItemCreate(name=name, parts={"study": {"schema": "marey/document@1", **body}})
-    return lab.write(items.create_item, "lab", Kind.STUDY, request, who=who)
+    request = ItemCreate(name=name, parts={"character": {"schema": "marey/document@1", **body}})
+    return lab.write(items.create_item, "lab", Kind.CHARACTER, request, who=who)
 
 
 def readers(lab: Lab) -> set[Any]:
@@ -48,7 +48,7 @@ def test_a_document_shares_what_it_names_with_the_readers_of_its_project(lab: La
     assert readers(lab) == everybody_inside
     lab.make_public()
     assert readers(lab) == everybody_inside | {lab.stranger.user_name, None}
-    lab.write(items.delete_item, "lab", Kind.STUDY, made.id, expected_rev=None)
+    lab.write(items.delete_item, "lab", Kind.CHARACTER, made.id, expected_rev=None)
     assert readers(lab) == {lab.contributor.user_name}
 
 
@@ -75,7 +75,7 @@ def test_naming_a_digest_in_words_shares_nothing(lab: Lab) -> None:
 def test_a_stored_document_gives_no_access_to_who_stores_it_again_without_the_bytes(lab: Lab) -> None:
     lab.write(blobs.put_blob, FILE, who=lab.contributor)
     made = study(lab, lab.contributor, "mine", blob=DIGEST)
-    lab.write(items.delete_item, "lab", Kind.STUDY, made.id, expected_rev=None)
+    lab.write(items.delete_item, "lab", Kind.CHARACTER, made.id, expected_rev=None)
     with pytest.raises(ConflictProblem):
         study(lab, lab.owner, "theirs", blob=DIGEST)
 

@@ -179,8 +179,8 @@ def test_a_branch_that_moves_during_each_plan_leaves_the_job_for_later(
 def delete_and_purge(gaits: CommittingDesk, *found: str) -> list[PurgeAnswer]:
     """Delete these items, and purge all deleted studies; return the answer."""
     for item in found:
-        gaits.write(items.delete_item, "lab", Kind.STUDY, item, expected_rev=None)
-    request = PurgeRequest(collection="", kind=Kind.STUDY)
+        gaits.write(items.delete_item, "lab", Kind.CHARACTER, item, expected_rev=None)
+    request = PurgeRequest(collection="", kind=Kind.CHARACTER)
     return [gaits.write(purging.record_purge, "lab", request, gaits.read(purging.prepare_purge, "lab", request))]
 
 
@@ -193,7 +193,7 @@ def purge_dataset(gaits: CommittingDesk, name: str) -> None:
 def made_by(gaits: CommittingDesk) -> list[str]:
     """Return the items in the folder `made`."""
     filters = items.ItemFilters(collection="made")
-    return [one.id for one in gaits.read(items.list_items, "lab", Kind.STUDY, filters).items]
+    return [one.id for one in gaits.read(items.list_items, "lab", Kind.CHARACTER, filters).items]
 
 
 @pytest.mark.parametrize("when", ["before the plan", "after the plan"])
@@ -249,7 +249,7 @@ def test_chunks_that_a_purged_dataset_had_too_are_stored_again(
     def purge_and_move() -> None:
         purge_dataset(gaits, "other")
         gaits.change(PutEntry(path="later", item=thing))
-        gaits.change(RemoveEntry(path="later", kind=Kind.STUDY))
+        gaits.change(RemoveEntry(path="later", kind=Kind.CHARACTER))
 
     meanwhile(purge_and_move)
     assert commit_deferred(gaits.desk.database) == 1

@@ -36,14 +36,14 @@ def write(desk: Desk, function: Any, *args: Any, **kwargs: Any) -> Any:
 
 
 def study(desk: Desk, item_id: str) -> Item:
-    found: Item = read(desk, items.read_item, "lab", Kind.STUDY, item_id)
+    found: Item = read(desk, items.read_item, "lab", Kind.CHARACTER, item_id)
     return found
 
 
 def selected(desk: Desk, query: str, project: str = "lab") -> list[str]:
     """Return the names of the studies that a query selects."""
     filters = items.ItemFilters(query=query)
-    return [one.name for one in read(desk, items.list_items, project, Kind.STUDY, filters, sort="name").items]
+    return [one.name for one in read(desk, items.list_items, project, Kind.CHARACTER, filters, sort="name").items]
 
 
 def submit(desk: Desk, things: list[str], number: int = 0, **fields: Any) -> str:
@@ -68,9 +68,9 @@ def test_a_revert_restores_the_facets_of_the_earlier_content(desk: Desk) -> None
     (thing,) = desk.things(1)
     measure(desk, [thing], 0.5)
     changed = document(content="other")
-    write(desk, items.put_part, "lab", Kind.STUDY, thing, "study", changed, expected_rev=None)
+    write(desk, items.put_part, "lab", Kind.CHARACTER, thing, "character", changed, expected_rev=None)
     assert study(desk, thing).facets == {}
-    back = write(desk, items.revert_item, "lab", Kind.STUDY, thing, ItemRevert(revision=1), expected_rev=None)
+    back = write(desk, items.revert_item, "lab", Kind.CHARACTER, thing, ItemRevert(revision=1), expected_rev=None)
     assert (back.revision, back.facets) == (3, {"usage": 0.5})
 
 
@@ -83,14 +83,14 @@ def test_a_job_publishes_facets_of_its_inputs_when_it_completes(desk: Desk) -> N
     assert selected(desk, "has facet.usage") == []
     desk.complete(lease)
     assert study(desk, things[1]).facets == {"usage": 0.5, "used_frames": 1.0}
-    assert [one.facets for one in read(desk, items.list_items, "lab", Kind.STUDY, sort="name").items[1:]] == [
+    assert [one.facets for one in read(desk, items.list_items, "lab", Kind.CHARACTER, sort="name").items[1:]] == [
         {"usage": 0.25}, {"usage": 0.5, "used_frames": 1.0}, {},
     ]  # fmt: skip
     assert selected(desk, "facet.usage > 0.25") == ["thing1"]
     assert selected(desk, "facet.usage in (0.25, 0.5) and not has facet.used_frames") == ["thing0"]
     assert selected(desk, "folder = raw and not facet.usage > 0.25") == ["thing0", "thing2"]
     explained = read(
-        desk, items.explain_query, "lab", Kind.STUDY, items.ItemFilters(), "facet.usage >= 0.25 and name = thing1"
+        desk, items.explain_query, "lab", Kind.CHARACTER, items.ItemFilters(), "facet.usage >= 0.25 and name = thing1"
     )
     assert (explained.selected, [(one.hides, one.alone) for one in explained.conditions]) == (1, [(2, 0), (3, 1)])
 
@@ -99,7 +99,7 @@ def test_a_facet_belongs_to_the_revision_that_was_measured(desk: Desk) -> None:
     (thing,) = desk.things(1)
     submit(desk, [thing])
     lease = desk.claim()
-    desk.publish(Draft("thing0", Kind.STUDY, "thing0", {"study": document(number=10)}, "raw"))
+    desk.publish(Draft("thing0", Kind.CHARACTER, "thing0", {"character": document(number=10)}, "raw"))
     assert study(desk, thing).revision == 2
     desk.stage_outputs(lease, output("m"), facets=(measured(thing, 0.5),))
     desk.complete(lease)
@@ -126,7 +126,7 @@ def test_a_shared_result_states_facets_of_the_revisions_of_its_own_job(desk: Des
     things = desk.things(1)
     first = measure(desk, things, 0.5)
     for number in (7, 0):  # back to the content that was measured, as another revision
-        desk.publish(Draft("thing0", Kind.STUDY, "thing0", {"study": document(number=number)}, "raw"))
+        desk.publish(Draft("thing0", Kind.CHARACTER, "thing0", {"character": document(number=number)}, "raw"))
     assert (study(desk, things[0]).revision, study(desk, things[0]).facets) == (3, {})
     assert desk.job(submit(desk, things)).cached_from == first
     assert study(desk, things[0]).facets == {"usage": 0.5}
@@ -170,7 +170,7 @@ def test_an_attempt_states_only_declared_facets_of_its_inputs(desk: Desk, facets
 
 def test_a_job_with_an_evaluation_states_facets_of_its_clips(desk: Desk) -> None:
     (own, unnamed, revised), far = desk.things(3), "study_far"
-    desk.publish(Draft("d", Kind.STUDY, "thing2", {"study": document(number=9)}, "raw"))
+    desk.publish(Draft("d", Kind.CHARACTER, "thing2", {"character": document(number=9)}, "raw"))
     named = [{"item": own, "revision": 1}, {"item": revised, "revision": 2}, {"item": revised, "revision": 3}]
     odd: list[Any] = [{"item": far, "revision": 1}, {"item": [own]}, None]
     evaluation = {
@@ -217,7 +217,7 @@ def test_an_attempt_that_fails_or_lost_its_lease_publishes_no_facets(desk: Desk)
 def test_a_purge_deletes_facets_and_no_job_adds_them_afterwards(desk: Desk) -> None:
     thing, kept = desk.things(2)
     measure(desk, [thing, kept], 0.5, 0.6)
-    write(desk, items.delete_item, "lab", Kind.STUDY, thing, expected_rev=None)
+    write(desk, items.delete_item, "lab", Kind.CHARACTER, thing, expected_rev=None)
     wanted = PurgeRequest(item=thing)
     write(desk, purging.record_purge, "lab", wanted, read(desk, purging.prepare_purge, "lab", wanted))
     project_id = read(desk, projects.require, "lab").id
@@ -238,7 +238,7 @@ def test_a_query_shows_no_facets_of_another_project(desk: Desk) -> None:
 
     def add(tx: Any) -> None:
         other = projects.require(tx, "other")
-        draft = Draft("far", Kind.STUDY, "far", {"study": document(number=1)})
+        draft = Draft("far", Kind.CHARACTER, "far", {"character": document(number=1)})
         (made,) = publish(tx, other, [draft], author_id=None, rights=ALL_RIGHTS)
         publish_facets(tx, other.id, [[made.item, 1, {"usage": 1.0}], [things[0], 1, {"usage": 1.0}]])
 

@@ -40,7 +40,7 @@ class FullLab(Lab):
         clip = self.add_clip(self.rig, collection="a/b", info={"source": {"file": digest_of(FILE)}}, tags=("t",))
         self.write(items.put_part, "lab", Kind.CLIP, clip.id, "info", {"subject": "x"}, expected_rev=None)
         study = {"schema": "marey/document@1", "x": np.arange(5.0), "blob": digest_of(FILE)}
-        self.write(items.create_item, "lab", Kind.STUDY, ItemCreate(name="s", parts={"study": study}))
+        self.write(items.create_item, "lab", Kind.CHARACTER, ItemCreate(name="s", parts={"character": study}))
         sent = self.write(uploads.create_upload, 10)
         self.write(uploads.append, sent.id, 0, b"12345")
 

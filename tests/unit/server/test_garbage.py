@@ -40,7 +40,7 @@ def rows(lab: Lab, table: Table[Any]) -> set[str]:
 
 
 def publish_study(tx: Transaction, name: str = "s") -> Item:
-    return items.create_item(tx, "lab", Kind.STUDY, ItemCreate(name=name, parts={"study": TREE}))
+    return items.create_item(tx, "lab", Kind.CHARACTER, ItemCreate(name=name, parts={"character": TREE}))
 
 
 def test_what_nothing_refers_to_goes_after_a_day_and_what_something_refers_to_stays(
@@ -71,7 +71,7 @@ def test_arrays_go_with_the_document_that_held_them_unless_another_holds_them_to
 
     shared, own = np.arange(10.0), np.arange(20.0)
     kept = {"schema": "marey/document@1", "x": shared}
-    lab.write(items.create_item, "lab", Kind.STUDY, ItemCreate(name="kept", parts={"study": kept}))
+    lab.write(items.create_item, "lab", Kind.CHARACTER, ItemCreate(name="kept", parts={"character": kept}))
     lab.write(documents.store_document, {"schema": "marey/document@1", "x": shared, "y": own})
     clock.advance(LONG_S)
     collected = garbage.collect_garbage(lab.database)
@@ -89,7 +89,7 @@ def test_what_a_running_attempt_has_staged_stays_for_as_long_as_it_runs(lab: Lab
         tx.execute(sqlalchemy.insert(job).values(**given))
         given = {"job_id": "job_1", "fence": 1, "worker": "w", "token_hash": "h", "started_us": 0}
         tx.execute(sqlalchemy.insert(attempt).values(**given))
-        draft = {"parts": {"study": staged}}
+        draft = {"parts": {"character": staged}}
         given = {"job_id": "job_1", "fence": 1, "name": "o", "position": 0, "draft": draft}
         tx.execute(sqlalchemy.insert(staged_output).values(**given))
         blobs.put_blob(tx, FILE)

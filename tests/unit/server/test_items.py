@@ -461,10 +461,11 @@ def test_documents_are_checked_against_their_schema(lab: Lab, rig: Item) -> None
     assert refused(lab, Kind.SKELETON, {"mapping": {"joints": {}}}).error_code == "part-required"
     assert refused(lab, Kind.SKELETON, {"hierarchy": {**skeleton_tree(), "schema": "marey/motion@1"}})
     assert (
-        refused(lab, Kind.STUDY, {"study": {"schema": "marey/document@1", "text": "nul \x00"}}).error_code == "bad-text"
+        refused(lab, Kind.CHARACTER, {"character": {"schema": "marey/document@1", "text": "nul \x00"}}).error_code
+        == "bad-text"
     )
-    assert refused(lab, Kind.STUDY, {"study": {"schema": "marey/document@1", "text": "\ud800"}})
-    assert refused(lab, Kind.STUDY, {"study": {"schema": "marey/document@1", "x": float("nan")}})
+    assert refused(lab, Kind.CHARACTER, {"character": {"schema": "marey/document@1", "text": "\ud800"}})
+    assert refused(lab, Kind.CHARACTER, {"character": {"schema": "marey/document@1", "x": float("nan")}})
 
 
 def test_a_motion_names_a_skeleton_of_the_project_with_its_joints(lab: Lab, rig: Item, database: Database) -> None:
@@ -494,14 +495,14 @@ def test_nobody_refers_to_stored_arrays_by_their_digest(lab: Lab, rig: Item) -> 
     assert set(body["poses"]) == {"dtype", "shape", "content"}
     assert refused(lab, Kind.CLIP, {"motion": body}).errors[0].code == "array-reference"
     study = {"schema": "marey/document@1", "stolen": [body["poses"]]}
-    assert refused(lab, Kind.STUDY, {"study": study}).errors[0].pointer == "/stolen/0"
+    assert refused(lab, Kind.CHARACTER, {"character": study}).errors[0].pointer == "/stolen/0"
 
 
 def test_documents_of_other_kinds_hold_anything(lab: Lab) -> None:
     study = {"schema": "marey/document@1", "n": [1, 2.5, None, True, "é"], "big": 2**62}
     study["a/b~c"] = {"x": np.arange(4, dtype="<i8")}
-    made = lab.write(items.create_item, "lab", Kind.STUDY, ItemCreate(name="s", parts={"study": study}))
-    back = lab.read(items.read_part, "lab", Kind.STUDY, made.id, "study", arrays="decoded").tree
+    made = lab.write(items.create_item, "lab", Kind.CHARACTER, ItemCreate(name="s", parts={"character": study}))
+    back = lab.read(items.read_part, "lab", Kind.CHARACTER, made.id, "character", arrays="decoded").tree
     np.testing.assert_array_equal(back.pop("a/b~c")["x"], np.arange(4))
     study.pop("a/b~c")
     assert back == study

@@ -88,7 +88,7 @@ def test_a_job_fails_if_the_dataset_to_which_it_commits_is_damaged(gaits: Commit
 def test_an_entry_that_was_removed_meanwhile_is_a_conflict(gaits: CommittingDesk) -> None:
     gaits.put("made/a", number=1)
     made = gaits.submit(into="made")
-    gaits.change(RemoveEntry(path="made/a", kind=Kind.STUDY))
+    gaits.change(RemoveEntry(path="made/a", kind=Kind.CHARACTER))
     gaits.work("a")
     conflict = gaits.job(made).publish_conflict
     assert conflict is not None
@@ -134,7 +134,7 @@ def test_changes_of_other_parts_of_an_entry_are_combined(gaits: CommittingDesk) 
     gaits.work("a")
     (made,) = gaits.desk.outputs(first)
     second = gaits.submit(into="made", cache="off")
-    gaits.write(items.change_item, "lab", Kind.STUDY, made.item, ItemChange(tags=("seen",)), expected_rev=None)
+    gaits.write(items.change_item, "lab", Kind.CHARACTER, made.item, ItemChange(tags=("seen",)), expected_rev=None)
     gaits.change(PutEntry(path="made/a", item=made.item))
     gaits.work("a", facts={"again": 1})
     assert gaits.job(second).publish_conflict is None
@@ -497,7 +497,7 @@ def test_outputs_of_one_name_are_numbered(gaits: CommittingDesk) -> None:
     lease = gaits.desk.claim()
     drafts = [
         StagedOutput(
-            name=f"n{number}", kind=Kind.STUDY, item_name="rig", parts={"study": document(number=number // 2)},
+            name=f"n{number}", kind=Kind.CHARACTER, item_name="rig", parts={"character": document(number=number // 2)},
             reuse="by_content",
         )
         for number in range(4)
@@ -534,7 +534,7 @@ def test_events_and_lineage_name_the_commit(gaits: CommittingDesk) -> None:
     assert told["branch.moved"].body["job"] == made
     assert told["branch.moved"].body["commit"] == told["job.succeeded"].body["commit"] == gaits.head()
     (output,) = gaits.desk.outputs(made)
-    graph = gaits.read(items.read_lineage_graph, "lab", Kind.STUDY, output.item, LineageRequest())
+    graph = gaits.read(items.read_lineage_graph, "lab", Kind.CHARACTER, output.item, LineageRequest())
     assert [(one.id, one.commit) for one in graph.jobs] == [(made, gaits.head())]
 
 

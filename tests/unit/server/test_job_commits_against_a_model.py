@@ -113,7 +113,7 @@ class CommittingMachine(RuleBasedStateMachine):
         self.model = Model({MAIN: first, "work": first}, {MAIN: len(NAMES), "work": len(NAMES)})
 
     def put(self, name: str, number: int, branch: str) -> None:
-        draft = Draft("d", Kind.STUDY, f"{name}{number}", {"study": document(name=name, number=number)}, "own")
+        draft = Draft("d", Kind.CHARACTER, f"{name}{number}", {"character": document(name=name, number=number)}, "own")
         (made,) = self.gaits.desk.publish(draft)
         self.gaits.change(PutEntry(path=f"made/{name}", item=made.item), branch=branch)
 
@@ -125,7 +125,7 @@ class CommittingMachine(RuleBasedStateMachine):
         if branch in self.model.protected or head.get(name) == number:
             return
         if number is None:
-            self.gaits.change(RemoveEntry(path=f"made/{name}", kind=Kind.STUDY), branch=branch)
+            self.gaits.change(RemoveEntry(path=f"made/{name}", kind=Kind.CHARACTER), branch=branch)
         else:
             self.put(name, number, branch)
         self.model.heads[branch] = applied(head, {name: number})
@@ -211,7 +211,7 @@ class CommittingMachine(RuleBasedStateMachine):
         assert {one.name for one in refs} == self.model.heads.keys()
         for branch, state in self.model.heads.items():
             listed = datasets.list_entries(tx, *place, branch, path="", cursor=None, limit=1000).items
-            found = {entry.path.rpartition("/")[2]: entry.parts["study"] for entry in listed}
+            found = {entry.path.rpartition("/")[2]: entry.parts["character"] for entry in listed}
             assert found.keys() == state.keys()
             for name, content in found.items():
                 assert self.contents.setdefault(content, (name, state[name])) == (name, state[name])

@@ -74,11 +74,13 @@ def test_a_job_gets_what_another_made_once_that_has_succeeded(desk: Desk) -> Non
     assert ready.state == "queued"
     (made,) = desk.outputs(maker)
     assert ready.inputs == {
-        "things": [{"item": made.item, "revision": 1, "kind": "study", "name": "a", "collection": "made", "below": ""}]
+        "things": [
+            {"item": made.item, "revision": 1, "kind": "character", "name": "a", "collection": "made", "below": ""}
+        ]
     }
     assert square(desk) == [["a"]]
     (squared,) = desk.outputs(job)
-    lineage = desk.database.read(desk.user, items.read_lineage, "lab", Kind.STUDY, squared.item)
+    lineage = desk.database.read(desk.user, items.read_lineage, "lab", Kind.CHARACTER, squared.item)
     assert [(edge.item, edge.revision) for edge in lineage.inputs] == [(made.item, 1)]
 
 
@@ -140,7 +142,7 @@ def test_inputs_are_the_revisions_the_job_made_not_newer_ones(desk: Desk) -> Non
     maker = desk.submit("sum", into="made")
     (job,) = desk.submit_many(squares_of(maker, after=[desk.submit()]))
     make(desk, maker, "a")
-    desk.publish(Draft("again", Kind.STUDY, "a", {"study": document(number=77)}, "made"))
+    desk.publish(Draft("again", Kind.CHARACTER, "a", {"character": document(number=77)}, "made"))
     desk.complete(desk.claim(kinds=("errand",)))
     (lease,) = desk.claim_many()
     assert (lease.job, lease.inputs["things"][0].revision) == (job, 1)
@@ -162,7 +164,7 @@ def test_an_output_that_was_deleted_meanwhile_is_no_input(desk: Desk) -> None:
     (job,) = desk.submit_many(squares_of(maker, after=[desk.submit()]))
     make(desk, maker, "a", "b")
     kept, deleted = desk.outputs(maker)
-    desk.database.write(desk.user, items.delete_item, "lab", Kind.STUDY, deleted.item, expected_rev=None)
+    desk.database.write(desk.user, items.delete_item, "lab", Kind.CHARACTER, deleted.item, expected_rev=None)
     desk.complete(desk.claim(kinds=("errand",)))
     assert [pin["item"] for pin in desk.job(job).inputs["things"]] == [kept.item]
 
@@ -293,7 +295,7 @@ def test_a_job_for_which_nothing_was_made_fails_and_says_who_made_nothing(desk: 
     reason, code, detail = failure_of(desk, job)
     assert (desk.state(job), reason, code) == ("failed", "error", "no-input")
     assert maker in detail
-    assert "study" in detail
+    assert "character" in detail
     assert failure_of(desk, after)[0] == "dependency_failed"
     assert desk.job(job).inputs == {"things": [{"job": maker}]}
 
@@ -420,7 +422,7 @@ def test_a_job_that_failed_is_tried_again_with_the_inputs_it_had(desk: Desk) -> 
     desk.stage(good, "done")
     desk.complete(good)
     desk.fail(bad, retryable=False)
-    desk.publish(Draft("again", Kind.STUDY, "a", {"study": document(number=77)}, "made"))
+    desk.publish(Draft("again", Kind.CHARACTER, "a", {"character": document(number=77)}, "made"))
     second = again(desk, job)
     assert (desk.job(second).children, desk.job(second).retry_of) == ({"succeeded": 1, "queued": 1}, job)
     assert square(desk) == [["c"]]

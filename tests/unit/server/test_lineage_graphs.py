@@ -26,7 +26,7 @@ Edges = Collection[tuple[int, int]]
 def study(lab: Lab, name: str, *sources: Published, role: str = "of", content: object = 1) -> Published:
     """Publish a revision of a study with other items as sources, and return it."""
     draft = Draft(
-        name, Kind.STUDY, name, {"study": {"of": name, "content": content}}, reuse="by_name",
+        name, Kind.CHARACTER, name, {"character": {"of": name, "content": content}}, reuse="by_name",
         sources={role: [(one.item, one.revision) for one in sources]},
     )  # fmt: skip
 
@@ -41,7 +41,7 @@ def study(lab: Lab, name: str, *sources: Published, role: str = "of", content: o
 
 def graph_of(lab: Lab, one: Published, **kwargs: Any) -> LineageGraph:
     found: LineageGraph = lab.read(
-        items.read_lineage_graph, lab.name, Kind.STUDY, one.item, LineageRequest(revision=one.revision, **kwargs)
+        items.read_lineage_graph, lab.name, Kind.CHARACTER, one.item, LineageRequest(revision=one.revision, **kwargs)
     )
     return found
 
@@ -82,7 +82,7 @@ def test_a_graph_starts_from_one_revision_and_names_newer_and_deleted_ones(lab: 
     first = study(lab, "cut", raw)
     newer = study(lab, "raw", content=2)
     second = study(lab, "cut", newer, content=2)
-    lab.write(items.delete_item, "lab", Kind.STUDY, raw.item, expected_rev=None)
+    lab.write(items.delete_item, "lab", Kind.CHARACTER, raw.item, expected_rev=None)
 
     (start, source) = graph_of(lab, first).revisions
 
@@ -132,7 +132,7 @@ def test_revisions_of_projects_that_the_caller_may_not_read_are_left_out(lab: La
     end = study(lab, "end", secret, middle)
 
     def read(who: Any) -> set[str]:
-        graph = lab.read(items.read_lineage_graph, "lab", Kind.STUDY, end.item, LineageRequest(), who=who)
+        graph = lab.read(items.read_lineage_graph, "lab", Kind.CHARACTER, end.item, LineageRequest(), who=who)
         return {one.path for one in graph.revisions}
 
     assert read(lab.reader) == {"end"}

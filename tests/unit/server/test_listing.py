@@ -185,7 +185,7 @@ def test_a_cursor_serves_only_the_list_it_came_from(filled: FilledLab) -> None:
     for wrong in (
         lambda: ask(cursor, sort="-name"),
         lambda: ask(cursor, sort="name", filters=ItemFilters(q="w")),
-        lambda: filled.read(items.list_items, "lab", Kind.STUDY, cursor=cursor, sort="name"),
+        lambda: filled.read(items.list_items, "lab", Kind.CHARACTER, cursor=cursor, sort="name"),
         lambda: ask(cursor[:-2] + "AA", sort="name"),
         lambda: ask("", sort="name"),
         lambda: ask("é€", sort="name"),

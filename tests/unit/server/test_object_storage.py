@@ -79,7 +79,7 @@ def remote(lab: Lab, objects: ObjectsInMemory) -> Lab:
 def publish(lab: Lab, digest: str) -> None:
     """Let an item refer to a blob, so that the blob is kept."""
     tree = {"schema": "marey/document@1", "blob": digest}
-    lab.write(items.create_item, "lab", Kind.STUDY, ItemCreate(name=digest[-12:], parts={"study": tree}))
+    lab.write(items.create_item, "lab", Kind.CHARACTER, ItemCreate(name=digest[-12:], parts={"character": tree}))
 
 
 def defects(lab: Lab) -> list[str]:

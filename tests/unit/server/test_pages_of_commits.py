@@ -34,7 +34,7 @@ ALLOWED = {
 
 
 def add(gaits: CommittingDesk, name: str, content: object) -> str:
-    draft = Draft("d", Kind.STUDY, name, {"study": document(content=content, name=name)}, "raw")
+    draft = Draft("d", Kind.CHARACTER, name, {"character": document(content=content, name=name)}, "raw")
     return gaits.desk.publish(draft)[0].item
 
 

@@ -153,9 +153,11 @@ def test_results_know_what_they_were_made_from_through_the_whole_pipeline(desk: 
     work_off(desk)
     (overview,) = desk.outputs(made["survey"].id)
     first, *_ = desk.outputs(made["sum"].id)
-    assert not desk.database.read(desk.user, items.read_staleness, "lab", Kind.STUDY, overview.item).stale
+    assert not desk.database.read(desk.user, items.read_staleness, "lab", Kind.CHARACTER, overview.item).stale
     document = {"schema": "marey/document@1", "changed": True}
-    desk.database.write(desk.user, items.put_part, "lab", Kind.STUDY, first.item, "study", document, expected_rev=None)
-    found = desk.database.read(desk.user, items.read_staleness, "lab", Kind.STUDY, overview.item)
+    desk.database.write(
+        desk.user, items.put_part, "lab", Kind.CHARACTER, first.item, "character", document, expected_rev=None
+    )
+    found = desk.database.read(desk.user, items.read_staleness, "lab", Kind.CHARACTER, overview.item)
     assert found.stale
     assert {edge.item for edge in found.because} == {first.item}

@@ -85,7 +85,7 @@ def test_the_time_function_beside_an_aligned_clip_is_written_in_whole_frames() -
 
 def test_other_kinds_have_no_file_of_the_predecessor() -> None:
     with pytest.raises(InvalidProblem, match="exported as json"):
-        write_predecessor(Kind.STUDY, "s", {"study": {}}, None, PredecessorOptions())
+        write_predecessor(Kind.CHARACTER, "s", {"character": {}}, None, PredecessorOptions())
 
 
 @pytest.mark.parametrize(

@@ -226,8 +226,8 @@ def test_staged_documents_with_references_keep_their_arrays(lab: Lab) -> None:
 def test_sources_become_lineage_in_both_directions(lab: Lab) -> None:
     clip, rig = publish(lab, clip_draft(), rig_draft())
     sources = {"clip": [(clip.item, 1)], "skeleton": [(rig.item, 1)]}
-    (made,) = publish(lab, Draft("out", Kind.STUDY, "out", {"study": {"n": 1}}, sources=sources))
-    lineage = lab.read(items.read_lineage, "lab", Kind.STUDY, made.item)
+    (made,) = publish(lab, Draft("out", Kind.CHARACTER, "out", {"character": {"n": 1}}, sources=sources))
+    lineage = lab.read(items.read_lineage, "lab", Kind.CHARACTER, made.item)
     assert {(edge.role, edge.item, edge.revision, edge.kind) for edge in lineage.inputs} == {
         ("clip", clip.item, 1, Kind.CLIP), ("skeleton", rig.item, 1, Kind.SKELETON),
     }  # fmt: skip
@@ -239,11 +239,13 @@ def test_what_was_made_from_something_that_changed_is_stale_through_any_number_o
     clip, _ = publish(lab, clip_draft(), rig_draft())
     steps = [clip]
     for step in range(3):
-        draft = Draft("o", Kind.STUDY, f"s{step}", {"study": {"step": step}}, sources={"in": [(steps[-1].item, 1)]})
+        draft = Draft(
+            "o", Kind.CHARACTER, f"s{step}", {"character": {"step": step}}, sources={"in": [(steps[-1].item, 1)]}
+        )
         steps += publish(lab, draft)
 
     def staleness() -> Staleness:
-        return lab.read(items.read_staleness, "lab", Kind.STUDY, steps[-1].item)
+        return lab.read(items.read_staleness, "lab", Kind.CHARACTER, steps[-1].item)
 
     assert not staleness().stale
     lab.write(items.put_part, "lab", Kind.CLIP, clip.item, "info", {"subject": "x"}, expected_rev=None)
@@ -257,7 +259,9 @@ def item_that_was_added_to(lab: Lab) -> tuple[Published, Published]:
     Returns both clips.
     """
     clip, _ = publish(lab, clip_draft(), rig_draft())
-    (step,) = publish(lab, Draft("s", Kind.STUDY, "step", {"study": {"n": 1}}, sources={"clips": [(clip.item, 1)]}))
+    (step,) = publish(
+        lab, Draft("s", Kind.CHARACTER, "step", {"character": {"n": 1}}, sources={"clips": [(clip.item, 1)]})
+    )
     made, _ = publish(lab, replace(clip_draft("made", seed=1), sources={"step": [(step.item, 1)]}), rig_draft())
     part = {"info": {"subject": "x"}}
     (added,) = publish(lab, Draft("a", Kind.CLIP, "made", part, "raw", sources={"clip": [(made.item, 1)]}))
@@ -282,11 +286,12 @@ def test_a_changed_input_is_told_through_what_was_added_to_an_item_later(lab: La
 def test_who_still_uses_an_earlier_revision_of_such_an_item_is_stale(lab: Lab) -> None:
     _, made = item_that_was_added_to(lab)
     users = [
-        Draft(f"u{n}", Kind.STUDY, f"user{n}", {"study": {"n": n}}, sources={"clip": [(made.item, n)]}) for n in (1, 2)
+        Draft(f"u{n}", Kind.CHARACTER, f"user{n}", {"character": {"n": n}}, sources={"clip": [(made.item, n)]})
+        for n in (1, 2)
     ]
     old, new = publish(lab, *users)
-    assert lab.read(items.read_staleness, "lab", Kind.STUDY, old.item).stale
-    assert not lab.read(items.read_staleness, "lab", Kind.STUDY, new.item).stale
+    assert lab.read(items.read_staleness, "lab", Kind.CHARACTER, old.item).stale
+    assert not lab.read(items.read_staleness, "lab", Kind.CHARACTER, new.item).stale
 
 
 def test_the_event_of_a_revision_names_it_and_its_place(lab: Lab) -> None:

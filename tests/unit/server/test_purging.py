@@ -62,7 +62,9 @@ class House:
 
     def add(self, name: str, content: object = 1, collection: str = "raw", **parts: Any) -> str:
         """Create a study, and return its id."""
-        draft = Draft("d", Kind.STUDY, name, parts or {"study": document(content=content, name=name)}, collection)
+        draft = Draft(
+            "d", Kind.CHARACTER, name, parts or {"character": document(content=content, name=name)}, collection
+        )
         return self.desk.publish(draft)[0].item
 
     def add_clips(self, *names: str) -> tuple[str, list[str]]:
@@ -100,7 +102,7 @@ class House:
         )
         return found
 
-    def deleted(self, kind: Kind = Kind.STUDY) -> set[str]:
+    def deleted(self, kind: Kind = Kind.CHARACTER) -> set[str]:
         page = self.read(items.list_items, "lab", kind, items.ItemFilters(deleted=True))
         return {one.id for one in page.items}
 
@@ -156,7 +158,7 @@ def test_a_purged_item_frees_the_bytes_that_nothing_else_needs(house: House) -> 
 
 
 def test_content_that_another_item_has_is_not_freed(house: House) -> None:
-    one, other = house.add("one", study=document(n=1)), house.add("other", study=document(n=1))
+    one, other = house.add("one", character=document(n=1)), house.add("other", character=document(n=1))
     house.delete(one)
     assert house.purge(item=one).freed_bytes == 0
     assert house.collect().documents == 0
@@ -171,15 +173,15 @@ def test_a_purged_item_is_neither_listed_nor_restored_nor_purged_again(house: Ho
     house.delete(one)
     house.purge(item=one)
     assert house.deleted() == set()
-    for act in (lambda: house.write(items.restore_item, "lab", Kind.STUDY, one), lambda: house.purge(item=one)):
+    for act in (lambda: house.write(items.restore_item, "lab", Kind.CHARACTER, one), lambda: house.purge(item=one)):
         with pytest.raises(GoneProblem, match=f"{one}.*was purged on 20.*nothing can restore it"):
             act()
     with pytest.raises(NotFoundProblem):
-        house.read(items.read_item, "lab", Kind.STUDY, one)
+        house.read(items.read_item, "lab", Kind.CHARACTER, one)
     with pytest.raises(NotFoundProblem):
-        house.read(items.read_revision, "lab", Kind.STUDY, one, 1)
+        house.read(items.read_revision, "lab", Kind.CHARACTER, one, 1)
     with pytest.raises(NotFoundProblem):
-        house.read(items.find_part, "lab", Kind.STUDY, one, "study", revision=1)
+        house.read(items.find_part, "lab", Kind.CHARACTER, one, "character", revision=1)
     assert house.purge(collection="").purged == ()
     assert house.add(NAME) != one
 
@@ -239,7 +241,7 @@ def test_a_step_is_limited_by_the_number_of_revisions_too(house: House, monkeypa
     monkeypatch.setattr(candidates, "MOST_REVISIONS", 3)
     one, other = house.add("one"), house.add("other")
     for number in (1, 2):
-        house.write(items.put_part, "lab", Kind.STUDY, one, "study", document(n=number), expected_rev=None)
+        house.write(items.put_part, "lab", Kind.CHARACTER, one, "character", document(n=number), expected_rev=None)
     house.delete(one, other)
     first = house.purge(collection="raw")
     assert [row.item for row in first.purged] == [other]
@@ -270,7 +272,7 @@ def test_a_version_of_a_dataset_holds_the_items_of_its_entries(house: House) -> 
     walk, run = house.add("walk"), house.add("run")
     house.gaits.change(PutEntry(path="walk", item=walk), PutEntry(path="run", item=run))
     house.write(datasets.create_ref, "lab", "gaits", RefCreate(name="v1", kind=RefKind.TAG, at="main"))
-    house.gaits.change(RemoveEntry(path="run", kind=Kind.STUDY))
+    house.gaits.change(RemoveEntry(path="run", kind=Kind.CHARACTER))
     house.delete(walk, run)
     held = DatasetHolder(dataset="gaits", branches=("main",), tags=("v1",), commits=2)
     assert house.holders(walk).holders == (held,)
@@ -286,7 +288,7 @@ def test_a_version_of_a_dataset_holds_the_items_of_its_entries(house: House) -> 
 def test_a_version_that_has_an_earlier_revision_holds_the_item(house: House) -> None:
     walk = house.add("walk")
     house.gaits.change(PutEntry(path="walk", item=walk))
-    house.write(items.put_part, "lab", Kind.STUDY, walk, "study", document(n=2), expected_rev=None)
+    house.write(items.put_part, "lab", Kind.CHARACTER, walk, "character", document(n=2), expected_rev=None)
     house.delete(walk)
     assert house.holders(walk).holders == (DatasetHolder(dataset="gaits", branches=("main",), commits=1),)
 
@@ -349,7 +351,7 @@ def test_what_a_held_item_refers_to_is_held_by_it(house: House) -> None:
 def test_at_most_some_holders_are_listed_and_the_others_are_counted(house: House) -> None:
     target = house.add("target")
     for number in range(25):
-        house.add(f"s{number:02}", study=document(n=number, of={"item": target, "revision": 1}))
+        house.add(f"s{number:02}", character=document(n=number, of={"item": target, "revision": 1}))
     house.delete(target)
     held = house.holders(target)
     assert (len(held.holders), held.others) == (20, 5)
@@ -362,7 +364,7 @@ def test_items_of_another_project_hold_nothing(house: House, desk: Desk) -> None
     desk.database.write(desk.user, store_projects.create_project, ProjectCreate(name="other"))
 
     def refer(tx: Transaction) -> None:
-        draft = Draft("d", Kind.STUDY, "s", {"study": document(of={"item": target, "revision": 1})})
+        draft = Draft("d", Kind.CHARACTER, "s", {"character": document(of={"item": target, "revision": 1})})
         items.publish(
             tx, store_projects.require(tx, "other"), [draft], author_id=tx.principal.user_id, rights=ALL_RIGHTS
         )
@@ -441,9 +443,9 @@ def test_lineage_and_jobs_stay_readable_and_say_that_an_item_was_purged(house: H
     house.delete(source)
     house.purge(item=source)
 
-    lineage = house.read(items.read_lineage, "lab", Kind.STUDY, result)
+    lineage = house.read(items.read_lineage, "lab", Kind.CHARACTER, result)
     assert [(one.item, one.name, one.purged, one.revision) for one in lineage.inputs] == [(source, "", True, 1)]
-    graph = house.read(items.read_lineage_graph, "lab", Kind.STUDY, result, LineageRequest())
+    graph = house.read(items.read_lineage_graph, "lab", Kind.CHARACTER, result, LineageRequest())
     start, other = graph.revisions
     assert (start.purged, other.item, other.path, other.purged, other.deleted) == (False, source, "", True, True)
     groups, _links = grouped(graph)
@@ -451,13 +453,13 @@ def test_lineage_and_jobs_stay_readable_and_say_that_an_item_was_purged(house: H
         ("results/result@1", []),
         (f"{source}@1", ["purged"]),
     ]
-    assert not house.read(items.read_staleness, "lab", Kind.STUDY, result).stale
+    assert not house.read(items.read_staleness, "lab", Kind.CHARACTER, result).stale
     for one in (job, failed):
-        pin = {"item": source, "revision": 1, "kind": "study", "name": "", "collection": "", "purged": True}
+        pin = {"item": source, "revision": 1, "kind": "character", "name": "", "collection": "", "purged": True}
         assert house.desk.job(one).inputs == {"things": [pin]}
     with pytest.raises(ConflictProblem, match=f"its input {source} was purged"):
         house.desk.database.write(house.desk.user, retrying.retry_job, failed)
-    with pytest.raises(InvalidProblem, match="There is no study"):
+    with pytest.raises(InvalidProblem, match="There is no character"):
         house.desk.submit("square", inputs={"things": ({"item": source},)})
 
     house.delete(result)
@@ -474,7 +476,7 @@ def test_the_name_of_a_purged_item_is_nowhere_in_the_database(house: House) -> N
     house.write(
         items.change_item,
         "lab",
-        Kind.STUDY,
+        Kind.CHARACTER,
         result,
         ItemChange(tags=("anna",), collection="of-anna"),
         expected_rev=None,
@@ -496,9 +498,9 @@ def test_the_purge_is_an_event_with_its_actor_and_earlier_events_lose_the_name(h
     found = house.events(one)
     assert [event.kind for event in found] == ["item.created", "item.deleted", "item.purged"]
     assert found[-1].actor == "ann"
-    assert found[-1].body == {"item_kind": "study"}
+    assert found[-1].body == {"item_kind": "character"}
     assert all("name" not in event.body and "collection" not in event.body for event in found)
-    assert found[0].body["item_kind"] == "study"
+    assert found[0].body["item_kind"] == "character"
 
 
 def test_the_record_of_an_export_without_consent_loses_the_path_too(house: House) -> None:
@@ -538,7 +540,7 @@ def test_a_purged_result_is_computed_again_and_not_taken_from_the_cache(house: H
     house.desk.complete(lease)
     (made,) = house.desk.outputs(third)
     assert made.item != result
-    assert house.read(items.read_item, "lab", Kind.STUDY, made.item).name == "result"
+    assert house.read(items.read_item, "lab", Kind.CHARACTER, made.item).name == "result"
     assert house.faults() == []
 
 
@@ -609,7 +611,7 @@ def test_a_purge_that_was_prepared_before_a_commit_sees_the_commit(house: House)
     request = PurgeRequest(item=walk)
     house.delete(walk)
     prepared = house.read(purging.prepare_purge, "lab", request)
-    house.write(items.restore_item, "lab", Kind.STUDY, walk)
+    house.write(items.restore_item, "lab", Kind.CHARACTER, walk)
     house.gaits.change(PutEntry(path="walk", item=walk))
     with pytest.raises(ConflictProblem, match="delete it first"):
         house.write(purging.record_purge, "lab", request, prepared)
@@ -624,7 +626,7 @@ def test_a_job_that_was_submitted_after_the_preparation_holds_its_input(house: H
     request = PurgeRequest(item=thing)
     house.delete(thing)
     prepared = house.read(purging.prepare_purge, "lab", request)
-    house.write(items.restore_item, "lab", Kind.STUDY, thing)
+    house.write(items.restore_item, "lab", Kind.CHARACTER, thing)
     house.desk.submit("square", inputs={"things": ({"item": thing},)})
     house.delete(thing)
     with pytest.raises(ConflictProblem, match="the queued job"):
@@ -636,14 +638,14 @@ def test_a_job_that_named_an_item_after_the_preparation_loses_its_name_too(house
     request = PurgeRequest(item=thing)
     house.delete(thing)
     prepared = house.read(purging.prepare_purge, "lab", request)
-    house.write(items.restore_item, "lab", Kind.STUDY, thing)
+    house.write(items.restore_item, "lab", Kind.CHARACTER, thing)
     job, result = run(house.desk, thing, "result")
     house.delete(thing)
     house.write(purging.record_purge, "lab", request, prepared)
     assert house.desk.job(job).inputs["things"][0]["purged"]
     house.collect()
     assert NAME not in texts_of_database(house)
-    assert house.read(items.read_item, "lab", Kind.STUDY, result).name == "result"
+    assert house.read(items.read_item, "lab", Kind.CHARACTER, result).name == "result"
     assert house.faults() == []
 
 
@@ -704,7 +706,7 @@ def test_chunks_are_read_once_however_many_versions_share_them(house: House, mon
     many = [house.add(f"s{n}", n) for n in range(200)]
     house.gaits.change(*(PutEntry(path=f"folder-{n:03}/entry", item=one) for n, one in enumerate(many)))
     for number in range(5):
-        house.gaits.change(RemoveEntry(path=f"folder-{number:03}/entry", kind=Kind.STUDY))
+        house.gaits.change(RemoveEntry(path=f"folder-{number:03}/entry", kind=Kind.CHARACTER))
     house.delete(many[0])
     read: list[str] = []
 
@@ -720,7 +722,7 @@ def test_chunks_are_read_once_however_many_versions_share_them(house: House, mon
 def test_blobs_of_jobs_are_not_counted_as_freed(house: House) -> None:
     data = b"x" * 5000
     house.write(blobs.put_blob, data)
-    one = house.add("one", study=document(blob=digest_of(data)))
+    one = house.add("one", character=document(blob=digest_of(data)))
     job = house.desk.submit("errand")
     house.write(blobs.keep_for_job, job, [digest_of(data)])
     house.delete(one)

@@ -27,7 +27,7 @@ from marey_server.store.transaction import Transaction
 
 
 def add(desk: Desk, name: str, content: object = 1) -> str:
-    draft = Draft("d", Kind.STUDY, name, {"study": document(content=content, name=name)}, "raw")
+    draft = Draft("d", Kind.CHARACTER, name, {"character": document(content=content, name=name)}, "raw")
     return desk.publish(draft)[0].item
 
 
@@ -89,7 +89,7 @@ def test_a_purged_dataset_leaves_no_version_branch_tag_or_proposal(gaits: Commit
     gaits.desk.database.write(SYSTEM, events.number_events)
     found = gaits.read(events.list_events, "lab", after=0, subject=dataset_id, limit=100).items
     assert (found[-1].kind, found[-1].actor) == ("dataset.purged", "ann")
-    assert gaits.read(items.read_item, "lab", Kind.STUDY, walk).name == "walk"
+    assert gaits.read(items.read_item, "lab", Kind.CHARACTER, walk).name == "walk"
     assert sound(gaits)
 
 
@@ -97,7 +97,7 @@ def test_items_that_only_its_versions_held_can_be_purged_afterwards(gaits: Commi
     walk = add(gaits.desk, "walk")
     gaits.change(PutEntry(path="walk", item=walk))
     delete_gaits(gaits)
-    gaits.write(items.delete_item, "lab", Kind.STUDY, walk, expected_rev=None)
+    gaits.write(items.delete_item, "lab", Kind.CHARACTER, walk, expected_rev=None)
     with pytest.raises(ConflictProblem, match="the deleted dataset gaits"):
         purge_item(gaits, walk)
     purge(gaits)
@@ -109,7 +109,7 @@ def test_an_item_is_purged_whose_dataset_was_purged_since_the_preparation(gaits:
     walk = add(gaits.desk, "walk")
     gaits.change(PutEntry(path="walk", item=walk))
     delete_gaits(gaits)
-    gaits.write(items.delete_item, "lab", Kind.STUDY, walk, expected_rev=None)
+    gaits.write(items.delete_item, "lab", Kind.CHARACTER, walk, expected_rev=None)
     request = PurgeRequest(item=walk)
     prepared = gaits.read(purging.prepare_purge, "lab", request)
     purge(gaits)
@@ -127,12 +127,12 @@ def test_an_item_that_a_job_made_from_a_version_holds_the_dataset(gaits: Committ
     assert preview(gaits).holders == (waiting,)
     gaits.work("square")
     (made,) = gaits.desk.outputs(job)
-    holder = ItemHolder(item=made.item, kind=Kind.STUDY, path="made/square")
-    with pytest.raises(ConflictProblem, match=r"cited by the study made/square") as raised:
+    holder = ItemHolder(item=made.item, kind=Kind.CHARACTER, path="made/square")
+    with pytest.raises(ConflictProblem, match=r"cited by the character made/square") as raised:
         purge(gaits)
     assert raised.value.error_code == "still-held"
     assert DatasetPurgeAnswer.model_validate(raised.value.context).holders == (holder,)
-    gaits.write(items.delete_item, "lab", Kind.STUDY, made.item, expected_rev=None)
+    gaits.write(items.delete_item, "lab", Kind.CHARACTER, made.item, expected_rev=None)
     assert preview(gaits).holders == (holder.model_copy(update={"deleted": True}),)
     purge_item(gaits, made.item)
     assert purge(gaits).holders == ()

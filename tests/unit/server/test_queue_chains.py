@@ -83,7 +83,7 @@ def test_a_job_can_only_come_after_jobs_of_its_project(desk: Desk) -> None:
 def test_inputs_are_pinned_to_the_revisions_of_the_moment(desk: Desk) -> None:
     (thing,) = desk.things(1)
     job = desk.submit("square", inputs={"things": {"item": thing}})
-    desk.publish(Draft("again", Kind.STUDY, "thing0", {"study": document(number=77)}, "raw"))
+    desk.publish(Draft("again", Kind.CHARACTER, "thing0", {"character": document(number=77)}, "raw"))
     newer = desk.submit("square", inputs={"things": {"item": thing}})
     older = desk.submit("square", inputs={"things": [{"item": thing, "revision": 1}]}, seed=5)
     revisions = {lease.job: lease.inputs["things"][0].revision for lease in desk.claim_many()}
@@ -295,7 +295,7 @@ def test_a_task_cancelled_before_its_job_begins_is_not_waited_for(desk: Desk) ->
 
 
 def a_survey(desk: Desk, tasks: int = 3, **fields: Any) -> str:
-    if not desk.database.read(desk.user, items.list_items, "lab", Kind.STUDY).items:
+    if not desk.database.read(desk.user, items.list_items, "lab", Kind.CHARACTER).items:
         desk.things(2)
     return desk.submit("survey", inputs={"things": {"collection": "raw"}}, params={"number": tasks}, **fields)
 
@@ -333,7 +333,7 @@ def test_when_all_tasks_have_succeeded_a_worker_gathers_what_they_brought(desk: 
     desk.complete(gathering, result={"verdict": "fine"})
     assert (desk.state(job), desk.job(job).result) == ("succeeded", {"verdict": "fine", "outputs": 1})
     (made,) = desk.outputs(job)
-    lineage = desk.database.read(desk.user, items.read_lineage, "lab", Kind.STUDY, made.item)
+    lineage = desk.database.read(desk.user, items.read_lineage, "lab", Kind.CHARACTER, made.item)
     assert sorted(edge.name for edge in lineage.inputs) == ["thing0", "thing1"]
 
 
@@ -561,7 +561,7 @@ def test_a_changed_input_or_a_new_version_of_the_kind_is_computed_again(
     desk.submit("square", inputs=inputs)
     desk.complete(desk.claim())
     assert desk.state(desk.submit("square", inputs=inputs)) == "succeeded"
-    desk.publish(Draft("again", Kind.STUDY, "thing0", {"study": document(number=77)}, "raw"))
+    desk.publish(Draft("again", Kind.CHARACTER, "thing0", {"character": document(number=77)}, "raw"))
     assert desk.state(desk.submit("square", inputs=inputs)) == "queued"
 
     desk.submit("sum")
@@ -573,7 +573,7 @@ def test_a_changed_input_or_a_new_version_of_the_kind_is_computed_again(
 
 def test_results_know_exactly_which_revisions_they_were_made_from(desk: Desk) -> None:
     (thing,) = desk.things(1)
-    desk.publish(Draft("again", Kind.STUDY, "thing0", {"study": document(number=77)}, "raw"))
+    desk.publish(Draft("again", Kind.CHARACTER, "thing0", {"character": document(number=77)}, "raw"))
     both: Any = {"things": [{"item": thing, "revision": 1}, {"item": thing, "revision": 2}]}
     desk.submit("square", inputs=both)
     lease = desk.claim()
@@ -590,7 +590,7 @@ def test_results_know_exactly_which_revisions_they_were_made_from(desk: Desk) ->
             one.name: [
                 edge.revision
                 for edge in desk.database.read(
-                    desk.user, items.read_lineage, "lab", Kind.STUDY, one.item, revision_number=one.revision
+                    desk.user, items.read_lineage, "lab", Kind.CHARACTER, one.item, revision_number=one.revision
                 ).inputs
             ]
             for one in desk.outputs(job)
@@ -645,7 +645,7 @@ def test_a_result_whose_documents_are_gone_is_computed_again(desk: Desk) -> None
 
     def forget(tx: Transaction) -> None:
         draft = tx.execute(select(staged_output.c.draft)).scalar_one()
-        tx.execute(update(staged_output).values(draft=draft | {"parts": {"study": f"sha256:{'0' * 64}"}}))
+        tx.execute(update(staged_output).values(draft=draft | {"parts": {"character": f"sha256:{'0' * 64}"}}))
 
     desk.database.write(SYSTEM, forget)
     assert desk.state(desk.submit("sum")) == "queued"

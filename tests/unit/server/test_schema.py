@@ -198,7 +198,7 @@ def test_an_upgrade_records_many_items_of_jobs_in_portions(desk: Desk, database_
 
 def test_an_upgrade_keeps_commits_with_their_parents_and_events(gaits: CommittingDesk, database_url: str) -> None:
     database = gaits.desk.database
-    draft = Draft("d", Kind.STUDY, "walk", {"study": document(content=1, name="walk")}, "raw")
+    draft = Draft("d", Kind.CHARACTER, "walk", {"character": document(content=1, name="walk")}, "raw")
     walk = gaits.desk.publish(draft)[0].item
     for number in range(4):
         gaits.change(PutEntry(path=f"walk {number}", item=walk))

@@ -21,7 +21,7 @@ from marey_server.store.transaction import Transaction
 
 
 def add_version(gaits: CommittingDesk, name: str = "walk") -> None:
-    draft = Draft("d", Kind.STUDY, name, {"study": document(name=name)}, "raw")
+    draft = Draft("d", Kind.CHARACTER, name, {"character": document(name=name)}, "raw")
     gaits.change(PutEntry(path=name, item=gaits.desk.publish(draft)[0].item))
 
 
@@ -59,8 +59,8 @@ def test_a_tag_stays_while_a_job_or_its_result_cites_the_version(gaits: Committi
         delete(gaits, "v1")
     delete(gaits, "trial")  # a branch at the same version
     assert refs(gaits) == {"main", "v1"}
-    (made,) = gaits.read(items.list_items, "lab", Kind.STUDY, items.ItemFilters(collection="made")).items
-    gaits.write(items.delete_item, "lab", Kind.STUDY, made.id, expected_rev=None)
+    (made,) = gaits.read(items.list_items, "lab", Kind.CHARACTER, items.ItemFilters(collection="made")).items
+    gaits.write(items.delete_item, "lab", Kind.CHARACTER, made.id, expected_rev=None)
     request = PurgeRequest(item=made.id)
     gaits.write(purging.record_purge, "lab", request, gaits.read(purging.prepare_purge, "lab", request))
     delete(gaits, "v1")

@@ -181,7 +181,7 @@ def test_of_jobs_whose_shared_result_was_deleted_one_computes_and_the_others_wai
     lease = desk.claim()
     desk.stage(lease, "total")
     desk.complete(lease)
-    change_drafts(desk, parts={"study": f"sha256:{'0' * 64}"})
+    change_drafts(desk, parts={"character": f"sha256:{'0' * 64}"})
     share_rest(desk)
     assert states(desk, waiting) == {"succeeded": SHARED_AT_ONCE, "queued": 1, "waiting": 2}
     assert states(desk, [submit(desk, into="new")]) == {"waiting": 1}

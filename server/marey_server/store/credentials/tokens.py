@@ -37,6 +37,7 @@ from marey_server.store.ids import new_id
 from marey_server.store.jobs.claiming.rights import resolve_pod_token
 from marey_server.store.jobs.fencing import AUTHOR_MAY_RUN, RUNNING, lease_lost
 from marey_server.store.quotas.counting import require_room
+from marey_server.store.studies.participants import resolve_participant
 from marey_server.store.tables import attempt, job, token, user
 from marey_server.store.transaction import Transaction
 
@@ -90,8 +91,8 @@ def resolve_token(tx: Transaction, text: str) -> Principal:
         return _resolve_attempt(tx, secret)
     if (parts := split_user_token(text)) is not None:
         return _resolve_user(tx, *parts)
-    if (pod := resolve_pod_token(tx, text)) is not None:
-        return pod
+    if (other := resolve_pod_token(tx, text) or resolve_participant(tx, text)) is not None:
+        return other
     raise unknown_token()
 
 

@@ -107,6 +107,9 @@ class ReferenceCheck:
             self._require_frames(bodies["annotation"])
         elif kind is Kind.GRAPH:
             self._require_models(bodies["graph"])
+        elif kind is Kind.STUDY:
+            for number, motion in enumerate(bodies["study"]["motions"]):
+                self._referred(motion["clip"], Kind.CLIP, "motion", f"/study/motions/{number}/clip")
 
     def _require_joints(self, motion: Tree, pointer: str) -> None:
         hierarchy = self._referred(motion["skeleton"], Kind.SKELETON, "hierarchy", f"{pointer}/skeleton")

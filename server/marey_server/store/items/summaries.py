@@ -39,6 +39,9 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
         return _moved(bodies["motion"], {"warnings": warnings, **take_record(info)})
     if kind is Kind.PROCESSED:
         return _moved(bodies["motion"], _aligned(bodies["info"]))
+    if kind is Kind.STUDY:
+        study = bodies["study"]
+        return Summary({"title": study["title"], "motions": len(study["motions"])})
     return Summary({})
 
 

@@ -16,6 +16,7 @@ from marey_schemas.kinds import Kind
 from marey_server.store import collections, events
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purging.job_records import forget_in_jobs
+from marey_server.store.studies.participants import forget_studies
 from marey_server.store.tables import (
     blob,
     collection,
@@ -39,6 +40,7 @@ def erase(tx: Transaction, project_row: ProjectRow, rows: Sequence[Row[Any]], jo
     """Erase deleted items, and record an event for each; `jobs` are the jobs that name one of them."""
     ids = [row.id for row in rows]
     forget_in_jobs(tx, frozenset(ids), jobs)
+    forget_studies(tx, ids)
     events.forget_names(tx, ids, "name", "collection")
     events.forget_clips(tx, project_row.id, frozenset(ids))
     tx.execute(update(schedule).where(schedule.c.project_id == project_row.id).values(problem=None))

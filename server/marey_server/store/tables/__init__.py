@@ -67,6 +67,7 @@ from marey_server.store.tables.serving import (
     webhook,
     webhook_delivery,
 )
+from marey_server.store.tables.studies import study_participant, study_trial
 
 __all__ = [
     "HAS_LONG_LOG",
@@ -126,6 +127,8 @@ __all__ = [
     "server_state",
     "sign_in_limit",
     "staged_output",
+    "study_participant",
+    "study_trial",
     "token",
     "tree_chunk",
     "upload",

@@ -1,0 +1,1 @@
+"""Commands `study`, which carry out perceptual studies."""

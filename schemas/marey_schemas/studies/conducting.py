@@ -1,0 +1,86 @@
+"""Requests of those who carry out a study, and the answers to them: links, progress and judgements."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Literal
+
+from pydantic import Field
+
+from marey_schemas.base import Answer, Request
+from marey_schemas.sizes import DAY_S
+
+MOST_LINKS_AT_ONCE = 100
+MOST_LINK_DAYS = 180
+MOST_JUDGES_AT_ONCE = 50
+"""Greatest number of participants whose judgements one answer contains."""
+
+ParticipantState = Literal["invited", "started", "finished", "withdrawn"]
+
+
+class StudyLinksCreate(Request):
+    """Request for links, each for one participant."""
+
+    count: int = Field(1, ge=1, le=MOST_LINKS_AT_ONCE, description="Number of links.")
+    expires_in_s: int = Field(
+        30 * DAY_S, ge=60, le=MOST_LINK_DAYS * DAY_S, description="Seconds within which a participant can begin."
+    )
+
+
+class NewStudyLink(Answer):
+    """Link for one participant; its code is shown only once."""
+
+    participant: str = Field(description="Pseudonym of the participant, such as p1.")
+    code: str = Field(description="Code of the link, which follows the address of the server and `/s/#`.")
+
+
+class NewStudyLinks(Answer):
+    """New links of a study."""
+
+    revision: int = Field(description="Revision of the study that these participants see.")
+    expires_at: datetime
+    links: tuple[NewStudyLink, ...]
+
+
+class StudyParticipant(Answer):
+    """A participant, under a pseudonym."""
+
+    id: str
+    participant: str = Field(description="Pseudonym, such as p1.")
+    revision: int = Field(description="Revision of the study that the participant sees.")
+    state: ParticipantState
+    answered: int
+    timeouts: int
+    expires_at: datetime | None = Field(description="End of the link; null once the participant has begun.")
+
+
+class StudyProgress(Answer):
+    """Numbers of participants and trials, over all revisions of a study."""
+
+    invited: int = Field(description="Links that nobody has used yet and that have not expired.")
+    started: int
+    finished: int
+    withdrawn: int
+    answered: int = Field(description="Number of answered trials.")
+    timeouts: int
+
+
+class JudgedTrial(Answer):
+    """A trial that was answered or timed out."""
+
+    index: int = Field(description="Number of trials that the participant had answered before.")
+    number: int = Field(description="Number of the trial among all that were shown to the participant, from 1.")
+    shown: tuple[int, ...] = Field(description="Motions by place on the screen: indices into the motions of the study.")
+    chosen: tuple[int, int] | None = Field(description="Places of the chosen motions; null for a timeout.")
+    latency_s: float | None = Field(description="Time until the answer, by the clock of the server.")
+    timeouts_before: int = Field(description="Number of timeouts since the last answer.")
+    seed: int
+    client_fps: float | None
+
+
+class JudgingParticipant(Answer):
+    """The trials of one participant."""
+
+    participant: str = Field(description="Pseudonym, such as p1.")
+    finished: bool
+    trials: tuple[JudgedTrial, ...]

@@ -1,0 +1,1 @@
+"""Resources of perceptual studies: for their participants, and for those who carry them out."""

@@ -1,0 +1,140 @@
+"""Resources for those who carry out a study: links, participants, progress and judgements."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from marey_schemas.studies.conducting import (
+    MOST_JUDGES_AT_ONCE,
+    JudgingParticipant,
+    NewStudyLinks,
+    StudyLinksCreate,
+    StudyParticipant,
+    StudyProgress,
+)
+from marey_server.handlers.items import kind_of
+from marey_server.http.caching import WITH_SECRET
+from marey_server.http.declarations import Access, reads, writes
+from marey_server.http.queries import MAX_INTEGER, PageQuery
+from marey_server.http.reply import Rendered, Reply
+from marey_server.http.resource import Resource
+from marey_server.motions.drawing_trials import draw_plans
+from marey_server.store.studies import conducting, judgements
+
+TAG = "Studies"
+
+
+class JudgementsQuery(PageQuery):
+    """Query parameters that select one page of participants of one revision of a study."""
+
+    revision: int = Field(ge=1, le=MAX_INTEGER, description="Revision of the study that the participants saw.")
+    limit: int = Field(
+        MOST_JUDGES_AT_ONCE, ge=1, le=MOST_JUDGES_AT_ONCE, description="Greatest number of participants in a page."
+    )
+
+
+class StudyParticipants(Resource):
+    """Participants of a study, and links for further ones."""
+
+    path = "/projects/{project}/{kind}/{item}/participants"
+    tag = TAG
+
+    @reads(access=Access.MAINTAINER, query=PageQuery, answer=StudyParticipant, paged=True, public=False)
+    async def get(self, project: str, kind: str, item: str, query: PageQuery) -> Rendered:
+        """List the participants of a study (kind `studies`) under pseudonyms, without the codes of their links."""
+        return await self.answer(
+            conducting.list_participants, project, kind_of(kind), item, cursor=query.cursor, limit=query.limit
+        )
+
+    @writes(access=Access.MAINTAINER, body=StudyLinksCreate, answer=NewStudyLinks, status=201)
+    async def post(self, project: str, kind: str, item: str, body: StudyLinksCreate) -> Rendered:
+        """Create links, each for one participant without an account; the codes are shown only once.
+
+        The participants see the newest revision of the study. Their trials are drawn from its seed, such that every
+        participant sees every motion equally often, and that pairs of motions are balanced over participants.
+        """
+        planned = await self.look_up(conducting.plan_links, project, kind_of(kind), item, body)
+        plans = await self.compute(draw_plans, planned, body.count)
+        return await self.answer_with(
+            lambda made: Reply(made, headers=WITH_SECRET),
+            conducting.create_links,
+            project,
+            kind_of(kind),
+            item,
+            body,
+            planned,
+            plans,
+        )
+
+
+class OneStudyParticipant(Resource):
+    """A participant of a study."""
+
+    path = "/projects/{project}/{kind}/{item}/participants/{participant}"
+    tag = TAG
+
+    @writes(access=Access.MAINTAINER)
+    async def delete(self, project: str, kind: str, item: str, participant: str) -> Rendered:
+        """Delete what is stored about a participant, named by id; the link is not valid any more."""
+        return await self.answer(conducting.withdraw_participant, project, kind_of(kind), item, participant)
+
+
+class StudyProgressResource(Resource):
+    """Progress of a study."""
+
+    path = "/projects/{project}/{kind}/{item}/progress"
+    tag = TAG
+
+    @reads(access=Access.READER, answer=StudyProgress)
+    async def get(self, project: str, kind: str, item: str) -> Rendered:
+        """Return numbers of participants and trials of a study, without anything about single participants."""
+        return await self.answer(conducting.read_progress, project, kind_of(kind), item)
+
+
+class StudyJudgementsResource(Resource):
+    """Judgements of a study's participants."""
+
+    path = "/projects/{project}/{kind}/{item}/judgements"
+    tag = TAG
+
+    @reads(access=Access.MAINTAINER, query=JudgementsQuery, answer=JudgingParticipant, paged=True, public=False)
+    async def get(self, project: str, kind: str, item: str, query: JudgementsQuery) -> Rendered:
+        """List what the participants who saw a revision of a study answered, under pseudonyms and without dates."""
+        return await self.answer(
+            judgements.list_judgements,
+            project,
+            kind_of(kind),
+            item,
+            revision=query.revision,
+            cursor=query.cursor,
+            limit=query.limit,
+        )
+
+
+class AttemptJudgements(Resource):
+    """Judgements of a study that is the input of a job."""
+
+    path = "/jobs/{job}/attempts/{fence:int}/judgements/{item}"
+    tag = "Work"
+
+    @reads(access=Access.ATTEMPT, scope=None, query=JudgementsQuery, answer=JudgingParticipant, paged=True)
+    async def get(self, job: str, fence: int, item: str, query: JudgementsQuery) -> Rendered:
+        """List what participants of a study answered, for an attempt of a job whose author is a maintainer."""
+        return await self.answer(
+            judgements.list_for_attempt,
+            job,
+            fence,
+            item,
+            revision=query.revision,
+            cursor=query.cursor,
+            limit=query.limit,
+        )
+
+
+RESOURCES: tuple[type[Resource], ...] = (
+    StudyParticipants,
+    OneStudyParticipant,
+    StudyProgressResource,
+    StudyJudgementsResource,
+    AttemptJudgements,
+)

@@ -1,0 +1,1 @@
+"""Perceptual studies: links, participants, their trials, and their judgements."""
