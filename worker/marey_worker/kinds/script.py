@@ -39,6 +39,10 @@ NOT_ISOLATED = (
     "this system allows no namespaces with mounts, so that the script could change modes and times of files of the "
     "worker's user"
 )
+NOT_BOUNDED = (
+    "the kernel of this system does not limit the number of the script's processes, which only its guard counts; run "
+    "the worker as an ordinary user, and allow namespaces"
+)
 GUARD_MODULE = "marey_worker.scripts.guard"
 
 
@@ -120,8 +124,7 @@ def _run_guarded(order: GuardedCommand) -> CommandEnd:
 
 def _words_of(end: CommandEnd) -> str:
     how = f"exit status {end.status}" if end.stopped is None else f"stopped: {end.stopped}"
-    missing = "" if end.isolated else f"; {NOT_ISOLATED}"
-    return f"{how}{missing}"
+    return "; ".join([how, *([] if end.isolated else [NOT_ISOLATED]), *([] if end.bounded else [NOT_BOUNDED])])
 
 
 def _failure(end: CommandEnd) -> str:
