@@ -63,7 +63,7 @@ class GuardedCommand:
 class CommandEnd:
     """End of a command: its exit status (128 plus the number of a signal), or the reason why it was stopped.
 
-    `isolated` tells whether it had namespaces of its own, and `bounded` whether the kernel limited its processes.
+    `isolated` states whether it had namespaces of its own, and `bounded` whether the kernel limited its processes.
     """
 
     status: int | None
