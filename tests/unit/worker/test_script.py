@@ -17,7 +17,9 @@ import numpy as np
 import psutil
 import pytest
 from tests.support.project_in_memory import ProjectInMemory, add_clip
+from typer.testing import CliRunner
 
+from marey_client.cli.app import app
 from marey_motion import read_motion
 from marey_motion.gait import generate_gait
 from marey_schemas.consents import CONSENT_EXPIRED
@@ -216,6 +218,18 @@ def test_the_kernel_stops_a_fork_bomb_before_the_guard_counts(tmp_path: Path, *,
     assert (end.isolated, end.bounded) == (namespaces, namespaces or os.geteuid() == 0)
     assert end.stopped == "it had more than 16 processes at the same time"
     assert not end.bounded or 16 < int(end.tail) < 16 * THREADS_PER_PROCESS
+
+
+def test_doctor_says_how_far_a_machine_confines_scripts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(REPOSITORIES_VARIABLE, "[]")
+    command = ["doctor", "--no-local", "--no-remote"]
+    told = CliRunner().invoke(app, command)
+    assert (told.exit_code, told.stdout) == (0, "ok       scripts: confined, with all limits\n")
+    end = CommandEnd(0, None, "", isolated=True, bounded=False)
+    monkeypatch.setattr(script, "_run_guarded", lambda order: end)
+    assert f"warning  scripts: {script.NOT_BOUNDED}" in CliRunner().invoke(app, command).stdout
+    monkeypatch.setattr(script, "landlock_version", lambda: 0)
+    assert CliRunner().invoke(app, command).exit_code == 1
 
 
 @pytest.mark.parametrize("what", HOSTILE)

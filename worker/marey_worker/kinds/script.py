@@ -22,7 +22,7 @@ from marey_schemas.options.imports import ImportOptions
 from marey_schemas.processes.environment import clean_environment, thread_limits
 from marey_schemas.queue.comparisons import Curves
 from marey_schemas.queue.own_pods import IMAGE_VARIABLE
-from marey_schemas.queue.scripts import PYTHON, ScriptDeclaration, ScriptParams
+from marey_schemas.queue.scripts import PYTHON, ScriptDeclaration, ScriptLimits, ScriptParams
 from marey_schemas.queue.worker_protocol import StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.staged_results import StagedResults
@@ -72,6 +72,19 @@ def run(context: Context, params: ScriptParams) -> dict[str, Any]:
         raise JobRefused("script-failed" if end.stopped is None else "script-limit", _failure(end))
     context.progress(2, 3, "storing the results")
     return {"script": params.script, **_publish(context, params, declared, folder), "consent_ended": ended}
+
+
+def examine() -> tuple[str, str, str]:
+    """Run a command that does nothing as a script; return a check, its state (ok, warning or fault) and a detail."""
+    if landlock_version() == 0:
+        return "scripts", "fault", "this machine cannot confine scripts: they need Linux 5.13 with Landlock"
+    with tempfile.TemporaryDirectory(prefix="marey-doctor-") as folder:
+        limits = ScriptLimits().model_dump()
+        end = _run_guarded(GuardedCommand((sys.executable, "-c", "pass"), folder, {}, **limits))
+    if end.status != 0:
+        return "scripts", "fault", _failure(end)
+    missing = _missing(end)
+    return "scripts", "warning" if missing else "ok", "; ".join(missing) or "confined, with all limits"
 
 
 def _require_program(declared: ScriptDeclaration, code: Path) -> None:
@@ -124,7 +137,12 @@ def _run_guarded(order: GuardedCommand) -> CommandEnd:
 
 def _words_of(end: CommandEnd) -> str:
     how = f"exit status {end.status}" if end.stopped is None else f"stopped: {end.stopped}"
-    return "; ".join([how, *([] if end.isolated else [NOT_ISOLATED]), *([] if end.bounded else [NOT_BOUNDED])])
+    return "; ".join([how, *_missing(end)])
+
+
+def _missing(end: CommandEnd) -> list[str]:
+    """Return in words what this system did not limit."""
+    return [*([] if end.isolated else [NOT_ISOLATED]), *([] if end.bounded else [NOT_BOUNDED])]
 
 
 def _failure(end: CommandEnd) -> str:
