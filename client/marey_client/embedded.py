@@ -47,6 +47,12 @@ def examine(*, data: Path | None, database_url: str | None) -> list[tuple[str, s
     return found
 
 
+def examine_scripts() -> tuple[str, str, str]:
+    """Check how far this machine confines scripts; return the name of the check, its state and a detail."""
+    found: tuple[str, str, str] = room("marey_worker.kinds.script", "worker").examine()
+    return found
+
+
 def compute_capacity(**amounts: Any) -> dict[str, Any]:
     """Return what an amount of work needs, and the measured costs from which this is computed."""
     answers = room("marey_server.capacity.answers", "server")

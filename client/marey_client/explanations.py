@@ -82,6 +82,9 @@ def _why_queued(
     job: Job, running: list[Job], now: datetime, workers: list[Worker] | None, limit: RunningJobs | None
 ) -> str:
     wait_s = (job.run_at - now).total_seconds()
+    refused = job.progress.note if OWN_POD_LABEL in job.labels and job.progress is not None else ""
+    if wait_s > 0 and refused:
+        return f"queued: {refused}. The server starts its next pod in {wait_s:.0f} s at the earliest."
     if wait_s > 0:
         return (
             f"queued: the next attempt starts in {wait_s:.0f} s at the earliest, after attempt {job.attempt} of "
@@ -101,6 +104,7 @@ def _why_queued(
         return (
             f"queued: it runs in a pod of its own, {_why_own_pod(job)}. The server starts this pod in its cluster; "
             "other workers never claim the job. If no pod starts, the log of the server says why."
+            + (f" Earlier, {refused}." if refused else "")
         )
     shown = " ".join(f"{name}={value}" for name, value in sorted(job.labels.items()))
     wanted = f"jobs of the kind {job.kind}" + (f" and has the labels {shown}" if shown else "")

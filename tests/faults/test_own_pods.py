@@ -6,6 +6,7 @@ The dispatcher runs in this process; the tests claim and complete jobs as pods d
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from marey_schemas.queue.scripts import ScriptCreate, ScriptRunCreate
 from marey_schemas.queue.worker_protocol import Lease
 from marey_server.errors import LeaseLostProblem
 from marey_server.launchers.kubernetes import view
+from marey_server.launchers.kubernetes.cluster import Cluster
 from marey_server.launchers.kubernetes.worker_jobs import WorkerJobs
 from marey_server.launchers.launcher import EngineError
 from marey_server.store.jobs import fencing
@@ -189,6 +191,51 @@ def test_jobs_whose_images_are_no_longer_allowed_keep_no_other_job_waiting(bench
     for _ in range(4):
         bench.round()
     assert bench.jobs() == [name_of(job, 1)]
+
+
+def test_jobs_that_no_node_can_run_give_their_places_to_others(bench: DispatchBench, cluster: StubCluster) -> None:
+    cluster.kubelet.images.clear()
+    bench.open(most=1, patience_s=100)
+    stuck = bench.desk.submit("sum", resources=LARGE)
+    bench.rounds_until(bench.jobs)
+    other = bench.desk.submit("sum", params={"number": 2}, resources=LARGE)
+    bench.rounds_until(lambda: name_of(other, 1) in bench.jobs(), step_s=20)
+    assert name_of(stuck, 1) not in bench.jobs()
+    told = bench.desk.job(stuck).progress
+    assert told is not None
+    assert "no node ran the pod within 100 s" in told.note
+    assert "ErrImagePull" in told.note
+    cluster.kubelet.images[IMAGE] = WAITS
+    bench.rounds_until(bench.pods)
+    bench.desk.complete(bench.claim(other)[0])
+    bench.desk.clock.advance(101)
+    bench.rounds_until(lambda: name_of(stuck, 1) in bench.jobs(), step_s=1)
+
+
+def test_a_job_whose_pod_the_cluster_refuses_keeps_no_other_job_waiting(
+    bench: DispatchBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = bench.desk.submit("sum", resources=LARGE)
+    second = bench.desk.submit("sum", params={"number": 2}, resources=LARGE)
+    real = Cluster.create_job
+
+    async def create_job(cluster: Cluster, job: dict[str, Any]) -> dict[str, Any]:
+        if job["metadata"]["name"] == name_of(first, 1):
+            job = deepcopy(job)
+            job["spec"]["template"]["spec"]["restartPolicy"] = "Always"
+        return await real(cluster, job)
+
+    monkeypatch.setattr(Cluster, "create_job", create_job)
+    bench.round()
+    bench.round()
+    assert bench.jobs() == [name_of(second, 1)]
+    told = bench.desk.job(first).progress
+    assert told is not None
+    assert "the cluster refused the pod: the cluster answers 4" in told.note
+    monkeypatch.undo()
+    bench.desk.clock.advance(61)
+    bench.round()
+    assert bench.jobs() == sorted([name_of(first, 1), name_of(second, 1)])
 
 
 def test_a_server_that_dies_before_it_has_created_the_token_is_replaced(

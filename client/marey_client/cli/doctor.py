@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Annotated
 
@@ -49,11 +50,12 @@ def doctor(
     ] = 8,
     as_json: AsJson = False,
 ) -> None:
-    """Check settings, clock, disk, data folder, database, kernels, the running server, and its workers.
+    """Check settings, clock, disk, data folder, database, kernels, scripts, the running server, and its workers.
 
     Prints one line for each check: ok, warning or fault, and what to do. The exit status is 1 if there are faults. On a
     machine without a server's data folder, use --no-local; while the server is stopped, use --no-remote. Only the token
-    of an administrator shows workers and the reason why a server is not ready.
+    of an administrator shows workers and the reason why a server is not ready. Where MAREY_SCRIPT_REPOSITORIES is set,
+    the command also checks how far this machine confines scripts.
 
     With --chaos, the command creates a project, of which you are the owner, starts workers for this project only, kills
     and pauses them, loses answers, and repeats requests with wrong times. Then it checks that each job has exactly one
@@ -70,6 +72,7 @@ def doctor(
         from marey_client import embedded
 
         findings += embedded.examine(data=data, database_url=database_url)
+    findings += _check_scripts()
     if remote:
         from marey_client.marey import Marey
         from marey_client.retries import ONCE
@@ -78,6 +81,14 @@ def doctor(
         with Marey(credential.url, credential.bearer, retries=ONCE, timeout_s=10.0) as marey:
             findings += check_server(marey)
     return _print(findings, as_json)
+
+
+def _check_scripts() -> list[Finding]:
+    """Return how far this machine confines scripts, if its workers run any."""
+    from marey_client import embedded
+    from marey_schemas.queue.scripts import REPOSITORIES_VARIABLE
+
+    return [embedded.examine_scripts()] if REPOSITORIES_VARIABLE in os.environ else []
 
 
 def _print(findings: list[Finding], as_json: bool) -> None:

@@ -73,6 +73,15 @@ class OwnPods(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     most: int = Field(20, ge=1, le=1000, description="Greatest number of such pods at the same time.")
+    most_of_project: int | None = Field(
+        None, ge=1, le=1000, description="Greatest number of such pods of one project. Absent: as most."
+    )
+    patience_s: int = Field(
+        600,
+        ge=1,
+        le=86_400,
+        description="Seconds after which a pod that no node runs makes place for waiting jobs; its job waits as long.",
+    )
     memory_mb: int = Field(4096, ge=64, description="A job whose memory limit in MiB is greater gets a pod of its own.")
     expected_s: int = Field(60, ge=0, description="A job that is expected to take more seconds gets a pod of its own.")
     labels: dict[str, dict[str, str]] = Field(

@@ -88,6 +88,11 @@ def test_a_job_with_a_pod_of_its_own_says_why() -> None:
     pod = {"marey/own-pod": "yes"}
     assert "its memory limit or its expected" in explain(job(labels=pod), [], [], NOW, [worker(("retarget",), {})])[0]
     assert "it needs 2 graphics processors" in explain(job(labels={"marey/gpus": "2"} | pod), [], [], NOW)[0]
+    held = job(labels=pod, progress={"done": 0, "note": "no node ran the pod"})
+    assert "Earlier, no node ran the pod." in explain(held, [], [], NOW)[0]
+    held = job(labels=pod, progress={"done": 0, "note": "no node ran the pod"}, run_at=NOW + timedelta(seconds=30))
+    told = "queued: no node ran the pod. The server starts its next pod in 30 s at the earliest."
+    assert explain(held, [], [], NOW) == [told]
     own = job(kind="script", params={"declaration": {"image": "torch@sha256:ab"}}, labels=pod)
     assert "names the image torch@sha256:ab. The server starts this pod in its cluster" in explain(own, [], [], NOW)[0]
 

@@ -36,8 +36,10 @@ MANIFESTS: dict[str, Manifest] = {
     "indexed-job": worker_job(Pool("gpu", "https://marey.example.org", RICH, GPU), "prod-gpu-k1", count=3),
 }
 OWN = Pool("OWN-PODS", "http://marey:8460", RICH, WorkerRequest({"marey/own-pod": "yes"}, ("model",), gpus=1))
-MANIFESTS["own-pod"] = own_pod_job(OWN, Dispatch("job_01m8h", 3, 2), time_limit_s=3600, environment={"A": "b"})
-MANIFESTS["own-pods-of-tasks"] = own_pod_job(OWN, Dispatch("job_01m8h", 1, 0, 9, 4), time_limit_s=3600)
+MANIFESTS["own-pod"] = own_pod_job(
+    OWN, Dispatch("job_01m8h", 3, 2, project="p"), time_limit_s=3600, environment={"A": "b"}
+)
+MANIFESTS["own-pods-of-tasks"] = own_pod_job(OWN, Dispatch("job_01m8h", 1, 0, 9, 4, "p"), time_limit_s=3600)
 OWNER = {**MANIFESTS["job"], "metadata": {**MANIFESTS["job"]["metadata"], "uid": UID}}
 MANIFESTS["secret"] = token_secret(OWNER, "marey_secret")
 

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 from tests.support.cluster.dispatching import OWN_IMAGE
 from tests.support.queue_desk import KINDS, Desk
 
+from marey_schemas.access import ProjectCreate
 from marey_schemas.queue.jobs import JobCreate, Resources
 from marey_schemas.queue.own_pods import GPUS_LABEL, OWN_POD_LABEL, is_allowed_image
 from marey_schemas.queue.scripts import ScriptCreate, ScriptRunCreate
@@ -20,7 +21,9 @@ from marey_server.launchers.kubernetes.dispatch_plan import DispatchPlan
 from marey_server.launchers.kubernetes.manifests import Manifest, Pool
 from marey_server.launchers.kubernetes.options import ClusterOptions
 from marey_server.launchers.kubernetes.own_pod_jobs import Dispatch, own_pod_job
+from marey_server.launchers.kubernetes.states import stuck_jobs
 from marey_server.process.settings import Settings
+from marey_server.store import projects
 from marey_server.store.credentials import tokens
 from marey_server.store.jobs import queue
 from marey_server.store.jobs.claiming import own_pods, rights
@@ -253,13 +256,63 @@ def test_no_pod_is_started_for_a_job_that_must_wait_for_another_pod(desk: Desk) 
     assert waiting(first, third) == [second]
 
 
+def test_projects_take_turns_for_pods(desk: Desk) -> None:
+    first = [desk.submit(resources=LARGE) for _ in range(3)]
+    desk.project = "other"
+    desk.database.write(desk.user, projects.create_project, ProjectCreate(name="other"))
+    second = [desk.submit(resources=LARGE) for _ in range(2)]
+    waiting = desk.database.read(SYSTEM, own_pods.read_waiting, 4)
+    assert [one.id for one in waiting] == [first[0], second[0], first[1], second[1]]
+    assert len({one.project for one in waiting}) == 2
+
+
+def test_pods_of_tasks_that_have_claimed_nothing_count_against_the_limit_of_their_project(desk: Desk) -> None:
+    given = {"things": [{"item": desk.things(1)[0]}]}
+    parent = desk.submit("survey", params={"number": 3}, inputs=given, resources=LARGE)
+    other = desk.submit(resources=LARGE)
+    desk.limit_running(3)
+
+    def waiting(pods: int) -> list[str]:
+        return [one.id for one in desk.database.read(SYSTEM, own_pods.read_waiting, 10, (), {parent: pods})]
+
+    assert (waiting(2), waiting(3)) == ([other], [])
+    claim(desk, pod_of(desk, parent), job=parent, task=0)
+    assert (waiting(2), waiting(3)) == ([other], [])
+
+
+def test_a_job_that_makes_place_waits_and_says_why(desk: Desk) -> None:
+    given = {"things": [{"item": desk.things(1)[0]}]}
+    parent = desk.submit("survey", params={"number": 2}, inputs=given, resources=LARGE)
+    single, running = (desk.submit(resources=LARGE) for _ in range(2))
+    claim(desk, pod_of(desk, running), job=running)
+
+    def postpone(job: str, *, tasks: bool) -> bool:
+        return desk.database.write(SYSTEM, own_pods.postpone, job, "no node: " + "x" * 999, 60.0, tasks=tasks)
+
+    assert (postpone(single, tasks=False), postpone(parent, tasks=True), postpone(running, tasks=False)) == (
+        True,
+        True,
+        False,
+    )
+    told = desk.job(single).progress
+    assert told is not None
+    assert told.note.startswith("no node: xx")
+    assert desk.database.read(SYSTEM, own_pods.read_waiting, 10) == []
+    desk.clock.advance(61)
+    assert len(desk.database.read(SYSTEM, own_pods.read_waiting, 10)) == 3
+    claim(desk, pod_of(desk, single), job=single)
+    assert desk.job(single).progress is None
+
+
 # -- which pods are started -------------------------------------------------------------------------------------------
 
 POOL = Pool("OWN-PODS", "http://marey:8460", ClusterOptions(image=OWN_IMAGE))
 
 
-def a_job(name: str, fence: int = 0, parent: str | None = None, position: int | None = None, of: int = 0) -> WaitingJob:
-    return WaitingJob(name, "errand", fence, 60, 512, YES, None, parent, position, of)
+def a_job(
+    name: str, fence: int = 0, parent: str | None = None, position: int | None = None, of: int = 0, **fields: Any
+) -> WaitingJob:
+    return WaitingJob(name, "errand", fence, 60, 512, YES, None, parent, position, of, **fields)
 
 
 def in_cluster(dispatch: Dispatch, **status: Any) -> dict[str, Manifest]:
@@ -294,6 +347,40 @@ def test_no_more_pods_are_started_than_allowed() -> None:
     assert [one.dispatch for one in plan.decide(0, [a_job("job_6", 2, "job_p", 6, 9)], jobs)] == [
         Dispatch("job_6", 3, 2)
     ]
+
+
+def test_the_project_with_the_fewest_pods_gets_the_next_one() -> None:
+    waiting = [a_job(f"job_{n}", parent="job_p", position=n, of=9, project="a") for n in range(9)]
+    waiting += [a_job(f"job_{letter}", project="b") for letter in "xyz"]
+    jobs = in_cluster(Dispatch("job_w", 1, project="b"))
+    starts = DispatchPlan(most=6).decide(0, waiting, jobs)
+    assert [(one.dispatch.job, one.dispatch.parallel) for one in starts] == [("job_p", 3), ("job_x", 1), ("job_y", 1)]
+    starts = DispatchPlan(most=6, most_of_project=2).decide(0, waiting, jobs)
+    assert [(one.dispatch.job, one.dispatch.parallel) for one in starts] == [("job_p", 2), ("job_x", 1)]
+
+
+def test_no_more_tasks_get_pods_than_the_limit_of_their_project_allows() -> None:
+    tasks = [a_job(f"job_{n}", parent="job_p", position=n, of=9, limited=True) for n in range(3)]
+    (start,) = DispatchPlan(most=20).decide(0, tasks, {})
+    assert (start.dispatch.size, start.dispatch.parallel) == (9, 3)
+
+
+def test_pods_that_no_node_runs_make_place_only_if_other_jobs_need_it() -> None:
+    plan = DispatchPlan(most=2, patience_s=100)
+    jobs = in_cluster(Dispatch("job_a", 1)) | in_cluster(Dispatch("job_b", 1))
+    assert stuck_jobs(jobs, []).keys() == jobs.keys()
+    old, new = sorted(jobs)
+    for now_s, waiting, stuck, expected in (
+        (0, [], [old], []), (50, [], [old, new], []), (100, [], [old, new], []),
+        (120, [a_job("job_c")], [old, new], [old]), (160, [a_job("job_c"), a_job("job_d")], [old, new], [old, new]),
+        (170, [a_job("job_c")], [new], [new]), (180, [a_job("job_c")], [], []), (190, [a_job("job_c")], [new], []),
+    ):  # fmt: skip
+        assert plan.decide(now_s, waiting, jobs) == []
+        assert plan.step_back(now_s, {name: jobs[name] for name in stuck}) == expected
+    full = DispatchPlan(most=9, most_of_project=1, patience_s=0)
+    jobs = in_cluster(Dispatch("job_a", 1, project="a")) | in_cluster(Dispatch("job_b", 1, project="b"))
+    assert full.decide(0, [a_job("job_c", project="b")], jobs) == []
+    assert full.step_back(0, jobs) == [name for name in jobs if "job-b" in name]
 
 
 def test_one_task_and_the_tasks_of_huge_jobs_get_jobs_of_their_own() -> None:

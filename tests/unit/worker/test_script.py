@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,9 @@ import numpy as np
 import psutil
 import pytest
 from tests.support.project_in_memory import ProjectInMemory, add_clip
+from typer.testing import CliRunner
 
+from marey_client.cli.app import app
 from marey_motion import read_motion
 from marey_motion.gait import generate_gait
 from marey_schemas.consents import CONSENT_EXPIRED
@@ -31,7 +34,14 @@ from marey_worker.scripts.checkout import FetchFailed
 from marey_worker.scripts.confinement import landlock_version
 from marey_worker.scripts.fields import read_fields
 from marey_worker.scripts.files import OUTPUTS, collect
-from marey_worker.scripts.guard import LOG_BYTES, fault_of_files, nameless_bytes
+from marey_worker.scripts.guard import (
+    LOG_BYTES,
+    THREADS_PER_PROCESS,
+    CommandEnd,
+    GuardedCommand,
+    fault_of_files,
+    nameless_bytes,
+)
 
 pytestmark = pytest.mark.skipif(landlock_version() == 0, reason="scripts need Linux with Landlock")
 
@@ -181,6 +191,47 @@ HOSTILE = {
 }
 
 
+BOMB = (  # it stops by itself
+    "import os, time\nmade = 0\nwhile made < 400:\n try:\n  if os.fork() == 0: time.sleep(60); os._exit(0)\n"
+    " except OSError: break\n made += 1\nos.write(1, b'%d' % made)\ntime.sleep(60)"
+)
+LATE_GUARD = """
+from marey_worker.scripts import guard
+from marey_worker.scripts.namespaces import Separation
+guard.LOOK_EVERY_S = 20.0  # as on a machine that has no time for it, until the bomb has printed a number
+if not {namespaces}:
+    guard.separate = lambda folder, network, user: Separation(False, user)
+guard.main()
+"""
+
+
+@pytest.mark.parametrize("namespaces", [True, False])
+def test_the_kernel_stops_a_fork_bomb_before_the_guard_counts(tmp_path: Path, *, namespaces: bool) -> None:
+    """Without namespaces, the kernel limits only a user without other processes, which only root can choose."""
+    order = GuardedCommand((sys.executable, "-c", BOMB), str(tmp_path), {}, 60, 1024, 8, 16, network=False)
+    read_end, write_end = os.pipe()
+    with os.fdopen(read_end) as result:
+        command = [sys.executable, "-c", LATE_GUARD.format(namespaces=namespaces), str(write_end)]
+        subprocess.run(command, input=json.dumps(asdict(order)), text=True, pass_fds=[write_end], check=True)
+        os.close(write_end)
+        end = CommandEnd(**json.loads(result.read()))
+    assert (end.isolated, end.bounded) == (namespaces, namespaces or os.geteuid() == 0)
+    assert end.stopped == "it had more than 16 processes at the same time"
+    assert not end.bounded or 16 < int(end.tail) < 16 * THREADS_PER_PROCESS
+
+
+def test_doctor_says_how_far_a_machine_confines_scripts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(REPOSITORIES_VARIABLE, "[]")
+    command = ["doctor", "--no-local", "--no-remote"]
+    told = CliRunner().invoke(app, command)
+    assert (told.exit_code, told.stdout) == (0, "ok       scripts: confined, with all limits\n")
+    end = CommandEnd(0, None, "", isolated=True, bounded=False)
+    monkeypatch.setattr(script, "_run_guarded", lambda order: end)
+    assert f"warning  scripts: {script.NOT_BOUNDED}" in CliRunner().invoke(app, command).stdout
+    monkeypatch.setattr(script, "landlock_version", lambda: 0)
+    assert CliRunner().invoke(app, command).exit_code == 1
+
+
 @pytest.mark.parametrize("what", HOSTILE)
 def test_a_script_that_exceeds_a_limit_is_killed_with_all_its_processes(repository: Repository, what: str) -> None:
     text, reason = HOSTILE[what]
@@ -237,6 +288,7 @@ DENIED = {
     "Unix socket": "__import__('socket').socket(1).connect('{outside}/socket')",
     "mode": "__import__('os').chmod('{outside}/secret', 0o777)",
     "times": "__import__('os').utime('{outside}/secret')",
+    "user": "__import__('os').setuid(1001)",  # root, as the script sees it
     "signal": "__import__('os').kill({parent}, 0)",
 }
 

@@ -22,7 +22,7 @@ from marey_schemas.options.imports import ImportOptions
 from marey_schemas.processes.environment import clean_environment, thread_limits
 from marey_schemas.queue.comparisons import Curves
 from marey_schemas.queue.own_pods import IMAGE_VARIABLE
-from marey_schemas.queue.scripts import PYTHON, ScriptDeclaration, ScriptParams
+from marey_schemas.queue.scripts import PYTHON, ScriptDeclaration, ScriptLimits, ScriptParams
 from marey_schemas.queue.worker_protocol import StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.staged_results import StagedResults
@@ -38,6 +38,10 @@ LAST_LINES = 10
 NOT_ISOLATED = (
     "this system allows no namespaces with mounts, so that the script could change modes and times of files of the "
     "worker's user"
+)
+NOT_BOUNDED = (
+    "the kernel of this system does not limit the number of the script's processes, which only its guard counts; run "
+    "the worker as an ordinary user, and allow namespaces"
 )
 GUARD_MODULE = "marey_worker.scripts.guard"
 
@@ -68,6 +72,19 @@ def run(context: Context, params: ScriptParams) -> dict[str, Any]:
         raise JobRefused("script-failed" if end.stopped is None else "script-limit", _failure(end))
     context.progress(2, 3, "storing the results")
     return {"script": params.script, **_publish(context, params, declared, folder), "consent_ended": ended}
+
+
+def examine() -> tuple[str, str, str]:
+    """Run a command that does nothing as a script; return a check, its state (ok, warning or fault) and a detail."""
+    if landlock_version() == 0:
+        return "scripts", "fault", "this machine cannot confine scripts: they need Linux 5.13 with Landlock"
+    with tempfile.TemporaryDirectory(prefix="marey-doctor-") as folder:
+        limits = ScriptLimits().model_dump()
+        end = _run_guarded(GuardedCommand((sys.executable, "-c", "pass"), folder, {}, **limits))
+    if end.status != 0:
+        return "scripts", "fault", _failure(end)
+    missing = _missing(end)
+    return "scripts", "warning" if missing else "ok", "; ".join(missing) or "confined, with all limits"
 
 
 def _require_program(declared: ScriptDeclaration, code: Path) -> None:
@@ -120,8 +137,12 @@ def _run_guarded(order: GuardedCommand) -> CommandEnd:
 
 def _words_of(end: CommandEnd) -> str:
     how = f"exit status {end.status}" if end.stopped is None else f"stopped: {end.stopped}"
-    missing = "" if end.isolated else f"; {NOT_ISOLATED}"
-    return f"{how}{missing}"
+    return "; ".join([how, *_missing(end)])
+
+
+def _missing(end: CommandEnd) -> list[str]:
+    """Return in words what this system did not limit."""
+    return [*([] if end.isolated else [NOT_ISOLATED]), *([] if end.bounded else [NOT_BOUNDED])]
 
 
 def _failure(end: CommandEnd) -> str:

@@ -1,8 +1,4 @@
-"""Confinement of the processes of a script by the Linux kernel.
-
-Landlock limits the files that the processes can open. Namespaces, where the system lets users create them, hide other
-processes and the network.
-"""
+"""Confinement of the processes of a script by Landlock, which limits the files that they can open."""
 
 from __future__ import annotations
 
@@ -14,11 +10,6 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-CLONE_NEWNS, CLONE_NEWIPC, CLONE_NEWUSER = 0x00020000, 0x08000000, 0x10000000
-CLONE_NEWPID, CLONE_NEWNET = 0x20000000, 0x40000000
-MS_BIND, MS_REC, MS_PRIVATE = 1 << 12, 1 << 14, 1 << 18
-_MOUNT_SETATTR = 442
-_AT_FDCWD, _AT_RECURSIVE, _MOUNT_READ_ONLY = -100, 0x8000, 1
 PR_SET_CHILD_SUBREAPER, PR_SET_NO_NEW_PRIVS = 36, 38
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # the same numbers on all architectures
 _PATH_BENEATH = 1
@@ -46,31 +37,12 @@ def landlock_version() -> int:
     """Return the version of Landlock that the kernel has, and 0 if it has none."""
     if sys.platform != "linux":
         return 0
-    return max(0, int(_libc().syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), 1)))
-
-
-def separate(writable: Path, *, network: bool) -> bool:
-    """Move the next child of this process to namespaces of its own; return whether the system allowed it.
-
-    This process must have only one thread. Its next child sees no other processes and, unless `network` is true, no
-    network. Both see all files outside `writable` as read-only.
-    """
-    user, group = os.geteuid(), os.getegid()
-    flags = CLONE_NEWUSER | CLONE_NEWNS | CLONE_NEWPID | CLONE_NEWIPC | (0 if network else CLONE_NEWNET)
-    if _libc().unshare(flags) != 0:
-        return False
-    for file, text in (("setgroups", "deny"), ("uid_map", f"1000 {user} 1"), ("gid_map", f"1000 {group} 1")):
-        Path(f"/proc/self/{file}").write_text(text)
-    try:
-        _make_read_only(writable)
-    except NotConfinedError:  # some containers allow namespaces, but no mounts
-        return False
-    return True
+    return max(0, int(libc().syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), 1)))
 
 
 def adopt_orphans() -> None:
     """Make this process the parent of its descendants whose own parents end."""
-    _libc().prctl(PR_SET_CHILD_SUBREAPER, 1)
+    libc().prctl(PR_SET_CHILD_SUBREAPER, 1)
 
 
 def confine(writable: Path, *, network: bool) -> None:
@@ -82,38 +54,18 @@ def confine(writable: Path, *, network: bool) -> None:
     if version == 0:
         raise NotConfinedError("the kernel of this machine has no Landlock (Linux 5.13 or later)")
     everything = _rights_of(version)
-    libc = _libc()
     tcp = 0 if network or version < 4 else 3
     scoped = 0 if version < 6 else 3  # abstract sockets and signals
     fields = struct.pack("=QQQ", everything, tcp, scoped)[: 8 if version < 4 else 16 if version < 6 else 24]
-    ruleset = _check(libc.syscall(_CREATE_RULESET, fields, ctypes.c_size_t(len(fields)), 0))
+    ruleset = check(libc().syscall(_CREATE_RULESET, fields, ctypes.c_size_t(len(fields)), 0))
     reading = EXECUTE | READ_FILE | READ_DIR
     readable = [*PROGRAMS, *SYSTEM_FILES, sys.prefix, sys.base_prefix, *(NETWORK_FILES if network else ())]
     _allow(ruleset, readable, reading & everything)
     _allow(ruleset, DEVICES, (READ_FILE | WRITE_FILE) & everything)
     _allow(ruleset, [str(writable)], everything)
-    _check(libc.prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0))
-    _check(libc.syscall(_RESTRICT_SELF, ruleset, 0))
+    check(libc().prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0))
+    check(libc().syscall(_RESTRICT_SELF, ruleset, 0))
     os.close(ruleset)
-
-
-def _make_read_only(writable: Path) -> None:
-    """Make all files read-only for the namespace of this process, except those below `writable`.
-
-    Landlock does not limit changes of modes, owners and times, which this process may make to all files of its user.
-    Raises `NotConfinedError`.
-    """
-    libc, folder = _libc(), os.fsencode(writable)
-    _check(libc.mount(None, b"/", None, ctypes.c_ulong(MS_REC | MS_PRIVATE), None))
-    _set_read_only(b"/", read_only=True, flags=_AT_RECURSIVE)
-    _check(libc.mount(folder, folder, None, ctypes.c_ulong(MS_BIND), None))
-    _set_read_only(folder, read_only=False, flags=0)
-
-
-def _set_read_only(path: bytes, *, read_only: bool, flags: int) -> None:
-    attributes = struct.pack("=QQQQ", _MOUNT_READ_ONLY * read_only, _MOUNT_READ_ONLY * (not read_only), 0, 0)
-    size = ctypes.c_size_t(len(attributes))
-    _check(_libc().syscall(_MOUNT_SETATTR, _AT_FDCWD, path, ctypes.c_uint(flags), attributes, size))
 
 
 def _rights_of(version: int) -> int:
@@ -130,15 +82,17 @@ def _allow(ruleset: int, paths: Iterable[str], rights: int) -> None:
             continue
         granted = rights if stat.S_ISDIR(os.fstat(opened).st_mode) else rights & _OF_FILES
         rule = struct.pack("=Qi", granted, opened)
-        _check(_libc().syscall(_ADD_RULE, ruleset, _PATH_BENEATH, rule, 0))
+        check(libc().syscall(_ADD_RULE, ruleset, _PATH_BENEATH, rule, 0))
         os.close(opened)
 
 
-def _check(answer: int) -> int:
+def check(answer: int) -> int:
+    """Return the answer of the kernel to a call. Raises `NotConfinedError` if it is an error."""
     if answer < 0:
         raise NotConfinedError(f"this system cannot confine it: {os.strerror(ctypes.get_errno())}")
     return answer
 
 
-def _libc() -> ctypes.CDLL:
+def libc() -> ctypes.CDLL:
+    """Return the C library, through which this package calls the kernel."""
     return ctypes.CDLL(None, use_errno=True)

@@ -18,7 +18,7 @@ import stat
 import sys
 import time
 from collections.abc import Collection, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import NoReturn
@@ -27,7 +27,9 @@ import psutil
 
 from marey_schemas.processes.limits import PR_SET_PDEATHSIG, die_with_parent
 from marey_schemas.sizes import MIB
-from marey_worker.scripts.confinement import NotConfinedError, adopt_orphans, confine, separate
+from marey_worker.scripts.command_user import become, free_user, give, look_as
+from marey_worker.scripts.confinement import NotConfinedError, adopt_orphans, confine
+from marey_worker.scripts.namespaces import Separation, separate
 from marey_worker.scripts.system_calls import filter_system_calls
 
 LOOK_EVERY_S = 0.05
@@ -59,12 +61,16 @@ class GuardedCommand:
 
 @dataclass(frozen=True)
 class CommandEnd:
-    """End of a command: its exit status (128 plus the number of a signal), or the reason why it was stopped."""
+    """End of a command: its exit status (128 plus the number of a signal), or the reason why it was stopped.
+
+    `isolated` states whether it had namespaces of its own, and `bounded` whether the kernel limited its processes.
+    """
 
     status: int | None
     stopped: str | None
     tail: str
     isolated: bool
+    bounded: bool
 
 
 def main() -> None:
@@ -76,33 +82,50 @@ def main() -> None:
     die_with_parent()
     _take_precedence()
     adopt_orphans()
-    isolated = separate(Path(order.folder), network=order.network)
+    by_root = os.geteuid() == 0
+    place = _prepare(order)
+    bounded = place.isolated if not by_root else place.user is not None
+    die_with_parent()  # again: the kernel forgets this when a process changes its user
     read_end, write_end = os.pipe()
     held = os.fork()
     if held == 0:
         os.close(read_end)
         os.close(result)
-        _hold(order, write_end, isolated=isolated)
+        _hold(order, write_end, place.user, bounded=bounded)
     os.close(write_end)
     watch = _Watch(order, held, read_end)
     stopped = watch.run()
-    end = CommandEnd(watch.status, stopped, watch.tail.decode("utf-8", "replace"), isolated)
+    end = CommandEnd(watch.status, stopped, watch.tail.decode("utf-8", "replace"), place.isolated, bounded)
     os.write(result, json.dumps(asdict(end)).encode())
 
 
-def _hold(order: GuardedCommand, output: int, *, isolated: bool) -> NoReturn:
+def _prepare(order: GuardedCommand) -> Separation:
+    """Create the namespaces of the command, and give its folder to its user, if it gets one of its own."""
+    folder = Path(order.folder)
+    place = separate(folder, network=order.network, user=free_user())
+    if place.user is None:
+        return place
+    if not give(folder, place.user):
+        return replace(place, user=None)
+    look_as(place.user)
+    return place
+
+
+def _hold(order: GuardedCommand, output: int, user: int | None, *, bounded: bool) -> NoReturn:
     """Start the confined command, wait for it, and exit with its status.
 
     In a process namespace of its own, this is the first process: when it ends, the kernel kills all others.
     """
     os.setsid()
-    _die_with_parent()
     null = os.open(os.devnull, os.O_RDONLY)
     for number, end in enumerate((null, output, output)):
         os.dup2(end, number)
     os.chdir(order.folder)
     try:
-        _limit(order, isolated=isolated)
+        if user is not None:
+            become(user)
+        _die_with_parent()
+        _limit(order, bounded=bounded)
         confine(Path(order.folder), network=order.network)
         filter_system_calls()
         command = os.fork()
@@ -122,8 +145,8 @@ def _hold(order: GuardedCommand, output: int, *, isolated: bool) -> NoReturn:
 def _take_precedence() -> None:
     """Let this process always run before those of the command, if the system allows it.
 
-    The kernel limits the number of processes (RLIMIT_NPROC) of every user but root. A worker that runs as root must
-    count them itself, and could not do it in time if thousands of processes shared the processors with it.
+    If the kernel does not limit the number of processes, the guard of a worker that runs as root must count them, and
+    could not do it in time if thousands of them shared the processors with it.
     """
     if os.geteuid() == 0:
         with contextlib.suppress(PermissionError):
@@ -135,14 +158,14 @@ def _die_with_parent() -> None:
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def _limit(order: GuardedCommand, *, isolated: bool) -> None:
+def _limit(order: GuardedCommand, *, bounded: bool) -> None:
     limits = {
         resource.RLIMIT_CORE: 0,
         resource.RLIMIT_DATA: order.memory_mb * MIB,
         resource.RLIMIT_FSIZE: order.written_mb * MIB,
         resource.RLIMIT_NOFILE: OPEN_FILES,
     }
-    if isolated:  # otherwise, all processes of the user would count
+    if bounded:  # otherwise, all processes of the user would count
         limits[resource.RLIMIT_NPROC] = order.processes * THREADS_PER_PROCESS
     for which, limit in limits.items():
         _, hard = resource.getrlimit(which)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,13 +17,15 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 
+_OTHER_CONTROLS = re.compile("[\x7f-\x9f]")
 COPIED = ("id", "job")
 """Columns that people copy into the next command; on a narrow terminal, the other columns are shortened."""
 
 
 def print_json(value: Any) -> None:
-    """Print as JSON: a model, or lists and dicts of models and plain values."""
-    typer.echo(json.dumps(_plain(value), indent=2, ensure_ascii=False))
+    """Print as JSON: a model, or lists and dicts of models and plain values; all control characters are escaped."""
+    text = json.dumps(_plain(value), indent=2, ensure_ascii=False)  # escapes those below U+0020
+    typer.echo(_OTHER_CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}", text))
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, right: Sequence[str] = ()) -> None:

@@ -27,10 +27,16 @@ PAGE = 500
 """Number of objects in one answer to a list."""
 LOG_LINES = 5
 _ALREADY_EXISTS, _NOT_FOUND, _GONE = 409, 404, 410
+_OF_OBJECT = frozenset({400, 403, 413, 422})
+"""Statuses of answers to invalid objects, and to objects that policies or quotas of the cluster do not admit."""
 
 
 class VersionGone(EngineError):
     """Error of a watch that begins at a version that the cluster has forgotten; list the objects again."""
+
+
+class ObjectRefused(EngineError):
+    """The cluster refused a request because of its object; other requests may succeed."""
 
 
 class NoSuchObject(EngineError):
@@ -227,4 +233,4 @@ def _error(status: int, problem: Manifest) -> EngineError:
         return VersionGone(message)
     if status == _ALREADY_EXISTS and problem.get("reason") == "AlreadyExists":
         return ObjectExists(message)
-    return EngineError(message)
+    return ObjectRefused(message) if status in _OF_OBJECT else EngineError(message)

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from marey_schemas.backoff import Backoff
-from marey_server.launchers.kubernetes.own_pod_jobs import Dispatch, PodPlace, dispatch_of, job_of, places_of, pods_of
+from marey_server.launchers.kubernetes.own_pod_jobs import (
+    Dispatch,
+    PodPlace,
+    dispatch_of,
+    job_of,
+    places_of,
+    pods_of,
+    project_of,
+)
 from marey_server.launchers.kubernetes.states import is_over
 from marey_server.store.jobs.claiming.own_pods import WaitingJob
 
@@ -26,10 +35,31 @@ class Started:
 
 
 @dataclass
+class _StartGroup:
+    """A job, or the tasks of a parent with `size` tasks, that start together; `most` is how many pods they can use."""
+
+    job: WaitingJob
+    size: int | None
+    most: int
+    places: int = 0
+
+
+@dataclass
 class DispatchPlan:
-    """Decisions of a dispatcher. It remembers only when it saw that pods ended without a claim."""
+    """Decisions of a dispatcher. It remembers only since when pods wait, and when it saw that they ended unclaimed.
+
+    At most `most` pods exist, and at most `most_of_project` of each project. Pods that no node runs for `patience_s`
+    seconds give their places to jobs that wait for places.
+    """
 
     most: int
+    most_of_project: int | None = None
+    patience_s: float = float("inf")
+    _lacking: int = 0
+    """Number of starts for which the last decision had no places."""
+    _lacking_of: dict[str, int] = field(default_factory=dict)
+    """The same for each project that has as many pods as it may have; only its own pods can make place."""
+    _stuck_since_s: dict[str, float] = field(default_factory=dict)
     _next_s: dict[str, float] = field(default_factory=dict)
     """Time of the next start of a job, by the name of the Job that ended without a claim."""
 
@@ -48,17 +78,51 @@ class DispatchPlan:
         numbers = _newest_numbers(jobs.values())
         held = self._held_back(now_s, waiting, jobs)
         due = [one for one in waiting if one.id not in held and not served & {*_places_of(one)}]
-        room = self.most - sum(map(pods_of, jobs.values()))
-        starts: list[Started] = []
-        for one, size in _grouped(due, numbers):
+        return [_start(group, numbers) for group in self._share(_grouped(due, numbers), jobs.values())]
+
+    def step_back(self, now_s: float, stuck: Mapping[str, Mapping[str, Any]]) -> list[str]:
+        """Return which of the Jobs that no node runs, given by name, must make place for others; the oldest first."""
+        self._stuck_since_s = {name: self._stuck_since_s.get(name, now_s) for name in stuck}
+        late = [name for name, since_s in self._stuck_since_s.items() if now_s - since_s >= self.patience_s]
+        chosen: list[str] = []
+        for name in sorted(late, key=self._stuck_since_s.__getitem__):
+            project = project_of(stuck[name])
+            if self._lacking_of.get(project, 0) > 0:
+                self._lacking_of[project] -= 1
+            elif self._lacking > 0:
+                self._lacking -= 1
+            else:
+                continue
+            chosen.append(name)
+        return chosen
+
+    def _share(self, groups: Iterable[_StartGroup], jobs: Iterable[Mapping[str, Any]]) -> list[_StartGroup]:
+        """Give the free places one by one to the project with the fewest pods; return the groups that got any."""
+        pods: Counter[str] = Counter()
+        for job in jobs:
+            pods[project_of(job)] += pods_of(job)
+        room = self.most - pods.total()
+        queues: dict[str, list[_StartGroup]] = {}
+        for group in groups:
+            queues.setdefault(group.job.project, []).append(group)
+        share = self.most if self.most_of_project is None else self.most_of_project
+        started: list[_StartGroup] = []
+        while open_ := [one for one in queues if queues[one] and pods[one] < share]:
             if room <= 0:
                 break
-            parallel = 1 if size is None else min(size, room)
-            job_id = one.id if size is None else str(one.parent)
-            number = numbers.get(job_id, one.fence if size is None else 0) + 1
-            starts.append(Started(one, Dispatch(job_id, number, one.fence, size, parallel)))
-            room -= parallel
-        return starts
+            project = min(open_, key=pods.__getitem__)
+            group = queues[project][0]
+            group.places += 1
+            pods[project] += 1
+            room -= 1
+            if group.places == 1:
+                started.append(group)
+            if group.places == group.most:
+                queues[project].pop(0)
+        left = {project: sum(group.places == 0 for group in queue) for project, queue in queues.items()}
+        self._lacking_of = {project: count for project, count in left.items() if pods[project] >= share}
+        self._lacking = sum(left.values()) - sum(self._lacking_of.values())
+        return started
 
     def _held_back(
         self, now_s: float, waiting: Sequence[WaitingJob], jobs: Mapping[str, Mapping[str, Any]]
@@ -90,10 +154,18 @@ def _newest_numbers(jobs: Iterable[Mapping[str, Any]]) -> dict[str, int]:
     return numbers
 
 
-def _grouped(due: Sequence[WaitingJob], numbers: Mapping[str, int]) -> Iterable[tuple[WaitingJob, int | None]]:
-    """Yield the jobs to start, each with the number of its siblings if all of them start together.
+def _start(group: _StartGroup, numbers: Mapping[str, int]) -> Started:
+    one = group.job
+    job_id = one.id if group.size is None else str(one.parent)
+    number = numbers.get(job_id, one.fence if group.size is None else 0) + 1
+    return Started(one, Dispatch(job_id, number, one.fence, group.size, group.places, one.project))
 
-    Tasks start together if none of them had a pod before, and at least two of them wait.
+
+def _grouped(due: Sequence[WaitingJob], numbers: Mapping[str, int]) -> Iterable[_StartGroup]:
+    """Yield what to start: single jobs, and tasks that start together.
+
+    Tasks start together if none of them had a pod before, and at least two of them wait. If their project has a limit,
+    they get only as many pods as may run, because more of them would hold nodes and wait.
     """
     fresh = [one for one in due if one.parent is not None and one.fence == 0 and one.parent not in numbers]
     counts: dict[str, int] = {}
@@ -104,7 +176,7 @@ def _grouped(due: Sequence[WaitingJob], numbers: Mapping[str, int]) -> Iterable[
     for one in due:
         parent = one.parent if one in fresh and counts.get(str(one.parent), 0) > 1 else None
         if parent is None:
-            yield one, None
+            yield _StartGroup(one, None, 1)
         elif parent not in seen:
             seen.add(parent)
-            yield one, one.siblings
+            yield _StartGroup(one, one.siblings, counts[parent] if one.limited else one.siblings)

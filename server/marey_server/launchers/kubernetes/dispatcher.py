@@ -1,7 +1,8 @@
 """Dispatcher: starts a pod of its own for each job that needs one, and deletes the pods of jobs that have ended.
 
-The dispatcher stores nothing. What it has started, it reads from the cluster; the names of Jobs and the tokens of pods
-are computed from the ids of jobs. So a server that ends at any moment leaves nothing that the next one does not find.
+The dispatcher stores only until when a job waits, and why, in the job. What it has started, it reads from the cluster;
+the names of Jobs and the tokens of pods are computed from the ids of jobs. So a server that ends at any moment leaves
+nothing that the next one does not find.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 import logging
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 from marey_schemas.queue.own_pods import IMAGE_VARIABLE, is_allowed_image
@@ -29,8 +31,9 @@ from marey_server.launchers.kubernetes.own_pod_jobs import (
     own_pod_job,
     own_pod_labels,
     places_of,
+    pods_of,
 )
-from marey_server.launchers.kubernetes.states import end_of, group_pods, is_over, worker_names
+from marey_server.launchers.kubernetes.states import end_of, group_pods, is_over, stuck_jobs, worker_names
 from marey_server.launchers.kubernetes.worker_jobs import WorkerJobs
 from marey_server.launchers.launcher import EngineError, WorkerRequest, read_options
 from marey_server.launchers.rounds import ServerLead, ask, repeat
@@ -38,7 +41,7 @@ from marey_server.process.settings import Settings
 from marey_server.process.worker_pools import OwnPods
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import SERVER
-from marey_server.store.jobs.claiming.own_pods import WaitingJob, read_unfinished, read_waiting
+from marey_server.store.jobs.claiming.own_pods import WaitingJob, postpone, read_unfinished, read_waiting
 from marey_server.store.jobs.claiming.rights import pod_token, read_pod_key
 from marey_server.store.transaction import Transaction
 
@@ -50,6 +53,8 @@ RENEW_LEAD_S = 15.0
 """Seconds after which the lead is renewed, so that not every round writes to the database."""
 WORKER_MB = 512
 """Memory of a pod in MiB beside the limit of its job, for the process that talks to the server."""
+AFTER_REFUSAL_S = 60.0
+"""Seconds after which a job is started again whose Job the cluster has refused."""
 DELETE_AFTER_S = 10.0
 """Seconds after the end of a job in which its pods can end by themselves and leave their logs."""
 
@@ -72,7 +77,7 @@ class Dispatcher:
         self._lead_until_s = float("-inf")
         key = database.read(SYSTEM, read_pod_key)
         self._jobs = WorkerJobs(self._options, own_pod_labels(self._options), lambda job: pod_token(key, job_of(job)))
-        self._plan = DispatchPlan(self._rules.most)
+        self._plan = DispatchPlan(self._rules.most, self._rules.most_of_project, self._rules.patience_s)
         self._ended_at_s: dict[str, float] = {}
         """When this process saw first that the job of a Job has ended, by the name of the Job."""
         self._explained: set[str] | None = None
@@ -100,6 +105,7 @@ class Dispatcher:
         self._explain_ends()
         await self._delete_finished()
         await self._start_waiting()
+        await self._step_back()
 
     async def _leads(self) -> bool:
         now_s = self._clock_s()
@@ -113,13 +119,36 @@ class Dispatcher:
     async def _start_waiting(self) -> None:
         jobs = self._jobs.view.jobs
         served = [place.job for job in jobs.values() if not is_split(job) for place in places_of(job)]
-        split = {job_of(job) for job in jobs.values() if is_split(job) and not is_over(job)}
+        split = {job_of(job): pods_of(job) for job in jobs.values() if is_split(job) and not is_over(job)}
         limit = self._rules.most + len(jobs) + len(self._refused)  # so that refused jobs keep none of the others out
-        waiting = await self._read(lambda tx: read_waiting(tx, limit, served, sorted(split)))
+        waiting = await self._read(lambda tx: read_waiting(tx, limit, served, split))
         starts = self._plan.decide(self._clock_s(), list(filter(self._is_allowed, waiting)), jobs)
-        if starts:
-            made = await ask(self._jobs.create(map(self._job, starts)))
+        if not starts:
+            return
+        asked = {job["metadata"]["name"]: job for job in map(self._job, starts)}
+        made, refused = await ask(self._jobs.create_allowed(asked.values()))
+        if made:
             log.info("own pods: started %s", ", ".join(job["metadata"]["name"] for job in made))
+        for name, reason in refused.items():
+            await self._postpone(asked[name], f"the cluster refused the pod: {reason}", AFTER_REFUSAL_S)
+
+    async def _step_back(self) -> None:
+        """Delete pods that no node has run for long, if other jobs wait for their places; they are started later."""
+        jobs = dict(self._jobs.view.jobs)
+        stuck = stuck_jobs(jobs, self._jobs.view.pods.values())
+        pause_s = self._rules.patience_s
+        for name in self._plan.step_back(self._clock_s(), {name: jobs[name] for name in stuck}):
+            reason = f"no node ran the pod within {pause_s} s, so that it made place for other jobs: {stuck[name]}"
+            if await self._postpone(jobs[name], reason, pause_s):
+                await ask(self._jobs.delete(name))
+
+    async def _postpone(self, job: Manifest, reason: str, pause_s: float) -> bool:
+        """Let the job of a Job wait, unless it is claimed already; return whether it waits."""
+        of_job = partial(postpone, job_id=job_of(job), reason=reason, pause_s=pause_s, tasks=is_split(job))
+        postponed = await asyncio.wrap_future(self._database.submit_write(SYSTEM, of_job))
+        if postponed:
+            log.warning("own pods: %s starts in %d s at the earliest: %s", job_of(job), pause_s, reason)
+        return postponed
 
     def _is_allowed(self, one: WaitingJob) -> bool:
         """Return whether the image of a job is still allowed; a refusal is logged once."""

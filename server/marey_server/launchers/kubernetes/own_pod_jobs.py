@@ -25,6 +25,7 @@ class Dispatch:
     """Start of pods for a job: the `number` of the start, and the number of claims of the job until then.
 
     With `size`, the job is a parent job, and each of its tasks has a pod; at most `parallel` of them run at once.
+    `project` is the id of the job's project.
     """
 
     job: str
@@ -32,6 +33,7 @@ class Dispatch:
     fence: int = 0
     size: int | None = None
     parallel: int = 1
+    project: str = ""
 
     def name(self, options: ClusterOptions) -> str:
         """Return the name of the Job, which is the same whenever the same start is repeated."""
@@ -69,7 +71,9 @@ def own_pod_job(
     metadata, spec = job["metadata"], job["spec"]
     own = {JOB_ID_LABEL: dispatch.job}
     metadata["labels"] |= own
-    metadata["annotations"][DISPATCH_ANNOTATION] = json.dumps({"number": dispatch.number, "fence": dispatch.fence})
+    metadata["annotations"][DISPATCH_ANNOTATION] = json.dumps(
+        {"number": dispatch.number, "fence": dispatch.fence, "project": dispatch.project}
+    )
     refused = {"containerName": CONTAINER, "operator": "In", "values": [REFUSED_STATUS]}
     action = "FailJob" if dispatch.size is None else "FailIndex"
     spec["podFailurePolicy"]["rules"].append({"action": action, "onExitCodes": refused})
@@ -93,8 +97,18 @@ def job_of(job: Mapping[str, Any]) -> str:
 
 def dispatch_of(job: Mapping[str, Any]) -> tuple[int, int]:
     """Return the number of the start of a Job, and the number of claims until then."""
-    stored = json.loads(job["metadata"].get("annotations", {}).get(DISPATCH_ANNOTATION, "{}"))
+    stored = _dispatch(job)
     return int(stored.get("number", 0)), int(stored.get("fence", 0))
+
+
+def project_of(job: Mapping[str, Any]) -> str:
+    """Return the id of the project of a Job; it is empty if an older server started the Job."""
+    return str(_dispatch(job).get("project", ""))
+
+
+def _dispatch(job: Mapping[str, Any]) -> dict[str, Any]:
+    stored: dict[str, Any] = json.loads(job["metadata"].get("annotations", {}).get(DISPATCH_ANNOTATION, "{}"))
+    return stored
 
 
 def places_of(job: Mapping[str, Any]) -> Iterator[PodPlace]:

@@ -149,6 +149,18 @@ def blocked_reason(pod: Document) -> str | None:
     return ": ".join(filter(None, (found["reason"], found.get("message"))))
 
 
+def stuck_jobs(jobs: Mapping[str, Document], pods: Iterable[Document]) -> dict[str, str]:
+    """Return the Jobs that no node runs, by name, with the reason: their pods are blocked, or have not been created."""
+    pods_of = group_pods(pods)
+    found: dict[str, str] = {}
+    for name, job in jobs.items():
+        of_job = [pod for worker in worker_names(job) for pod in pods_of.get(worker, ()) if not has_terminated(pod)]
+        reasons = list(map(blocked_reason, of_job))
+        if not is_over(job) and None not in reasons:
+            found[name] = next(filter(None, reasons), "the cluster has not created the pod")
+    return found
+
+
 def _container_status(pod: Document) -> Document:
     every = pod.get("status", {}).get("containerStatuses") or ()
     return next((one for one in every if one["name"] == CONTAINER), {})

@@ -8,12 +8,11 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from typing import TypeVar
 
 from marey_server import faults
-from marey_server.launchers.kubernetes.cluster import Cluster, NoSuchObject, ObjectExists
+from marey_server.launchers.kubernetes.cluster import Cluster, NoSuchObject, ObjectExists, ObjectRefused
 from marey_server.launchers.kubernetes.manifests import Manifest, token_secret
 from marey_server.launchers.kubernetes.options import ClusterOptions
 from marey_server.launchers.kubernetes.states import blocked_reason, launched_workers, worker_names, worker_of
 from marey_server.launchers.kubernetes.view import ClusterView
-from marey_server.launchers.launcher import EngineError
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -46,6 +45,20 @@ class WorkerJobs:
     async def create(self, jobs: Iterable[Manifest]) -> Sequence[Manifest]:
         """Create Jobs with their Secrets, and return them. Jobs with these names that exist already are returned."""
         return await self.all(self._create(job) for job in jobs)
+
+    async def create_allowed(self, jobs: Iterable[Manifest]) -> tuple[list[Manifest], dict[str, str]]:
+        """Create Jobs as `create` does; return those that exist now, and why the cluster refuses others, by name."""
+        refused: dict[str, str] = {}
+
+        async def create(job: Manifest) -> Manifest | None:
+            try:
+                return await self._create(job)
+            except ObjectRefused as error:
+                refused[job["metadata"]["name"]] = str(error)
+                return None
+
+        made = await self.all(map(create, jobs))
+        return [job for job in made if job is not None], refused
 
     async def delete(self, job: str) -> bool:
         """Delete a Job with its pods and its Secret; return whether it existed."""
@@ -83,7 +96,7 @@ class WorkerJobs:
         except ObjectExists:
             made = await self.cluster.read_job(name)
             if not job["metadata"]["labels"].items() <= made["metadata"].get("labels", {}).items():
-                raise EngineError(f"the cluster has another Job with the name {name}") from None
+                raise ObjectRefused(f"the cluster has another Job with the name {name}") from None
         self.view.put_job(made)
         faults.point("dispatch.before_token")
         await self._supply_token(made)
@@ -107,6 +120,9 @@ class WorkerJobs:
             await self.cluster.create_secret(token_secret(job, self._token_of(job)))
         except ObjectExists:
             log.debug("the Secret of the Job %s exists", name)
+        except ObjectRefused:
+            await self.delete(name)  # its pods could only wait
+            raise
         self._with_token.add(name)
 
     def _log_blocked(self) -> None:

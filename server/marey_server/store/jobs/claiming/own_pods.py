@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Row, exists, func, literal, or_, select
+from sqlalchemy import Row, case, exists, func, literal, or_, select, update
 
-from marey_schemas.queue.jobs import JobState
+from marey_schemas.queue.jobs import LONGEST_NOTE, JobState, Progress
 from marey_schemas.queue.own_pods import OWN_POD_LABEL
 from marey_schemas.queue.scripts import SCRIPT
 from marey_server.access.labels import labels_key, labels_of
 from marey_server.store.jobs.claiming.turns import claim_order
 from marey_server.store.jobs.fencing import QUEUED, RUNNING
+from marey_server.store.jobs.policy import SECOND_US
 from marey_server.store.quotas.running_jobs import count_leased
 from marey_server.store.tables import job, project, queue_share
 from marey_server.store.transaction import Transaction, in_lists
@@ -29,7 +30,8 @@ class WaitingJob:
     """Queued job that needs a pod of its own.
 
     `parent` and `position` are those of a task, and `siblings` is the number of tasks of its parent. `fence` counts the
-    claims of the job. `image` is the image that the script of the job names, if any.
+    claims of the job. `image` is the image that the script of the job names, if any. `limited` states whether its
+    `project` has a limit of running jobs.
     """
 
     id: str
@@ -42,20 +44,26 @@ class WaitingJob:
     parent: str | None = None
     position: int | None = None
     siblings: int = 0
+    project: str = ""
+    limited: bool = False
 
 
 def read_waiting(
-    tx: Transaction, limit: int, served: Collection[str] = (), split: Collection[str] = ()
+    tx: Transaction, limit: int, served: Collection[str] = (), split: Mapping[str, int] | None = None
 ) -> list[WaitingJob]:
-    """Return the first `limit` jobs that could start now and need a pod of their own, in the order of claims.
+    """Return the first `limit` jobs that could start now and need a pod of their own.
+
+    Projects take turns; the jobs of a project are in the order of claims.
 
     Jobs of a project whose limit of running jobs is reached are left out, and jobs whose concurrency key is in use.
 
     Parameters
     ----------
     served : ids of jobs that have a pod already
-    split : ids of jobs whose tasks have a pod each; tasks that were claimed before are returned nevertheless
+    split : ids of jobs whose tasks have a pod each, with the number of pods that they may have now; tasks that were
+        claimed before are returned nevertheless
     """
+    split = split or {}
     rival, parent = job.alias("rival"), job.alias("parent")
     rival_runs = exists().where(
         rival.c.project_id == job.c.project_id, rival.c.concurrency_key == job.c.concurrency_key,
@@ -83,10 +91,13 @@ def read_waiting(
             job.c.id.not_in(served),
             or_(job.c.parent_id.is_(None), job.c.fence > 0, job.c.parent_id.not_in(split)),
         )
-        .order_by(*claim_order(job))
+        .order_by(
+            func.row_number().over(partition_by=job.c.project_id, order_by=claim_order(job)), *claim_order(job)
+        )
         .limit(limit)
     )  # fmt: skip
-    return [_waiting(row) for row in _one_of_each_key(tx.execute(statement).all(), _unclaimed(tx, served))]
+    unclaimed = [*_unclaimed(tx, served), *_unclaimed_tasks(tx, split)]
+    return [_waiting(row) for row in _one_of_each_key(tx.execute(statement).all(), unclaimed)]
 
 
 def read_unfinished(tx: Transaction, ids: Collection[str]) -> set[str]:
@@ -98,20 +109,56 @@ def read_unfinished(tx: Transaction, ids: Collection[str]) -> set[str]:
     return found
 
 
-def _unclaimed(tx: Transaction, served: Collection[str]) -> list[Row[Any]]:
-    """Return the projects and concurrency keys of the served jobs that their pods have not claimed yet."""
+def postpone(tx: Transaction, job_id: str, reason: str, pause_s: float, *, tasks: bool) -> bool:
+    """Let a job without an attempt wait, or all such tasks of it; return whether there was one.
+
+    The job says why: the reason is the note of its progress until a worker claims it.
+    """
+    note = Progress(done=0, note=reason[:LONGEST_NOTE])
+    until_us = tx.now_us + round(pause_s * SECOND_US)
+    statement = (
+        update(job)
+        .where((job.c.parent_id if tasks else job.c.id) == job_id, job.c.state == QUEUED)
+        .values(
+            run_at_us=case((job.c.run_at_us > until_us, job.c.run_at_us), else_=until_us),
+            progress=note.model_dump(mode="json"),
+            rev=job.c.rev + 1,
+        )
+        .returning(job.c.id)
+    )
+    return bool(tx.execute(statement).all())
+
+
+Unclaimed = tuple[str, str | None]
+"""Project and concurrency key of a job whose pod has not claimed it yet."""
+
+
+def _unclaimed(tx: Transaction, served: Collection[str]) -> Iterator[Unclaimed]:
+    """Yield the served jobs that their pods have not claimed yet."""
     statement = select(job.c.project_id, job.c.concurrency_key).where(job.c.state == QUEUED)
-    return [row for some in in_lists(served) for row in tx.execute(statement.where(job.c.id.in_(some)))]
+    for some in in_lists(served):
+        for row in tx.execute(statement.where(job.c.id.in_(some))):
+            yield row.project_id, row.concurrency_key
 
 
-def _one_of_each_key(rows: Collection[Row[Any]], unclaimed: Collection[Row[Any]]) -> list[Row[Any]]:
+def _unclaimed_tasks(tx: Transaction, split: Mapping[str, int]) -> Iterator[Unclaimed]:
+    """Yield one entry for each pod of split jobs that has not claimed its task yet."""
+    task = job.alias("task")
+    running = select(func.count()).where(task.c.parent_id == job.c.id, task.c.state == RUNNING).scalar_subquery()
+    statement = select(job.c.id, job.c.project_id, running.label("running"))
+    for some in in_lists(split):
+        for row in tx.execute(statement.where(job.c.id.in_(some))):
+            yield from [(row.project_id, None)] * max(0, split[row.id] - row.running)
+
+
+def _one_of_each_key(rows: Collection[Row[Any]], unclaimed: Collection[Unclaimed]) -> list[Row[Any]]:
     """Return the rows without those that cannot run beside an earlier one, or beyond the limit of their project.
 
     Jobs whose pods have not claimed them yet count as earlier ones; otherwise, pods would start that can only wait.
     """
     kept: list[Row[Any]] = []
-    keys = {(row.project_id, row.concurrency_key) for row in unclaimed if row.concurrency_key is not None}
-    chosen = Counter(row.project_id for row in unclaimed)
+    keys = {one for one in unclaimed if one[1] is not None}
+    chosen = Counter(project_id for project_id, _ in unclaimed)
     for row in rows:
         if row.most_running is not None and row.running + chosen[row.project_id] >= row.most_running:
             continue
@@ -128,5 +175,6 @@ def _waiting(row: Row[Any]) -> WaitingJob:
     declaration = (row.params.get("declaration") or {}) if row.kind == SCRIPT else {}
     return WaitingJob(
         row.id, row.kind, row.fence, row.time_limit_s, row.memory_limit_mb, labels_of(row.labels_key),
-        declaration.get("image"), row.parent_id, row.position, row.siblings or 0,
+        declaration.get("image"), row.parent_id, row.position, row.siblings or 0, row.project_id,
+        row.most_running is not None,
     )  # fmt: skip
