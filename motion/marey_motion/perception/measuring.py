@@ -15,8 +15,9 @@ from marey_motion.looping import LoopSeam, continue_motion, rotated
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.simulation_root import DIRECTION_WINDOW_S, window_frames
 from marey_motion.motion import Motion
-from marey_motion.perception.metric import JOINT_CLASSES, WITHOUT_ANGLES, Measurement
+from marey_motion.perception.metric import JOINT_CLASSES
 from marey_motion.skeleton import Skeleton
+from marey_schemas.documents.metrics import WITHOUT_ANGLES, Measurement
 
 _SAME_REST = 1e-3
 _ROUNDED_FRAMES = 1e-9

@@ -12,6 +12,7 @@ from marey_schemas.documents.annotations import Annotation
 from marey_schemas.documents.clips import ClipInfo, MotionDocument
 from marey_schemas.documents.evaluations import EvaluationDocument, EvaluationRecords
 from marey_schemas.documents.graphs import ModelGraph
+from marey_schemas.documents.metrics import MetricDocument
 from marey_schemas.documents.models import MotionPrimitiveDocument
 from marey_schemas.documents.references import OutputRef as OutputRef
 from marey_schemas.documents.references import RevisionRef as RevisionRef
@@ -48,6 +49,7 @@ SCHEMAS: dict[str, type[Request]] = {
         SampleTreeDocument,
         ModelReport,
         ModelGraph,
+        MetricDocument,
         OpenDocument,
     )
 }
