@@ -127,6 +127,27 @@ COMPARE = KindDeclaration(
     outputs={"document": "file", "report": "file"},
 )
 
+_METRIC = InputSpec(
+    kind=Kind.METRIC,
+    required=False,
+    description="A stored perceptual metric; alternatively, the parameter `metric` names a built-in one.",
+)
+
+DISTANCES = KindDeclaration(
+    name="distances",
+    description="Measures how different clips look to people: perceptual distances of all pairs, motion maps, and "
+    "registration curves.",
+    params=job_params.DistancesParams,
+    implementation="marey_worker.kinds.distances:run",
+    version=1,
+    inputs={
+        "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to compare, all of one skeleton."),
+        "metric": _METRIC,
+        "rig": _RIG,
+    },
+    outputs={"document": "file", "maps": "file", "report": "file"},
+)
+
 _EVALUATED = InputSpec(
     kind=Kind.EVALUATION, description="The evaluation; its clips are read at the revisions that it used."
 )
@@ -319,7 +340,7 @@ def kind_of_job(name: str, params: Mapping[str, Any]) -> KindDeclaration:
 
 
 BUILT_IN = (
-    IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN, MODEL, TREE,
+    IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, DISTANCES, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN, MODEL, TREE,
     RUN_SCRIPT,
 )  # fmt: skip
 

@@ -30,6 +30,7 @@ from marey_schemas.options.imports import ImportOptions
 from marey_schemas.options.improvement import OptimisationOptions, SuggestionOptions, SweepOptions
 from marey_schemas.options.matching import FeatureWeights
 from marey_schemas.options.modelling import ModelOptions, TreeOptions
+from marey_schemas.options.perception import DistanceOptions, MetricChoice
 
 
 class TaggedResults(Request):
@@ -194,6 +195,20 @@ class CompareParams(Request):
         "", max_length=200, description="Title of the report; default: the names of the two evaluations."
     )
     report: bool = Field(True, description="Write the report, a self-contained HTML page.")
+
+
+MOST_COMPARED_CLIPS = 300
+"""Greatest number of clips of a table of perceptual distances."""
+
+
+class DistancesParams(DistanceOptions, MetricChoice):
+    """Parameters of jobs of the kind `distances`."""
+
+    loops: tuple[ItemId, ...] = Field(
+        (), max_length=MOST_COMPARED_CLIPS, description="Clips that are loops, in addition to those tagged `loop`."
+    )
+    title: str = Field("", max_length=200, description="Title of the report; default: the names of the clips.")
+    report: bool = Field(True, description="Write the report, a self-contained HTML page, and its figures.")
 
 
 class SuggestParams(SuggestionOptions):
