@@ -14,7 +14,7 @@ import numpy as np
 from marey_motion.arrays import Floats, Ints
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
-from marey_motion.looping import LoopSeam, loop_seam
+from marey_motion.looping import loop_seam
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.simulation_root import raw_root
 from marey_motion.motion import Motion

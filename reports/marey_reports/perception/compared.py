@@ -19,7 +19,6 @@ from marey_schemas.options.perception import DistanceOptions
 
 MOST_DRAWN_FRAMES = 1200
 """Greatest number of rows and columns of a drawn map; maps of longer clips show every second frame, or fewer."""
-_PUBLISHED_NOISE = 0.05
 _PUBLISHED_MEAN = 5 / 6
 
 
@@ -107,18 +106,20 @@ def _claims_of(metric: MetricDocument) -> Iterator[str]:
         )
         return
     who = "29 people who judged walks of 21 others on one neutral figure"
-    noise, mean = _PUBLISHED_NOISE, f" The mean difference of two of these walks is {_PUBLISHED_MEAN:.2f}."
+    mean = f" The mean difference of two of these walks is {_PUBLISHED_MEAN:.2f}."
     if metric.origin == "fitted":
         known = metric.fit
-        who = "people who judged" if known is None else f"{known.participants} people who judged {known.motions} motions"
-        noise, mean = (known and known.noise_ceiling) or _PUBLISHED_NOISE, ""
+        who = (
+            "people who judged" if known is None else f"{known.participants} people who judged {known.motions} motions"
+        )
+        mean = ""
     yield (
         f"The weights come from {who}: a distance estimates how rarely people would call two motions the most similar "
         f"of four, from 0 (always) to 1 (never).{mean}"
     )
     yield (
-        f"The judgements themselves have a standard error of {noise:.2f}, so distances that differ by less than "
-        f"{2 * noise:.2f} are not distinguished."
+        f"The judgements themselves have a standard error of {metric.judgement_error:.2f}, so distances that differ by "
+        f"less than {2 * metric.judgement_error:.2f} are not distinguished."
     )
     if metric.origin == "published":
         yield "Only natural walks were judged. For runs, turns, dances or single poses, nobody was asked."
@@ -128,4 +129,3 @@ def _thinned(clip: MeasuredClip, step: int) -> MeasuredClip:
     if step == 1:
         return clip
     return replace(clip.at(np.arange(0, clip.frame_count, step, dtype=np.float64)), rate_hz=clip.rate_hz / step)
-

@@ -8,10 +8,10 @@ import numpy as np
 
 from marey_motion.version import code_version
 from marey_reports.drawing.drawn import DrawnFigure
-from marey_reports.drawing.markup import Content, Html, element, joined
+from marey_reports.drawing.markup import Html, element, joined
 from marey_reports.drawing.page import Section, page, shown
 from marey_reports.drawing.paper import labels_of
-from marey_reports.drawing.tables import Number, facts, folded, number, table
+from marey_reports.drawing.tables import Cell, Number, facts, folded, number, table
 from marey_reports.perception.compared import ComparedSet
 from marey_reports.perception.distance_table import draw_distance_table
 from marey_reports.perception.motion_maps import draw_components, draw_registration
@@ -99,7 +99,7 @@ def _pairs(subject: ComparedSet) -> Html:
     names = labels_of([clip.name for clip in subject.clips])
     listed = ranked if len(ranked) <= MOST_LISTED_PAIRS else ranked[:MOST_LISTED_PAIRS]
     measured = [component.measurement for component in subject.metric.components]
-    rows = [
+    rows: list[Sequence[Cell]] = [
         (
             f"{names[i]} – {names[j]}",
             number(float(subject.distances.totals[i, j]), 3),
@@ -118,7 +118,7 @@ def _claims(subject: ComparedSet) -> Html:
 
 def _clips(subject: ComparedSet) -> Html:
     rate = subject.metric.frame_rate_hz
-    rows: list[Sequence[Number | Content]] = [
+    rows: list[Sequence[Cell]] = [
         (
             clip.name,
             number(clip.recorded.frame_count / rate, 2),
@@ -135,7 +135,7 @@ def _clips(subject: ComparedSet) -> Html:
 def _metric(subject: ComparedSet) -> Html:
     metric = subject.metric
     heads = ("measurement", "shaping", "share", "c", "N", *(name.replace("_", " ") for name in JOINT_CLASS_NAMES))
-    rows = [
+    rows: list[Sequence[Cell]] = [
         (
             component.measurement,
             component.shaping if component.shaping != "power" else f"power {component.exponent:.3g}",

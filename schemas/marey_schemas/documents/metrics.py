@@ -63,6 +63,9 @@ _NO_SHARES = "The paper prints no shares of angles, positions and velocities; ea
 _MOST_ROUNDING = 0.0025
 """Greatest deviation from the sum 1 that the rounding of printed weights explains."""
 
+PUBLISHED_ERROR = 0.05
+"""Standard error of a published perceived difference: 1,827 trials show each of 210 pairs 52 times."""
+
 _BUILT_IN_PATTERN = r"^(published|uniform)/(?:(angles|positions|velocities)-)?(euclid|manhattan|sigmoid)$"
 BuiltInMetric = Annotated[str, StringConstraints(pattern=_BUILT_IN_PATTERN)]
 """Name of a metric that needs no item, such as `published/sigmoid` or `published/positions-manhattan`.
@@ -168,6 +171,12 @@ class MetricDocument(Request):
         if abs(total - 1.0) > 1e-6:
             raise ValueError(f"components: the shares have the sum {total:g}; it must be 1")
         return self
+
+    @property
+    def judgement_error(self) -> float:
+        """The standard error of the judgements that the weights were fitted to."""
+        known = None if self.fit is None else self.fit.noise_ceiling
+        return PUBLISHED_ERROR if known is None else known
 
     def identity_digest(self) -> Digest:
         """Return the digest of everything that determines distances: two metrics with equal digests are the same."""

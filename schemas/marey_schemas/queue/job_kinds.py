@@ -40,6 +40,13 @@ _RIGS = InputSpec(
 )
 
 
+_METRIC = InputSpec(
+    kind=Kind.METRIC,
+    required=False,
+    description="A stored perceptual metric; alternatively, the parameter `metric` names a built-in one.",
+)
+
+
 def _may_hold_graphs(params: Mapping[str, Any]) -> bool:
     """Return whether one of the files to import may be a graph of motion models, judging by its name.
 
@@ -106,6 +113,7 @@ EVALUATE = KindDeclaration(
             description="The evaluation whose normaliser (scaling of features) is used, so that the results of "
             "both evaluations can be compared.",
         ),
+        "metric": _METRIC,
     },
     outputs={"evaluation": Kind.EVALUATION},
     facets=USAGE_FACETS,
@@ -125,12 +133,6 @@ COMPARE = KindDeclaration(
         ),
     },
     outputs={"document": "file", "report": "file"},
-)
-
-_METRIC = InputSpec(
-    kind=Kind.METRIC,
-    required=False,
-    description="A stored perceptual metric; alternatively, the parameter `metric` names a built-in one.",
 )
 
 DISTANCES = KindDeclaration(
@@ -165,7 +167,7 @@ SUGGEST = KindDeclaration(
     params=job_params.SuggestParams,
     implementation="marey_worker.kinds.suggest:run",
     version=2,
-    inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES},
+    inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES, "metric": _METRIC},
     outputs={"document": "file"},
     facets=REMOVAL_FACETS,
 )
@@ -273,6 +275,7 @@ ALIGN = KindDeclaration(
             description="Annotations of these clips; their segments and keyframes cut the clips into parts, "
             "which are aligned one by one.",
         ),
+        "metric": _METRIC,
         "rig": _RIG,
     },
     outputs={"processed": Kind.PROCESSED},
@@ -340,8 +343,8 @@ def kind_of_job(name: str, params: Mapping[str, Any]) -> KindDeclaration:
 
 
 BUILT_IN = (
-    IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, DISTANCES, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN, MODEL, TREE,
-    RUN_SCRIPT,
+    IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, DISTANCES, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN, MODEL,
+    TREE, RUN_SCRIPT,
 )  # fmt: skip
 
 

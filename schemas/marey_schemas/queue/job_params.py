@@ -49,7 +49,7 @@ MOST_EXAMPLES = 2000
 """Greatest number of examples that are all compared with each other; mirrored copies count."""
 
 
-class AlignParams(AlignOptions, SuffixedResults):
+class AlignParams(AlignOptions, MetricChoice, SuffixedResults):
     """Parameters of jobs of the kind `align`."""
 
     layer: LayerName | None = Field(
@@ -137,7 +137,7 @@ TRIALS_PER_TASK = 8
 MOST_EVALUATION_TASKS = 64
 
 
-class EvaluateParams(EvaluationOptions, TaggedResults):
+class EvaluateParams(EvaluationOptions, MetricChoice, TaggedResults):
     """Parameters of jobs of the kind `evaluate`."""
 
     name: ItemName = Field("evaluation", description="Name of the result.")
@@ -211,7 +211,7 @@ class DistancesParams(DistanceOptions, MetricChoice):
     report: bool = Field(True, description="Write the report, a self-contained HTML page, and its figures.")
 
 
-class SuggestParams(SuggestionOptions):
+class SuggestParams(SuggestionOptions, MetricChoice):
     """Parameters of jobs of the kind `suggest`."""
 
 

@@ -13,7 +13,8 @@ from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
 from marey_motion.perception.comparing import ClipDistances, ComparableClip, compare_clips, prepare_comparison
 from marey_motion.perception.metric import metric_of
-from marey_reports.perception.page import ComparedSet, draw_distance_figures, render_distances
+from marey_reports.perception.compared import ComparedSet
+from marey_reports.perception.page import draw_distance_figures, render_distances
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.metrics import MetricDocument, MetricIdentity
 from marey_schemas.options.perception import DistanceOptions
@@ -90,8 +91,11 @@ def _prepared(
         try:
             clip = documents.clip_from_document(motion, rigged.skeleton)
             loop = is_loop(pin, info, params.loops)
-            yield pin, prepare_comparison(
-                clip, body, metric, document.frame_rate_hz, name=pin.path, cycles=params.cycles, loop=loop
+            yield (
+                pin,
+                prepare_comparison(
+                    clip, body, metric, document.frame_rate_hz, name=pin.path, cycles=params.cycles, loop=loop
+                ),
             )
         except MotionError as error:
             refusals.add(pin, error)
@@ -151,5 +155,3 @@ def _maps(subject: ComparedSet) -> bytes:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     return buffer.getvalue()
-
-
