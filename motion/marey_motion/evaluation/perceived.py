@@ -134,7 +134,7 @@ class PerceivedRows:
 
 
 def indistinguishable(metric: MetricDocument) -> float:
-    """Compute the distance up to which people do not distinguish two motions from equal ones.
+    """Compute the distance up to which judgements do not tell two motions from motions that are nearly equal.
 
     Parameters
     ----------

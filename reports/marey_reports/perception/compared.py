@@ -118,8 +118,8 @@ def _claims_of(metric: MetricDocument) -> Iterator[str]:
         f"of four, from 0 (always) to 1 (never).{mean}"
     )
     yield (
-        f"The judgements themselves have a standard error of {metric.judgement_error:.2f}, so distances that differ by "
-        f"less than {2 * metric.judgement_error:.2f} are not distinguished."
+        f"The judgements themselves have a standard error of {metric.judgement_error:.2f}, so the metric cannot order "
+        f"distances that differ by less than {2 * metric.judgement_error:.2f}."
     )
     if metric.origin == "published":
         yield "Only natural walks were judged. For runs, turns, dances or single poses, nobody was asked."

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.support.command_line import CommandLine
 
+from marey_client import Marey
 from marey_client.errors import Invalid, JobUnsuccessful
 from marey_client.handles.metrics import Distances, Metric
 from marey_client.jobs import Jobs
@@ -16,6 +19,27 @@ from marey_client.project import ProjectHandle
 from marey_schemas.documents.metrics import built_in_metric
 
 pytestmark = pytest.mark.timeout(300)
+PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "compare-clips-as-people-see-them.md"
+
+
+def test_the_commands_and_the_example_of_the_page_run(
+    marey: Marey, lab: ProjectHandle, run: CommandLine, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    for clip, name in zip(list(lab.clips.list(sort="name"))[:2], ("slow", "fast"), strict=True):
+        run("mv", f"lab/{clip.path}", f"lab/walks/{name}")
+    blocks = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+    done = [run(*shlex.split(line, comments=True)[1:]) for block in blocks for line in block.splitlines()]
+    assert "Only natural walks were judged." in done[0].stderr
+    assert "metric: published/manhattan" in done[6].stdout
+    assert "by the metric published/positions-sigmoid" in done[8].stdout
+    info = next(iter(lab.processed.list())).part("info")
+    assert info["metric"]["name"] == info["options"]["metric"] == "published/positions-sigmoid"
+    (evaluated,) = lab.evaluations.list()
+    assert evaluated.document()["perceived"]["transitions"] > 0
+    (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    exec(example, {"marey": marey})
+    assert "(9, 9)" in capsys.readouterr().out
 
 
 def test_two_walks_have_a_distance_with_maps_and_a_curve(lab: ProjectHandle, run: CommandLine, tmp_path: Path) -> None:

@@ -111,7 +111,7 @@ def _pair_to_tree(pair: NearDuplicate) -> Tree:
 
 
 def _metric_to_tree(metric: MetricDocument | None) -> Tree:
-    """Describe the metric, and the distance up to which people do not distinguish motions; empty without a metric."""
+    """Describe the metric, and the greatest distance of near-duplicates to remove; empty without a metric."""
     if metric is None:
         return {}
     known = MetricIdentity.of(metric).model_dump(mode="json")
