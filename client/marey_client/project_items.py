@@ -12,7 +12,7 @@ from marey_client.handles.annotations import AnnotationHandle
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.edits import EditHandle, Edits
 from marey_client.handles.evaluations import EvaluationHandle
-from marey_client.handles.metrics import MetricHandle, Metrics
+from marey_client.handles.metrics import MetricHandle, PerceptualMetrics
 from marey_client.handles.models import ModelHandle
 from marey_client.handles.processed import ProcessedHandle
 from marey_client.handles.purges import purge_items
@@ -76,9 +76,9 @@ class ProjectItems:
         return Items(self.transport, self.name, Kind.EVALUATION, EvaluationHandle)
 
     @cached_property
-    def metrics(self) -> Metrics:
+    def metrics(self) -> PerceptualMetrics:
         """The perceptual metrics of the project."""
-        return Metrics(self.transport, self.name, Kind.METRIC, MetricHandle)
+        return PerceptualMetrics(self.transport, self.name, Kind.METRIC, MetricHandle)
 
     def items(self, kind: Kind) -> Items[Any]:
         """The items of the project, of any kind."""

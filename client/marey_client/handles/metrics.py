@@ -33,7 +33,7 @@ Metric: TypeAlias = MetricHandle | str
 """A stored metric, its id, or the name of a built-in metric such as `published/sigmoid`."""
 
 
-class Metrics(Items[MetricHandle]):
+class PerceptualMetrics(Items[MetricHandle]):
     """The perceptual metrics of a project."""
 
     def store(self, metric: MetricDocument | str, name: str, *, collection: str = "") -> MetricHandle:

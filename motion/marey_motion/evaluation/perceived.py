@@ -42,7 +42,16 @@ class PerceivedTransitions:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any] | None) -> PerceivedTransitions | None:
-        """Read the result from the document of an evaluation; None if no metric was chosen."""
+        """Read the result from the document of an evaluation.
+
+        Parameters
+        ----------
+        tree : mapping or None    member `perceived` of the document; None if no metric was chosen
+
+        Returns
+        -------
+        PerceivedTransitions or None    the result
+        """
         return None if tree is None else cls(**{field.name: tree[field.name] for field in fields(cls)})
 
 
@@ -134,7 +143,7 @@ class PerceivedRows:
 
 
 def indistinguishable(metric: MetricDocument) -> float:
-    """Compute the distance up to which judgements do not tell two motions from motions that are nearly equal.
+    """Compute the greatest distance of two motions that judgements cannot separate from nearly equal motions.
 
     Parameters
     ----------

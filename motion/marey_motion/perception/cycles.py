@@ -45,8 +45,8 @@ def find_period(clip: MeasuredClip, metric: PerceptualMetric) -> Period:
     """Find the period of a clip: the first significant minimum of the mean distance along diagonals of its motion map.
 
     A minimum is significant if it is in the lowest quarter of the range of distances: half a cycle, at which left and
-    right are exchanged, is a minimum, too, but a shallow one. A loop starts in a frame that differs from the frame half a
-    period later, at least half as much as in most frames; so it does not contain somebody who stands still.
+    right are exchanged, is a minimum, too, but a shallow one. A loop starts in a frame that differs enough from the
+    frame half a period later; so it does not show somebody who stands still.
 
     Parameters
     ----------

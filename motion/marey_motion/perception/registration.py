@@ -9,8 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import BSpline
-from scipy.optimize import lsq_linear
 
 from marey_motion.alignment.dtw import align, align_cyclic
 from marey_motion.alignment.warp import LEAST_SLOPE, time_function
@@ -138,6 +136,9 @@ def increasing_spline(times: Floats, rate_hz: float) -> Floats:
     -------
     (n,) float64    strictly increasing times
     """
+    from scipy.interpolate import BSpline
+    from scipy.optimize import lsq_linear
+
     last = len(times) - 1
     spans = max(1, round(last / (KNOT_SPACING_S * rate_hz)))
     knots = np.concatenate((np.zeros(_DEGREE), np.linspace(0.0, last, spans + 1), np.full(_DEGREE, float(last))))

@@ -28,7 +28,6 @@ from marey_worker.job_io.refusals import Refusals
 from marey_worker.job_io.skeleton_cache import read_rigged
 from marey_worker.job_io.stored_reports import stored_figure
 
-STEPS = 3
 Prepared = tuple[PinnedInput, ComparableClip]
 
 

@@ -148,7 +148,7 @@ class _Families:
             aligned += 1
             distance = warped_distance(own, theirs, limit=limit_m)
             if distance <= limit_m:
-                perceived = self._seen and self._seen.distance(self._clips[one], self._clips[place])
+                perceived = None if self._seen is None else self._seen.distance(self._clips[one], self._clips[place])
                 pair = _pair(self._clips[one], self._clips[place], distance, perceived)
                 near.setdefault(self._family[place], []).append(pair)
         nearest = [min(pairs, key=lambda pair: pair.distance_cm) for pairs in near.values()]
