@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,15 +13,18 @@ from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.duplicates import NearDuplicates, find_near_duplicates, spared_sources
 from marey_motion.evaluation.perceived import PerceivedRows, indistinguishable, require_same_metric
-from marey_motion.gait import generate_gait
+from marey_motion.formats import read_motion
+from marey_motion.gait import game_skeleton, generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.perception import comparing
 from marey_motion.perception.comparing import ComparableClip, compare_clips, prepare_comparison
+from marey_motion.perception.maps import paired_distances
 from marey_motion.perception.metric import metric_of
 from marey_motion.perception.registration import clip_distance
-from marey_motion.rigs import map_joints
+from marey_motion.retargeting import plan_retarget, retarget
+from marey_motion.rigs import guess_axes, map_joints
 from marey_schemas.documents.metrics import (
     MetricComponent,
     MetricDocument,
@@ -199,3 +203,32 @@ def test_what_people_do_not_distinguish_comes_from_the_judgements() -> None:
     fit = MetricFit(motions=21, participants=10, trials=630, pairs=210, rmse=0.1, noise_ceiling=0.08)
     ours = PAPER.model_copy(update={"origin": "fitted", "fit": fit})
     assert indistinguishable(ours) == pytest.approx(0.059 + 0.16)
+
+
+REAL = (
+    "bandai-namco-1/dataset-1_walk_normal_001.bvh", "bandai-namco-1/dataset-1_walk_tired_001.bvh",
+    "cmu-amc/16/16_15.amc", "cmu-amc/16/16_31.amc",
+)  # fmt: skip
+
+
+def test_loops_of_real_walks_have_no_seam_and_walks_of_one_person_are_nearest(mocap: Path) -> None:
+    target = game_skeleton()
+    mapping = map_joints(target)
+    body, axes = MatchingBody.from_mapping(target, mapping), guess_axes(target, mapping)
+    clips = []
+    for name in REAL:
+        file = mocap / name
+        asf = file.parent / f"{file.parent.name}.asf"
+        companion = asf.read_bytes() if file.suffix == ".amc" else None
+        clip = read_motion(file.read_bytes(), file.name, companion=companion).clip
+        own = map_joints(clip.skeleton)
+        plan = plan_retarget(clip.skeleton, own, guess_axes(clip.skeleton, own), target, mapping, axes)
+        made = prepare_comparison(retarget(clip, plan), body, METRIC, 60.0, name=name)
+        assert made.period is not None
+        assert 1.0 < made.period.frames / 60.0 < 1.3
+        steps = paired_distances(made.compared, made.compared.at(np.arange(1.0, made.period.frames + 1.0)), METRIC)
+        assert steps[-1] <= 1.5 * np.quantile(steps, 0.9)
+        clips.append(made.compared)
+    totals = compare_clips(clips, METRIC).totals
+    assert np.unravel_index(np.argmin(totals + np.eye(4) * 9), totals.shape) == (2, 3)
+    assert totals[2, 3] < 0.5 * totals[:2, 2:].min()
