@@ -22,7 +22,10 @@ MOST_LISTED_PAIRS = 30
 
 
 def draw_distance_figures(subject: ComparedSet) -> dict[str, DrawnFigure]:
-    """Draw the table of distances of three clips or more, and the maps of the nearest and the farthest pair."""
+    """Draw the table of distances of three clips or more, and the maps of the nearest and the farthest pair.
+
+    Maps by component are drawn only for metrics with several components.
+    """
     figures: dict[str, DrawnFigure] = {}
     if len(subject.clips) > 2:
         sketch = draw_distance_table(subject)
@@ -42,9 +45,10 @@ def draw_distance_figures(subject: ComparedSet) -> dict[str, DrawnFigure]:
         )  # fmt: skip
         name = f"{start}registration"
         figures[name] = DrawnFigure(registration, name, "1", f"Motion maps{end}")
-        name = f"{start}components"
-        components = draw_components(one, other, subject.computed)
-        figures[name] = DrawnFigure(components, name, "6", f"Motion maps by component{end}")
+        if len(subject.metric.components) > 1:
+            name = f"{start}components"
+            components = draw_components(one, other, subject.computed)
+            figures[name] = DrawnFigure(components, name, "6", f"Motion maps by component{end}")
     return figures
 
 
