@@ -66,8 +66,8 @@ class Distances(Findings):
         """Return motion maps and registration curves of the drawn pairs: the only pair, or nearest and farthest.
 
         The names begin with `pair0_` or `pair1_`. They end with the measurement or `combined` for maps, with frames of
-        the first clip as rows; with `map_rates_hz` for the frame rates of rows and columns; and with `curve_first_s`
-        and `curve_second_s` for the times at which both clips show the same moment.
+        the first clip as rows; with `map_rate_hz` for the frame rate of rows and columns; and with `curve_first_s` and
+        `curve_second_s` for the times at which both clips show the same moment.
         """
         with np.load(io.BytesIO(Blobs(self.transport).fetch(self._blob("maps")))) as arrays:
             return dict(arrays)

@@ -167,4 +167,15 @@ def compare_clips(
 
 
 def _distance(clips: Sequence[MeasuredClip], metric: PerceptualMetric, pair: tuple[int, int]) -> ClipDistance:
-    return clip_distance(clips[pair[0]], clips[pair[1]], metric)
+    one, other = (clips[number] for number in pair)
+    try:
+        return clip_distance(one, other, metric)
+    except MotionError as error:
+        if error.code != "alignment-impossible":
+            raise
+        raise MotionError(
+            f"clips {pair[0] + 1} and {pair[1] + 1} have {one.frame_count} and {other.frame_count} frames, and the "
+            "moments of clips whose lengths differ so much cannot be matched; compare loops of one cycle, or cut the "
+            "longer clip",
+            code="lengths-differ",
+        ) from error

@@ -54,16 +54,21 @@ class ComparedSet:
         """Return the registration curve of a pair."""
         return registration_curve(self.clips[pair[0]].compared, self.clips[pair[1]].compared, self.computed)
 
-    def drawable(self, number: int, *, recorded: bool = False) -> tuple[NamedClip, int]:
-        """Return a clip, as it was recorded or as it was compared, with few enough frames to draw, and the step."""
-        one = self.clips[number]
-        clip = one.recorded if recorded else one.compared
-        step = -(-clip.frame_count // MOST_DRAWN_FRAMES)
-        return NamedClip(one.name, _thinned(clip, step)), step
+    def drawable(self, pair: tuple[int, int]) -> tuple[NamedClip, NamedClip]:
+        """Return the compared clips of a pair with few enough frames to draw; both have the same frame rate."""
+        clips = [self.clips[number] for number in pair]
+        step = -(-max(clip.compared.frame_count for clip in clips) // MOST_DRAWN_FRAMES)
+        one, other = (NamedClip(clip.name, _thinned(clip.compared, step)) for clip in clips)
+        return one, other
+
+    def recorded(self, number: int) -> NamedClip:
+        """Return a clip as it was recorded, with few enough frames to draw."""
+        clip = self.clips[number]
+        return NamedClip(clip.name, _thinned(clip.recorded, -(-clip.recorded.frame_count // MOST_DRAWN_FRAMES)))
 
     def arrays(self, pair: tuple[int, int]) -> dict[str, np.ndarray]:
-        """Return maps of a pair by component and combined, the curve, and the frame rates of rows and columns."""
-        (one, first_step), (other, second_step) = self.drawable(pair[0]), self.drawable(pair[1])
+        """Return maps of a pair by component and combined, their frame rate, and the curve."""
+        one, other = self.drawable(pair)
         curve, rate = self.curve(pair), self.metric.frame_rate_hz
         maps = {
             component.measurement: component_map(one.clip, other.clip, self.computed, component)
@@ -71,7 +76,7 @@ class ComparedSet:
         }
         found: dict[str, np.ndarray] = {name: np.asarray(values, np.float32) for name, values in maps.items()}
         found["combined"] = np.asarray(motion_map(one.clip, other.clip, self.computed), np.float32)
-        found["map_rates_hz"] = np.array([rate / first_step, rate / second_step])
+        found["map_rate_hz"] = np.array(one.clip.rate_hz)
         found["curve_first_s"], found["curve_second_s"] = np.arange(len(curve.times)) / rate, curve.times / rate
         return found
 

@@ -61,5 +61,5 @@ def draw_distance_table(subject: ComparedSet) -> Sketch:
         f"Perceptual distances of {count} clips by the metric {subject.metric.name}. The clips are in the order of the "
         "first principal component of the table, so similar clips tend to be neighbours."
     )
-    columns = {"clip": names, **{name: totals[:, place] for place, name in enumerate(names)}}
+    columns = {"clip": names, **{f"to {place + 1}": totals[:, place] for place in range(count)}}
     return Sketch(figure, {"distances": columns}, caption)

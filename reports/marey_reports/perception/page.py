@@ -33,16 +33,17 @@ def draw_distance_figures(subject: ComparedSet) -> dict[str, DrawnFigure]:
     pairs = subject.drawn_pairs()
     words = ("nearest", "farthest") if len(pairs) > 1 else ("",)
     for word, pair in zip(words, pairs, strict=True):
-        (one, _), (other, _), (recorded, _) = (
-            subject.drawable(pair[0]),
-            subject.drawable(pair[1]),
-            subject.drawable(pair[0], recorded=True),
-        )
+        one, other = subject.drawable(pair)
         start, end = (f"{word}-", f" of the {word} pair") if word else ("", "")
         registration = draw_registration(
-            one, other, subject.computed, subject.clips[pair[0]].period, subject.curve(pair), recorded=recorded,
+            one,
+            other,
+            subject.computed,
+            subject.clips[pair[0]].period,
+            subject.curve(pair),
+            recorded=subject.recorded(pair[0]),
             rate_hz=subject.metric.frame_rate_hz,
-        )  # fmt: skip
+        )
         name = f"{start}registration"
         figures[name] = DrawnFigure(registration, name, "1", f"Motion maps{end}")
         if len(subject.metric.components) > 1:

@@ -25,6 +25,8 @@ from marey_motion.perception.metric import metric_of
 from marey_motion.perception.registration import clip_distance
 from marey_motion.retargeting import plan_retarget, retarget
 from marey_motion.rigs import guess_axes, map_joints
+from marey_reports.perception.compared import ComparedSet
+from marey_reports.perception.page import draw_distance_figures
 from marey_schemas.documents.metrics import (
     MetricComponent,
     MetricDocument,
@@ -35,6 +37,7 @@ from marey_schemas.documents.metrics import (
 )
 from marey_schemas.options.alignment import AlignOptions
 from marey_schemas.options.matching import DatabaseOptions
+from marey_schemas.options.perception import DistanceOptions
 
 PAPER = built_in_metric("published/positions-sigmoid")
 METRIC = metric_of(PAPER)
@@ -117,6 +120,20 @@ def test_what_is_too_long_is_refused_before_it_is_computed(monkeypatch: pytest.M
     monkeypatch.setattr(comparing, "MOST_COMPARED_FRAMES", 100)
     with pytest.raises(MotionError, match="cut it first"):
         comparable(gait)
+
+
+def test_whole_clips_of_different_lengths_are_drawn_at_one_rate_or_refused() -> None:
+    long, (gait, *_) = comparable(generate_gait(1.2, 0.0, 21.0), cycles="whole"), gaits()
+    short = comparable(generate_gait(1.2, 0.0, 15.0), cycles="whole")
+    clips = [long, short]
+    found = compare_clips([clip.compared for clip in clips], METRIC)
+    subject = ComparedSet(PAPER, clips, found, DistanceOptions(cycles="whole"))
+    arrays = subject.arrays((0, 1))
+    assert (arrays["combined"].shape, float(arrays["map_rate_hz"])) == ((630, 450), 30.0)
+    assert set(draw_distance_figures(subject)) == {"registration"}
+    assert any("Whole clips" in claim for claim in subject.claims())
+    with pytest.raises(MotionError, match="clips 1 and 2 have 1260 and 240 frames"):
+        compare_clips([long.compared, comparable(gait, cycles="whole").compared], METRIC)
 
 
 def test_a_person_who_stands_first_gives_a_loop_of_walking() -> None:
