@@ -238,6 +238,7 @@ def test_loops_of_real_walks_have_no_seam_and_walks_of_one_person_are_nearest(mo
         asf = file.parent / f"{file.parent.name}.asf"
         companion = asf.read_bytes() if file.suffix == ".amc" else None
         clip = read_motion(file.read_bytes(), file.name, companion=companion).clip
+        assert clip is not None
         own = map_joints(clip.skeleton)
         plan = plan_retarget(clip.skeleton, own, guess_axes(clip.skeleton, own), target, mapping, axes)
         made = prepare_comparison(retarget(clip, plan), body, METRIC, 60.0, name=name)
@@ -247,5 +248,5 @@ def test_loops_of_real_walks_have_no_seam_and_walks_of_one_person_are_nearest(mo
         assert steps[-1] <= 1.5 * np.quantile(steps, 0.9)
         clips.append(made.compared)
     totals = compare_clips(clips, METRIC).totals
-    assert np.unravel_index(np.argmin(totals + np.eye(4) * 9), totals.shape) == (2, 3)
+    assert int(np.argmin(totals + np.eye(4) * 9)) == 2 * 4 + 3
     assert totals[2, 3] < 0.5 * totals[:2, 2:].min()
