@@ -15,6 +15,7 @@ from marey_client.handles.datasets import Datasets
 from marey_client.handles.edits import Commands
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.handles.invitations import Invitations
+from marey_client.handles.metrics import Metric
 from marey_client.handles.models import ModelHandle
 from marey_client.handles.pipelines import PipelineRun, submit_pipeline
 from marey_client.handles.schedules import Schedules
@@ -30,6 +31,7 @@ from marey_client.requests import (
     align_request,
     annotate_request,
     cut_request,
+    distances_request,
     edit_request,
     evaluate_request,
     model_request,
@@ -241,6 +243,7 @@ class ProjectHandle(ProjectItems):
         *,
         into: str,
         annotations: Annotations | None = None,
+        metric: Metric | None = None,
         priority: int = 0,
         cache: CacheMode = "use",
         commit: CommitTo = None,
@@ -249,9 +252,10 @@ class ProjectHandle(ProjectItems):
         """Submit a job that aligns clips of one skeleton, all of which show the same action.
 
         `options` are those of `AlignParams`, for example `rate_hz=30` or `layer="steps"`. If `options` name a layer or
-        labels, the default for `annotations` is the annotations of the clips.
+        labels, the default for `annotations` is the annotations of the clips. With a `metric`, perceptual distances are
+        the costs of poses.
         """
-        request = align_request(self, clips, annotations, AlignParams.model_validate(options))
+        request = align_request(self, clips, annotations, AlignParams.model_validate(options), metric)
         chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
         return self.submit(request.model_copy(update=chosen))
 
@@ -282,6 +286,7 @@ class ProjectHandle(ProjectItems):
         *,
         into: str = "",
         normaliser: EvaluationHandle | str | None = None,
+        metric: Metric | None = None,
         priority: int = 0,
         cache: CacheMode = "use",
         commit: CommitTo = None,
@@ -291,11 +296,28 @@ class ProjectHandle(ProjectItems):
 
         `options` are those of `EvaluateParams`, for example `name="walks-eval"` or `database={"mirroring": "add"}`;
         `normaliser` is another evaluation, or the id of one: its scaling of features is used, so that the results of
-        both evaluations can be compared.
+        both evaluations can be compared. With a `metric`, the perceptual distances of transitions are measured, too.
         """
-        request = evaluate_request(self, clips, EvaluateParams.model_validate(options), normaliser)
+        request = evaluate_request(self, clips, EvaluateParams.model_validate(options), normaliser, metric)
         chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
         return self.submit(request.model_copy(update=chosen))
+
+    def distances(
+        self,
+        clips: Clips,
+        *,
+        metric: Metric | None = None,
+        priority: int = 0,
+        cache: CacheMode = "use",
+        **options: Any,
+    ) -> Job:
+        """Submit a job that measures how different clips look to people, by a perceptual metric.
+
+        `metric` is a stored metric, its id, or the name of a built-in one, such as `published/sigmoid`; `options` are
+        those of `DistancesParams`. `handles.metrics.Distances` reads the result.
+        """
+        request = distances_request(self, clips, metric, options)
+        return self.submit(request.model_copy(update={"priority": priority, "cache": cache}))
 
     def evaluation(self, job: Job, *, on_progress: OnProgress | None = None) -> EvaluationHandle:
         """Wait for a job, and return the evaluation that it created. Raises `JobUnsuccessful` if the job failed."""

@@ -12,6 +12,7 @@ from marey_client.handles.annotations import AnnotationHandle
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.edits import EditHandle, Edits
 from marey_client.handles.evaluations import EvaluationHandle
+from marey_client.handles.metrics import MetricHandle, PerceptualMetrics
 from marey_client.handles.models import ModelHandle
 from marey_client.handles.processed import ProcessedHandle
 from marey_client.handles.purges import purge_items
@@ -80,11 +81,16 @@ class ProjectItems:
         """The perceptual studies of the project."""
         return Studies(self.transport, self.name, Kind.STUDY, StudyHandle)
 
+    @cached_property
+    def metrics(self) -> PerceptualMetrics:
+        """The perceptual metrics of the project."""
+        return PerceptualMetrics(self.transport, self.name, Kind.METRIC, MetricHandle)
+
     def items(self, kind: Kind) -> Items[Any]:
         """The items of the project, of any kind."""
         known: tuple[Items[Any], ...] = (
             self.clips, self.skeletons, self.annotations, self.processed, self.edits, self.models, self.evaluations,
-            self.studies,
+            self.studies, self.metrics,
         )  # fmt: skip
         return next((one for one in known if one.kind is kind), Items(self.transport, self.name, kind, ItemHandle))
 

@@ -13,6 +13,7 @@ from marey_client.handles.annotations import AnnotationHandle
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.edits import Commands, EditHandle, as_edit
 from marey_client.handles.evaluations import EvaluationHandle
+from marey_client.handles.metrics import Metric, metric_choice
 from marey_client.handles.processed import ProcessedHandle
 from marey_client.imports import LocalFile, Notice
 from marey_client.jobs import job_request
@@ -24,6 +25,7 @@ from marey_schemas.queue.job_params import (
     AlignParams,
     AnnotateParams,
     CutParams,
+    DistancesParams,
     EditParams,
     EvaluateParams,
     ModelParams,
@@ -74,7 +76,11 @@ def cut_request(project: ProjectItems, annotations: Annotations, params: CutPara
 
 
 def align_request(
-    project: ProjectItems, clips: Clips, annotations: Annotations | None, params: AlignParams
+    project: ProjectItems,
+    clips: Clips,
+    annotations: Annotations | None,
+    params: AlignParams,
+    metric: Metric | None = None,
 ) -> JobCreate:
     """Return the job request to align clips with each other.
 
@@ -82,7 +88,9 @@ def align_request(
     name a layer, only annotations in this layer are used.
     """
     found = {item.id: item for item in items_at(project.clips, clips)}
-    inputs: dict[str, Any] = {"clips": as_inputs(clips)}
+    chosen, named = metric_choice(metric)
+    params = params.model_copy(update=named)
+    inputs: dict[str, Any] = {"clips": as_inputs(clips), **chosen}
     if len(edited := project.edited_rigs(found.values())) == 1:
         (inputs["rig"],) = edited
     if annotations is not None:
@@ -113,11 +121,17 @@ def edit_request(project: ProjectItems, clips: Clips, commands: Commands, option
 
 
 def evaluate_request(
-    project: ProjectItems, clips: Clips, params: EvaluateParams, normaliser: EvaluationHandle | str | None
+    project: ProjectItems,
+    clips: Clips,
+    params: EvaluateParams,
+    normaliser: EvaluationHandle | str | None,
+    metric: Metric | None = None,
 ) -> JobCreate:
     """Return the job request to evaluate clips; clips with the tag `loop` are treated as loops."""
     found = list(items_at(project.clips, clips))
-    inputs: dict[str, Any] = {"clips": as_inputs(clips)}
+    chosen, named = metric_choice(metric)
+    params = params.model_copy(update=named)
+    inputs: dict[str, Any] = {"clips": as_inputs(clips), **chosen}
     if normaliser is not None:
         inputs["normaliser"] = ItemInput(item=normaliser) if isinstance(normaliser, str) else normaliser.as_input()
     if len(edited := project.edited_rigs(found)) == 1:
@@ -125,6 +139,22 @@ def evaluate_request(
     if tagged := [item.id for item in found if LOOP_TAG in item.tags]:
         params = params.model_copy(update={"loops": tuple(dict.fromkeys((*params.loops, *tagged)))})
     return job_request("evaluate", inputs, params)
+
+
+def distances_request(
+    project: ProjectItems, clips: Clips, metric: Metric | None, options: Mapping[str, Any]
+) -> JobCreate:
+    """Return the job request to compare clips by a metric; clips with the tag `loop` are treated as loops.
+
+    `options` are those of `DistancesParams`.
+    """
+    found = list(items_at(project.clips, clips))
+    chosen, named = metric_choice(metric)
+    params = DistancesParams.model_validate({**options, **named})
+    inputs: dict[str, Any] = {"clips": as_inputs(clips), **chosen}
+    if len(edited := project.edited_rigs(found)) == 1:
+        (inputs["rig"],) = edited
+    return job_request("distances", inputs, params)
 
 
 def model_request(aligned: AlignedClips, params: ModelParams) -> JobCreate:

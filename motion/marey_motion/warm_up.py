@@ -225,17 +225,20 @@ def _align(clip: Clip) -> None:
 
 
 def _perceive(clip: Clip) -> None:
-    """Compile the kernels of motion maps: compare a clip with itself."""
+    """Compile the kernels of motion maps and registration: compare a clip with itself, and as a cycle."""
     from marey_motion.matching.body import MatchingBody
     from marey_motion.motion import Motion
     from marey_motion.perception.maps import motion_map
     from marey_motion.perception.measuring import measure_motion
     from marey_motion.perception.metric import published_metric
+    from marey_motion.perception.registration import registration_curve
     from marey_motion.rigs import map_joints
 
     body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
     measured = measure_motion(Motion.of(clip), body, clip.frame_rate_hz)
     motion_map(measured, measured, published_metric())
+    cycle = replace(measured.at(np.arange(20.0)), cyclic=True)
+    registration_curve(cycle, cycle, published_metric())
 
 
 def _measure(clip: Clip) -> None:

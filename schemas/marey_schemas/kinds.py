@@ -64,7 +64,7 @@ PARTS: dict[Kind, dict[str, PartSpec]] = {
         "records": PartSpec("marey/evaluation-records@1", False, "evaluation"),
         "report": PartSpec("marey/evaluation-report@1", False, "evaluation"),
     },
-    Kind.METRIC: {"metric": PartSpec("marey/document@1", True)},
+    Kind.METRIC: {"metric": PartSpec("marey/perceptual-metric@1", True)},
     Kind.STUDY: {"study": PartSpec("marey/study@1", True)},
 }
 """Parts by kind of item. Kinds whose schema is not fixed yet use `marey/document@1`, which allows any members."""

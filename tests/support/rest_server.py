@@ -104,7 +104,7 @@ def running(database: Database, folder: Path, **settings: Any) -> Iterator[Serve
 
     async def main() -> None:
         stop = asyncio.Event()
-        given = {"script_repositories": (SCRIPTS_AT,), "warm_up": False} | settings
+        given: dict[str, Any] = {"script_repositories": (SCRIPTS_AT,), "warm_up": False} | settings
         chosen = Settings(data=folder, port=0, drain_s=5, **given)
         children = shared_children() if chosen.child_limits == Settings().child_limits else None
         app = create_app(chosen, database, children)

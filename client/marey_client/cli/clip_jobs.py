@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
+from marey_client.cli.perception.metrics import MetricName, metric_at
 from marey_client.cli.terminal.following import JOB, Into, Sources, Wait, clips_at, follow, input_at, print_ended
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_message, print_table
@@ -21,6 +22,7 @@ ALIGN = OptionsOf(
     "marey_schemas.queue.job_params:AlignParams",
     short={"rate_hz": "--rate", "mirroring": "--mirror"},
     nulls={"slope_limit": "-1"},
+    without=("metric",),
 )
 CUT = OptionsOf(
     "marey_schemas.queue.job_params:CutParams",
@@ -32,7 +34,6 @@ CUT = OptionsOf(
     },
 )
 REFERENCES = ("medoid", "nearest_mean_length")
-ALIGNED_COLUMNS = ("clip", "frames", "cost, cm²", "slowest", "fastest", "")
 SQUARE_CM = 1e4  # in a square metre
 
 
@@ -83,6 +84,7 @@ def align(
             "clips."
         ),
     ] = None,
+    metric: MetricName = None,
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
@@ -99,7 +101,14 @@ def align(
             params["reference"] = _reference(marey, params["reference"])
         clips = [clips_at(marey, address) for address in addresses]
         project = marey.project(addresses[0].project)
-        submitted = project.align(clips, into=into.strip("/"), annotations=given or None, **job, **params)
+        submitted = project.align(
+            clips,
+            into=into.strip("/"),
+            annotations=given or None,
+            metric=metric_at(marey, metric),
+            **job,
+            **params,
+        )
         ended = follow(marey, submitted, wait=wait, as_json=as_json)
     if ended is not None:
         print_ended(ended, as_json, _print_aligned)
@@ -151,21 +160,25 @@ def _reference(marey: Marey, text: str) -> str:
 
 
 def _print_aligned(result: dict[str, Any]) -> None:
+    metric = result.get("metric")
+    cost, scale = ("cost, cm²", SQUARE_CM) if metric is None else ("distance", 1.0)
+    columns = ("clip", "frames", cost, "slowest", "fastest", "")
     rows = [
         (
             one["name"],
             one["frames"],
-            f"{one['cost'] * SQUARE_CM:.2f}",
+            f"{one['cost'] * scale:.2f}",
             f"{one['least_slope']:.2f}",
             f"{one['greatest_slope']:.2f}",
             "reference" if one["name"] == result["reference"] else "",
         )
         for one in result["aligned"]
     ]
-    print_table(ALIGNED_COLUMNS, rows, right=ALIGNED_COLUMNS[1:5])
+    print_table(columns, rows, right=columns[1:5])
     keyframes = ", ".join(f"{label} {frame}" for label, frame in result["keyframes"].items())
     typer.echo(
         f"{counted(result['clips'], 'clip')} of {counted(result['frames'], 'frame')} at {result['frame_rate_hz']:g} Hz"
         + (f"; keyframes: {keyframes}" if keyframes else "")
         + f"; {len(result['refused'])} refused"
+        + ("" if metric is None else f"; metric: {metric['name']}")
     )

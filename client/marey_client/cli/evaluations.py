@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project, find_item, require_item
+from marey_client.cli.perception.metrics import MetricName, metric_at
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import JOB, Sources, Wait, clips_at, follow, print_commit
 from marey_client.cli.terminal.invocation import AsJson, connect
@@ -17,7 +18,7 @@ from marey_client.cli.terminal.typed_values import is_frame
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from marey_client.handles.evaluations import EvaluationHandle
     from marey_client.marey import Marey
@@ -32,7 +33,7 @@ EVALUATE = OptionsOf(
         "duration_s": "--duration",
         "mirroring": "--mirror",
     },
-    without=("loops", "trims"),
+    without=("loops", "trims", "metric"),
 )
 
 Loops = Annotated[
@@ -66,6 +67,7 @@ def evaluate(
     loop: Loops = None,
     trim: Trims = None,
     normaliser: Normaliser = None,
+    metric: MetricName = None,
     out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,
     wait: Wait = True,
     as_json: AsJson = False,
@@ -88,6 +90,7 @@ def evaluate(
             [clips_at(marey, address) for address in addresses],
             into=folder if into is None else into.strip("/"),
             normaliser=evaluation_at(marey, normaliser).id if normaliser else None,
+            metric=metric_at(marey, metric),
             **job,
             **params,
         )
@@ -206,12 +209,24 @@ def _print_evaluation(found: EvaluationHandle, as_json: bool) -> None:
     if as_json:
         return print_json({"evaluation": found.item, "summary": found.summary(), "trials": found.trials()})
     typer.echo(found.verdict)
+    if (perceived := found.document().get("perceived")) is not None:
+        typer.echo(perceived_text(perceived))
     worst = sorted(found.trials(), key=lambda row: -(row["offset_mean"] or 0.0))[:WORST_SHOWN]
     rows = [(row["trial"], _number(row["offset_mean"], 2), _number(row["se_v"], 2), _number(row["se_omega_deg"], 1))
             for row in worst]  # fmt: skip
     columns = ("worst trials", "offset m", "speed error m/s", "turn error deg/s")
     print_table(columns, rows, right=columns[1:])
     return print_message(f"to write the report, run marey report {found.project}/{found.path} --out report.html")
+
+
+def perceived_text(perceived: Mapping[str, Any]) -> str:
+    """Return a sentence about the perceptual distances of transitions."""
+    if not perceived["transitions"]:
+        return f"There are no transitions to measure by the metric {perceived['metric']}."
+    return (
+        f"{counted(perceived['transitions'], 'transition')}: perceptual distance {perceived['median']:.2f} (median), "
+        f"{perceived['p95']:.2f} (95th percentile), by the metric {perceived['metric']}."
+    )
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address
-from marey_client.cli.evaluations import evaluation_at
+from marey_client.cli.evaluations import evaluation_at, perceived_text
+from marey_client.cli.perception.metrics import MetricName, metric_at
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import FINDINGS_JOB, Wait, clips_at, follow
 from marey_client.cli.terminal.invocation import AsJson, connect
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 WEIGHT = {"objective": "--weight"}
 COMPARE = OptionsOf("marey_schemas.queue.job_params:CompareParams")
-SUGGEST = OptionsOf("marey_schemas.queue.job_params:SuggestParams", short=WEIGHT)
+SUGGEST = OptionsOf("marey_schemas.queue.job_params:SuggestParams", short=WEIGHT, without=("metric",))
 OPTIMISE = OptionsOf("marey_schemas.queue.job_params:OptimiseParams", short=WEIGHT)
 SWEEP = OptionsOf("marey_schemas.queue.job_params:SweepParams", short=WEIGHT)
 
@@ -109,6 +110,7 @@ def suggest(
             "line."
         ),
     ] = None,
+    metric: MetricName = None,
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
@@ -120,7 +122,8 @@ def suggest(
         )
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
-        request = handle.suggest_request(_places(marey, handle, candidates), **params)
+        places = _places(marey, handle, candidates)
+        request = handle.suggest_request(places, metric=metric_at(marey, metric), **params)
         found = _found(marey, handle, request, job, wait, as_json)
         if found is None:
             return
@@ -217,6 +220,7 @@ def _print_comparison(document: Mapping[str, Any]) -> None:
     ]  # fmt: skip
     columns = ("metric", "before", "after", "change", "95 % interval", "verdict")
     print_table(columns, rows, right=columns[1:5])
+    _print_perceived(document)
     if moved:
         worst = sorted(moved, key=lambda one: -_rise(one))[:SHOWN]
         rows_of_trials = [
@@ -227,6 +231,13 @@ def _print_comparison(document: Mapping[str, Any]) -> None:
     for name, label in (("removed", "removed"), ("added", "added"), ("newly_unused", "newly unused")):
         if document[name]:
             typer.echo(f"{label}: {counted(len(document[name]), 'clip')}")
+
+
+def _print_perceived(document: Mapping[str, Any]) -> None:
+    """Print the perceptual distances of transitions, if an evaluation has them."""
+    for name in ("before", "after"):
+        if (perceived := document.get(f"perceived_{name}")) is not None:
+            typer.echo(f"{name}: {perceived_text(perceived)}")
 
 
 def _rise(one: Mapping[str, Any]) -> float:
@@ -260,6 +271,11 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
             if len(entries) > SHOWN:
                 typer.echo(f"  … and {len(entries) - SHOWN} more; --json has all.")
             typer.echo("")
+    if (metric := document["near_duplicates"].get("metric")) is not None:
+        typer.echo(
+            f"Near-duplicates whose perceptual distance exceeds {document['near_duplicates']['most_perceived']:.2f} "
+            f"are kept, because they look different; metric: {metric['name']}."
+        )
     for one in document["unusable"]:
         print_message(
             f"{one['folder']}: {counted(one['clips'], 'clip')} cannot be matched: {one['detail']} ({one['code']})"

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.findings import Findings
+from marey_client.handles.metrics import Metric, metric_choice
 from marey_client.handles.reports import ReportedHandle, saved
 from marey_client.jobs import Jobs, OnProgress, job_request
 from marey_client.places import Places, as_inputs
@@ -79,13 +80,18 @@ class EvaluationHandle(ReportedHandle):
         return self._run(self.compare_request(after, **options), on_progress)
 
     def suggest(
-        self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
+        self,
+        candidates: Places[ClipHandle] = (),
+        *,
+        metric: Metric | None = None,
+        on_progress: OnProgress | None = None,
+        **options: Any,
     ) -> Findings:
         """Find clips that can be removed, and `candidates` (clips or folders of clips) that fill gaps in the coverage.
 
-        `options` are those of `SuggestParams`.
+        `options` are those of `SuggestParams`. With a `metric`, near-duplicates that look different are kept.
         """
-        return self._run(self.suggest_request(candidates, **options), on_progress)
+        return self._run(self.suggest_request(candidates, metric=metric, **options), on_progress)
 
     def optimise(
         self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
@@ -107,9 +113,13 @@ class EvaluationHandle(ReportedHandle):
         inputs = {"before": self.as_input(), "after": after.as_input()}
         return job_request("compare", inputs, CompareParams.model_validate(options))
 
-    def suggest_request(self, candidates: Places[ClipHandle] = (), **options: Any) -> JobCreate:
+    def suggest_request(
+        self, candidates: Places[ClipHandle] = (), *, metric: Metric | None = None, **options: Any
+    ) -> JobCreate:
         """Return the job request of `suggest`; `options` are those of `SuggestParams`."""
-        return job_request("suggest", self._with_candidates(candidates), SuggestParams.model_validate(options))
+        chosen, named = metric_choice(metric)
+        params = SuggestParams.model_validate({**options, **named})
+        return job_request("suggest", {**self._with_candidates(candidates), **chosen}, params)
 
     def optimise_request(self, candidates: Places[ClipHandle] = (), **options: Any) -> JobCreate:
         """Return the job request of `optimise`; `options` are those of `OptimiseParams`."""

@@ -1,4 +1,4 @@
-"""Findings: results of jobs on evaluations, with numbers and a document; some kinds of jobs also make a report."""
+"""Findings: results of jobs, with numbers and a document; some kinds of jobs also make a report."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from marey_client.transport import Transport
 from marey_schemas.encoding.codecs import JSON, decode_tree
 from marey_schemas.queue.jobs import Job
 
+FILES = ("document", "report", "maps", "figures", "fitted")
+"""Members of a result that refer to files."""
+
 
 @dataclass(frozen=True)
 class Findings:
@@ -22,11 +25,7 @@ class Findings:
     @property
     def summary(self) -> dict[str, Any]:
         """The main numbers of the result."""
-        return {
-            name: value
-            for name, value in (self.job.result or {}).items()
-            if name not in ("document", "report", "metric")
-        }
+        return {name: value for name, value in (self.job.result or {}).items() if name not in FILES}
 
     def document(self) -> dict[str, Any]:
         """Return all results; arrays are numpy arrays."""

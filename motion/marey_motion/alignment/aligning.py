@@ -33,6 +33,9 @@ from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
 from marey_motion.mirroring import mirror_clip
 from marey_motion.motion import Motion
+from marey_motion.perception.maps import motion_map
+from marey_motion.perception.measuring import MeasuredClip, measure_motion
+from marey_motion.perception.metric import PerceptualMetric
 from marey_motion.resampling import resample_motion
 from marey_motion.skeleton import SAME_OFFSET_M, Skeleton, same_hierarchy
 from marey_schemas.options.alignment import MEDOID, NEAREST_MEAN_LENGTH, AlignOptions
@@ -76,7 +79,7 @@ class _Prepared:
     motion: Motion
     placement: Placement
     sections: Sections
-    points: CostPoints
+    points: CostPoints | MeasuredClip
 
     @property
     def uid(self) -> str:
@@ -110,6 +113,7 @@ def align_clips(
     body: MatchingBody,
     options: AlignOptions | None = None,
     *,
+    metric: PerceptualMetric | None = None,
     threads: int = 1,
     progress: Progress | None = None,
     on_refusal: OnRefusal | None = None,
@@ -124,6 +128,8 @@ def align_clips(
     clips : sequence of SourceExample    clips of one skeleton
     body : MatchingBody    body of that skeleton
     options : AlignOptions, optional    options; `options.reference` may be the uid of an example
+    metric : PerceptualMetric, optional    the cost of a pair of poses is their perceptual distance, without unit; by
+        default, the cost is that of `frame_costs`, in square metres
     threads : int    threads to use
     progress : callable, optional    called as progress(done, total, note)
     on_refusal : callable, optional    called as on_refusal(example, error) for each example that cannot be aligned and
@@ -137,7 +143,14 @@ def align_clips(
     ------
     MotionError    if the options do not fit the clips, or if fewer than two examples can be aligned
     """
-    run = _Aligning(body, options or AlignOptions(), threads, progress or (lambda _done, _total, _note: None))
+    how = options or AlignOptions()
+    if metric is not None and (how.weights or how.window > 1 or how.cost != AlignOptions().cost):
+        raise MotionError(
+            "the options cost, window and weights have no effect with a perceptual metric, which has weights of its "
+            "own; leave them out",
+            code="option-invalid",
+        )
+    run = _Aligning(body, how, metric, threads, progress or (lambda _done, _total, _note: None))
     run.on_refusal = on_refusal
     return run.align(sorted(clips, key=lambda one: (one.name, one.uid)))
 
@@ -147,9 +160,17 @@ class _Aligning:
 
     on_refusal: OnRefusal | None = None
 
-    def __init__(self, body: MatchingBody, options: AlignOptions, threads: int, progress: Progress) -> None:
+    def __init__(
+        self,
+        body: MatchingBody,
+        options: AlignOptions,
+        metric: PerceptualMetric | None,
+        threads: int,
+        progress: Progress,
+    ) -> None:
         self._body = body
         self._options = options
+        self._metric = metric
         self._weights = joint_weights(body, options.weights)
         self._threads = max(1, threads)
         self._tell = progress
@@ -258,7 +279,11 @@ class _Aligning:
             )
         sections = sections_of(example.cuts, frames, rate_ratio=rate_hz / clip.frame_rate_hz)
         moved, placement = to_canonical(motion, self._body, keep_height=self._options.keep_height)
-        points = cost_points(moved.positions(skeleton), self._options, self._weights)
+        points = (
+            cost_points(moved.positions(skeleton), self._options, self._weights)
+            if self._metric is None
+            else measure_motion(moved, self._body, rate_hz)
+        )
         return _Prepared(example, moved, placement, sections, points)
 
     def _common_labels(self, prepared: Sequence[_Prepared]) -> tuple[tuple[str, ...], ...]:
@@ -280,7 +305,7 @@ class _Aligning:
         totals = pairwise_totals(
             [one.points for one in prepared],
             [one.sections.bounds for one in prepared],
-            self._options,
+            self._costs,
             max_run=self._options.slope_limit,
             threads=self._threads,
             progress=lambda done, total: self._tell(done, total, f"comparing {len(prepared)} clips"),
@@ -304,11 +329,18 @@ class _Aligning:
 
     def _found(self, reference: _Prepared, one: _Prepared) -> SectionedAlignment:
         return align_sections(
-            costs_between(reference.points, one.points, self._options),
+            self._costs(reference.points, one.points),
             reference.sections.bounds,
             one.sections.bounds,
             partial(align, max_run=self._options.slope_limit),
         )
+
+    def _costs(self, a: CostPoints | MeasuredClip, b: CostPoints | MeasuredClip) -> Floats:
+        if isinstance(a, MeasuredClip) and isinstance(b, MeasuredClip) and self._metric is not None:
+            return motion_map(a, b, self._metric)
+        assert isinstance(a, CostPoints)
+        assert isinstance(b, CostPoints)
+        return costs_between(a, b, self._options)
 
 
 def joint_weights(body: MatchingBody, given: Mapping[str, float]) -> Floats:

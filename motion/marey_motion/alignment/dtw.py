@@ -63,14 +63,32 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
         total, length = kernels.align(matrix, longest)
     else:
         total, length = kernels.align_limited(matrix, max_run, longest)
-    if not np.isfinite(total):
-        raise MotionError(
-            f"{len(matrix)} frames cannot be aligned with {matrix.shape[1]} frames if one motion may pause for "
-            f"at most {max_run} frames of the other; raise this limit",
-            code="alignment-impossible",
-            where="max_run",
-        )
-    return Alignment(longest[:length][::-1].copy(), float(total))
+    return _found(matrix, max_run, longest[:length], total)
+
+
+def align_cyclic(costs: ArrayLike, *, max_run: int) -> tuple[Alignment, int]:
+    """Try every frame of a cyclic second motion as its first, and find the path with the least mean cost.
+
+    Parameters
+    ----------
+    costs : (n, m) float    finite costs of each pair of frames
+    max_run : int    as for `align`
+
+    Returns
+    -------
+    alignment : Alignment    path, which counts frames of the second motion from `shift`, and total
+    shift : int    frame of the second motion that corresponds to frame 0 of the first
+
+    Raises
+    ------
+    MotionError    as `align`
+    """
+    from marey_motion.alignment import dtw_kernels as kernels
+
+    matrix = _checked(costs, max_run)
+    longest = np.empty((sum(matrix.shape) - 1, 2), dtype=np.int32)
+    total, length, shift = kernels.align_limited_cyclic(matrix, max_run, longest)
+    return _found(matrix, max_run, longest[:length], total), int(shift)
 
 
 def least_total(costs: Floats, *, max_run: int | None = None) -> float:
@@ -89,6 +107,18 @@ def least_total(costs: Floats, *, max_run: int | None = None) -> float:
 
     costs = np.ascontiguousarray(costs)
     return float(kernels.total(costs) if max_run is None else kernels.total_limited(costs, max_run))
+
+
+def _found(matrix: Floats, max_run: int | None, backwards: NDArray[np.int32], total: float) -> Alignment:
+    """Return an alignment, given its path from the last cell to the first. Raises `MotionError` if there is none."""
+    if not np.isfinite(total):
+        raise MotionError(
+            f"{len(matrix)} frames cannot be aligned with {matrix.shape[1]} frames if one motion may pause for "
+            f"at most {max_run} frames of the other; raise this limit",
+            code="alignment-impossible",
+            where="max_run",
+        )
+    return Alignment(backwards[::-1].copy(), float(total))
 
 
 def _checked(costs: ArrayLike, max_run: int | None) -> Floats:

@@ -132,6 +132,26 @@ def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def align_limited_cyclic(costs, max_run, path):  # type: ignore[no-untyped-def]
+    """Fill `path` like `align_limited`, with columns shifted so that the mean cost of the cells is least.
+
+    Column `shift` becomes the first; the path counts columns from it. Returns the total cost, infinite if no shift has
+    a path, the number of cells, and the shift.
+    """
+    n, m = costs.shape
+    shifted, tried = np.empty((n, m)), np.empty_like(path)
+    best, best_total, best_length, best_shift = np.inf, np.inf, 0, 0
+    for shift in range(m):
+        shifted[:, : m - shift] = costs[:, shift:]
+        shifted[:, m - shift :] = costs[:, :shift]
+        total, length = align_limited(shifted, max_run, tried)
+        if length > 0 and total / length < best:
+            best, best_total, best_length, best_shift = total / length, total, length, shift
+            path[:length] = tried[:length]
+    return best_total, best_length, best_shift
+
+
+@compiled
 def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
     """Compute the total cost of the cheapest path with limited runs in O(max_run·m) memory; infinite if none exists."""
     n, m = costs.shape

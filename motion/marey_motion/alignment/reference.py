@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
-from marey_motion.alignment.cost import CostPoints, costs_between
 from marey_motion.alignment.dtw import least_total
 from marey_motion.arrays import Floats
-from marey_schemas.options.alignment import CostOptions
 
+Points = TypeVar("Points")
 Advance = Callable[[int, int], None]
 """Function called with the number of alignments done and their total."""
 
@@ -54,9 +54,9 @@ def medoid(totals: Floats) -> int:
 
 
 def pairwise_totals(
-    points: Sequence[CostPoints],
+    points: Sequence[Points],
     bounds: Sequence[Sequence[int]],
-    options: CostOptions,
+    costs_of: Callable[[Points, Points], Floats],
     *,
     max_run: int | None,
     threads: int = 1,
@@ -68,24 +68,24 @@ def pairwise_totals(
 
     Parameters
     ----------
-    points : sequence of CostPoints    points of each motion
+    points : sequence    points of each motion, in any form that `costs_of` accepts
     bounds : sequence of sequences of int    bounds of each motion's sections; all motions have the same number of
         bounds
-    options : CostOptions    options of the cost
+    costs_of : callable    called as costs_of(points, points of another motion); returns their costs (n, m)
     max_run : int or None    slope limit of `dtw.align`
     threads : int    threads to use
     progress : callable, optional    called as progress(done, total)
 
     Returns
     -------
-    (n, n) float64    square metres; infinite where alignment is impossible
+    (n, n) float64    in the unit of the costs; infinite where alignment is impossible
     """
     count = len(points)
     totals = np.zeros((count, count))
 
     def fill(first: int) -> None:
         for other in range(first + 1, count):
-            costs = costs_between(points[first], points[other], options)
+            costs = costs_of(points[first], points[other])
             totals[first, other] = _sectioned_total(costs, bounds[first], bounds[other], max_run)
 
     done, pairs = 0, count * (count - 1) // 2

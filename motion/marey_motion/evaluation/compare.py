@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.perceived import require_same_metric
 from marey_motion.evaluation.provenance import require_comparable
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.matching.record import TrialRecord
@@ -124,6 +125,7 @@ def compare_results(before: EvaluationResult, after: EvaluationResult) -> Compar
     MotionError    if the conditions differ (the error names them), or if an evaluation was read without its records
     """
     require_comparable(before.provenance, after.provenance)
+    require_same_metric(before.perceived, after.perceived)
     if not (len(before.records) == len(before.trials) == len(after.trials) == len(after.records)):
         raise MotionError("both evaluations must contain the records of all their trials", code="records-missing")
     uids = {clip.uid for clip in before.clips}, {clip.uid for clip in after.clips}

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.evaluation.perceived import PerceivedTransitions
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import TrialRecord
@@ -104,6 +105,7 @@ class EvaluationResult:
     switches : (S, 3) int64    for each pair of rows between which the suite jumped: the row before the jump, the
         row after it, and the number of these jumps; ordered by the first two
     records : record of each trial, in the order of `trials`
+    perceived : transitions under a perceptual metric; None if none was chosen
     baseline : result of the same suite over clips generated for every cell of the grid, without records; None if not
         computed
     """
@@ -119,3 +121,4 @@ class EvaluationResult:
     records: tuple[TrialRecord, ...]
     baseline: EvaluationResult | None = None
     notes: tuple[str, ...] = ()
+    perceived: PerceivedTransitions | None = None

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.perceived import PerceivedTransitions
 from marey_motion.evaluation.result import ClipUsage, Coverage, EvaluationResult, Provenance, TrialResult
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import DatabaseClip
@@ -34,7 +35,8 @@ def result_to_tree(result: EvaluationResult) -> Tree:
     -------
     dict    plain values and arrays
     """
-    return {"schema": EVALUATION_SCHEMA, **_result_body(result)}
+    perceived = {} if result.perceived is None else {"perceived": asdict(result.perceived)}
+    return {"schema": EVALUATION_SCHEMA, **_result_body(result), **perceived}
 
 
 def _result_body(result: EvaluationResult) -> Tree:
@@ -106,6 +108,7 @@ def _result(tree: Mapping[str, Any], records: Sequence[TrialRecord]) -> Evaluati
         records=tuple(records),
         baseline=None if tree["baseline"] is None else _result(tree["baseline"], ()),
         notes=tuple(tree["notes"]),
+        perceived=PerceivedTransitions.from_tree(tree.get("perceived")),
     )
 
 

@@ -20,6 +20,7 @@ from marey_motion.perception.metric import PerceptualMetric
 
 SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 0.6, 2.0
 _SIGNIFICANT = 0.25
+_LEAST_MOVED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +45,8 @@ def find_period(clip: MeasuredClip, metric: PerceptualMetric) -> Period:
     """Find the period of a clip: the first significant minimum of the mean distance along diagonals of its motion map.
 
     A minimum is significant if it is in the lowest quarter of the range of distances: half a cycle, at which left and
-    right are exchanged, is a minimum, too, but a shallow one.
+    right are exchanged, is a minimum, too, but a shallow one. A loop starts in a frame that differs enough from the
+    frame half a period later; so it does not show somebody who stands still.
 
     Parameters
     ----------
@@ -80,7 +82,10 @@ def find_period(clip: MeasuredClip, metric: PerceptualMetric) -> Period:
         )
     period = int(lags[minima[0]])
     apart = _lagged(clip, period, metric)[: clip.frame_count - 2 * period]
-    return Period(period, int(np.argmin(apart)), lags, means)
+    # Somebody who stands still repeats every pose, so frames of standing would make the best loop.
+    moved = _lagged(clip, period // 2, metric)[: len(apart)]
+    moves = moved >= _LEAST_MOVED * np.quantile(moved, 0.9)
+    return Period(period, int(np.argmin(np.where(moves, apart, np.inf))), lags, means)
 
 
 def cut_loop(motion: Motion, body: MatchingBody, period: Period) -> tuple[Motion, LoopSeam]:

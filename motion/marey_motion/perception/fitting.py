@@ -12,7 +12,8 @@ from scipy.stats import spearmanr
 
 from marey_motion.arrays import Floats, Ints
 from marey_motion.errors import MotionError
-from marey_motion.perception.metric import Component, Measurement, Shaping, shaped
+from marey_motion.perception.metric import Component, shaped
+from marey_schemas.documents.metrics import Measurement, Shaping
 
 EXPONENTS = (0.1, 3.0)
 _GRID = 30

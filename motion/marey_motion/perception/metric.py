@@ -9,19 +9,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
+from marey_schemas.documents import metrics
+from marey_schemas.documents.metrics import (
+    MEASUREMENTS,
+    METRIC_CODE,
+    AngleMeasure,
+    JointClass,
+    Measurement,
+    MetricDocument,
+    Shaping,
+    classes_of,
+)
 
-Measurement = Literal["angles", "positions", "velocities"]
-Shaping = Literal["euclid", "manhattan", "sigmoid", "power"]
-AngleMeasure = Literal["half_angle", "angle", "one_minus_dot", "log_norm"]
-
-MEASUREMENTS: tuple[Measurement, ...] = get_args(Measurement)
-JOINT_CLASSES: Mapping[str, tuple[str, ...]] = {
+JOINT_CLASSES: Mapping[JointClass, tuple[str, ...]] = {
     "head": ("head",),
     "clavicle": ("left_clavicle", "right_clavicle"),
     "upper_arm": ("left_shoulder", "right_shoulder"),
@@ -32,32 +38,6 @@ JOINT_CLASSES: Mapping[str, tuple[str, ...]] = {
     "toe": ("left_toe", "right_toe"),
 }
 """Standard joints of each class. A bone is where its upper end is, so the forearm is at the elbow."""
-WITHOUT_ANGLES = ("hand", "toe")
-"""Classes for which the paper has no angles."""
-
-PUBLISHED: Mapping[Measurement, Mapping[Shaping, tuple[float | None, ...]]] = {
-    "angles": {
-        "euclid": (23.335, 0.508, 659.272, 0.000, 0.000, 0.006, 0.000, None, 0.669, 0.325, None),
-        "manhattan": (18.448, 0.324, 19.537, 0.041, 0.003, 0.061, 0.000, None, 0.622, 0.273, None),
-        "sigmoid": (18.004, 0.312, 20.016, 0.039, 0.008, 0.076, 0.000, None, 0.614, 0.263, None),
-    },
-    "positions": {
-        "euclid": (17.117, 0.290, 206.509, 0.062, 0.000, 0.551, 0.181, 0.000, 0.000, 0.050, 0.156),
-        "manhattan": (13.423, 0.069, 9.909, 0.020, 0.000, 0.362, 0.429, 0.000, 0.000, 0.000, 0.189),
-        "sigmoid": (13.264, 0.059, 10.375, 0.015, 0.000, 0.344, 0.455, 0.000, 0.000, 0.000, 0.184),
-    },
-    "velocities": {
-        "euclid": (25.779, 0.431, 1914.283, 0.000, 0.000, 0.000, 0.000, 0.605, 0.000, 0.298, 0.098),
-        "manhattan": (22.039, 0.193, 36.885, 0.000, 0.000, 0.000, 0.000, 0.551, 0.000, 0.298, 0.151),
-        "sigmoid": (21.993, 0.189, 36.532, 0.000, 0.000, 0.000, 0.000, 0.564, 0.000, 0.306, 0.157),
-    },
-}
-"""Figure 5 of the paper as printed: difference, c, N, and the weights in the order of `JOINT_CLASSES`."""
-MISPRINTS = (
-    "The weights of velocities with the sigmoid have the sum 1.027; 0.130 for the toe would give 1.",
-    "The text says that velocities use hands, thighs and calves; the table has hand, calf and toe, and no thigh.",
-)
-_MOST_ROUNDING = 0.0025
 
 
 @dataclass(frozen=True)
@@ -161,18 +141,38 @@ class PerceptualMetric:
             raise MotionError("length_unit_m and velocity_interval_s must be finite and above 0")
 
 
-def classes_of(measurement: Measurement) -> tuple[str, ...]:
-    """List the joint classes of a measurement.
+def metric_of(document: MetricDocument) -> PerceptualMetric:
+    """Make the metric that a document describes.
 
     Parameters
     ----------
-    measurement : str    angles, positions or velocities
+    document : MetricDocument    weights and conventions
 
     Returns
     -------
-    tuple of str    names of classes, in the order of `JOINT_CLASSES`
+    PerceptualMetric    the metric
+
+    Raises
+    ------
+    MotionError    if the distances of the metric were defined by another version of the computation
     """
-    return tuple(name for name in JOINT_CLASSES if measurement != "angles" or name not in WITHOUT_ANGLES)
+    if document.code_version != METRIC_CODE:
+        raise MotionError(
+            f"the metric {document.name} is defined for {document.code_version}, and this version computes "
+            f"{METRIC_CODE}; fit the metric again",
+            code="metric-of-other-version",
+        )
+    return PerceptualMetric(
+        document.name,
+        tuple(_component_of(one) for one in document.components),
+        tuple(one.share for one in document.components),
+        document.angle,
+        document.side_reduce,
+        document.identity,
+        document.root_alignment,
+        document.length_unit_m,
+        document.velocity_interval_s,
+    )
 
 
 def published_component(measurement: Measurement, shaping: Shaping) -> Component:
@@ -191,16 +191,11 @@ def published_component(measurement: Measurement, shaping: Shaping) -> Component
     ------
     MotionError    for the shaping `power`, for which nothing was published
     """
-    row = PUBLISHED[measurement].get(shaping)
-    if row is None:
+    if shaping not in metrics.PUBLISHED[measurement]:
         raise MotionError(
             "the paper prints no weights for this shaping; use euclid, manhattan or sigmoid", where=shaping
         )
-    _, constant, norm, *weights = row
-    assert constant is not None
-    assert norm is not None
-    given = {name: weight for name, weight in zip(JOINT_CLASSES, weights, strict=True) if weight is not None}
-    return Component(measurement, shaping, constant, norm, given)
+    return _component_of(metrics.published_component(measurement, shaping))
 
 
 def published_metric(
@@ -244,23 +239,6 @@ def uniform_metric(shaping: Shaping = "manhattan", exponent: float = 1.0) -> Per
     return PerceptualMetric(f"uniform, {shaping}", components, (1 / 3, 1 / 3, 1 / 3))
 
 
-def doubtful_weights(component: Component) -> str:
-    """Describe what is wrong with the sum of a component's weights, for a warning.
-
-    Parameters
-    ----------
-    component : Component    weights
-
-    Returns
-    -------
-    str    a sentence; empty if the sum is 1 within rounding of printed weights
-    """
-    total = sum(component.weights.values())
-    if abs(total - 1.0) <= _MOST_ROUNDING:
-        return ""
-    return f"The weights of {component.measurement} have the sum {total:.3f}; they are divided by it."
-
-
 def shaped(differences: Floats, shaping: Shaping, exponent: float = 1.0) -> Floats:
     """Apply a shaping F to differences.
 
@@ -279,3 +257,14 @@ def shaped(differences: Floats, shaping: Shaping, exponent: float = 1.0) -> Floa
     if shaping == "sigmoid":
         return differences / (differences + 1.0)
     return differences.copy() if shaping == "manhattan" else np.asarray(differences**exponent)
+
+
+def _component_of(document: metrics.MetricComponent) -> Component:
+    return Component(
+        document.measurement,
+        document.shaping,
+        document.constant,
+        document.norm,
+        dict(document.weights.items()),
+        document.exponent,
+    )

@@ -9,10 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import BSpline
-from scipy.optimize import lsq_linear
 
-from marey_motion.alignment.dtw import align
+from marey_motion.alignment.dtw import align, align_cyclic
 from marey_motion.alignment.warp import LEAST_SLOPE, time_function
 from marey_motion.arrays import Floats, Ints32
 from marey_motion.errors import MotionError
@@ -88,15 +86,9 @@ def registration_curve(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetri
             code="too-many-frames",
         )
     costs = neighbourhood_costs(motion_map(a, b, metric), round(0.5 * NEIGHBOURHOOD_S * a.rate_hz), cyclic=cyclic)
-    best: tuple[float, int, Ints32] | None = None
-    for shift in range(b.frame_count if cyclic else 1):
-        found = align(np.roll(costs, -shift, axis=1), max_run=SLOPE_LIMIT)
-        mean = found.total / len(found.path)
-        if best is None or mean < best[0]:
-            best = mean, shift, found.path
-    assert best is not None
-    mean, shift, path = best
-    return RegistrationCurve(path, shift, shift + increasing_spline(time_function(path), a.rate_hz), mean)
+    found, shift = align_cyclic(costs, max_run=SLOPE_LIMIT) if cyclic else (align(costs, max_run=SLOPE_LIMIT), 0)
+    times = shift + increasing_spline(time_function(found.path), a.rate_hz)
+    return RegistrationCurve(found.path, shift, times, found.total / len(found.path))
 
 
 def neighbourhood_costs(costs: Floats, reach: int, *, cyclic: bool = False) -> Floats:
@@ -144,6 +136,9 @@ def increasing_spline(times: Floats, rate_hz: float) -> Floats:
     -------
     (n,) float64    strictly increasing times
     """
+    from scipy.interpolate import BSpline
+    from scipy.optimize import lsq_linear
+
     last = len(times) - 1
     spans = max(1, round(last / (KNOT_SPACING_S * rate_hz)))
     knots = np.concatenate((np.zeros(_DEGREE), np.linspace(0.0, last, spans + 1), np.full(_DEGREE, float(last))))

@@ -30,9 +30,10 @@ from marey_motion.perception.judging import (
     triangle_violations,
 )
 from marey_motion.perception.measuring import MeasuredClip, classes_measured
-from marey_motion.perception.metric import Component, PerceptualMetric, Shaping, uniform_metric
+from marey_motion.perception.metric import Component, PerceptualMetric, uniform_metric
 from marey_motion.perception.ordering import MotionOrder, order_motions
 from marey_motion.perception.registration import differences_along_curve
+from marey_schemas.documents.metrics import MetricDocument, Shaping
 
 SHAPINGS: tuple[Shaping, ...] = ("euclid", "manhattan", "sigmoid", "power")
 INTERVAL = (0.025, 0.975)
@@ -305,14 +306,14 @@ def metric_to_tree(analysis: StudyAnalysis, fit: MetricFit, study: Mapping[str, 
         "noise_ceiling": analysis.table.noise_ceiling,
         "left_out_rmse": _number(fit.left_out_rmse),
     }
-    return {
-        "schema": "marey/perceptual-metric@1",
+    tree = {
         "name": fit.metric.name,
         "origin": "fitted",
         "study": dict(study),
         "components": components,
         "fit": quality,
     }
+    return MetricDocument.model_validate(tree).stored()
 
 
 def analysis_to_tree(analysis: StudyAnalysis, study: Mapping[str, object]) -> dict[str, Any]:

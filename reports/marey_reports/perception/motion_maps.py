@@ -45,35 +45,58 @@ class NamedClip(NamedTuple):
 
 
 def draw_registration(
-    one: NamedClip, other: NamedClip, metric: PerceptualMetric, period: Period, curve: RegistrationCurve
+    one: NamedClip,
+    other: NamedClip,
+    metric: PerceptualMetric,
+    period: Period | None,
+    curve: RegistrationCurve,
+    *,
+    recorded: NamedClip | None = None,
+    rate_hz: float | None = None,
 ) -> Sketch:
-    """Draw a clip against itself with its period, and against another clip with the registration curve (figure 1)."""
-    maps = [motion_map(one.clip, second.clip, metric) for second in (one, other)]
-    figure, panels, images = _panels(maps, [(one, one), (one, other)], ["", ""])
-    rate = one.clip.rate_hz
-    length_s, last_s = period.frames / rate, (one.clip.frame_count - 1) / rate
+    """Draw a clip against itself with its period, and two clips with their registration curve (figure 1).
+
+    `recorded` is the clip in which the period was found, by default `one`. Without a period, only the second map is
+    drawn. `rate_hz` is the frame rate of period and curve, by default that of `one`; the clips may have fewer frames.
+    """
+    rate = rate_hz or one.clip.rate_hz
+    pairs = [(one, other)] if period is None else [(recorded or one, recorded or one), (one, other)]
+    maps = [motion_map(first.clip, second.clip, metric) for first, second in pairs]
+    figure, panels, images = _panels(maps, pairs, [""] * len(pairs))
     for panel in panels:
         panel.autoscale(enable=False)
-    _line(panels[0], [0.0, last_s - length_s], [length_s, last_s], PATH, "one period apart")
-    start_s = period.start / rate
-    _line(panels[0], [start_s, start_s], [start_s, start_s + length_s], PERIOD, "period")
+    tables: dict[str, dict[str, Floats]] = {}
+    caption = f"Perceptual distance of every pair of moments, by the metric {metric.name}. "
+    if period is not None:
+        own = pairs[0][0]
+        _draw_period(panels[0], own, period, rate)
+        tables["lags"] = {"lag_s": period.lags / rate, "distance": period.differences}
+        caption += (
+            f"Left: {own.name} with itself; moments that are a period of {period.frames / rate:.2f} s apart look "
+            "alike. Right: "
+        )
     frames = np.arange(len(curve.times))
-    there = curve.times % other.clip.frame_count if other.clip.cyclic else curve.times
+    there = curve.times % (other.clip.frame_count * rate / other.clip.rate_hz) if other.clip.cyclic else curve.times
     # A curve that goes on over the seam of a cycle is drawn in parts.
     parts = np.split(frames, np.flatnonzero(np.diff(there) < 0) + 1)
     for number, part in enumerate(parts):
-        _line(panels[1], part / rate, there[part] / rate, PATH, "same moment" if number == 0 else "")
+        _line(panels[-1], part / rate, there[part] / rate, PATH, "same moment" if number == 0 else "")
     for panel in panels:
         add_keys(panel, loc="upper left", bbox_to_anchor=(-0.02, -0.17), ncols=2, handlelength=1.4, columnspacing=1.2)
     _bar(figure, images[-1], len(maps) - 1)
-    caption = (
-        f"Perceptual distance of every pair of moments, by the metric {metric.name}. Left: {one.name} with itself; "
-        f"moments that are a period of {length_s:.2f} s apart look alike. Right: {one.name} and {other.name}; the "
-        f"curve joins moments of the same phase, with a mean distance of {curve.mean_cost:.2f}."
+    caption += (
+        f"{one.name} and {other.name}; the curve joins moments of the same phase, with a mean distance of "
+        f"{curve.mean_cost:.2f}."
     )
-    table = {"first_s": frames / rate, "second_s": curve.times / rate}
-    lags = {"lag_s": period.lags / rate, "distance": period.differences}
-    return Sketch(figure, {"curve": table, "lags": lags}, caption)
+    tables["curve"] = {"first_s": frames / rate, "second_s": curve.times / rate}
+    return Sketch(figure, tables, caption)
+
+
+def _draw_period(panel: Axes, own: NamedClip, period: Period, rate: float) -> None:
+    length_s, last_s = period.frames / rate, (own.clip.frame_count - 1) / own.clip.rate_hz
+    _line(panel, [0.0, last_s - length_s], [length_s, last_s], PATH, "one period apart")
+    start_s = period.start / rate
+    _line(panel, [start_s, start_s], [start_s, start_s + length_s], PERIOD, "period")
 
 
 def draw_components(one: NamedClip, other: NamedClip, metric: PerceptualMetric) -> Sketch:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from marey_schemas.base import Request
+from marey_schemas.documents.metrics import MetricIdentity
 from marey_schemas.encoding.arrays import ArrayOf
 from marey_schemas.names import Digest, JointName, Label
 from marey_schemas.queue.job_params import AlignParams
@@ -63,7 +64,13 @@ class AlignmentInfo(Request):
         default_factory=dict, max_length=10_000, description="Canonical frame of each keyframe, by label."
     )
     cost: float = Field(
-        0.0, ge=0, allow_inf_nan=False, description="Mean cost per frame of the alignment, in square metres."
+        0.0,
+        ge=0,
+        allow_inf_nan=False,
+        description="Mean cost per frame of the alignment, in square metres; with a perceptual metric, without unit.",
+    )
+    metric: MetricIdentity | None = Field(
+        None, description="Perceptual metric whose distance of poses was the cost; costs of other metrics differ."
     )
     options: AlignParams | None = Field(None, description="Options of the alignment; absent if unknown.")
 

@@ -12,6 +12,7 @@ from marey_schemas.documents.annotations import Annotation
 from marey_schemas.documents.clips import ClipInfo, MotionDocument
 from marey_schemas.documents.evaluations import EvaluationDocument, EvaluationRecords
 from marey_schemas.documents.graphs import ModelGraph
+from marey_schemas.documents.metrics import MetricDocument
 from marey_schemas.documents.models import MotionPrimitiveDocument
 from marey_schemas.documents.references import OutputRef as OutputRef
 from marey_schemas.documents.references import RevisionRef as RevisionRef
@@ -50,6 +51,7 @@ SCHEMAS: dict[str, type[Request]] = {
         ModelReport,
         ModelGraph,
         StudyDocument,
+        MetricDocument,
         OpenDocument,
     )
 }

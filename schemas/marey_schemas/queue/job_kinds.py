@@ -40,6 +40,13 @@ _RIGS = InputSpec(
 )
 
 
+_METRIC = InputSpec(
+    kind=Kind.METRIC,
+    required=False,
+    description="A stored perceptual metric; alternatively, the parameter `metric` names a built-in one.",
+)
+
+
 def _may_hold_graphs(params: Mapping[str, Any]) -> bool:
     """Return whether one of the files to import may be a graph of motion models, judging by its name.
 
@@ -106,6 +113,7 @@ EVALUATE = KindDeclaration(
             description="The evaluation whose normaliser (scaling of features) is used, so that the results of "
             "both evaluations can be compared.",
         ),
+        "metric": _METRIC,
     },
     outputs={"evaluation": Kind.EVALUATION},
     facets=USAGE_FACETS,
@@ -127,6 +135,21 @@ COMPARE = KindDeclaration(
     outputs={"document": "file", "report": "file"},
 )
 
+DISTANCES = KindDeclaration(
+    name="distances",
+    description="Measures how different clips look to people: perceptual distances of all pairs, motion maps, and "
+    "registration curves.",
+    params=job_params.DistancesParams,
+    implementation="marey_worker.kinds.distances:run",
+    version=1,
+    inputs={
+        "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to compare, all of one skeleton."),
+        "metric": _METRIC,
+        "rig": _RIG,
+    },
+    outputs={"document": "file", "maps": "file", "report": "file"},
+)
+
 _EVALUATED = InputSpec(
     kind=Kind.EVALUATION, description="The evaluation; its clips are read at the revisions that it used."
 )
@@ -144,7 +167,7 @@ SUGGEST = KindDeclaration(
     params=job_params.SuggestParams,
     implementation="marey_worker.kinds.suggest:run",
     version=2,
-    inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES},
+    inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES, "metric": _METRIC},
     outputs={"document": "file"},
     facets=REMOVAL_FACETS,
 )
@@ -252,6 +275,7 @@ ALIGN = KindDeclaration(
             description="Annotations of these clips; their segments and keyframes cut the clips into parts, "
             "which are aligned one by one.",
         ),
+        "metric": _METRIC,
         "rig": _RIG,
     },
     outputs={"processed": Kind.PROCESSED},
@@ -304,7 +328,7 @@ ANALYSE_STUDY = KindDeclaration(
     implementation="marey_worker.kinds.analyse_study:run",
     version=1,
     inputs={"study": InputSpec(kind=Kind.STUDY, description="The study, at the revision that its participants saw.")},
-    outputs={"document": "file", "report": "file", "metric": "file"},
+    outputs={"document": "file", "report": "file", "fitted": "file"},
     never_cached_for=_reads_answers,
 )
 
@@ -337,8 +361,8 @@ def kind_of_job(name: str, params: Mapping[str, Any]) -> KindDeclaration:
 
 
 BUILT_IN = (
-    IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN, MODEL, TREE,
-    ANALYSE_STUDY, RUN_SCRIPT,
+    IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, DISTANCES, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN, MODEL,
+    TREE, ANALYSE_STUDY, RUN_SCRIPT,
 )  # fmt: skip
 
 

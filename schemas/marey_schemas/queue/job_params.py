@@ -30,6 +30,7 @@ from marey_schemas.options.imports import ImportOptions
 from marey_schemas.options.improvement import OptimisationOptions, SuggestionOptions, SweepOptions
 from marey_schemas.options.matching import FeatureWeights
 from marey_schemas.options.modelling import ModelOptions, TreeOptions
+from marey_schemas.options.perception import DistanceOptions, MetricChoice
 
 
 class TaggedResults(Request):
@@ -48,7 +49,7 @@ MOST_EXAMPLES = 2000
 """Greatest number of examples that are all compared with each other; mirrored copies count."""
 
 
-class AlignParams(AlignOptions, SuffixedResults):
+class AlignParams(AlignOptions, MetricChoice, SuffixedResults):
     """Parameters of jobs of the kind `align`."""
 
     layer: LayerName | None = Field(
@@ -136,7 +137,7 @@ TRIALS_PER_TASK = 8
 MOST_EVALUATION_TASKS = 64
 
 
-class EvaluateParams(EvaluationOptions, TaggedResults):
+class EvaluateParams(EvaluationOptions, MetricChoice, TaggedResults):
     """Parameters of jobs of the kind `evaluate`."""
 
     name: ItemName = Field("evaluation", description="Name of the result.")
@@ -209,7 +210,21 @@ class AnalyseStudyParams(Request):
     )
 
 
-class SuggestParams(SuggestionOptions):
+MOST_COMPARED_CLIPS = 300
+"""Greatest number of clips of a table of perceptual distances."""
+
+
+class DistancesParams(DistanceOptions, MetricChoice):
+    """Parameters of jobs of the kind `distances`."""
+
+    loops: tuple[ItemId, ...] = Field(
+        (), max_length=MOST_COMPARED_CLIPS, description="Clips that are loops, in addition to those tagged `loop`."
+    )
+    title: str = Field("", max_length=200, description="Title of the report; default: the names of the clips.")
+    report: bool = Field(True, description="Write the report, a self-contained HTML page, and its figures.")
+
+
+class SuggestParams(SuggestionOptions, MetricChoice):
     """Parameters of jobs of the kind `suggest`."""
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from marey_motion.alignment.cost import cost_points, frame_costs
+from marey_motion.alignment.cost import cost_points, costs_between, frame_costs
 from marey_motion.alignment.dtw import align
 from marey_motion.alignment.reference import medoid, nearest_mean_length, pairwise_totals
 from marey_motion.alignment.segments import align_sections
@@ -54,7 +54,12 @@ def test_costs_of_pairs_are_those_of_aligning_each_section_of_each_two(max_run: 
     ready = [cost_points(cloud, options) for cloud in points]
     told = []
     totals = pairwise_totals(
-        ready, bounds, options, max_run=max_run, threads=threads, progress=lambda *done: told.append(done)
+        ready,
+        bounds,
+        lambda one, other: costs_between(one, other, options),
+        max_run=max_run,
+        threads=threads,
+        progress=lambda *done: told.append(done),
     )
     assert np.array_equal(totals, totals.T)
     for i, one in enumerate(points):

@@ -24,8 +24,9 @@ from marey_motion.perception.judging import (
     simulate_judgements,
     triangle_violations,
 )
-from marey_motion.perception.metric import Component, classes_of
+from marey_motion.perception.metric import Component
 from marey_motion.perception.ordering import order_motions
+from marey_schemas.documents.metrics import classes_of
 
 MOTIONS = 21
 PAIRS = np.triu_indices(MOTIONS, 1)

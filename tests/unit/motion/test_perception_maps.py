@@ -22,21 +22,23 @@ from marey_motion.perception import maps
 from marey_motion.perception.maps import component_map, joint_differences, map_blocks, motion_map, paired_distances
 from marey_motion.perception.measuring import MeasuredClip, classes_measured, measure_motion
 from marey_motion.perception.metric import (
-    MEASUREMENTS,
-    PUBLISHED,
-    AngleMeasure,
     Component,
-    Measurement,
     PerceptualMetric,
-    Shaping,
-    classes_of,
-    doubtful_weights,
     published_component,
     published_metric,
     uniform_metric,
 )
 from marey_motion.rigs import map_joints
 from marey_motion.skeleton import Skeleton
+from marey_schemas.documents.metrics import (
+    MEASUREMENTS,
+    PUBLISHED,
+    AngleMeasure,
+    Measurement,
+    Shaping,
+    built_in_metric,
+    classes_of,
+)
 
 KINDS: tuple[tuple[Measurement, Shaping], ...] = tuple(product(MEASUREMENTS, get_args(Shaping)))
 
@@ -51,7 +53,7 @@ def walks() -> tuple[MeasuredClip, MeasuredClip]:
     return measured(generate_gait(1.3, 0.2, 1.2)), measured(generate_gait(2.1, -0.4, 0.9))
 
 
-def metric_of(component: Component, **options: object) -> PerceptualMetric:
+def one_component(component: Component, **options: object) -> PerceptualMetric:
     return replace(PerceptualMetric("one", (component,), (1.0,)), **options)  # type: ignore[arg-type]
 
 
@@ -69,8 +71,8 @@ def test_the_published_table_is_as_printed() -> None:
             assert component.shares_of(classes_of(measurement)).sum() == pytest.approx(1.0, abs=1e-15)
     odd = {which: round(total, 3) for which, total in sums.items() if abs(total - 1.0) > 0.0015}
     assert odd == {("positions", "sigmoid"): 0.998, ("velocities", "sigmoid"): 1.027}
-    assert "1.027" in doubtful_weights(published_component("velocities", "sigmoid"))
-    assert not doubtful_weights(published_component("angles", "euclid"))
+    assert "1.027" in built_in_metric("published/velocities-sigmoid").notes[0]
+    assert not built_in_metric("published/angles-euclid").notes
     assert published_component("velocities", "sigmoid").weights["thigh"] == 0.0
     # The mean of the experiment's table is 5/6, so these are the typical differences of a joint.
     expected: dict[Measurement, tuple[float, ...]] = {
@@ -121,7 +123,7 @@ def test_maps_are_those_of_the_formulas(measurement: Measurement, shaping: Shapi
     weights = {name: 1.0 + k for k, name in enumerate(classes_of(measurement))}
     component = Component(measurement, shaping, 0.2, 7.0, weights, exponent=0.3)
     for options in ({}, {"side_reduce": "sum"}, *({"angle": kind} for kind in get_args(AngleMeasure))):
-        metric = metric_of(component, **options)
+        metric = one_component(component, **options)
         expected = brute_force(a, b, component, metric)
         np.testing.assert_allclose(component_map(a, b, metric, component), expected, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(paired_distances(a, b, metric), np.diag(expected), rtol=1e-9, atol=1e-9)
@@ -138,7 +140,7 @@ def squares_after_turn(angle: float, one: Floats, other: Floats) -> float:
 def test_kovar_alignment_is_the_best_rotation_and_shift() -> None:
     a, b = (clip.at(np.arange(0.0, 40.0, 13.0)) for clip in walks())
     squares = Component("positions", "euclid", 0.0, 1.0, {"calf": 1.0})
-    metric = metric_of(squares, root_alignment="kovar2d")
+    metric = one_component(squares, root_alignment="kovar2d")
     calves = slice(a.starts[a.classes.index("calf")], a.starts[a.classes.index("calf") + 1])
     expected = np.empty((len(a.positions), len(b.positions)))
     for i, j in np.ndindex(expected.shape):
@@ -157,7 +159,7 @@ def test_kovar_alignment_is_the_best_rotation_and_shift() -> None:
 def test_distances_of_frames_obey_the_axioms_of_a_metric(measurement: Measurement, shaping: Shaping) -> None:
     clip = walks()[0].at(np.arange(0.0, 60.0, 2.3))
     weights = dict.fromkeys(classes_of(measurement), 1.0)
-    found = motion_map(clip, clip, metric_of(Component(measurement, shaping, 0.3, 5.0, weights, exponent=0.7)))
+    found = motion_map(clip, clip, one_component(Component(measurement, shaping, 0.3, 5.0, weights, exponent=0.7)))
     assert (np.diag(found) == 0.0).all()
     np.testing.assert_allclose(found, found.T, rtol=1e-13)
     assert found[~np.eye(len(found), dtype=bool)].min() > 0.3
@@ -169,9 +171,9 @@ def test_squares_violate_the_triangle_inequality_and_the_constant_can_apply_to_e
     clip = walks()[0].at(np.zeros(3))
     clip.positions[:, :, 0] = np.array([[0.0], [0.1], [0.2]])
     square = Component("positions", "euclid", 0.0, 1.0, {"head": 1.0})
-    found = motion_map(clip, clip, metric_of(square))
+    found = motion_map(clip, clip, one_component(square))
     assert found[0, 2] - found[0, 1] - found[1, 2] == pytest.approx(0.02)
-    kept = metric_of(replace(square, constant=0.4), identity="constant")
+    kept = one_component(replace(square, constant=0.4), identity="constant")
     assert np.diag(motion_map(clip, clip, kept)).tolist() == [0.4, 0.4, 0.4]
 
 
@@ -199,7 +201,9 @@ def test_units_change_n_by_their_powers_except_for_the_sigmoid() -> None:
     shapings: tuple[Shaping, ...] = ("manhattan", "euclid", "sigmoid")
     for shaping in shapings:
         component = Component("positions", shaping, 0.0, 1.0, {"forearm": 1.0})
-        ratio = motion_map(a, b, metric_of(component, length_unit_m=0.01)) / motion_map(a, b, metric_of(component))
+        ratio = motion_map(a, b, one_component(component, length_unit_m=0.01)) / motion_map(
+            a, b, one_component(component)
+        )
         factors[shaping] = ratio.min(), ratio.max()
     assert factors["manhattan"] == pytest.approx((100.0, 100.0), rel=1e-12)
     assert factors["euclid"] == pytest.approx((1e4, 1e4), rel=1e-12)
@@ -254,6 +258,6 @@ def test_a_skeleton_without_some_joints_is_compared_by_the_others() -> None:
     clip = measure_motion(Motion.of(gait), replace(body, standard_joints=known), 60.0)
     assert "toe" not in clip.classes
     component = published_component("positions", "manhattan")
-    found = joint_differences(clip, clip.at(np.arange(60.0)[::-1]), metric_of(component), component)
+    found = joint_differences(clip, clip.at(np.arange(60.0)[::-1]), one_component(component), component)
     assert found.shape == (60, 7)
     assert component.shares_of(clip.classes)[clip.classes.index("upper_arm")] == pytest.approx(0.362 / 0.811)

@@ -148,7 +148,7 @@ def build_set(
     clips cannot be used for motion matching.
     """
     motions = list(read_motions(context, wanted.clips))
-    rigged = read_rigged(context, _common_rig(context, wanted, motions))
+    rigged = read_rigged(context, common_rig(context, wanted, motions))
     body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
     return build_clips(context, wanted, motions, body, options, normaliser)
 
@@ -169,7 +169,7 @@ def build_clips(
             name=pin.path,
             clip=documents.clip_from_document(motion, body.skeleton),
             content=content,
-            loop=pin.item in wanted.loops or LOOP_TAG in (info or {}).get("tags", ()),
+            loop=is_loop(pin, info, wanted.loops),
             frames=_trim(pin, motion, wanted.trims),
             tags=tuple((info or {}).get("tags", ())),
         )
@@ -177,6 +177,11 @@ def build_clips(
     ]
     context.progress(0, None, f"building a database of {counted(len(clips), 'clip')}")
     return build_database(clips, body, options, normaliser=normaliser)
+
+
+def is_loop(pin: PinnedInput, info: Mapping[str, Any] | None, loops: Sequence[str]) -> bool:
+    """Return whether a clip is a loop: because the job lists it in `loops`, or by the tag in its part `info`."""
+    return pin.item in loops or LOOP_TAG in (info or {}).get("tags", ())
 
 
 def uid_of(pin: PinnedInput) -> str:
@@ -197,7 +202,7 @@ def read_motions(context: Context, pins: Sequence[PinnedInput]) -> Iterator[tupl
         yield document_digest(tree), MotionDocument.model_validate(tree)
 
 
-def _common_rig(context: Context, wanted: ClipSet, motions: Sequence[tuple[str, MotionDocument]]) -> Rig:
+def common_rig(context: Context, wanted: ClipSet, motions: Sequence[tuple[str, MotionDocument]]) -> Rig:
     """Return the skeleton of all clips, at the newest revision in use. Raises `JobRefused` if there are several."""
     used = [RevisionRef.model_validate(motion.skeleton.model_dump()) for _, motion in motions]
     (most, count), *others = Counter(ref.item for ref in used).most_common()

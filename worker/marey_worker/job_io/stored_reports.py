@@ -21,7 +21,7 @@ def store_report(
             "title": title,
             "html": _stored(context, page.encode()),
             "scripts": _scripts(page),
-            "figures": tuple(_stored_figure(context, figure, trial) for trial, figure in figures),
+            "figures": tuple(stored_figure(context, figure, trial) for trial, figure in figures),
         }
     )
     return report.model_dump(mode="json", by_alias=True)
@@ -37,7 +37,8 @@ def _scripts(page: str) -> tuple[str, ...]:
     return (f"sha256-{base64.b64encode(digest).decode()}",) if found else ()
 
 
-def _stored_figure(context: Context, figure: DrawnFigure, trial: str | None) -> StoredFigure:
+def stored_figure(context: Context, figure: DrawnFigure, trial: str | None = None) -> StoredFigure:
+    """Store a figure in all its formats as files; return the entry of a document that refers to these files."""
     files = {name: _stored(context, data) for name, data in figure.files().items()}
     tables = {table: files[f"{figure.name}-{table}.csv"] for table in figure.tables}
     return StoredFigure(

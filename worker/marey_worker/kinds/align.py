@@ -15,8 +15,10 @@ from marey_motion.alignment.aligning import MIRRORED, SourceExample, align_clips
 from marey_motion.alignment.segments import Cut, cuts_of
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
+from marey_motion.perception.metric import metric_of
 from marey_schemas.documents.annotations import Annotation
 from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.documents.metrics import MetricIdentity
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.kinds import Kind
@@ -25,6 +27,7 @@ from marey_schemas.options.alignment import MEDOID, NEAREST_MEAN_LENGTH, AlignOp
 from marey_schemas.queue.job_params import MOST_EXAMPLES, AlignParams
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
+from marey_worker.job_io.chosen_metric import read_metric
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import require_different
@@ -69,6 +72,7 @@ class _Job:
         self._pins = {_uid(pin): pin for pin in context.inputs["clips"]}
         self._refusals = Refusals(context)
         self._annotations: dict[str, PinnedInput] = {}
+        self._metric = read_metric(context, params.metric)
 
     def run(self) -> dict[str, Any]:
         self._require_names()
@@ -83,6 +87,7 @@ class _Job:
                 with_mirrored(examples, body) if self._params.mirroring == "add" else examples,
                 body,
                 self._options(),
+                metric=None if self._metric is None else metric_of(self._metric),
                 threads=self._context.threads,
                 progress=self._context.progress,
                 on_refusal=lambda example, error: self._refusals.add(
@@ -268,9 +273,18 @@ class _Job:
                     for one in examples
                 ],
                 "rig": [rig.skeleton.model_dump(), rig.mapping.model_dump()],
-                "options": self._params.model_dump(mode="json"),
+                "options": self._written_options(),
+                **self._metric_tree(),
             }
         )
+
+    def _written_options(self) -> dict[str, Any]:
+        """Return the parameters; without a metric, they are written as before metrics could be chosen."""
+        return self._params.model_dump(mode="json", exclude={"metric"} if self._params.metric is None else set())
+
+    def _metric_tree(self) -> dict[str, Any]:
+        """Return the identity of the metric as a member of documents; empty without a metric."""
+        return {} if self._metric is None else {"metric": MetricIdentity.of(self._metric).model_dump(mode="json")}
 
     # -- results --
 
@@ -278,7 +292,7 @@ class _Job:
         return self._pins[uid.removesuffix(MIRRORED)]
 
     def _stage(self, aligned: AlignedSet, skeleton: RevisionRef, digest: str) -> None:
-        options = self._params.model_dump(mode="json")
+        options = self._written_options()
         results = StagedResults(self._context)
         for done, one in enumerate(aligned.clips):
             self._context.progress(done, len(aligned.clips), "writing results")
@@ -295,8 +309,9 @@ class _Job:
         sources = {"clips": tuple(used.as_input() for used in dict.fromkeys((pin, reference)))}
         if _uid(pin) in self._annotations:
             sources["annotations"] = (self._annotations[_uid(pin)].as_input(),)
-        if rig := self._context.inputs.get("rig"):
-            sources["rig"] = tuple(used.as_input() for used in rig)
+        for name in ("rig", "metric"):
+            if pins := self._context.inputs.get(name):
+                sources[name] = tuple(used.as_input() for used in pins)
         return StagedOutput(
             name=f"{pin.collection}/{self._name(pin, ending)}",
             kind=Kind.PROCESSED,
@@ -305,7 +320,10 @@ class _Job:
             tags=self._params.tags,
             parts={
                 "motion": motion.model_dump(by_alias=True),
-                "info": aligned_documents.example_to_tree(aligned, one, digest=digest, options=options),
+                "info": {
+                    **aligned_documents.example_to_tree(aligned, one, digest=digest, options=options),
+                    **self._metric_tree(),
+                },
             },
             sources=sources,
         )
@@ -320,6 +338,7 @@ class _Job:
             "keyframes": dict(aligned.keyframes),
             "mean_cost": float(np.mean([one.cost for one in aligned.clips])),
             "set": digest,
+            **self._metric_tree(),
             "aligned": [_row(one) for one in aligned.clips],
             "refused": self._refusals.entries,
         }

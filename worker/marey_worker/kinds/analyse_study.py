@@ -67,7 +67,7 @@ def run(context: Context, params: AnalyseStudyParams) -> dict[str, Any]:
     tree["labels"] = [one.label for one in study.motions]
     result = {**_headline(analysis), "document": store_document(context, tree)}
     if analysis.fits:
-        result["metric"] = store_document(context, metric_to_tree(analysis, analysis.fits[0], ref))
+        result["fitted"] = store_document(context, metric_to_tree(analysis, analysis.fits[0], ref))
     if params.report:
         context.progress(0, None, "writing the report")
         page = render_study_report(analysis, _names(context, study), refusal, title=params.title or study.title)

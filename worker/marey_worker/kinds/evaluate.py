@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
 from typing import Any
 
 from marey_motion.evaluation.judgement import judge
+from marey_motion.evaluation.perceived import PerceivedRows
 from marey_motion.evaluation.relevance import recorded_rows, sum_by_source
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import records_from_tree, records_to_tree, result_to_tree
@@ -24,6 +26,7 @@ from marey_schemas.queue.facets import ItemFacets
 from marey_schemas.queue.job_params import EvaluateParams
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
+from marey_worker.job_io.chosen_metric import read_metric
 from marey_worker.job_io.matching_clips import read_clips, refusing_motion_errors, uid_of, wanted_clips
 from marey_worker.job_io.stored_reports import store_report
 
@@ -70,6 +73,8 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
             baseline = evaluate_baseline(options, threads=context.threads)
         context.progress(2, GATHERING_STEPS, "measuring the trials")
         result = assemble(database, options, trials, records, baseline=baseline)
+        if (metric := read_metric(context, params.metric)) is not None:
+            result = replace(result, perceived=PerceivedRows(database, metric).transitions(result.switches))
     evaluation = {
         **result_to_tree(result),
         "normaliser": database.normaliser.as_tree(),
@@ -86,7 +91,8 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
     )
     context.publish_facets(facets_of(result, context.inputs["clips"]))
     simulating_s = round(sum(one["seconds"] for one in results), 4)
-    return {"verdict": evaluation["verdict"], **evaluation["headline"], "simulating_s": simulating_s}
+    perceived = {} if result.perceived is None else {"perceived": asdict(result.perceived)}
+    return {"verdict": evaluation["verdict"], **evaluation["headline"], **perceived, "simulating_s": simulating_s}
 
 
 def _trials(params: EvaluateParams, options: EvaluationOptions) -> tuple[Trial, ...]:

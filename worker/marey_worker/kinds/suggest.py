@@ -10,6 +10,7 @@ from marey_schemas.queue.facets import ItemFacets
 from marey_schemas.queue.job_params import SuggestParams
 from marey_worker.context import Context
 from marey_worker.job_io.candidates import read_candidates
+from marey_worker.job_io.chosen_metric import read_metric
 from marey_worker.job_io.evaluated_set import read_evaluated_set, store_document
 from marey_worker.job_io.matching_clips import refusing_motion_errors, split_uid
 
@@ -24,6 +25,7 @@ def run(context: Context, params: SuggestParams) -> dict[str, Any]:
             evaluated.result,
             collections=candidates.databases,
             options=params,
+            metric=read_metric(context, params.metric),
             threads=context.threads,
             progress=context.progress,
         )

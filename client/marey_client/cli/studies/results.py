@@ -105,13 +105,13 @@ def analyse(
 
 def _save_metric(found: Findings, path: Path) -> None:
     try:
-        found.save_file("metric", path)
+        found.save_file("fitted", path)
     except LookupError as error:
         raise WrongUsage(f"no metric was fitted: {'; '.join(found.document()['refusals'])}") from error
 
 
 def _print_analysis(summary: Mapping[str, object], document: Mapping[str, object]) -> None:
-    print_pairs([(name.replace("_", " "), str(value)) for name, value in summary.items() if name != "metric"])
+    print_pairs([(name.replace("_", " "), str(value)) for name, value in summary.items()])
     refusals = document["refusals"]
     assert isinstance(refusals, list)
     for text in refusals:

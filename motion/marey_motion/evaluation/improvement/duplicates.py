@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from marey_motion.alignment.dtw import RangeBounds, distance_bound, warped_distance
 from marey_motion.evaluation.improvement.selection import clips_by_source, source_of
+from marey_motion.evaluation.perceived import PerceivedRows
 from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 
@@ -35,6 +36,7 @@ class NearDuplicate:
     distance_cm : distance of the two motions per frame, as in the description of the module, but in centimetres
     same_content : whether both are the same frames of clips with equal content
     mirrored : whether the first motion is nearly the mirror image of the second
+    perceived : perceptual distance of the two motions; None without a metric
     """
 
     first: str
@@ -44,6 +46,7 @@ class NearDuplicate:
     distance_cm: float
     same_content: bool
     mirrored: bool
+    perceived: float | None = None
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,7 @@ def find_near_duplicates(
     database: MatchingDatabase,
     *,
     threshold_cm: float,
+    seen: PerceivedRows | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
@@ -72,6 +76,7 @@ def find_near_duplicates(
     ----------
     database : MatchingDatabase    the clips
     threshold_cm : float    centimetres per frame
+    seen : PerceivedRows, optional    the rows under a perceptual metric, by which pairs are measured, too
     threads : int, optional    threads to use, one per processor if None
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
@@ -84,7 +89,7 @@ def find_near_duplicates(
     ------
     EvaluationCancelled    if cancelled
     """
-    families = _Families(database)
+    families = _Families(database, seen)
     found: list[NearDuplicate] = []
     aligned = compared = 0
 
@@ -109,7 +114,8 @@ def find_near_duplicates(
 class _Families:
     """The clips of a database, grouped by source: a clip and its mirrored copy have the same source."""
 
-    def __init__(self, database: MatchingDatabase) -> None:
+    def __init__(self, database: MatchingDatabase, seen: PerceivedRows | None) -> None:
+        self._seen = seen
         families = clips_by_source(database.clips).values()
         self._clips = [database.clips[index] for own in families for index in own]
         self._family = np.repeat(np.arange(len(families)), [len(own) for own in families])
@@ -142,7 +148,8 @@ class _Families:
             aligned += 1
             distance = warped_distance(own, theirs, limit=limit_m)
             if distance <= limit_m:
-                pair = _pair(self._clips[one], self._clips[place], distance)
+                perceived = None if self._seen is None else self._seen.distance(self._clips[one], self._clips[place])
+                pair = _pair(self._clips[one], self._clips[place], distance, perceived)
                 near.setdefault(self._family[place], []).append(pair)
         nearest = [min(pairs, key=lambda pair: pair.distance_cm) for pairs in near.values()]
         return nearest, aligned, len(others)
@@ -171,7 +178,7 @@ def frame_points(database: MatchingDatabase) -> NDArray[np.float64]:
 
 
 def spared_sources(
-    database: MatchingDatabase, duplicates: NearDuplicates, ticks: dict[str, int]
+    database: MatchingDatabase, duplicates: NearDuplicates, ticks: dict[str, int], *, most_perceived: float = np.inf
 ) -> tuple[tuple[str, NearDuplicate], ...]:
     """Choose the source clips that can be spared: after their removal, no pair of near-duplicates is left.
 
@@ -183,6 +190,7 @@ def spared_sources(
     database : MatchingDatabase    the clips
     duplicates : NearDuplicates    the pairs
     ticks : mapping of str to int    number of ticks for which each source is displayed, by uid
+    most_perceived : float    pairs with a greater perceptual distance look different, so both of their clips stay
 
     Returns
     -------
@@ -192,13 +200,14 @@ def spared_sources(
     frames = {source: database.clips[own[0]].frame_count for source, own in families.items()}
     gone: dict[str, NearDuplicate] = {}
     for pair in duplicates.pairs:
-        if pair.first not in gone and pair.second not in gone:
+        alike = pair.perceived is None or pair.perceived <= most_perceived
+        if alike and pair.first not in gone and pair.second not in gone:
             worth = {source: (ticks.get(source, 0), frames[source]) for source in (pair.first, pair.second)}
             gone[pair.first if worth[pair.first] < worth[pair.second] else pair.second] = pair
     return tuple(gone.items())
 
 
-def _pair(one: DatabaseClip, other: DatabaseClip, distance: float) -> NearDuplicate:
+def _pair(one: DatabaseClip, other: DatabaseClip, distance: float, perceived: float | None) -> NearDuplicate:
     mirrored = (one.mirrored_from is None) != (other.mirrored_from is None)
     return NearDuplicate(
         first=source_of(one),
@@ -208,4 +217,5 @@ def _pair(one: DatabaseClip, other: DatabaseClip, distance: float) -> NearDuplic
         distance_cm=100.0 * distance,
         same_content=distance == 0.0 and one.content == other.content != "" and not mirrored,
         mirrored=mirrored,
+        perceived=perceived,
     )

@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.duplicates import (
     NearDuplicate,
@@ -20,12 +22,14 @@ from marey_motion.evaluation.improvement.filling import Addition, Filling, plan_
 from marey_motion.evaluation.improvement.redundancy import PlannedRemoval, Removal, leave_one_out, plan_removals
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.unused import Unused, find_unused
+from marey_motion.evaluation.perceived import PerceivedRows, indistinguishable
 from marey_motion.evaluation.provenance import provenance_of
 from marey_motion.evaluation.relevance import sum_by_source
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.similarity import PoseSimilarity, accepted_distance, measure_similarity
 from marey_motion.evaluation.suite import CancelCallback
 from marey_motion.matching.database import MatchingDatabase
+from marey_schemas.documents.metrics import MetricDocument
 from marey_schemas.options.improvement import SuggestionOptions
 
 ProgressCallback = Callable[[int, int, str], None]
@@ -50,6 +54,7 @@ class Suggestions:
     fillings, additions : clips of other collections that fill holes. In `fillings`, each is measured alone; `additions`
         is a sequence in which each is measured after all earlier clips were added
     tried : number of clips that were left out one at a time, and number of all clips that a trial needs
+    metric : perceptual metric by which near-duplicates were measured, too
     """
 
     result: EvaluationResult
@@ -63,6 +68,7 @@ class Suggestions:
     fillings: tuple[Filling, ...]
     additions: tuple[Addition, ...]
     tried: tuple[int, int]
+    metric: MetricDocument | None = None
 
 
 def suggest(
@@ -71,6 +77,7 @@ def suggest(
     *,
     collections: Mapping[str, MatchingDatabase] | None = None,
     options: SuggestionOptions | None = None,
+    metric: MetricDocument | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
@@ -84,6 +91,7 @@ def suggest(
     collections : mapping of str to MatchingDatabase, optional    other collections to search for clips, by name; of any
         skeleton
     options : SuggestionOptions, optional    options
+    metric : MetricDocument, optional    perceptual metric: near-duplicates that look different are kept
     threads : int, optional    threads to use, one per processor if None
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
@@ -106,7 +114,11 @@ def suggest(
     )
     unused = find_unused(database, trials, records, result.options, index=simulation.index)
     duplicates = find_near_duplicates(
-        database, threshold_cm=how.duplicate_cm, threads=threads, **stages.watch("duplicates")
+        database,
+        threshold_cm=how.duplicate_cm,
+        seen=None if metric is None else PerceivedRows(database, metric),
+        threads=threads,
+        **stages.watch("duplicates"),
     )
     ticks = {use.uid: use.ticks for use in sum_by_source(database.clips, result.usage)}
     threshold = how.blendable_m or accepted_distance(records) or USUAL_BLENDABLE_M
@@ -121,7 +133,10 @@ def suggest(
         redundant=redundant,
         plan=plan,
         duplicates=duplicates,
-        spared=spared_sources(database, duplicates, ticks),
+        spared=spared_sources(
+            database, duplicates, ticks, most_perceived=np.inf if metric is None else indistinguishable(metric)
+        ),
+        metric=metric,
         similarity=similarity,
         fillings=fillings,
         additions=plan_fillings(fillings, result.coverage, others, result.options),

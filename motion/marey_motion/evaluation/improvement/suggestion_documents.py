@@ -10,10 +10,13 @@ import numpy as np
 
 from marey_motion.evaluation.compare import Comparison
 from marey_motion.evaluation.improvement import reasons
+from marey_motion.evaluation.improvement.duplicates import NearDuplicate
 from marey_motion.evaluation.improvement.optimise import Optimisation
 from marey_motion.evaluation.improvement.redundancy import PlannedRemoval, Removal
 from marey_motion.evaluation.improvement.suggest import Suggestions
+from marey_motion.evaluation.perceived import indistinguishable
 from marey_motion.evaluation.similarity import PoseSimilarity
+from marey_schemas.documents.metrics import MetricDocument, MetricIdentity
 
 COMPARISON_SCHEMA = "marey/comparison@1"
 SUGGESTIONS_SCHEMA = "marey/suggestions@1"
@@ -44,6 +47,7 @@ def comparison_to_tree(comparison: Comparison) -> Tree:
         "added": list(comparison.added),
         "newly_unused": list(comparison.newly_unused),
         "coverage_change_s": comparison.coverage_change_s,
+        **{f"perceived_{name}": asdict(side.perceived) for name, side in sides.items() if side.perceived is not None},
     }
 
 
@@ -75,7 +79,8 @@ def suggestions_to_tree(suggestions: Suggestions) -> Tree:
         "redundant": _redundant_to_tree(found),
         "near_duplicates": {
             "threshold_cm": found.duplicates.threshold_cm,
-            "pairs": [asdict(pair) for pair in found.duplicates.pairs],
+            "pairs": [_pair_to_tree(pair) for pair in found.duplicates.pairs],
+            **_metric_to_tree(found.metric),
             "spared": [
                 {"source": source, "reason": reasons.why_duplicate(source, pair)} for source, pair in found.spared
             ],
@@ -93,6 +98,24 @@ def suggestions_to_tree(suggestions: Suggestions) -> Tree:
             for step in found.additions
         ],
     }
+
+
+def _pair_to_tree(pair: NearDuplicate) -> Tree:
+    """Convert a pair; without a metric, it has no perceptual distance."""
+    tree = asdict(pair)
+    if pair.perceived is None:
+        del tree["perceived"]
+    elif not np.isfinite(pair.perceived):
+        tree["perceived"] = None
+    return tree
+
+
+def _metric_to_tree(metric: MetricDocument | None) -> Tree:
+    """Describe the metric, and the greatest distance of near-duplicates to remove; empty without a metric."""
+    if metric is None:
+        return {}
+    known = MetricIdentity.of(metric).model_dump(mode="json")
+    return {"metric": known, "most_perceived": indistinguishable(metric)}
 
 
 def _redundant_to_tree(suggestions: Suggestions) -> Tree:

@@ -1,0 +1,181 @@
+"""Perceptual distances between all clips of a set: preparation of the clips, and the table of distances."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+
+from marey_motion.arrays import Floats, Ints
+from marey_motion.clip import Clip
+from marey_motion.errors import MotionError
+from marey_motion.looping import loop_seam
+from marey_motion.matching.body import MatchingBody
+from marey_motion.matching.simulation_root import raw_root
+from marey_motion.motion import Motion
+from marey_motion.perception.cycles import Period, cut_loop, find_period
+from marey_motion.perception.measuring import MeasuredClip, measure_motion
+from marey_motion.perception.metric import PerceptualMetric
+from marey_motion.perception.registration import ClipDistance, clip_distance
+from marey_motion.resampling import resample_motion
+
+MOST_COMPARED_FRAMES = 3600
+"""Greatest number of frames of a clip, at the rate of the metric."""
+MOST_TABLE_CELLS = 2_000_000_000
+"""Greatest number of cells of all motion maps of a table of distances."""
+
+Progress = Callable[[float, float | None, str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class ComparableClip:
+    """A clip that is ready to be compared.
+
+    Parameters
+    ----------
+    name : str    name for people
+    recorded : MeasuredClip    the whole clip
+    compared : MeasuredClip    what is compared: a loop of one cycle, or the whole clip
+    motion : Motion    the frames of `compared`
+    period : Period, optional    where the loop was cut out of the clip; None if no loop was cut
+    """
+
+    name: str
+    recorded: MeasuredClip
+    compared: MeasuredClip
+    motion: Motion
+    period: Period | None
+
+
+@dataclass(frozen=True, eq=False)
+class ClipDistances:
+    """Distances of all pairs of N clips.
+
+    Parameters
+    ----------
+    totals : (N, N) float64    perceptual distances, symmetric, 0 on the diagonal
+    by_component : (C, N, N) float64    the same for each component of the metric, before it is multiplied by its share
+    """
+
+    totals: Floats
+    by_component: Floats
+
+    def pairs_by_distance(self) -> Ints:
+        """List the pairs i < j, the nearest first.
+
+        Returns
+        -------
+        (N (N - 1) / 2, 2) int64    pairs of clips
+        """
+        pairs = np.stack(np.triu_indices(len(self.totals), 1), axis=1)
+        return pairs[np.argsort(self.totals[tuple(pairs.T)], kind="stable")]
+
+
+def prepare_comparison(
+    clip: Clip,
+    body: MatchingBody,
+    metric: PerceptualMetric,
+    rate_hz: float,
+    *,
+    name: str,
+    cycles: Literal["cut", "whole"] = "cut",
+    loop: bool = False,
+) -> ComparableClip:
+    """Measure a clip at the rate of a metric, and cut a loop of one cycle out of it if asked for.
+
+    Parameters
+    ----------
+    clip : Clip    the clip
+    body : MatchingBody    body of its skeleton
+    metric : PerceptualMetric    the metric
+    rate_hz : float    frame rate at which the metric measures clips
+    name : str    name for people
+    cycles : str    cut: compare a loop of one cycle; whole: compare the whole clip
+    loop : bool    whether the clip is a loop already, which is never cut
+
+    Returns
+    -------
+    ComparableClip    the clip with its measurements
+
+    Raises
+    ------
+    MotionError    if the clip is too long, or no cycle is found in it
+    """
+    frames = clip.frame_count * rate_hz / clip.frame_rate_hz
+    if frames > MOST_COMPARED_FRAMES:
+        raise MotionError(
+            f"the clip has {frames:,.0f} frames at {rate_hz:g} Hz, and at most {MOST_COMPARED_FRAMES:,} can be "
+            "compared; cut it first",
+            code="too-many-frames",
+        )
+    motion, seam = Motion.of(clip), None
+    if loop:
+        root = raw_root(motion.positions(body.skeleton), body)
+        seam = loop_seam(root.positions, np.unwrap(root.headings))
+    motion = resample_motion(motion, clip.frame_rate_hz, rate_hz, seam=seam)
+    recorded = measure_motion(motion, body, rate_hz, seam=seam)
+    if loop or cycles == "whole":
+        return ComparableClip(name, recorded, recorded, motion, None)
+    period = find_period(recorded, metric)
+    cut, seam = cut_loop(motion, body, period)
+    return ComparableClip(name, recorded, measure_motion(cut, body, rate_hz, seam=seam), cut, period)
+
+
+def compare_clips(
+    clips: Sequence[MeasuredClip], metric: PerceptualMetric, *, threads: int = 1, progress: Progress | None = None
+) -> ClipDistances:
+    """Compute the perceptual distances of all pairs of clips.
+
+    Parameters
+    ----------
+    clips : sequence of MeasuredClip    N clips
+    metric : PerceptualMetric    the metric
+    threads : int    number of threads
+    progress : callable, optional    called with the number of pairs done, the number of all pairs, and a note
+
+    Returns
+    -------
+    ClipDistances    distances of all pairs
+
+    Raises
+    ------
+    MotionError    if clips cannot be compared, or the motion maps of all pairs have more than `MOST_TABLE_CELLS` cells
+    """
+    pairs = list(combinations(range(len(clips)), 2))
+    counts = np.array([clip.frame_count for clip in clips])
+    if (cells := (int(counts.sum()) ** 2 - int((counts**2).sum())) // 2) > MOST_TABLE_CELLS:
+        raise MotionError(
+            f"the motion maps of {len(pairs):,} pairs would have {cells:,} cells, and at most {MOST_TABLE_CELLS:,} can "
+            "be computed; compare fewer or shorter clips",
+            code="too-many-frames",
+        )
+    totals = np.zeros((len(clips), len(clips)))
+    parts = np.zeros((len(metric.components), len(clips), len(clips)))
+    with ThreadPoolExecutor(threads) as pool:
+        found = pool.map(partial(_distance, clips, metric), pairs)
+        for done, ((i, j), distance) in enumerate(zip(pairs, found, strict=True)):
+            if progress is not None:
+                progress(done, len(pairs), f"comparing {len(clips)} clips")
+            totals[i, j] = totals[j, i] = distance.total
+            parts[:, i, j] = parts[:, j, i] = distance.by_component
+    return ClipDistances(totals, parts)
+
+
+def _distance(clips: Sequence[MeasuredClip], metric: PerceptualMetric, pair: tuple[int, int]) -> ClipDistance:
+    one, other = (clips[number] for number in pair)
+    try:
+        return clip_distance(one, other, metric)
+    except MotionError as error:
+        if error.code != "alignment-impossible":
+            raise
+        raise MotionError(
+            f"clips {pair[0] + 1} and {pair[1] + 1} have {one.frame_count} and {other.frame_count} frames, and the "
+            "moments of clips whose lengths differ so much cannot be matched; compare loops of one cycle, or cut the "
+            "longer clip",
+            code="lengths-differ",
+        ) from error

@@ -1,0 +1,136 @@
+"""Compared clips with their distances: what is drawn, and what the metric can and cannot say about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from marey_motion.perception.comparing import ClipDistances, ComparableClip
+from marey_motion.perception.maps import component_map, motion_map
+from marey_motion.perception.measuring import MeasuredClip
+from marey_motion.perception.metric import PerceptualMetric, metric_of
+from marey_motion.perception.registration import RegistrationCurve, registration_curve
+from marey_reports.perception.motion_maps import NamedClip
+from marey_schemas.documents.metrics import MetricDocument
+from marey_schemas.options.perception import DistanceOptions
+
+MOST_DRAWN_FRAMES = 1200
+"""Greatest number of rows and columns of a drawn map; maps of longer clips show every second frame, or fewer."""
+_PUBLISHED_MEAN = 5 / 6
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedSet:
+    """N clips that were compared by a metric.
+
+    Parameters
+    ----------
+    metric : the metric
+    clips : the clips
+    distances : distances of all pairs
+    options : options of the comparison
+    """
+
+    metric: MetricDocument
+    clips: Sequence[ComparableClip]
+    distances: ClipDistances
+    options: DistanceOptions
+
+    @cached_property
+    def computed(self) -> PerceptualMetric:
+        """The metric as functions of motion use it."""
+        return metric_of(self.metric)
+
+    def drawn_pairs(self) -> tuple[tuple[int, int], ...]:
+        """Return the pairs whose maps are drawn: the nearest and the farthest, or the only one."""
+        ranked = self.distances.pairs_by_distance()
+        chosen = ranked[:1] if len(ranked) == 1 else ranked[[0, -1]]
+        return tuple((int(i), int(j)) for i, j in chosen)
+
+    def curve(self, pair: tuple[int, int]) -> RegistrationCurve:
+        """Return the registration curve of a pair."""
+        return registration_curve(self.clips[pair[0]].compared, self.clips[pair[1]].compared, self.computed)
+
+    def drawable(self, pair: tuple[int, int]) -> tuple[NamedClip, NamedClip]:
+        """Return the compared clips of a pair with few enough frames to draw; both have the same frame rate."""
+        clips = [self.clips[number] for number in pair]
+        step = -(-max(clip.compared.frame_count for clip in clips) // MOST_DRAWN_FRAMES)
+        one, other = (NamedClip(clip.name, _thinned(clip.compared, step)) for clip in clips)
+        return one, other
+
+    def recorded(self, number: int) -> NamedClip:
+        """Return a clip as it was recorded, with few enough frames to draw."""
+        clip = self.clips[number]
+        return NamedClip(clip.name, _thinned(clip.recorded, -(-clip.recorded.frame_count // MOST_DRAWN_FRAMES)))
+
+    def arrays(self, pair: tuple[int, int]) -> dict[str, np.ndarray]:
+        """Return maps of a pair by component and combined, their frame rate, and the curve."""
+        one, other = self.drawable(pair)
+        curve, rate = self.curve(pair), self.metric.frame_rate_hz
+        maps = {
+            component.measurement: component_map(one.clip, other.clip, self.computed, component)
+            for component in self.computed.components
+        }
+        found: dict[str, np.ndarray] = {name: np.asarray(values, np.float32) for name, values in maps.items()}
+        found["combined"] = np.asarray(motion_map(one.clip, other.clip, self.computed), np.float32)
+        found["map_rate_hz"] = np.array(one.clip.rate_hz)
+        found["curve_first_s"], found["curve_second_s"] = np.arange(len(curve.times)) / rate, curve.times / rate
+        return found
+
+    def missing_classes(self) -> tuple[str, ...]:
+        """Return the joint classes with a weight that the skeleton of the clips lacks."""
+        has = self.clips[0].compared.classes
+        weighted = [name for one in self.metric.components for name, weight in one.weights.items() if weight > 0]
+        return tuple(dict.fromkeys(name for name in weighted if name not in has))
+
+    def claims(self) -> Iterator[str]:
+        """Yield what the metric can and cannot say about these clips, one sentence or two at a time."""
+        yield from _claims_of(self.metric)
+        if self.options.cycles == "whole" and not all(clip.compared.cyclic for clip in self.clips):
+            yield (
+                "Whole clips were compared from their first to their last frames. If they contain different numbers of "
+                "steps, moments that do not belong together are compared."
+            )
+        if missing := self.missing_classes():
+            yield (
+                f"The skeleton has no {', no '.join(missing)}; the other joints count more, which nobody has judged."
+            )
+        if self.distances.totals.max() > 1.0:
+            yield "Distances above 1 lie outside what people can answer; only their order has a meaning."
+        yield from self.metric.notes
+
+
+def _claims_of(metric: MetricDocument) -> Iterator[str]:
+    if metric.origin == "uniform":
+        yield (
+            "All joints have equal weights, which were not fitted to judgements of people: the distances say which "
+            "clips move alike, not how different they look."
+        )
+        return
+    who = "29 people who judged walks of 21 others on one neutral figure"
+    mean = f" The mean difference of two of these walks is {_PUBLISHED_MEAN:.2f}."
+    if metric.origin == "fitted":
+        known = metric.fit
+        who = (
+            "people who judged" if known is None else f"{known.participants} people who judged {known.motions} motions"
+        )
+        mean = ""
+    yield (
+        f"The weights come from {who}: a distance estimates how rarely people would call two motions the most similar "
+        f"of four, from 0 (always) to 1 (never).{mean}"
+    )
+    yield (
+        f"The judgements themselves have a standard error of {metric.judgement_error:.2f}, so the metric cannot order "
+        f"distances that differ by less than {2 * metric.judgement_error:.2f}."
+    )
+    if metric.origin == "published":
+        yield "Only natural walks were judged. For runs, turns, dances or single poses, nobody was asked."
+
+
+def _thinned(clip: MeasuredClip, step: int) -> MeasuredClip:
+    if step == 1:
+        return clip
+    return replace(clip.at(np.arange(0, clip.frame_count, step, dtype=np.float64)), rate_hz=clip.rate_hz / step)

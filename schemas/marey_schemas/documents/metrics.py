@@ -1,0 +1,262 @@
+"""Perceptual metrics: part `metric` of an item of the kind `metric`, and the metrics that need no item.
+
+The distance of two poses by one measurement is c + N · Σ w F(x), with the sum over joint classes. The distance of a
+metric is the mean of its components' distances, weighted by their shares.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self, get_args
+
+from pydantic import Field, StringConstraints, model_validator
+
+from marey_schemas.base import Request
+from marey_schemas.documents.references import OutputRef, RevisionRef
+from marey_schemas.encoding.canonical import document_digest
+from marey_schemas.names import Digest
+
+Measurement = Literal["angles", "positions", "velocities"]
+Shaping = Literal["euclid", "manhattan", "sigmoid", "power"]
+AngleMeasure = Literal["half_angle", "angle", "one_minus_dot", "log_norm"]
+JointClass = Literal["head", "clavicle", "upper_arm", "forearm", "hand", "thigh", "calf", "toe"]
+
+MEASUREMENTS: tuple[Measurement, ...] = get_args(Measurement)
+JOINT_CLASS_NAMES: tuple[JointClass, ...] = get_args(JointClass)
+WITHOUT_ANGLES: tuple[JointClass, ...] = ("hand", "toe")
+"""Classes for which the paper has no angles."""
+METRIC_RATE_HZ = 60.0
+"""Frame rate at which the built-in metrics measure clips; clips of other rates are resampled."""
+METRIC_CODE = "perceptual-metric@1"
+"""Version of the computation of distances; it changes whenever the same metric may give other distances."""
+
+_Amount = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
+_Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+_Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+
+PUBLISHED: Mapping[Measurement, Mapping[Shaping, tuple[float | None, ...]]] = {
+    "angles": {
+        "euclid": (23.335, 0.508, 659.272, 0.000, 0.000, 0.006, 0.000, None, 0.669, 0.325, None),
+        "manhattan": (18.448, 0.324, 19.537, 0.041, 0.003, 0.061, 0.000, None, 0.622, 0.273, None),
+        "sigmoid": (18.004, 0.312, 20.016, 0.039, 0.008, 0.076, 0.000, None, 0.614, 0.263, None),
+    },
+    "positions": {
+        "euclid": (17.117, 0.290, 206.509, 0.062, 0.000, 0.551, 0.181, 0.000, 0.000, 0.050, 0.156),
+        "manhattan": (13.423, 0.069, 9.909, 0.020, 0.000, 0.362, 0.429, 0.000, 0.000, 0.000, 0.189),
+        "sigmoid": (13.264, 0.059, 10.375, 0.015, 0.000, 0.344, 0.455, 0.000, 0.000, 0.000, 0.184),
+    },
+    "velocities": {
+        "euclid": (25.779, 0.431, 1914.283, 0.000, 0.000, 0.000, 0.000, 0.605, 0.000, 0.298, 0.098),
+        "manhattan": (22.039, 0.193, 36.885, 0.000, 0.000, 0.000, 0.000, 0.551, 0.000, 0.298, 0.151),
+        "sigmoid": (21.993, 0.189, 36.532, 0.000, 0.000, 0.000, 0.000, 0.564, 0.000, 0.306, 0.157),
+    },
+}
+"""Figure 5 of the paper as printed: difference, c, N, and the weights in the order of `JOINT_CLASS_NAMES`."""
+
+_TEXT_AND_TABLE = (
+    "The text of the paper says that velocities use hands, thighs and calves; its table has hand, calf and toe, and no "
+    "thigh. The table is used."
+)
+_NO_SHARES = "The paper prints no shares of angles, positions and velocities; each has a third."
+_MOST_ROUNDING = 0.0025
+"""Greatest deviation from the sum 1 that the rounding of printed weights explains."""
+
+PUBLISHED_ERROR = 0.05
+"""Standard error of a published perceived difference: 1,827 trials show each of 210 pairs 52 times."""
+
+_BUILT_IN_PATTERN = r"^(published|uniform)/(?:(angles|positions|velocities)-)?(euclid|manhattan|sigmoid)$"
+BuiltInMetric = Annotated[str, StringConstraints(pattern=_BUILT_IN_PATTERN)]
+"""Name of a metric that needs no item, such as `published/sigmoid` or `published/positions-manhattan`.
+
+`published/` uses the weights of the paper, `uniform/` equal weights, c = 0 and N = 1. Without a measurement, all three
+are combined in equal shares.
+"""
+
+
+class MetricComponent(Request):
+    """Distance of poses by one measurement, and its share of the metric."""
+
+    measurement: Measurement
+    shaping: Shaping = Field(
+        description="F: euclid x², manhattan x, sigmoid x / (x + 1), power x^exponent; x is the difference of a class."
+    )
+    exponent: float = Field(1.0, gt=0, le=10, allow_inf_nan=False, description="Exponent of the shaping `power`.")
+    constant: _Amount = Field(description="c, which is added for poses that differ.")
+    norm: _Amount = Field(description="N, by which the weighted mean of F is multiplied.")
+    weights: dict[JointClass, _Amount] = Field(
+        min_length=1, description="Weight of each joint class, with any sum; they are divided by their sum."
+    )
+    share: _Share = Field(description="Share of the component in the metric; the shares have the sum 1.")
+    intervals: dict[JointClass, tuple[_Number, _Number]] = Field(
+        default_factory=dict,
+        description="95 % interval of each weight, divided by the sum of all, over resampled participants; empty: "
+        "unknown.",
+    )
+
+    @model_validator(mode="after")
+    def _check_classes(self) -> Self:
+        if self.measurement == "angles" and (wrong := [name for name in WITHOUT_ANGLES if name in self.weights]):
+            raise ValueError(f"weights: angles have no class {wrong[0]}; remove it")
+        if not sum(self.weights.values()) > 0:
+            raise ValueError("weights: at least one weight must be above 0")
+        return self
+
+
+class MetricFit(Request):
+    """Agreement of a fitted metric with the judgements that it was fitted to."""
+
+    motions: int = Field(ge=3, description="Number of motions.")
+    participants: int = Field(ge=1, description="Number of people who judged.")
+    trials: int = Field(ge=1, description="Number of answered trials.")
+    pairs: int = Field(ge=1, description="Number of pairs of motions with a known difference.")
+    rmse: _Amount = Field(description="Root mean square of fitted minus perceived differences.")
+    r2: _Number | None = Field(None, description="Share of the variance that the fit explains.")
+    spearman: _Number | None = Field(None, description="Rank correlation of fitted and perceived differences.")
+    noise_ceiling: _Amount | None = Field(
+        None, description="Standard error of the perceived differences; a fit that is closer describes noise."
+    )
+    left_out_rmse: _Amount | None = Field(
+        None, description="Root mean square error for motions that were left out of the fit, one at a time."
+    )
+
+
+class MetricDocument(Request):
+    """Part `metric` of a metric: weights, conventions of the measurement, and origin."""
+
+    schema_: Literal["marey/perceptual-metric@1"] = Field("marey/perceptual-metric@1", alias="schema")
+    name: str = Field(min_length=1, max_length=300, description="Name that is shown to people.")
+    origin: Literal["published", "uniform", "fitted"] = Field(
+        description="published: weights of the paper; uniform: equal weights; fitted: fitted to judgements."
+    )
+    study: RevisionRef | OutputRef | None = Field(
+        None, description="The study whose judgements a fitted metric comes from."
+    )
+    components: tuple[MetricComponent, ...] = Field(
+        min_length=1, max_length=len(MEASUREMENTS), description="At most one component for each measurement."
+    )
+    angle: AngleMeasure = Field(
+        "half_angle",
+        description="Measure of angles. half_angle: arccos |q · p|; angle: twice as large; one_minus_dot: 1 - |q · p|; "
+        "log_norm: norm of the logarithm of the rotation, equal to half_angle.",
+    )
+    side_reduce: Literal["mean", "sum"] = Field(
+        "mean", description="Whether the difference of a class is the mean or the sum of both sides."
+    )
+    identity: Literal["zero", "constant"] = Field(
+        "zero", description="Distance of equal poses. zero: 0; constant: the constants of the components."
+    )
+    root_alignment: Literal["mean_heading", "kovar2d"] = Field(
+        "mean_heading",
+        description="How place and heading are removed. mean_heading: the hips are at the origin, without the mean "
+        "heading of one second; kovar2d: each pair of poses is superposed.",
+    )
+    length_unit_m: _Positive = Field(1.0, description="Metres in one unit of length.")
+    velocity_interval_s: _Positive = Field(1.0 / 30.0, description="Seconds in which velocities count displacement.")
+    frame_rate_hz: float = Field(
+        METRIC_RATE_HZ, ge=1, le=1000, allow_inf_nan=False, description="Frame rate at which clips are measured."
+    )
+    code_version: str = Field(METRIC_CODE, max_length=64, description="Version of the computation of distances.")
+    fit: MetricFit | None = Field(None, description="Agreement with the judgements; null unless fitted.")
+    notes: tuple[Annotated[str, Field(max_length=1000)], ...] = Field(
+        (), max_length=32, description="What people should know before they use the metric."
+    )
+
+    @model_validator(mode="after")
+    def _check_components(self) -> Self:
+        if len({one.measurement for one in self.components}) != len(self.components):
+            raise ValueError("components: two components have the same measurement; keep one of them")
+        total = sum(one.share for one in self.components)
+        if abs(total - 1.0) > 1e-6:
+            raise ValueError(f"components: the shares have the sum {total:g}; it must be 1")
+        return self
+
+    @property
+    def judgement_error(self) -> float:
+        """The standard error of the judgements that the weights were fitted to."""
+        known = None if self.fit is None else self.fit.noise_ceiling
+        return PUBLISHED_ERROR if known is None else known
+
+    def identity_digest(self) -> Digest:
+        """Return the digest of everything that determines distances: two metrics with equal digests are the same."""
+        without = {"schema_", "name", "origin", "study", "fit", "notes"}
+        tree = self.model_dump(mode="json", exclude=without)
+        for component in tree["components"]:
+            del component["intervals"]
+        return document_digest(tree)
+
+    def stored(self) -> dict[str, Any]:
+        """Return the document as it is stored."""
+        return self.model_dump(mode="json", by_alias=True)
+
+
+class MetricIdentity(Request):
+    """The metric of a result. Results can be compared only if their metrics have the same digest."""
+
+    name: str = Field(max_length=300, description="Name that is shown to people.")
+    digest: Digest = Field(description="Digest of everything that determines distances.")
+
+    @classmethod
+    def of(cls, metric: MetricDocument) -> MetricIdentity:
+        """Return the identity of a metric."""
+        return cls(name=metric.name, digest=metric.identity_digest())
+
+
+def built_in_names() -> tuple[str, ...]:
+    """Return the names of all metrics that need no item."""
+    shapings = tuple(PUBLISHED["angles"])
+    ways = [*shapings, *(f"{measurement}-{shaping}" for measurement in MEASUREMENTS for shaping in shapings)]
+    return tuple(f"{origin}/{way}" for origin in ("published", "uniform") for way in ways)
+
+
+def is_built_in(name: str) -> bool:
+    """Return whether a metric that needs no item has this name."""
+    return re.fullmatch(_BUILT_IN_PATTERN, name) is not None
+
+
+def built_in_metric(name: str) -> MetricDocument:
+    """Return a metric that needs no item. Raises `KeyError` if none has this name."""
+    found = re.fullmatch(_BUILT_IN_PATTERN, name)
+    if found is None:
+        raise KeyError(name)
+    origin, measurement, printed = found.groups()
+    measurements = [one for one in MEASUREMENTS if measurement in (None, one)]
+    shaping = next(one for one in PUBLISHED["angles"] if one == printed)
+    make = published_component if origin == "published" else _uniform_component
+    components = tuple(make(one, shaping, 1.0 / len(measurements)) for one in measurements)
+    notes = _published_notes(components) if origin == "published" else ()
+    return MetricDocument(name=name, origin=origin, components=components, notes=notes)
+
+
+def published_component(measurement: Measurement, shaping: Shaping, share: float = 1.0) -> MetricComponent:
+    """Return a component with the weights that the paper prints. Raises `KeyError` for the shaping `power`."""
+    _, constant, norm, *weights = PUBLISHED[measurement][shaping]
+    given = {name: weight for name, weight in zip(JOINT_CLASS_NAMES, weights, strict=True) if weight is not None}
+    return MetricComponent(
+        measurement=measurement, shaping=shaping, constant=constant or 0.0, norm=norm or 0.0, weights=given, share=share
+    )
+
+
+def classes_of(measurement: Measurement) -> tuple[str, ...]:
+    """Return the joint classes of a measurement."""
+    return tuple(name for name in JOINT_CLASS_NAMES if measurement != "angles" or name not in WITHOUT_ANGLES)
+
+
+def _published_notes(components: tuple[MetricComponent, ...]) -> tuple[str, ...]:
+    notes = []
+    for component in components:
+        total = sum(component.weights.values())
+        if abs(total - 1.0) > _MOST_ROUNDING:
+            notes.append(
+                f"The printed weights of {component.measurement} have the sum {total:.3f}; they are divided by it."
+            )
+        if component.measurement == "velocities":
+            notes.append(_TEXT_AND_TABLE)
+    return (*notes, _NO_SHARES) if len(components) > 1 else tuple(notes)
+
+
+def _uniform_component(measurement: Measurement, shaping: Shaping, share: float) -> MetricComponent:
+    weights = dict.fromkeys(classes_of(measurement), 1.0)
+    given = {"measurement": measurement, "shaping": shaping, "constant": 0.0, "norm": 1.0}
+    return MetricComponent.model_validate({**given, "weights": weights, "share": share})
