@@ -40,7 +40,7 @@ def test_the_commands_of_the_page_lead_from_clips_to_a_metric(
     lab: ProjectHandle, run: CommandLine, server: ServerProcess, marey: Marey
 ) -> None:
     (run.folder / "consent.txt").write_text("I take part in this study.\n", encoding="utf-8")
-    create, invite, status, listing, *exports, analyse, withdraw = commands()
+    create, invite, status, listing, *exports, analyse, store, withdraw = commands()
     run(*create)
     made = run(*invite)
     codes = re.findall(r"/s/#(mareystudy_\w+)", made.stdout)
@@ -76,6 +76,9 @@ def test_the_commands_of_the_page_lead_from_clips_to_a_metric(
     report = (run.folder / "report.html").read_text(encoding="utf-8")
     assert "velocities, manhattan" in report
     assert "best rmse" in printed.stdout
+    run(*store)
+    (stored,) = lab.metrics.list(collection="metrics")
+    assert stored.document().stored() == metric
 
     run(*withdraw)
     assert [one.state for one in study.participants()] == ["withdrawn", "finished", "finished"]

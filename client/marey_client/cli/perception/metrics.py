@@ -13,6 +13,7 @@ from marey_client.cli.terminal.following import FINDINGS_JOB, Sources, Wait, cli
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_refused, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.terminal.typed_values import read_json
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -36,7 +37,12 @@ MetricName = Annotated[
         "or project/folder/name.",
     ),
 ]
-Shown = Annotated[str, typer.Argument(help="Name of a built-in metric, or project/folder/name.")]
+Shown = Annotated[
+    str,
+    typer.Argument(
+        help="Name of a built-in metric, project/folder/name, or JSON file of a metric (name ends in .json)."
+    ),
+]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -184,8 +190,10 @@ add_command(metric, compare, params=DISTANCES, job=FINDINGS_JOB)
 
 def _document(context: typer.Context, name: str) -> MetricDocument:
     """Return the document of a metric; only a stored one needs the server."""
-    from marey_schemas.documents.metrics import built_in_metric, is_built_in
+    from marey_schemas.documents.metrics import MetricDocument, built_in_metric, is_built_in
 
+    if name.endswith(".json"):
+        return MetricDocument.model_validate(read_json(name))
     if is_built_in(name):
         return built_in_metric(name)
     with connect(context) as marey:
