@@ -242,7 +242,9 @@ def test_a_reference_to_an_item_of_the_receiving_project_is_refused_with_what_to
     body = {"schema": "marey/document@1", "rig": {"item": rig.id, "revision": 1}}
     study = lab.items(Kind.CHARACTER).create("character", {"character": body})
     commit(gaits, character=study)
-    with pytest.raises(RequestFailed, match=f"character 'character' refers to the item {rig.id} of this project") as caught:
+    with pytest.raises(
+        RequestFailed, match=f"character 'character' refers to the item {rig.id} of this project"
+    ) as caught:
         partner.datasets.pull(gaits, "gaits")
     assert (caught.value.code, "another project" in str(caught.value)) == ("other-content", True)
     marey.create_project(ProjectCreate(name="third"))
