@@ -13,6 +13,7 @@ from marey_schemas.documents.clips import ClipInfo, MotionDocument
 from marey_schemas.documents.evaluations import EvaluationDocument, EvaluationRecords
 from marey_schemas.documents.graphs import ModelGraph
 from marey_schemas.documents.models import MotionPrimitiveDocument
+from marey_schemas.documents.motion_indexes import MotionIndexDocument
 from marey_schemas.documents.references import OutputRef as OutputRef
 from marey_schemas.documents.references import RevisionRef as RevisionRef
 from marey_schemas.documents.reports import EvaluationReport, ModelReport
@@ -48,6 +49,7 @@ SCHEMAS: dict[str, type[Request]] = {
         SampleTreeDocument,
         ModelReport,
         ModelGraph,
+        MotionIndexDocument,
         OpenDocument,
     )
 }

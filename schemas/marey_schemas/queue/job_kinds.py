@@ -290,6 +290,27 @@ TREE = KindDeclaration(
     unclear_place=job_params.TreeParams.unclear_place,
 )
 
+INDEX = KindDeclaration(
+    name="index",
+    description="Builds or updates an index of the poses of clips, with which moments that resemble an example are "
+    "found.",
+    params=job_params.IndexParams,
+    implementation="marey_worker.kinds.index:run",
+    version=1,
+    inputs={
+        "clips": InputSpec(
+            kind=Kind.CLIP, many=True, parts=("motion",), description="The clips that the index shall contain."
+        ),
+        "index": InputSpec(
+            kind=Kind.INDEX,
+            required=False,
+            description="The index to update: the poses of clips that it contains at the same revision are kept.",
+        ),
+    },
+    outputs={"index": Kind.INDEX},
+    place_counts=True,
+)
+
 RUN_SCRIPT = KindDeclaration(
     name=SCRIPT,
     description="Runs a registered script: a command of a pinned Git commit. The script declares the inputs and "
@@ -320,7 +341,7 @@ def kind_of_job(name: str, params: Mapping[str, Any]) -> KindDeclaration:
 
 BUILT_IN = (
     IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN, MODEL, TREE,
-    RUN_SCRIPT,
+    INDEX, RUN_SCRIPT,
 )  # fmt: skip
 
 

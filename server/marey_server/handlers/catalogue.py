@@ -23,6 +23,7 @@ from marey_server.handlers import (
     reports,
     samples,
     searches,
+    similar,
     uploads,
     webhooks,
 )
@@ -50,6 +51,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     *reports.RESOURCES,
     *samples.RESOURCES,
     *searches.RESOURCES,
+    *similar.RESOURCES,
     *coverage_streams.RESOURCES,
     *imports.RESOURCES,
     *jobs.RESOURCES,
