@@ -134,6 +134,7 @@ BODIES: dict[str, Any] = {
     "AnnotationImport": {"document": {"sections": [{"start_idx": 0, "end_idx": 0}]}},
     "EditPreviewRequest": {"commands": [{"command": "trim", "start": 0, "stop": 1}]},
     "SearchRequest": {"constraints": [{"type": "root_heading", "at": "end", "heading_deg": 0}]},
+    "SimilarRequest": {"clip": "item_of_nobody", "frames": [0, 1]},
 }
 """A body for every request model of the routes. A route with a new model fails in tests until a body is added here."""
 
