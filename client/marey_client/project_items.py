@@ -25,7 +25,7 @@ from marey_schemas.items import Collection, CollectionChange, CollectionCreate, 
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, PurgeAnswer, PurgeRequest
 from marey_schemas.queue.jobs import ItemInput
-from marey_schemas.similar import SimilarAnswer, SimilarRequest
+from marey_schemas.search import SimilarAnswer, SimilarRequest
 
 
 class ProjectItems:

@@ -29,8 +29,7 @@ from marey_schemas.formats import DEFAULT_FORMAT, MOTION_FORMATS
 from marey_schemas.wording import counted, one_of
 
 if TYPE_CHECKING:
-    from marey_schemas.search import SearchAnswer
-    from marey_schemas.similar import SimilarAnswer
+    from marey_schemas.search import SearchAnswer, SimilarAnswer
 
 TREE = OptionsOf("marey_schemas.queue.job_params:TreeParams")
 
@@ -38,7 +37,7 @@ SEARCH = OptionsOf("marey_schemas.search:SearchRequest", without=("constraints",
 
 INDEX = OptionsOf("marey_schemas.queue.job_params:IndexParams")
 
-SIMILAR = OptionsOf("marey_schemas.similar:SimilarOptions", short={"results": "-n"})
+SIMILAR = OptionsOf("marey_schemas.search:SimilarOptions", short={"results": "-n"})
 _MOMENT = re.compile(r"(?P<clip>.+):(?P<first>[0-9]{1,9})(?:[-:](?P<end>[0-9]{1,9}))?")
 
 Many = list[str] | None

@@ -230,7 +230,8 @@ def step_bounds(poses, steps, firsts, ball_firsts, per_ball, out):  # type: igno
     """Fill out (S,) with lower bounds of the distances of all windows that start in a step.
 
     poses (samples, balls) holds bounds of single poses, and the samples are `steps` after the start. The run r has the
-    steps [firsts[r], firsts[r + 1]), and balls of `per_ball` steps from ball_firsts[r]. Steps in which no window starts that is within the run get infinity.
+    steps [firsts[r], firsts[r + 1]), and balls of `per_ball` steps from ball_firsts[r]. Steps in which no window starts
+    that is within the run get infinity.
     """
     samples = poses.shape[0]
     for run in range(firsts.shape[0] - 1):

@@ -23,7 +23,6 @@ from marey_server.handlers import (
     reports,
     samples,
     searches,
-    similar,
     uploads,
     webhooks,
 )
@@ -51,7 +50,6 @@ RESOURCES: tuple[type[Resource], ...] = (
     *reports.RESOURCES,
     *samples.RESOURCES,
     *searches.RESOURCES,
-    *similar.RESOURCES,
     *coverage_streams.RESOURCES,
     *imports.RESOURCES,
     *jobs.RESOURCES,

@@ -13,7 +13,7 @@ from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
 from marey_schemas.problems import FieldError
-from marey_schemas.similar import LONGEST_EXAMPLE_S, SimilarAnswer, SimilarMoment, SimilarRequest
+from marey_schemas.search import LONGEST_EXAMPLE_S, SimilarAnswer, SimilarMoment, SimilarRequest
 from marey_schemas.sizes import MIB
 from marey_schemas.wording import counted
 from marey_server.errors import InvalidProblem, NotFoundProblem

@@ -32,7 +32,9 @@ def features_of(clip: Clip) -> PoseFeatures:
     return clip_features(Motion.of(clip), body, clip.frame_rate_hz)
 
 
-def searched(folder: Path, runs: list[np.ndarray], *, present: list[int] | None = None, name: str = "s") -> SearchedShard:
+def searched(
+    folder: Path, runs: list[np.ndarray], *, present: list[int] | None = None, name: str = "s"
+) -> SearchedShard:
     bits, lengths = present or [ALL] * len(runs), [len(run) for run in runs]
     write_shard(folder / name, runs)
     path = folder / name
