@@ -156,7 +156,7 @@ def search_windows(
         )
     examples = [example] if not mirror else [example, Example(mirrored(example.poses), example.offsets)]
     with ThreadPoolExecutor(threads) as pool:
-        search = _Search(shards, examples, metric, pool)
+        search = _WindowSearch(shards, examples, metric, pool)
         return [search.told(*hit) for hit in search.best(count)]
 
 
@@ -168,7 +168,7 @@ class _Place(NamedTuple):
     row: int
 
 
-class _Search:
+class _WindowSearch:
     """State of a search: bounds of all steps, and the distances of windows in the steps compared so far."""
 
     def __init__(

@@ -13,20 +13,19 @@ import math
 import numpy as np
 
 from marey_motion.kernels import compiled, contracted, inlined
+from marey_motion.perception.map_kernels import ANGLE, EUCLID, MANHATTAN, ONE_MINUS_DOT, SIGMOID
 
-_EUCLID, _MANHATTAN, _SIGMOID = 0, 1, 2
-_WHOLE_ANGLE, _ONE_MINUS_DOT = 1, 2
 _CHUNK = 256
 
 
 @inlined
 def _shaped(x, shaping, exponent):  # type: ignore[no-untyped-def]
     """Apply a shaping F."""
-    if shaping == _SIGMOID:
+    if shaping == SIGMOID:
         return x / (x + 1.0)
-    if shaping == _MANHATTAN:
+    if shaping == MANHATTAN:
         return x
-    if shaping == _EUCLID:
+    if shaping == EUCLID:
         return x * x
     return x**exponent
 
@@ -34,10 +33,10 @@ def _shaped(x, shaping, exponent):  # type: ignore[no-untyped-def]
 @inlined
 def _angle(square, measure):  # type: ignore[no-untyped-def]
     """Compute the measure of an angle from the squared chord between quaternions."""
-    if measure == _ONE_MINUS_DOT:
+    if measure == ONE_MINUS_DOT:
         return 0.5 * square
     half = 2.0 * math.asin(min(0.5 * math.sqrt(square), 1.0))
-    return 2.0 * half if measure == _WHOLE_ANGLE else half
+    return 2.0 * half if measure == ANGLE else half
 
 
 @inlined
@@ -147,82 +146,85 @@ def balls(rows, starts, size, vectors, rotations, centres, radii):  # type: igno
 
 
 @contracted
+def _add_rotation_bounds(q, centres, radii, factor, measure, x):  # type: ignore[no-untyped-def]
+    """Add lower bounds of the distances of a rotation from those in balls (4, n)."""
+    zero = np.float32(0.0)
+    w, u, v, z = q[0], q[1], q[2], q[3]
+    cw, cu, cv, cz = centres[0], centres[1], centres[2], centres[3]
+    if measure == ANGLE:
+        factor = factor * np.float32(2.0)
+    for j in range(radii.shape[0]):
+        minus = (w - cw[j]) ** 2 + (u - cu[j]) ** 2 + (v - cv[j]) ** 2 + (z - cz[j]) ** 2
+        plus = (w + cw[j]) ** 2 + (u + cu[j]) ** 2 + (v + cv[j]) ** 2 + (z + cz[j]) ** 2
+        d = max(np.float32(math.sqrt(min(minus, plus))) - radii[j], zero)
+        x[j] += factor * (np.float32(0.5) * d * d if measure == ONE_MINUS_DOT else d)
+
+
+@contracted
+def _add_vector_bounds(q, centres, radii, factor, x):  # type: ignore[no-untyped-def]
+    """Add lower bounds of the distances of a vector from those in balls (3, n)."""
+    u, v, z = q[0], q[1], q[2]
+    cu, cv, cz = centres[0], centres[1], centres[2]
+    for j in range(radii.shape[0]):
+        d = (u - cu[j]) ** 2 + (v - cv[j]) ** 2 + (z - cz[j]) ** 2
+        x[j] += factor * max(np.float32(math.sqrt(d)) - radii[j], np.float32(0.0))
+
+
+@contracted
+def _add_shaped(x, weight, shaping, exponent, raw):  # type: ignore[no-untyped-def]
+    """Add weight · F(x)."""
+    if shaping == SIGMOID:
+        for j in range(x.shape[0]):
+            raw[j] += weight * (x[j] / (x[j] + np.float32(1.0)))
+    elif shaping == MANHATTAN:
+        for j in range(x.shape[0]):
+            raw[j] += weight * x[j]
+    elif shaping == EUCLID:
+        for j in range(x.shape[0]):
+            raw[j] += weight * x[j] * x[j]
+    else:
+        for j in range(x.shape[0]):
+            raw[j] += weight * np.float32(x[j] ** exponent)
+
+
+@contracted
 def pose_bounds(query, centres, radii, mine, tables, vectors, out):  # type: ignore[no-untyped-def]
     """Fill out (samples, balls) with lower bounds of the distances from each sample to the rows in the balls.
 
     Only balls b with mine[b] are filled: those to which the tables apply. All arithmetic is in single precision.
     """
+    for begin in range(0, centres.shape[1], _CHUNK):
+        some = slice(begin, min(begin + _CHUNK, centres.shape[1]))
+        if np.any(mine[some]):
+            for s in range(query.shape[0]):
+                total = _bounds_of_sample(query[s], centres[:, some], radii[:, some], tables, vectors)
+                for j in range(total.shape[0]):
+                    if mine[begin + j]:
+                        out[s, begin + j] = total[j]
+
+
+@contracted
+def _bounds_of_sample(q, centres, radii, tables, vectors):  # type: ignore[no-untyped-def]
+    """Compute lower bounds (n,) of the distances from a sample to the rows in balls."""
     rotated, places, factors, weights, starts, constants, shapings, exponents, measure, always = tables
-    count = centres.shape[1]
-    x = np.empty(_CHUNK, np.float32)
-    raw = np.empty(_CHUNK, np.float32)
-    total = np.empty(_CHUNK, np.float32)
-    zero, one = np.float32(0.0), np.float32(1.0)
-    for begin in range(0, count, _CHUNK):
-        n = min(_CHUNK, count - begin)
-        if not np.any(mine[begin : begin + n]):
-            continue
-        for s in range(query.shape[0]):
-            total[:] = zero
-            for c in range(constants.shape[0]):
-                raw[:] = zero
-                for t in range(starts[c], starts[c + 1]):
-                    x[:] = zero
-                    for side in range(2):
-                        if places[t, side] < 0:
-                            continue
-                        factor = np.float32(factors[t, side])
-                        if rotated[t]:
-                            p = places[t, side]
-                            at = 3 * vectors + 4 * p
-                            w, u, v, z = query[s, at], query[s, at + 1], query[s, at + 2], query[s, at + 3]
-                            cw = centres[at, begin : begin + n]
-                            cu = centres[at + 1, begin : begin + n]
-                            cv = centres[at + 2, begin : begin + n]
-                            cz = centres[at + 3, begin : begin + n]
-                            r = radii[vectors + p, begin : begin + n]
-                            if measure == _ONE_MINUS_DOT:
-                                for j in range(n):
-                                    minus = (w - cw[j]) ** 2 + (u - cu[j]) ** 2 + (v - cv[j]) ** 2 + (z - cz[j]) ** 2
-                                    plus = (w + cw[j]) ** 2 + (u + cu[j]) ** 2 + (v + cv[j]) ** 2 + (z + cz[j]) ** 2
-                                    d = max(np.float32(math.sqrt(min(minus, plus))) - r[j], zero)
-                                    x[j] += factor * np.float32(0.5) * d * d
-                            else:
-                                if measure == _WHOLE_ANGLE:
-                                    factor = factor * np.float32(2.0)
-                                for j in range(n):
-                                    minus = (w - cw[j]) ** 2 + (u - cu[j]) ** 2 + (v - cv[j]) ** 2 + (z - cz[j]) ** 2
-                                    plus = (w + cw[j]) ** 2 + (u + cu[j]) ** 2 + (v + cv[j]) ** 2 + (z + cz[j]) ** 2
-                                    x[j] += factor * max(np.float32(math.sqrt(min(minus, plus))) - r[j], zero)
-                        else:
-                            p = places[t, side]
-                            u, v, z = query[s, 3 * p], query[s, 3 * p + 1], query[s, 3 * p + 2]
-                            cu = centres[3 * p, begin : begin + n]
-                            cv = centres[3 * p + 1, begin : begin + n]
-                            cz = centres[3 * p + 2, begin : begin + n]
-                            r = radii[p, begin : begin + n]
-                            for j in range(n):
-                                d = (u - cu[j]) ** 2 + (v - cv[j]) ** 2 + (z - cz[j]) ** 2
-                                x[j] += factor * max(np.float32(math.sqrt(d)) - r[j], zero)
-                    weight = np.float32(weights[t])
-                    if shapings[c] == _SIGMOID:
-                        for j in range(n):
-                            raw[j] += weight * (x[j] / (x[j] + one))
-                    elif shapings[c] == _MANHATTAN:
-                        for j in range(n):
-                            raw[j] += weight * x[j]
-                    elif shapings[c] == _EUCLID:
-                        for j in range(n):
-                            raw[j] += weight * x[j] * x[j]
-                    else:
-                        for j in range(n):
-                            raw[j] += weight * np.float32(x[j] ** exponents[c])
-                constant = np.float32(constants[c])
-                for j in range(n):
-                    total[j] += raw[j] + (constant if always or raw[j] > zero else zero)
-            for j in range(n):
-                if mine[begin + j]:
-                    out[s, begin + j] = total[j]
+    total = np.zeros(centres.shape[1], np.float32)
+    x, raw = np.empty_like(total), np.empty_like(total)
+    for c in range(constants.shape[0]):
+        raw[:] = np.float32(0.0)
+        for t in range(starts[c], starts[c + 1]):
+            x[:] = np.float32(0.0)
+            for side in range(2):
+                p, factor = places[t, side], np.float32(factors[t, side])
+                if p >= 0 and rotated[t]:
+                    at = 3 * vectors + 4 * p
+                    ball = centres[at : at + 4], radii[vectors + p]
+                    _add_rotation_bounds(q[at : at + 4], ball[0], ball[1], factor, measure, x)
+                elif p >= 0:
+                    _add_vector_bounds(q[3 * p : 3 * p + 3], centres[3 * p : 3 * p + 3], radii[p], factor, x)
+            _add_shaped(x, np.float32(weights[t]), shapings[c], exponents[c], raw)
+        for j in range(raw.shape[0]):
+            total[j] += raw[j] + np.float32(constants[c] if always or raw[j] > 0.0 else 0.0)
+    return total
 
 
 @contracted

@@ -8,12 +8,9 @@ import numpy as np
 
 from marey_motion.arrays import Flags, Floats, Ints
 from marey_motion.errors import MotionError
+from marey_motion.perception.maps import ANGLE_NUMBERS, SHAPING_NUMBERS
 from marey_motion.perception.metric import JOINT_CLASSES, Component, PerceptualMetric, classes_of
 from marey_motion.similarity.features import JOINTS, ROTATED_JOINTS
-
-_SHAPINGS = {"euclid": 0, "manhattan": 1, "sigmoid": 2, "power": 3}
-_HALF_ANGLE, _WHOLE_ANGLE, _ONE_MINUS_DOT = 0, 1, 2
-_ANGLES = {"half_angle": _HALF_ANGLE, "log_norm": _HALF_ANGLE, "angle": _WHOLE_ANGLE, "one_minus_dot": _ONE_MINUS_DOT}
 
 
 class MetricTables(NamedTuple):
@@ -96,9 +93,9 @@ def metric_tables(metric: PerceptualMetric, present: Flags) -> MetricTables | No
         np.array(weights, np.float64),
         np.array(starts, np.int64),
         np.array([share * component.constant for share, component in used]),
-        np.array([_SHAPINGS[component.shaping] for _, component in used]),
+        np.array([SHAPING_NUMBERS[component.shaping] for _, component in used]),
         np.array([component.exponent for _, component in used]),
-        _ANGLES[metric.angle],
+        ANGLE_NUMBERS[metric.angle],
         metric.identity == "constant",
     )
 

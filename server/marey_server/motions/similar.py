@@ -30,8 +30,8 @@ Tree = dict[str, Any]
 SEARCH_INDEX = "marey_server.motions.similar:search_index"
 """Function that child processes run."""
 THREADS = 2
-CONTEXT_S = 1.0
-"""Seconds around the example that are read, too: its heading and velocities depend on them."""
+CONTEXT_READ_S = 1.5
+"""Seconds around the example that are read, too; its features depend on one second of them."""
 _CLIPS_CACHE_BYTES = 64 * MIB
 
 
@@ -101,7 +101,7 @@ def read_example(tx: Transaction, project: str, request: SimilarRequest) -> Foun
         raise _invalid("/frames", f"The clip has {counted(count, 'frame')}; the example ends at frame {stop}.")
     if (stop - start) / rate_hz > LONGEST_EXAMPLE_S:
         raise _invalid("/frames", f"The example is longer than {LONGEST_EXAMPLE_S:g} s; give fewer frames.")
-    margin = int(CONTEXT_S * rate_hz) + 2
+    margin = int(CONTEXT_READ_S * rate_hz) + 2
     first = max(0, start - margin)
     cut = items.cut_part(motion, slice(first, min(count, stop + margin)), None, encoded=True)
     skeleton = (project, Kind.SKELETON, motion["skeleton"]["item"])

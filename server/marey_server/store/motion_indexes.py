@@ -125,7 +125,7 @@ class IndexFiles:
         return self._folder / digest.removeprefix("sha256:")
 
     def missing(self, document: MotionIndexDocument) -> list[str]:
-        """List the digests of the files of an index that have no copy; make room for them.
+        """List the digests of the files of an index that have no copy; remove old copies if they do not fit.
 
         Raises `TooLargeProblem` if the index is too large to be searched.
         """

@@ -21,7 +21,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
 from marey_schemas.queue.jobs import Job
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = pytest.mark.timeout(900)
 
 
 def indexed(project: ProjectHandle, *places: str) -> dict[str, int]:

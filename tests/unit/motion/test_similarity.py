@@ -119,7 +119,7 @@ def test_the_distance_is_the_perceptual_metric_of_the_clips(tmp_path: Path) -> N
     one, other = (measure_motion(Motion.of(clip), body, 30.0) for clip in (slow, fast))
     metric = published_metric()
     (hit,) = search_windows([searched(tmp_path, [rows])], example, metric, 1)
-    exact = paired_distances(one.at(30.0 + offsets), other.at(float(hit.row) + offsets), metric)
+    exact = paired_distances(one.at(np.float64(30 + offsets)), other.at(np.float64(hit.row + offsets)), metric)
     assert hit.distance == pytest.approx(float(exact.mean()), abs=2e-5)
 
 

@@ -72,13 +72,7 @@ def run(context: Context, params: IndexParams) -> dict[str, Any]:
         left_out=left_out,
         shards=tuple(entries),
     )
-    sources = {name: tuple(ItemInput(item=pin.item, revision=pin.revision) for pin in pins_of)
-               for name, pins_of in context.inputs.items()}  # fmt: skip
-    part = document.model_dump(by_alias=True)
-    output = StagedOutput(
-        name="index", kind=Kind.INDEX, item_name=params.name, parts={"index": part}, sources=sources
-    )  # fmt: skip
-    context.stage([output])
+    _stage(context, params, document)
     return {
         "clips": document.clips,
         "new_clips": len(new) - left_out,
@@ -87,6 +81,15 @@ def run(context: Context, params: IndexParams) -> dict[str, Any]:
         "written_shards": len(entries) - len(whole),
         "seconds": round(time.monotonic() - started, 4),
     }
+
+
+def _stage(context: Context, params: IndexParams, document: MotionIndexDocument) -> None:
+    sources = {
+        name: tuple(ItemInput(item=pin.item, revision=pin.revision) for pin in pins)
+        for name, pins in context.inputs.items()
+    }
+    parts = {"index": document.model_dump(by_alias=True)}
+    context.stage([StagedOutput(name="index", kind=Kind.INDEX, item_name=params.name, parts=parts, sources=sources)])
 
 
 # -- the earlier index -------------------------------------------------------------------------------------------------
