@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
 from marey_schemas.queue.jobs import Job
 
-pytestmark = pytest.mark.timeout(900)
+pytestmark = pytest.mark.timeout(300)
 
 
 def indexed(project: ProjectHandle, *places: str) -> dict[str, int]:
@@ -44,7 +45,7 @@ def test_similar_moments_are_found_and_the_index_follows_the_project(
     assert run("index", "lab").stdout == "9 clips in 1 shard, 9 of them new\n"
 
     table = run("similar", "lab/walks/walk 1.5 0:30-60").stdout
-    assert table.splitlines()[0].split() == ["clip", "frames", "s", "distance"]
+    assert re.search(r"walks/walk \S+ \S+ +[0-9]+-[0-9]+ +[0-9.]+-[0-9.]+ +[0-9]\.[0-9]{3}", table), table
     found = lab.similar(walk, (30, 60), leave_out="nothing")
     assert (found.moments[0].path, found.moments[0].frames) == ("walks/walk 1.5 0", (30, 60))
     assert found.moments[0].distance == 0.0
