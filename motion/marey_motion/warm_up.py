@@ -254,7 +254,7 @@ def _find_similar(clip: Clip) -> None:
     offsets = sample_offsets(0.5)
     example = Example(PoseFeatures(features.rows[offsets], features.present), offsets)
     with TemporaryDirectory() as folder:
-        path, lengths, joints = Path(folder, "shard"), [len(features.rows)], [presence(features)]
+        path, lengths, joints = Path(folder, "shard"), np.array([len(features.rows)]), np.array([presence(features)])
         write_shard(path, [features.rows])
         searched = SearchedShard(lambda: Shard.open(path, lengths, joints), np.zeros(1, np.int64), np.zeros(1, bool))
         search_windows([searched], example, published_metric(), 1)

@@ -21,7 +21,7 @@ from marey_motion.arrays import Flags, Ints
 from marey_motion.errors import MotionError
 from marey_motion.perception.metric import PerceptualMetric
 from marey_motion.similarity.features import INDEX_RATE_HZ, ROTATIONS_AT, VECTORS, PoseFeatures, mirrored
-from marey_motion.similarity.shards import STEP_ROWS, STEPS_PER_BALL, Runs, Shard
+from marey_motion.similarity.shards import STEP_ROWS, STEPS_PER_BALL, Runs, Shard, joints_of
 from marey_motion.similarity.weighing import MetricTables, metric_tables, require_searchable
 
 MOST_SAMPLES = 32
@@ -179,6 +179,7 @@ class _WindowSearch:
         pool: ThreadPoolExecutor,
     ) -> None:
         self._shards, self._examples, self._metric, self._pool = shards, examples, metric, pool
+        self._known_tables: dict[int, MetricTables | None] = {}
         found = list(pool.map(self._bound, shards))
         self._runs = [runs for _, runs in found]
         self._ends = np.cumsum([len(bounds) for bounds, _ in found])
@@ -224,11 +225,18 @@ class _WindowSearch:
     def _tables(self, searched: SearchedShard, shard: Shard) -> list[tuple[MetricTables, Flags]]:
         """List the tables for the skeletons in a shard, each with the runs (R,) that are searched with them."""
         made = []
-        for present in np.unique(shard.present[~searched.closed], axis=0):
-            tables = metric_tables(self._metric, present & self._examples[0].poses.present)
+        for joints in map(int, np.unique(shard.joints[~searched.closed])):
+            tables = self._tables_for(joints)
             if tables is not None:
-                made.append((tables, (shard.present == present).all(axis=1) & ~searched.closed))
+                made.append((tables, (shard.joints == joints) & ~searched.closed))
         return made
+
+    def _tables_for(self, joints: int) -> MetricTables | None:
+        """Compute the tables for the example and clips with these joints; equal tables are computed once."""
+        if joints not in self._known_tables:
+            present = np.logical_and.reduce([joints_of(joints), *(one.poses.present for one in self._examples)])
+            self._known_tables[joints] = metric_tables(self._metric, present)
+        return self._known_tables[joints]
 
     def _unknown(self, wanted: int, most: float) -> Ints:
         """List the steps, ascending, that may hold windows up to a distance, and have not been compared up to it.
@@ -306,7 +314,7 @@ class _WindowSearch:
 
         searched = self._shards[place.shard]
         shard = searched.load()
-        tables = metric_tables(self._metric, shard.present[place.run] & example.poses.present)
+        tables = self._tables_for(int(shard.joints[place.run]))
         rows = shard.rows[shard.runs.starts[place.run] + place.row + example.offsets]
         apart = [
             pose_distance(one, row, tables, ROTATIONS_AT) for one, row in zip(example.poses.rows, rows, strict=True)

@@ -45,18 +45,18 @@ class Runs(NamedTuple):
     balls: Ints
 
     @classmethod
-    def of(cls, lengths: Sequence[int]) -> Self:
+    def of(cls, lengths: Ints) -> Self:
         """Find where runs begin.
 
         Parameters
         ----------
-        lengths : sequence of int    numbers of rows of the runs
+        lengths : (R,) int64    numbers of rows of the runs
 
         Returns
         -------
         Runs    firsts and ends
         """
-        counts = np.array([0, *lengths], np.int64)
+        counts = np.concatenate(([0], lengths)).astype(np.int64)
         each = (counts, -(-counts // STEP_ROWS), -(-counts // (STEP_ROWS * STEPS_PER_BALL)))
         return cls(*map(np.cumsum, each))
 
@@ -71,24 +71,24 @@ class Shard:
     centres : (WIDTH, B) float32    centres of the balls
     radii : (41, B) float32    radii of the balls: of each vector, then of each rotation
     runs : Runs    where each run begins and ends
-    present : (R, 15) bool    which of `JOINTS` the clip's skeleton has
+    joints : (R,) int64    which joints the skeleton of each clip has: `presence` of its features
     """
 
     rows: Rows
     centres: Rows
     radii: Rows
     runs: Runs
-    present: Flags
+    joints: Ints
 
     @classmethod
-    def open(cls, path: Path, lengths: Sequence[int], present: Sequence[int]) -> Self:
+    def open(cls, path: Path, lengths: Ints, joints: Ints) -> Self:
         """Map the file of a shard into memory.
 
         Parameters
         ----------
         path : Path    file that `write_shard` has written
-        lengths : sequence of int    numbers of rows of the runs
-        present : sequence of int    `presence` of each run
+        lengths : (R,) int64    numbers of rows of the runs
+        joints : (R,) int64    `presence` of each run
 
         Returns
         -------
@@ -106,8 +106,7 @@ class Shard:
             raise MotionError(f"the file of {len(mapped)} bytes is no shard of a motion index", code="shard-damaged")
         numbers: NDArray[np.float32] = np.frombuffer(mapped, "<f4", offset=_HEAD.size)
         table = numbers[: balls * (WIDTH + _RADII)].reshape(-1, balls)
-        bits = np.array(present, np.int64)[:, None] >> np.arange(len(JOINTS))
-        return cls(numbers[table.size :].reshape(-1, WIDTH), table[:WIDTH], table[WIDTH:], runs, bits & 1 == 1)
+        return cls(numbers[table.size :].reshape(-1, WIDTH), table[:WIDTH], table[WIDTH:], runs, joints)
 
 
 def presence(features: PoseFeatures) -> int:
@@ -124,6 +123,20 @@ def presence(features: PoseFeatures) -> int:
     return int(np.sum(features.present << np.arange(len(JOINTS))))
 
 
+def joints_of(presence: int) -> Flags:
+    """Decode which joints a skeleton has.
+
+    Parameters
+    ----------
+    presence : int    bits of `presence`
+
+    Returns
+    -------
+    (15,) bool    which of `JOINTS` the skeleton has
+    """
+    return np.asarray(presence >> np.arange(len(JOINTS)) & 1 == 1)
+
+
 def write_shard(path: Path, runs: Sequence[Rows]) -> None:
     """Write the file of a shard.
 
@@ -134,7 +147,7 @@ def write_shard(path: Path, runs: Sequence[Rows]) -> None:
     """
     from marey_motion.similarity.similarity_kernels import balls as fill_balls
 
-    places = Runs.of([len(run) for run in runs])
+    places = Runs.of(np.array([len(run) for run in runs]))
     rows = np.ascontiguousarray(np.concatenate(runs), "<f4")
     table = np.empty((WIDTH + _RADII, places.balls[-1]), "<f4")
     sizes = (STEP_ROWS * STEPS_PER_BALL, VECTORS, len(ROTATED_JOINTS))

@@ -238,7 +238,7 @@ def _searched(
         own = clips.items.index(order.request.clip)
         closed[own] |= order.request.leave_out == "clip"
         windows[own] = example.rows_around(order.request.frames[0], rate_hz)
-    path, rows, joints = Path(files.poses), clips.rows, clips.joints
+    path, rows, joints = Path(files.poses), np.array(clips.rows), np.array(clips.joints)
     return SearchedShard(lambda: Shard.open(path, rows, joints), ranks, closed, windows)
 
 

@@ -35,7 +35,7 @@ def features_of(clip: Clip) -> PoseFeatures:
 def searched(
     folder: Path, runs: list[np.ndarray], *, present: list[int] | None = None, name: str = "s"
 ) -> SearchedShard:
-    bits, lengths = present or [ALL] * len(runs), [len(run) for run in runs]
+    bits, lengths = np.array(present or [ALL] * len(runs)), np.array([len(run) for run in runs])
     write_shard(folder / name, runs)
     path = folder / name
     return SearchedShard(lambda: Shard.open(path, lengths, bits), np.arange(len(runs)), np.zeros(len(runs), np.bool_))
@@ -119,7 +119,8 @@ def test_the_distance_is_the_perceptual_metric_of_the_clips(tmp_path: Path) -> N
     one, other = (measure_motion(Motion.of(clip), body, 30.0) for clip in (slow, fast))
     metric = published_metric()
     (hit,) = search_windows([searched(tmp_path, [rows])], example, metric, 1)
-    exact = paired_distances(one.at(np.float64(30 + offsets)), other.at(np.float64(hit.row + offsets)), metric)
+    at_one, at_other = ((row + offsets).astype(np.float64) for row in (30, hit.row))
+    exact = paired_distances(one.at(at_one), other.at(at_other), metric)
     assert hit.distance == pytest.approx(float(exact.mean()), abs=2e-5)
 
 
@@ -175,7 +176,7 @@ def test_missing_joints_and_unusable_metrics_are_told(tmp_path: Path) -> None:
         search_windows([shard], example, turned, 1)
     (tmp_path / "cut").write_bytes((tmp_path / "s").read_bytes()[:-4])
     with pytest.raises(MotionError, match="is no shard"):
-        Shard.open(tmp_path / "cut", [60, 60], [ALL, ALL])
+        Shard.open(tmp_path / "cut", np.array([60, 60]), np.array([ALL, ALL]))
 
 
 def test_samples_of_a_window_are_whole_steps_apart() -> None:

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from marey_motion import documents
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
@@ -125,7 +127,7 @@ def _copy(context: Context, writer: _Writer, shard: IndexShard, clips: ShardClip
         return
     file = context.scratch / "earlier"
     file.write_bytes(context.blob(shard.poses.blob))
-    opened = Shard.open(file, clips.rows, clips.joints)
+    opened = Shard.open(file, np.array(clips.rows), np.array(clips.joints))
     for run in runs:
         first, last = opened.runs.starts[run : run + 2]
         facts = {name: getattr(clips, name)[run] for name in ShardClips.model_fields}
