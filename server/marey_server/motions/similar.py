@@ -158,13 +158,22 @@ _CLIPS: LruCache[str, ShardClips] = LruCache(max_bytes=_CLIPS_CACHE_BYTES, size_
 def search_index(packed: bytes) -> bytes:
     """Carry out a `SimilarOrder` and return packed `FoundWindows`.
 
-    Raises `InvalidProblem` if the example cannot be compared.
+    Raises `InvalidProblem` if the example cannot be compared, and `NotFoundProblem` if files of the index are missing.
     """
+    order = SimilarOrder.unpack(packed)
+    try:
+        return _search(order).pack()
+    except FileNotFoundError as error:  # a search of another index needed the space
+        raise NotFoundProblem(
+            "The copies of the index were removed during the search; repeat the request.", code="no-index"
+        ) from error
+
+
+def _search(order: SimilarOrder) -> FoundWindows:
     from marey_motion.errors import MotionError
     from marey_motion.perception.metric import published_metric
     from marey_motion.similarity.searching import search_windows
 
-    order = SimilarOrder.unpack(packed)
     lists = [_clips_of(files.clips) for files in order.shards]
     ranks = _ranks(lists)
     try:
@@ -181,7 +190,7 @@ def search_index(packed: bytes) -> bytes:
     known = {place for clips in lists for place in zip(clips.items, clips.revisions, strict=True)}
     behind = sum(head > 0 and (clip, head) not in known for clip, head in order.heads.items())
     windows = tuple(_window(hit, lists[hit.shard], length_s) for hit in hits)
-    return FoundWindows(windows=windows, searched_clips=searched, behind=behind).pack()
+    return FoundWindows(windows=windows, searched_clips=searched, behind=behind)
 
 
 def _clips_of(path: str) -> ShardClips:
@@ -192,6 +201,8 @@ def _ranks(lists: list[ShardClips]) -> list[Any]:
     """Number the clips of all shards in the order of their ids."""
     import numpy as np
 
+    if not lists:
+        return []
     sizes = np.cumsum([len(clips.items) for clips in lists])[:-1]
     ids = np.array([one for clips in lists for one in clips.items])
     ranks = np.empty(len(ids), np.int64)

@@ -148,13 +148,17 @@ class IndexFiles:
         return [file.blob for file in missing]
 
     def copy(self, tx: Transaction, digest: str) -> None:
-        """Copy a blob of an index that the caller may read; a copy appears only when it is complete."""
+        """Copy a blob of an index that the caller may read; a copy appears only when it is complete.
+
+        Raises `NotFoundProblem` if bytes of the blob are missing.
+        """
         size = tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar_one()
         handle, name = tempfile.mkstemp(dir=self._folder)
         try:
             with os.fdopen(handle, "wb") as file:
-                for chunk in tx.blobs.read(tx.connection, digest, 0, size):
-                    file.write(chunk)
+                written = sum(file.write(chunk) for chunk in tx.blobs.read(tx.connection, digest, 0, size))
+            if written != size:
+                raise NotFoundProblem("Files of the index are missing; build it again.", code="no-index")
             os.replace(name, self.path(digest))
         except BaseException:
             with suppress(FileNotFoundError):

@@ -99,5 +99,9 @@ def test_wrong_examples_are_refused_with_the_reason(lab: ProjectHandle, run: Com
             "POST", "/projects/lab/similar",
             content=json.dumps({"clip": walk.id, "frames": [0, 9], "results": 101}).encode(),
         )  # fmt: skip
+    for clip in lab.clips.list(collection="walks"):
+        if clip.id != walk.id:
+            clip.delete()
+    assert lab.similar(walk, (0, 9), leave_out="clip").moments == ()
     with pytest.raises(NotFound):
         lab.similar("clip_00000000000000000000000000", (0, 9))

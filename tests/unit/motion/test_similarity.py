@@ -167,6 +167,7 @@ def test_missing_joints_and_unusable_metrics_are_told(tmp_path: Path) -> None:
     shard = searched(tmp_path, [rows, rows], present=[ALL, 1])  # the second clip has a head alone
     example = Example(PoseFeatures(rows[:1], np.ones(15, np.bool_)), sample_offsets(0.0))
     assert {hit.run for hit in search_windows([shard], example, published_metric(), 10)} == {0}
+    assert search_windows([], example, published_metric(), 10) == []
     headless = Example(PoseFeatures(rows[:1], np.zeros(15, np.bool_)), sample_offsets(0.0))
     with pytest.raises(MotionError, match="none of the joints"):
         search_windows([shard], headless, published_metric(), 1)
