@@ -34,6 +34,7 @@ from marey_client.requests import (
     distances_request,
     edit_request,
     evaluate_request,
+    index_request,
     model_request,
     plan_model,
     retarget_request,
@@ -48,6 +49,7 @@ from marey_schemas.queue.job_params import (
     AnnotateParams,
     CutParams,
     EvaluateParams,
+    IndexParams,
     ModelParams,
     RetargetParams,
 )
@@ -236,6 +238,15 @@ class ProjectHandle(ProjectItems):
         request = cut_request(self, annotations, CutParams.model_validate(options))
         chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
         return self.submit(request.model_copy(update=chosen))
+
+    def index(self, clips: Clips = "", *, priority: int = 0, cache: CacheMode = "use", **options: Any) -> Job:
+        """Submit a job that indexes clips or folders (default: all clips), so that `similar` finds moments of them.
+
+        `options` are those of `IndexParams`. If the top folder has an index with this name, it is updated: clips at
+        revisions that it has are not read again, and it loses the clips that are not given.
+        """
+        request = index_request(self, clips, IndexParams.model_validate(options))
+        return self.submit(request.model_copy(update={"priority": priority, "cache": cache}))
 
     def align(
         self,

@@ -27,6 +27,7 @@ from marey_schemas.items import Collection, CollectionChange, CollectionCreate, 
 from marey_schemas.kinds import Kind
 from marey_schemas.purges import DatasetPurgeAnswer, DatasetPurgeRequest, PurgeAnswer, PurgeRequest
 from marey_schemas.queue.jobs import ItemInput
+from marey_schemas.search import SimilarAnswer, SimilarRequest
 
 
 class ProjectItems:
@@ -93,6 +94,19 @@ class ProjectItems:
             self.studies, self.metrics,
         )  # fmt: skip
         return next((one for one in known if one.kind is kind), Items(self.transport, self.name, kind, ItemHandle))
+
+    def similar(self, clip: ClipHandle | str, frames: int | tuple[int, int], **options: Any) -> SimilarAnswer:
+        """Find the moments of the project's clips that resemble a pose, or a window of frames, of a clip.
+
+        `clip` is a handle or an id, `frames` one frame or a half-open range. `options` are those of `SimilarOptions`.
+        The project needs an index of motions, which `ProjectHandle.index` builds.
+        """
+        name, revision = (clip, None) if isinstance(clip, str) else (clip.id, clip.item.revision)
+        first, end = (frames, frames + 1) if isinstance(frames, int) else frames
+        request = SimilarRequest.model_validate(
+            {"clip": name, "revision": revision, "frames": (first, end), **options}
+        )  # fmt: skip
+        return self.transport.post(SimilarAnswer, f"/projects/{self.name}/similar", request)
 
     @cached_property
     def collections(self) -> Collections:

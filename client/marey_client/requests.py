@@ -20,6 +20,7 @@ from marey_client.jobs import job_request
 from marey_client.places import Places, as_inputs, items_at
 from marey_client.project_items import ProjectItems
 from marey_schemas.items import LOOP_TAG, Item
+from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
 from marey_schemas.queue.job_params import (
     AlignParams,
@@ -28,6 +29,7 @@ from marey_schemas.queue.job_params import (
     DistancesParams,
     EditParams,
     EvaluateParams,
+    IndexParams,
     ModelParams,
     RetargetParams,
 )
@@ -155,6 +157,15 @@ def distances_request(
     if len(edited := project.edited_rigs(found)) == 1:
         (inputs["rig"],) = edited
     return job_request("distances", inputs, params)
+
+
+def index_request(project: ProjectItems, clips: Clips, params: IndexParams) -> JobCreate:
+    """Return the job request to index clips; an index with the same name in the top folder is updated."""
+    inputs: dict[str, Any] = {"clips": as_inputs(clips)}
+    earlier = next(iter(project.items(Kind.INDEX).list(path=params.name, page_size=1)), None)
+    if earlier is not None:
+        inputs["index"] = ItemInput(item=earlier.id)
+    return job_request("index", inputs, params)
 
 
 def model_request(aligned: AlignedClips, params: ModelParams) -> JobCreate:

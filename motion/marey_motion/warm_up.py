@@ -15,6 +15,7 @@ from dataclasses import replace
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import get_args
 
 import numpy as np
@@ -241,6 +242,27 @@ def _perceive(clip: Clip) -> None:
     registration_curve(cycle, cycle, published_metric())
 
 
+def _find_similar(clip: Clip) -> None:
+    """Compile the kernels of searches by example: search for a window of a clip, in a file as searches map it."""
+    from marey_motion.matching.body import MatchingBody
+    from marey_motion.motion import Motion
+    from marey_motion.perception.metric import published_metric
+    from marey_motion.rigs import map_joints
+    from marey_motion.similarity.features import PoseFeatures, clip_features
+    from marey_motion.similarity.searching import Example, SearchedShard, sample_offsets, search_windows
+    from marey_motion.similarity.shards import Shard, presence, write_shard
+
+    body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
+    features = clip_features(Motion.of(clip), body, clip.frame_rate_hz)
+    offsets = sample_offsets(0.5)
+    example = Example(PoseFeatures(features.rows[offsets], features.present), offsets)
+    with TemporaryDirectory() as folder:
+        path, lengths, joints = Path(folder, "shard"), np.array([len(features.rows)]), np.array([presence(features)])
+        write_shard(path, [features.rows])
+        searched = SearchedShard(lambda: Shard.open(path, lengths, joints), np.zeros(1, np.int64), np.zeros(1, bool))
+        search_windows([searched], example, published_metric(), 1)
+
+
 def _measure(clip: Clip) -> None:
     """Compile the kernels of live recordings: measure the coverage of a clip by the code that receives live frames."""
     from marey_motion.evaluation.online import OnlineCoverage
@@ -306,6 +328,7 @@ STAGES: Mapping[str, Callable[[Clip], None]] = {
     "alignment": _align,
     "coverage": _measure,
     "perception": _perceive,
+    "similarity": _find_similar,
 }
 """Functions that use kernels, by name.
 

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
+_PLURALS = {"processed": "processed", "study": "studies", "index": "indexes"}
+
 
 class Kind(StrEnum):
     """Kind of an item. The value is used in ids and documents, `plural` in URLs."""
@@ -18,11 +20,12 @@ class Kind(StrEnum):
     EVALUATION = "evaluation"
     METRIC = "metric"
     STUDY = "study"
+    INDEX = "index"
 
     @property
     def plural(self) -> str:
         """The name of the kind in URLs, for example `clips`."""
-        return "processed" if self is Kind.PROCESSED else ("studies" if self is Kind.STUDY else f"{self.value}s")
+        return _PLURALS.get(self.value, f"{self.value}s")
 
     @classmethod
     def from_plural(cls, plural: str) -> "Kind":
@@ -65,6 +68,7 @@ PARTS: dict[Kind, dict[str, PartSpec]] = {
         "report": PartSpec("marey/evaluation-report@1", False, "evaluation"),
     },
     Kind.METRIC: {"metric": PartSpec("marey/perceptual-metric@1", True)},
+    Kind.INDEX: {"index": PartSpec("marey/motion-index@1", True)},
     Kind.STUDY: {"study": PartSpec("marey/study@1", True)},
 }
 """Parts by kind of item. Kinds whose schema is not fixed yet use `marey/document@1`, which allows any members."""

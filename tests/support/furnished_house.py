@@ -139,6 +139,7 @@ BODIES: dict[str, Any] = {
     "TrialAnswer": {"chosen": [0, 1]},
     "StudyLinksCreate": {"count": 1},
     "SearchRequest": {"constraints": [{"type": "root_heading", "at": "end", "heading_deg": 0}]},
+    "SimilarRequest": {"clip": "item_of_nobody", "frames": [0, 1]},
 }
 """A body for every request model of the routes. A route with a new model fails in tests until a body is added here."""
 

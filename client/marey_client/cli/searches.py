@@ -1,16 +1,26 @@
-"""Commands `search` and `tree`."""
+"""Commands `search`, `tree`, `index` and `similar`."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
 from marey_client.cli.models import model_at
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.following import SEEDED_JOB, Wait, follow, print_ended
+from marey_client.cli.terminal.following import (
+    FINDINGS_JOB,
+    SEEDED_JOB,
+    Sources,
+    Wait,
+    clips_at,
+    follow,
+    print_ended,
+)
 from marey_client.cli.terminal.invocation import AsJson, connect, refuse_ignored
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
@@ -19,12 +29,16 @@ from marey_schemas.formats import DEFAULT_FORMAT, MOTION_FORMATS
 from marey_schemas.wording import counted, one_of
 
 if TYPE_CHECKING:
-    from marey_schemas.search import SearchAnswer
+    from marey_schemas.search import SearchAnswer, SimilarAnswer
 
 TREE = OptionsOf("marey_schemas.queue.job_params:TreeParams")
 
 SEARCH = OptionsOf("marey_schemas.search:SearchRequest", without=("constraints", "steps", "start", "motion"))
 
+INDEX = OptionsOf("marey_schemas.queue.job_params:IndexParams")
+
+SIMILAR = OptionsOf("marey_schemas.search:SimilarOptions", short={"results": "-n"})
+_MOMENT = re.compile(r"(?P<clip>.+):(?P<first>[0-9]{1,9})(?:[-:](?P<end>[0-9]{1,9}))?")
 
 Many = list[str] | None
 
@@ -33,6 +47,8 @@ def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
     add_command(app, tree, params=TREE, job=SEEDED_JOB)
     add_command(app, search, params=SEARCH)
+    add_command(app, index, params=INDEX, job=FINDINGS_JOB)
+    add_command(app, similar, params=SIMILAR)
 
 
 def tree(
@@ -155,6 +171,64 @@ def search(
     return None if written is None else typer.echo(written)
 
 
+def index(
+    context: typer.Context,
+    sources: Sources,
+    params: Chosen,
+    job: Chosen,
+    wait: Wait = True,
+    as_json: AsJson = False,
+) -> None:
+    """Build or update an index of the poses of clips, which `marey similar` searches.
+
+    `marey index lab` indexes all clips of the project `lab`. An update reads only new and changed clips.
+    """
+    addresses = addresses_in_one_project(sources)
+    with connect(context) as marey:
+        clips = [clips_at(marey, address) for address in addresses]
+        submitted = marey.project(addresses[0].project).index(clips, **params, **job)
+        ended = follow(marey, submitted, wait=wait, as_json=as_json)
+    if ended is not None:
+        print_ended(ended, as_json, _print_index)
+
+
+def _print_index(made: dict[str, Any]) -> None:
+    typer.echo(
+        f"{counted(made['clips'], 'clip')} in {counted(made['shards'], 'shard')}, {made['new_clips']} of them new"
+    )
+    if made["left_out"]:
+        print_message(f"{counted(made['left_out'], 'clip')} cannot be compared; the log of the job names them.")
+
+
+def similar(
+    context: typer.Context,
+    example: Annotated[
+        str,
+        typer.Argument(
+            help="A clip and its frames: project/folder/name:FIRST-END, where the frame END is not included, or "
+            "project/folder/name:FRAME for a single pose."
+        ),
+    ],
+    params: Chosen,
+    as_json: AsJson = False,
+) -> None:
+    """Find the moments of a project's clips that resemble some frames of a clip, the most similar first."""
+    from marey_schemas.kinds import Kind
+
+    parsed = _MOMENT.fullmatch(example)
+    if parsed is None:
+        raise WrongUsage(f"{example!r} names no frames; write project/folder/name:120-180, or :120 for a single pose")
+    first = int(parsed["first"])
+    end = first + 1 if parsed["end"] is None else int(parsed["end"])
+    if end <= first:
+        raise WrongUsage(f"{example!r}: the end, frame {end}, must be after the start, frame {first}")
+    place = Address.parse(parsed["clip"])
+    with connect(context) as marey:
+        clip = require_item(marey, place, [Kind.CLIP])
+        found = marey.project(place.project).similar(clip, (first, end), **params)
+    return print_json(found) if as_json else _print_similar(found)
+
+
 # -- reading what is asked ---------------------------------------------------------------------------------------------
 
 
@@ -225,6 +299,25 @@ def _start(text: str) -> dict[str, float | None]:
 
 
 # -- output ------------------------------------------------------------------------------------------------------------
+
+
+def _print_similar(found: SimilarAnswer) -> None:
+    rows = [
+        (
+            one.path,
+            f"{one.frames[0]}-{one.frames[1]}",
+            f"{one.start_s:.2f}-{one.end_s:.2f}",
+            f"{one.distance:.3f}",
+            "mirrored" if one.mirrored else "",
+        )
+        for one in found.moments
+    ]
+    print_table(("clip", "frames", "s", "distance", ""), rows, right=("frames", "s", "distance"))
+    if found.behind:
+        print_message(
+            f"{counted(found.behind, 'clip')} changed since the index was updated, and {found.searched_clips:,} were "
+            "searched; `marey index` updates it."
+        )
 
 
 def _print(answer: SearchAnswer) -> None:

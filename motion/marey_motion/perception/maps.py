@@ -15,8 +15,9 @@ from marey_motion.perception.metric import Component, PerceptualMetric, shaped
 
 MOST_CELLS = 50_000_000
 """Greatest number of cells of a map that is kept whole; greater maps are computed in blocks of rows."""
-_SHAPINGS = {"euclid": 0, "manhattan": 1, "sigmoid": 2, "power": 3}
-_ANGLES = {"half_angle": 0, "log_norm": 0, "angle": 1, "one_minus_dot": 2}
+SHAPING_NUMBERS = {"euclid": 0, "manhattan": 1, "sigmoid": 2, "power": 3}
+ANGLE_NUMBERS = {"half_angle": 0, "log_norm": 0, "angle": 1, "one_minus_dot": 2}
+"""Numbers by which kernels know shapings and measures of angles."""
 _BLOCK_CELLS = 4_000_000
 _NO_POINTS = np.empty((1, 0, 2))
 
@@ -113,7 +114,7 @@ def joint_differences(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetric
         one, other = a.rotations[:, _angled(a)], b.rotations[:, _angled(a)]
         chord = np.minimum(np.linalg.norm(one - other, axis=-1), np.linalg.norm(one + other, axis=-1))
         half = 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))
-        distances = {0: half, 1: 2.0 * half, 2: 0.5 * chord**2}[_ANGLES[metric.angle]]
+        distances = {0: half, 1: 2.0 * half, 2: 0.5 * chord**2}[ANGLE_NUMBERS[metric.angle]]
     else:
         one, other = _vectors(a, component, metric), _vectors(b, component, metric)
         if metric.root_alignment == "kovar2d":
@@ -174,7 +175,7 @@ def _raw(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetric, component: 
 
     starts, scales = _layout(a, metric, component)
     weights = component.shares_of(classes_measured(a, component.measurement))
-    shape = (_SHAPINGS[component.shaping], component.exponent)
+    shape = (SHAPING_NUMBERS[component.shaping], component.exponent)
     if component.measurement == "angles":
         one, other = a.rotations[frames][:, _angled(a)], b.rotations[:, _angled(a)]
     else:
@@ -182,7 +183,7 @@ def _raw(a: MeasuredClip, b: MeasuredClip, metric: PerceptualMetric, component: 
     out = np.empty((len(one), b.frame_count))
     tables = (as_kernel_input(one), as_kernel_input(other.transpose(1, 2, 0)), starts, scales, weights, shape)
     if component.measurement == "angles":
-        kernels.rotations(*tables, _ANGLES[metric.angle], out)
+        kernels.rotations(*tables, ANGLE_NUMBERS[metric.angle], out)
         return out
     ground = (_NO_POINTS, _NO_POINTS)
     if metric.root_alignment == "kovar2d":

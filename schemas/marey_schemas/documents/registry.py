@@ -14,6 +14,7 @@ from marey_schemas.documents.evaluations import EvaluationDocument, EvaluationRe
 from marey_schemas.documents.graphs import ModelGraph
 from marey_schemas.documents.metrics import MetricDocument
 from marey_schemas.documents.models import MotionPrimitiveDocument
+from marey_schemas.documents.motion_indexes import MotionIndexDocument
 from marey_schemas.documents.references import OutputRef as OutputRef
 from marey_schemas.documents.references import RevisionRef as RevisionRef
 from marey_schemas.documents.reports import EvaluationReport, ModelReport
@@ -52,6 +53,7 @@ SCHEMAS: dict[str, type[Request]] = {
         ModelGraph,
         StudyDocument,
         MetricDocument,
+        MotionIndexDocument,
         OpenDocument,
     )
 }

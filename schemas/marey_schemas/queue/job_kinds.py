@@ -332,6 +332,27 @@ ANALYSE_STUDY = KindDeclaration(
     never_cached_for=_reads_answers,
 )
 
+INDEX = KindDeclaration(
+    name="index",
+    description="Builds or updates an index of the poses of clips, with which moments that resemble an example are "
+    "found.",
+    params=job_params.IndexParams,
+    implementation="marey_worker.kinds.index:run",
+    version=1,
+    inputs={
+        "clips": InputSpec(
+            kind=Kind.CLIP, many=True, parts=("motion",), description="The clips that the index shall contain."
+        ),
+        "index": InputSpec(
+            kind=Kind.INDEX,
+            required=False,
+            description="The index to update: the poses of clips that it contains at the same revision are kept.",
+        ),
+    },
+    outputs={"index": Kind.INDEX},
+    place_counts=True,
+)
+
 RUN_SCRIPT = KindDeclaration(
     name=SCRIPT,
     description="Runs a registered script: a command of a pinned Git commit. The script declares the inputs and "
@@ -362,7 +383,7 @@ def kind_of_job(name: str, params: Mapping[str, Any]) -> KindDeclaration:
 
 BUILT_IN = (
     IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, DISTANCES, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN, MODEL,
-    TREE, ANALYSE_STUDY, RUN_SCRIPT,
+    TREE, ANALYSE_STUDY, INDEX, RUN_SCRIPT,
 )  # fmt: skip
 
 

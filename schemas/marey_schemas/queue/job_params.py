@@ -304,6 +304,12 @@ class ImportParams(ImportOptions):
     )
 
 
+class IndexParams(Request):
+    """Parameters of jobs of the kind `index`."""
+
+    name: ItemName = Field("motion-index", description="Name of the index; an index with this name is replaced.")
+
+
 class RetargetParams(SuffixedResults):
     """Parameters of jobs of the kind `retarget`."""
 

@@ -154,7 +154,7 @@ def load_kernels() -> None:
 
     The kernels are loaded in advance, because compiling missing kernels takes far longer than reading a file.
     """
-    compile_kernels(["files", "editing", "searches", "coverage"])
+    compile_kernels(["files", "editing", "searches", "coverage", "similarity"])
 
 
 def read_file(order: bytes) -> bytes:

@@ -16,6 +16,7 @@ BLOB_FOLDER = "blobs"
 WORKER_CACHE = "worker-cache"
 WORKER_TOKENS = "worker-tokens"
 WORKER_LOGS = "worker-logs"
+INDEX_COPIES = "motion-indexes"
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +36,7 @@ def prepare_data_folder(settings: Settings) -> None:
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     folder = settings.data.resolve()
     make_reserve(folder)
-    folders = (BLOB_FOLDER, WORKER_CACHE, WORKER_TOKENS, WORKER_LOGS)
+    folders = (BLOB_FOLDER, WORKER_CACHE, WORKER_TOKENS, WORKER_LOGS, INDEX_COPIES)
     own = {folder / name for name in (TOKEN_FILE, *folders, RESERVE_FILE, "marey.toml")}
     file = sqlite_file(settings.resolved_database_url)
     if file is not None and file.parent.is_dir():

@@ -23,6 +23,7 @@ from marey_server.motions.searching import SearchableKey
 from marey_server.process.child_starting import LOADED_FIRST, MODULES_FIRST
 from marey_server.process.children import Children
 from marey_server.process.computing import ComputeThreads
+from marey_server.process.data_folder import INDEX_COPIES
 from marey_server.process.disk_space import DiskSpace
 from marey_server.process.identity_provider import IdentityProvider
 from marey_server.process.memory import RequestMemory
@@ -42,6 +43,7 @@ from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.reaper import StartGrace
 from marey_server.store.monitoring.figures import read_figures
 from marey_server.store.monitoring.workers import WorkerMemory
+from marey_server.store.motion_indexes import IndexFiles
 
 log = logging.getLogger(__name__)
 
@@ -115,6 +117,7 @@ class Services:
         self.children = children or Children(settings.child_limits, LOADED_FIRST if settings.warm_up else MODULES_FIRST)
         self.disk = DiskSpace(settings.data, settings.min_free_bytes)
         self.memory = RequestMemory(settings.request_memory_bytes)
+        self.index_files = IndexFiles(settings.data / INDEX_COPIES)
         self.upload_hashes = UploadHashes(database)
         self._faults: list[str] = []
         self._tokens_noted: LruCache[str, float] = LruCache(max_entries=TOKENS_REMEMBERED)

@@ -31,6 +31,8 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
         return Summary({"verdict": bodies["evaluation"]["verdict"], **bodies["evaluation"]["headline"]})
     if kind is Kind.MODEL:
         return _learned(bodies["model"])
+    if kind is Kind.INDEX:
+        return Summary({name: bodies["index"][name] for name in ("clips", "rows", "left_out")})
     if kind is Kind.ANNOTATION:
         return Summary(_said(bodies["annotation"]))
     if kind is Kind.CLIP:

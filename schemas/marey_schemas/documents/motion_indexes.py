@@ -1,0 +1,55 @@
+"""Index of motions for searches by example: part `index` of an item of the kind `index`."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from marey_schemas.base import Request
+from marey_schemas.documents.reports import StoredFile
+from marey_schemas.names import ItemId
+
+MOST_SHARDS = 2000
+"""Greatest number of shards of an index: about 1,200 hours of motion."""
+INDEX_VERSION = 1
+"""Number of the form of shards; a server searches only indexes with this number."""
+
+
+class IndexShard(Request):
+    """Shard of an index: two files with the poses of many clips."""
+
+    clips: StoredFile = Field(description="List of the clips, a `ShardClips` as JSON.")
+    poses: StoredFile = Field(description="Features of the poses of these clips.")
+    rows: int = Field(ge=1, description="Number of poses.")
+    dropped: tuple[int, ...] = Field(
+        (), max_length=100_000, description="Numbers of clips in the list that no longer belong to the index."
+    )
+
+
+class MotionIndexDocument(Request):
+    """Part `index` of an index: its shards, and how many clips they contain."""
+
+    schema_: Literal["marey/motion-index@1"] = Field("marey/motion-index@1", alias="schema")
+    version: int = Field(INDEX_VERSION, ge=1, description="Number of the form of the shards.")
+    clips: int = Field(ge=0, description="Number of clips in the index.")
+    rows: int = Field(ge=0, description="Number of poses of these clips, 30 per second.")
+    left_out: int = Field(0, ge=0, description="Number of clips whose poses cannot be compared; the log names them.")
+    shards: tuple[IndexShard, ...] = Field((), max_length=MOST_SHARDS)
+
+
+class ShardClips(Request):
+    """Clips of a shard, in the order of their poses; the lists have equal lengths."""
+
+    items: tuple[ItemId, ...] = Field(description="Ids of the clips.")
+    revisions: tuple[int, ...] = Field(description="Revisions of the clips.")
+    rows: tuple[int, ...] = Field(description="Number of poses of each clip, 30 per second.")
+    joints: tuple[int, ...] = Field(description="Which of the compared joints each clip has, as bits.")
+    frames: tuple[int, ...] = Field(description="Number of frames of each clip.")
+    rates_hz: tuple[float, ...] = Field(description="Frames per second of each clip.")
+
+    @model_validator(mode="after")
+    def _check_lengths(self) -> Self:
+        if len({len(getattr(self, name)) for name in type(self).model_fields}) != 1:
+            raise ValueError("the lists must have equal lengths")
+        return self

@@ -1,0 +1,270 @@
+"""Searches by example: one transaction reads the example, and a child process searches the files of the index."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.documents.motion_indexes import ShardClips
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
+from marey_schemas.kinds import Kind
+from marey_schemas.lru import LruCache
+from marey_schemas.problems import FieldError
+from marey_schemas.search import LONGEST_EXAMPLE_S, SimilarAnswer, SimilarMoment, SimilarRequest
+from marey_schemas.sizes import MIB
+from marey_schemas.wording import counted
+from marey_server.errors import InvalidProblem, NotFoundProblem
+from marey_server.motions.child import Message, pack_tree, unpack_tree
+from marey_server.store import items
+from marey_server.store.motion_indexes import FoundClip, FoundIndex
+from marey_server.store.transaction import Transaction
+
+if TYPE_CHECKING:  # numeric modules are loaded by children alone
+    from marey_motion.similarity.searching import Example, Hit, SearchedShard
+
+Tree = dict[str, Any]
+
+SEARCH_INDEX = "marey_server.motions.similar:search_index"
+"""Function that child processes run."""
+THREADS = 2
+CONTEXT_READ_S = 1.5
+"""Seconds around the example that are read, too; its features depend on one second of them."""
+_CLIPS_CACHE_BYTES = 64 * MIB
+
+
+@dataclass(frozen=True, slots=True)
+class FoundExample:
+    """Example, with some context, and the skeleton of its clip; `first` is the example's first frame in `motion`."""
+
+    clip: str
+    revision: int
+    motion: Tree
+    first: int
+    frames: tuple[int, int]
+    hierarchy: Tree
+    mapping: Tree | None
+
+
+class ShardFiles(Message):
+    """Local files of a shard, and the numbers of the clips in it that do not belong to the index."""
+
+    clips: str
+    poses: str
+    dropped: tuple[int, ...]
+
+
+class SimilarOrder(Message):
+    """Message that asks a child process to search an index."""
+
+    request: SimilarRequest
+    revision: int
+    motion: bytes
+    first: int
+    hierarchy: bytes
+    mapping: bytes | None
+    shards: tuple[ShardFiles, ...]
+    heads: dict[str, int]
+
+
+class FoundWindow(Message):
+    """Window that resembles the example: its clip, frames and seconds."""
+
+    clip: str
+    revision: int
+    frames: tuple[int, int]
+    start_s: float
+    end_s: float
+    distance: float
+    mirrored: bool
+
+
+class FoundWindows(Message):
+    """Result of a search: windows, the number of clips searched, and of changed clips that were not searched."""
+
+    windows: tuple[FoundWindow, ...]
+    searched_clips: int
+    behind: int
+
+
+def read_example(tx: Transaction, project: str, request: SimilarRequest) -> FoundExample:
+    """Return the example of a search.
+
+    Raises `NotFoundProblem` if the clip does not exist, and `InvalidProblem` if it does not have the frames.
+    """
+    part = items.read_part(tx, project, Kind.CLIP, request.clip, "motion", revision=request.revision)
+    motion, (start, stop) = part.tree, request.frames
+    count, rate_hz = motion["poses"].shape[0], motion["frame_rate_hz"]
+    if stop > count:
+        raise _invalid("/frames", f"The clip has {counted(count, 'frame')}; the example ends at frame {stop}.")
+    if (stop - start) / rate_hz > LONGEST_EXAMPLE_S:
+        raise _invalid("/frames", f"The example is longer than {LONGEST_EXAMPLE_S:g} s; give fewer frames.")
+    margin = int(CONTEXT_READ_S * rate_hz) + 2
+    first = max(0, start - margin)
+    cut = items.cut_part(motion, slice(first, min(count, stop + margin)), None, encoded=True)
+    skeleton = (project, Kind.SKELETON, motion["skeleton"]["item"])
+    revision = motion["skeleton"]["revision"]
+    hierarchy = items.read_part(tx, *skeleton, "hierarchy", revision=revision).tree
+    try:
+        mapping = items.read_part(tx, *skeleton, "mapping", revision=revision).tree
+    except NotFoundProblem:  # an optional part: without it, the mapping is guessed
+        mapping = None
+    return FoundExample(request.clip, part.revision, cut, start - first, request.frames, hierarchy, mapping)
+
+
+def search_order(
+    request: SimilarRequest, found: FoundExample, index: FoundIndex, shards: tuple[ShardFiles, ...]
+) -> bytes:
+    """Return the packed message that asks a child process to search an index."""
+    return SimilarOrder(
+        request=request,
+        revision=found.revision,
+        motion=pack_tree(found.motion),
+        first=found.first,
+        hierarchy=pack_tree(found.hierarchy),
+        mapping=None if found.mapping is None else pack_tree(found.mapping),
+        shards=shards,
+        heads=index.heads,
+    ).pack()
+
+
+def answer_of(found: FoundWindows, index: FoundIndex, clips: dict[str, FoundClip]) -> SimilarAnswer:
+    """Return the answer; a clip that was changed or deleted during the search is left out."""
+    moments = [
+        SimilarMoment(path=clips[one.clip].path, **one.model_dump())
+        for one in found.windows
+        if one.clip in clips and clips[one.clip].head == one.revision
+    ]
+    return SimilarAnswer(
+        moments=tuple(moments),
+        index=RevisionRef(item=index.item, revision=index.revision),
+        searched_clips=found.searched_clips,
+        behind=found.behind,
+    )
+
+
+def _invalid(pointer: str, detail: str, code: str = "no-frames") -> InvalidProblem:
+    return InvalidProblem(detail, code=code, errors=[FieldError(pointer=pointer, code=code, detail=detail)])
+
+
+# -- in the child ------------------------------------------------------------------------------------------------------
+
+_CLIPS: LruCache[str, ShardClips] = LruCache(max_bytes=_CLIPS_CACHE_BYTES, size_of=lambda clips: 300 * len(clips.items))
+"""Cache of a child process: lists of clips by the path of their file, which never changes."""
+
+
+def search_index(packed: bytes) -> bytes:
+    """Carry out a `SimilarOrder` and return packed `FoundWindows`.
+
+    Raises `InvalidProblem` if the example cannot be compared, and `NotFoundProblem` if files of the index are missing.
+    """
+    order = SimilarOrder.unpack(packed)
+    try:
+        return _search(order).pack()
+    except FileNotFoundError as error:  # a search of another index needed the space
+        raise NotFoundProblem(
+            "The copies of the index were removed during the search; repeat the request.", code="no-index"
+        ) from error
+
+
+def _search(order: SimilarOrder) -> FoundWindows:
+    from marey_motion.errors import MotionError
+    from marey_motion.perception.metric import published_metric
+    from marey_motion.similarity.searching import search_windows
+
+    lists = [_clips_of(files.clips) for files in order.shards]
+    ranks = _ranks(lists)
+    try:
+        example, rate_hz = _example(order)
+        shards = [_searched(order, *one, rate_hz, example) for one in zip(order.shards, lists, ranks, strict=True)]
+        metric = published_metric(order.request.metric.partition("/")[2])  # type: ignore[arg-type]
+        hits = search_windows(
+            shards, example, metric, order.request.results, mirror=order.request.mirrored, threads=THREADS
+        )  # fmt: skip
+    except MotionError as error:
+        raise _invalid("/clip", f"The example cannot be searched for: {error}", error.code) from error
+    length_s = (order.request.frames[1] - order.request.frames[0] - 1) / rate_hz
+    searched = sum(int((~shard.closed).sum()) for shard in shards)
+    known = {place for clips in lists for place in zip(clips.items, clips.revisions, strict=True)}
+    behind = sum(head > 0 and (clip, head) not in known for clip, head in order.heads.items())
+    windows = tuple(_window(hit, lists[hit.shard], length_s) for hit in hits)
+    return FoundWindows(windows=windows, searched_clips=searched, behind=behind)
+
+
+def _clips_of(path: str) -> ShardClips:
+    return _CLIPS.get_or_make(path, lambda: ShardClips.model_validate_json(Path(path).read_bytes()))
+
+
+def _ranks(lists: list[ShardClips]) -> list[Any]:
+    """Number the clips of all shards in the order of their ids."""
+    import numpy as np
+
+    if not lists:
+        return []
+    sizes = np.cumsum([len(clips.items) for clips in lists])[:-1]
+    ids = np.array([one for clips in lists for one in clips.items])
+    ranks = np.empty(len(ids), np.int64)
+    ranks[np.argsort(ids, kind="stable")] = np.arange(len(ids))
+    return np.split(ranks, sizes)
+
+
+def _example(order: SimilarOrder) -> tuple[Example, float]:
+    """Compute the features of the example, and its frame rate."""
+    from marey_motion.documents import clip_from_document, mapping_from_document, skeleton_from_document
+    from marey_motion.matching.body import MatchingBody
+    from marey_motion.motion import Motion
+    from marey_motion.rigs import map_joints, require_trust
+    from marey_motion.similarity.features import INDEX_RATE_HZ, features_at
+    from marey_motion.similarity.searching import Example, sample_offsets
+
+    skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(unpack_tree(order.hierarchy)))
+    if order.mapping is None:
+        mapping = map_joints(skeleton)
+    else:
+        mapping = mapping_from_document(SkeletonMapping.model_validate(unpack_tree(order.mapping)), skeleton)[0]
+    body = MatchingBody.from_mapping(skeleton, require_trust(mapping))
+    clip = clip_from_document(MotionDocument.model_validate(unpack_tree(order.motion)), skeleton)
+    first, end = order.request.frames
+    offsets = sample_offsets((end - first - 1) / clip.frame_rate_hz)
+    times = order.first + offsets * (clip.frame_rate_hz / INDEX_RATE_HZ)
+    return Example(features_at(Motion.of(clip), body, clip.frame_rate_hz, times), offsets), clip.frame_rate_hz
+
+
+def _searched(
+    order: SimilarOrder, files: ShardFiles, clips: ShardClips, ranks: Any, rate_hz: float, example: Example
+) -> SearchedShard:
+    """Return a shard with what of it is searched: no dropped clips, and none that changed since the index was made."""
+    import numpy as np
+
+    from marey_motion.similarity.searching import SearchedShard
+    from marey_motion.similarity.shards import Shard
+
+    changed = [order.heads.get(one, number) != number for one, number in zip(clips.items, clips.revisions, strict=True)]
+    closed = np.array(changed, np.bool_)
+    closed[list(files.dropped)] = True
+    windows: dict[int, tuple[int, int]] = {}
+    if order.request.leave_out != "nothing" and order.request.clip in clips.items:
+        own = clips.items.index(order.request.clip)
+        closed[own] |= order.request.leave_out == "clip"
+        windows[own] = example.rows_around(order.request.frames[0], rate_hz)
+    path, rows, joints = Path(files.poses), np.array(clips.rows), np.array(clips.joints)
+    return SearchedShard(lambda: Shard.open(path, rows, joints), ranks, closed, windows)
+
+
+def _window(hit: Hit, clips: ShardClips, length_s: float) -> FoundWindow:
+    from marey_motion.similarity.features import INDEX_RATE_HZ
+
+    rate_hz, start_s = clips.rates_hz[hit.run], hit.row / INDEX_RATE_HZ
+    first = round(start_s * rate_hz)
+    end = min(first + round(length_s * rate_hz) + 1, clips.frames[hit.run])
+    return FoundWindow(
+        clip=clips.items[hit.run],
+        revision=clips.revisions[hit.run],
+        frames=(first, end),
+        start_s=start_s,
+        end_s=start_s + length_s,
+        distance=hit.distance,
+        mirrored=hit.mirrored,
+    )

@@ -1,0 +1,182 @@
+"""Indexes of motions: the index of a project, what has changed since it was updated, and local copies of its files.
+
+Searches map the files of an index into memory. So each server keeps copies of them in its data folder, whatever the
+backing of its blobs. A copy is named by its digest and never changes.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Collection, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sqlalchemy import or_, select
+
+from marey_schemas.documents.motion_indexes import INDEX_VERSION, MotionIndexDocument
+from marey_schemas.kinds import Kind
+from marey_schemas.sizes import GIB
+from marey_server.errors import ConflictProblem, NotFoundProblem, TooLargeProblem
+from marey_server.store import items, projects
+from marey_server.store.jobs import reach
+from marey_server.store.tables import blob, collection, item, job, revision
+from marey_server.store.transaction import Transaction, in_lists
+
+MOST_CHANGES = 20_000
+"""Greatest number of clips that may have changed since an index was updated; a search checks each of them."""
+MOST_COPIED_BYTES = 8 * GIB
+"""Greatest size of the copies of index files on one server, and so of one index."""
+
+
+class FoundIndex(NamedTuple):
+    """Index of a project, and the clips that were changed, created or deleted since its inputs were read.
+
+    `heads` maps the ids of these clips to their newest revisions; 0 for a deleted clip.
+    """
+
+    item: str
+    revision: int
+    document: MotionIndexDocument
+    heads: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class FoundClip:
+    """Clip in an answer: its path, and its newest revision."""
+
+    path: str
+    head: int
+
+
+def find_index(tx: Transaction, project: str, index: str | None) -> FoundIndex:
+    """Return the index with an id, or else the one that was updated last.
+
+    Raises `NotFoundProblem` if there is none, and `ConflictProblem` if it is too old to be searched.
+    """
+    project_row = projects.require(tx, project)
+    wanted = (item.c.project_id == project_row.id, item.c.kind == Kind.INDEX.value, item.c.deleted_us.is_(None))
+    statement = (
+        select(item.c.id, item.c.head, revision.c.created_us, job.c.created_us.label("submitted_us"))
+        .join(revision, (revision.c.item_id == item.c.id) & (revision.c.number == item.c.head))
+        .outerjoin(job, job.c.id == revision.c.job_id)
+        .where(*wanted, *([] if index is None else [item.c.id == index]))
+        .order_by(item.c.updated_us.desc(), item.c.id)
+        .limit(1)
+    )
+    row = tx.execute(statement).one_or_none()
+    if row is None or reach.unreachable_items(tx, [row.id]):
+        what = "This project has no index of motions" if index is None else f"There is no index {index!r}"
+        raise NotFoundProblem(
+            f"{what}; `marey index {project}` builds one.",
+            code="no-index",
+            unnamed="There is no such index of motions.",
+        )
+    found = items.read_part(tx, project, Kind.INDEX, row.id, "index", revision=row.head)
+    document = MotionIndexDocument.model_validate(found.tree)
+    if document.version != INDEX_VERSION:
+        raise ConflictProblem("The index has an older form; update it.", code="index-outdated")
+    since_us = row.created_us if row.submitted_us is None else row.submitted_us
+    return FoundIndex(row.id, row.head, document, _changed_since(tx, project_row.id, since_us))
+
+
+def _changed_since(tx: Transaction, project_id: str, since_us: int) -> dict[str, int]:
+    """Return the newest revisions of the clips that changed at or after a time; 0 for deleted clips."""
+    own = (item.c.project_id == project_id, item.c.kind == Kind.CLIP.value)
+    changed = or_(item.c.updated_us >= since_us, item.c.deleted_us >= since_us)
+    statement = select(item.c.id, item.c.head, item.c.deleted_us).where(*own, changed).limit(MOST_CHANGES + 1)
+    rows = tx.execute(statement).all()
+    if len(rows) > MOST_CHANGES:
+        raise ConflictProblem(
+            f"More than {MOST_CHANGES:,} clips have changed since the index was updated; update it.",
+            code="index-outdated",
+        )
+    return {row.id: row.head if row.deleted_us is None else 0 for row in rows}
+
+
+def name_clips(tx: Transaction, project: str, ids: Collection[str]) -> dict[str, FoundClip]:
+    """Return those of the clips that exist in the project, by id."""
+    project_row = projects.require(tx, project)
+    refused = reach.unreachable_items(tx, ids)
+    found: dict[str, FoundClip] = {}
+    for some in in_lists(sorted(set(ids) - refused)):
+        statement = (
+            select(item.c.id, item.c.head, item.c.name, collection.c.path)
+            .join(collection, collection.c.id == item.c.collection_id)
+            .where(item.c.project_id == project_row.id, item.c.kind == Kind.CLIP.value, item.c.id.in_(some))
+            .where(item.c.deleted_us.is_(None))
+        )
+        for row in tx.execute(statement):
+            found[row.id] = FoundClip(f"{row.path}/{row.name}".lstrip("/"), row.head)
+    return found
+
+
+class IndexFiles:
+    """Copies of the files of indexes in a folder of this server."""
+
+    def __init__(self, folder: Path, *, most_bytes: int = MOST_COPIED_BYTES) -> None:
+        self._folder = folder
+        self._most_bytes = most_bytes
+
+    def path(self, digest: str) -> Path:
+        """Return the path of the copy of a blob, whether or not it exists."""
+        return self._folder / digest.removeprefix("sha256:")
+
+    def missing(self, document: MotionIndexDocument) -> list[str]:
+        """List the digests of the files of an index that have no copy; remove old copies if they do not fit.
+
+        Raises `TooLargeProblem` if the index is too large to be searched.
+        """
+        files = [file for shard in document.shards for file in (shard.clips, shard.poses)]
+        needed_bytes = sum(file.size_bytes for file in files)
+        if needed_bytes > self._most_bytes:
+            raise TooLargeProblem(
+                f"The index has {needed_bytes:,} bytes; indexes of up to {self._most_bytes:,} bytes can be searched.",
+                code="index-too-large",
+            )
+        self._folder.mkdir(mode=0o700, exist_ok=True)
+        missing = []
+        for file in files:
+            try:
+                os.utime(self.path(file.blob))
+            except FileNotFoundError:
+                missing.append(file)
+        if missing:
+            self._make_room(self._most_bytes - sum(file.size_bytes for file in missing), {file.blob for file in files})
+        return [file.blob for file in missing]
+
+    def copy(self, tx: Transaction, digest: str) -> None:
+        """Copy a blob of an index that the caller may read; a copy appears only when it is complete.
+
+        Raises `NotFoundProblem` if bytes of the blob are missing.
+        """
+        size = tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar_one()
+        handle, name = tempfile.mkstemp(dir=self._folder)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                written = sum(file.write(chunk) for chunk in tx.blobs.read(tx.connection, digest, 0, size))
+            if written != size:
+                raise NotFoundProblem("Files of the index are missing; build it again.", code="no-index")
+            os.replace(name, self.path(digest))
+        except BaseException:
+            with suppress(FileNotFoundError):
+                os.unlink(name)
+            raise
+
+    def _make_room(self, most_bytes: int, kept: Collection[str]) -> None:
+        """Remove the copies that were not used for the longest time, except some, until they fit into a size."""
+        copies = sorted(self._others({self.path(digest).name for digest in kept}), key=lambda one: one[1])
+        held_bytes = sum(path.stat().st_size for path in self._folder.iterdir())
+        for path, _used, size_bytes in copies:
+            if held_bytes <= most_bytes:
+                return
+            path.unlink(missing_ok=True)
+            held_bytes -= size_bytes
+
+    def _others(self, kept: Collection[str]) -> Iterable[tuple[Path, float, Any]]:
+        for path in self._folder.iterdir():
+            if path.name not in kept:
+                found = path.stat()
+                yield path, found.st_mtime, found.st_size

@@ -1,0 +1,189 @@
+"""Searches by example: features, exactness against brute force, overlaps, mirrored examples."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from marey_motion.clip import Clip
+from marey_motion.errors import MotionError
+from marey_motion.gait import game_skeleton, generate_gait
+from marey_motion.matching.body import MatchingBody
+from marey_motion.mirroring import mirror_clip
+from marey_motion.motion import Motion
+from marey_motion.perception.maps import paired_distances
+from marey_motion.perception.measuring import measure_motion
+from marey_motion.perception.metric import PerceptualMetric, published_metric
+from marey_motion.retargeting import plan_retarget, retarget
+from marey_motion.rigs import guess_axes, map_joints
+from marey_motion.similarity.features import INDEX_RATE_HZ, JOINTS, WIDTH, PoseFeatures, clip_features, mirrored
+from marey_motion.similarity.searching import Example, Hit, SearchedShard, sample_offsets, search_windows
+from marey_motion.similarity.shards import Shard, presence, write_shard
+
+ALL = (1 << len(JOINTS)) - 1
+
+
+def features_of(clip: Clip) -> PoseFeatures:
+    body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
+    return clip_features(Motion.of(clip), body, clip.frame_rate_hz)
+
+
+def searched(
+    folder: Path, runs: list[np.ndarray], *, present: list[int] | None = None, name: str = "s"
+) -> SearchedShard:
+    bits, lengths = np.array(present or [ALL] * len(runs)), np.array([len(run) for run in runs])
+    write_shard(folder / name, runs)
+    path = folder / name
+    return SearchedShard(lambda: Shard.open(path, lengths, bits), np.arange(len(runs)), np.zeros(len(runs), np.bool_))
+
+
+def pose_distance(a: np.ndarray, b: np.ndarray, metric: PerceptualMetric) -> float:
+    """Compute the distance of two rows from the formulas of the metric, for all joints, in plain numpy."""
+    vectors = [np.linalg.norm(np.float64(a[:90]).reshape(30, 3) - np.float64(b[:90]).reshape(30, 3), axis=1)]
+    one, other = np.float64(a[90:]).reshape(11, 4), np.float64(b[90:]).reshape(11, 4)
+    chord = np.minimum(np.linalg.norm(one - other, axis=1), np.linalg.norm(one + other, axis=1))
+    angles, positions = 2 * np.arcsin(np.minimum(chord / 2, 1)), vectors[0][:15]
+    measured = {"angles": angles, "positions": positions, "velocities": vectors[0][15:] / 30}
+    sides = {"head": [0], "clavicle": [1, 2], "upper_arm": [3, 4], "forearm": [5, 6], "hand": [7, 8]}
+    legs = {"thigh": [9, 10], "calf": [11, 12], "toe": [13, 14]}
+    total = 0.0
+    for share, part in zip(metric.shares, metric.components, strict=True):
+        raw, weights = 0.0, sum(part.weights.values())
+        for joint, weight in part.weights.items():
+            at = np.array({**sides, **legs}[joint])
+            at = at - 2 if part.measurement == "angles" and joint in legs else at
+            x = float(measured[part.measurement][at].mean())
+            raw += weight / weights * {"euclid": x * x, "manhattan": x, "sigmoid": x / (x + 1)}[part.shaping]
+        total += share * (part.norm * raw + part.constant * (raw > 0))
+    return total
+
+
+def by_brute_force(runs: list[np.ndarray], example: Example, metric: PerceptualMetric, count: int) -> list[Hit]:
+    length = int(example.offsets[-1])
+    poses = example.poses.rows
+    left = [
+        Hit(0, run, row, float(np.mean([pose_distance(q, rows[row + o], metric)
+                                        for q, o in zip(poses, example.offsets, strict=True)])), False)
+        for run, rows in enumerate(runs) for row in range(len(rows) - length)
+    ]  # fmt: skip
+    hits: list[Hit] = []
+    for one in sorted(left, key=lambda hit: (hit.distance, hit.run, hit.row)):
+        if len(hits) < count and all(
+            hit.run != one.run or abs(hit.row - one.row) >= example.separation_rows for hit in hits
+        ):
+            hits.append(one)
+    return hits
+
+
+def random_run(rng: np.random.Generator, count: int, step: float) -> np.ndarray:
+    rows = np.cumsum(rng.normal(0.0, step, (count, WIDTH)), axis=0) + rng.normal(0.0, 0.3, WIDTH)
+    turns = rows[:, 90:].reshape(count, 11, 4)
+    turns /= np.linalg.norm(turns, axis=2, keepdims=True)
+    turns *= rng.choice([-1.0, 1.0], (count, 11, 1))
+    return rows.astype(np.float32)
+
+
+@settings(deadline=None, max_examples=12)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    step=st.sampled_from([0.0, 1e-3, 0.02, 0.5]),
+    seconds=st.sampled_from([0.0, 0.3, 1.0]),
+    shaping=st.sampled_from(["sigmoid", "manhattan", "euclid"]),
+    count=st.integers(1, 12),
+)
+def test_a_search_finds_what_brute_force_finds(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, step: float, seconds: float, shaping: str, count: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    runs = [random_run(rng, int(rng.integers(1, 60)), step) for _ in range(4)]
+    runs.append(runs[int(rng.integers(4))].copy())  # equal distances
+    metric, offsets = published_metric(shaping), sample_offsets(seconds)  # type: ignore[arg-type]
+    source = random_run(rng, 40, step) if seed % 2 else np.concatenate([*runs, runs[0]])[-40:]
+    example = Example(PoseFeatures(source[:1].repeat(len(offsets), 0) if step == 0 else source[offsets % len(source)],
+                                   np.ones(15, np.bool_)), offsets)  # fmt: skip
+    found = search_windows([searched(tmp_path_factory.mktemp("shards"), runs)], example, metric, count, threads=2)
+    expected = by_brute_force(runs, example, metric, count)
+    assert [hit[:3] for hit in found] == [hit[:3] for hit in expected]
+    np.testing.assert_allclose([hit.distance for hit in found], [hit.distance for hit in expected], atol=1e-6)
+
+
+def test_the_distance_is_the_perceptual_metric_of_the_clips(tmp_path: Path) -> None:
+    slow, fast = (generate_gait(speed, 0.1, 3.0, frame_rate_hz=30.0) for speed in (1.1, 1.5))
+    rows, offsets = features_of(fast).rows, sample_offsets(0.5)
+    example = Example(PoseFeatures(features_of(slow).rows[30 + offsets], features_of(slow).present), offsets)
+    body = MatchingBody.from_mapping(slow.skeleton, map_joints(slow.skeleton))
+    one, other = (measure_motion(Motion.of(clip), body, 30.0) for clip in (slow, fast))
+    metric = published_metric()
+    (hit,) = search_windows([searched(tmp_path, [rows])], example, metric, 1)
+    at_one, at_other = ((row + offsets).astype(np.float64) for row in (30, hit.row))
+    exact = paired_distances(one.at(at_one), other.at(at_other), metric)
+    assert hit.distance == pytest.approx(float(exact.mean()), abs=2e-5)
+
+
+def test_shards_and_their_number_make_no_difference(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    runs = [random_run(rng, 90, 0.02) for _ in range(6)]
+    example = Example(PoseFeatures(runs[2][sample_offsets(0.5) + 9], np.ones(15, np.bool_)), sample_offsets(0.5))
+    (whole,) = [searched(tmp_path, runs)]
+    parts = [searched(tmp_path, runs[first : first + 2], name=str(first)) for first in (0, 2, 4)]
+    parts = [SearchedShard(one.load, one.ranks + 2 * number, one.closed) for number, one in enumerate(parts)]
+    metric = published_metric()
+    one = [(hit.run, *hit[2:]) for hit in search_windows([whole], example, metric, 20)]
+    other = [(hit.run + 2 * hit.shard, *hit[2:]) for hit in search_windows(parts, example, metric, 20)]
+    assert one == other
+    closed = SearchedShard(whole.load, whole.ranks, np.arange(6) == 2)
+    assert all(hit.run != 2 for hit in search_windows([closed], example, metric, 20))
+
+
+def test_a_mirrored_example_finds_the_mirrored_clip(tmp_path: Path) -> None:
+    clip = generate_gait(1.5, 0.5, 3.0)
+    body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
+    features, other = features_of(clip), features_of(mirror_clip(clip, body.partners))
+    np.testing.assert_allclose(mirrored(features).rows[:, :90], other.rows[:, :90], atol=1e-4)
+    example = Example(PoseFeatures(features.rows[30 + sample_offsets(0.5)], features.present), sample_offsets(0.5))
+    (hit,) = search_windows([searched(tmp_path, [other.rows])], example, published_metric(), 1, mirror=True)
+    assert (hit.row, hit.mirrored) == (30, True)
+    assert hit.distance < 0.3
+
+
+def test_a_motion_is_found_on_another_skeleton_and_at_another_rate(tmp_path: Path) -> None:
+    clips = [generate_gait(speed, 0.0, 3.0, frame_rate_hz=120.0) for speed in (0.8, 1.2, 1.5, 2.0)]
+    skeletons = clips[0].skeleton, game_skeleton()
+    rigs = [(one, map_joints(one), guess_axes(one, map_joints(one))) for one in skeletons]
+    moved = [features_of(retarget(clip, plan_retarget(*rigs[0], *rigs[1]))) for clip in clips]
+    features, offsets = features_of(clips[2]), sample_offsets(1.0)
+    example = Example(PoseFeatures(features.rows[30 + offsets], features.present), offsets)
+    shard = searched(tmp_path, [one.rows for one in moved], present=[presence(one) for one in moved])
+    (hit,) = search_windows([shard], example, published_metric(), 1)
+    assert (hit.run, abs(hit.row - 30) <= 1) == (2, True)
+
+
+def test_missing_joints_and_unusable_metrics_are_told(tmp_path: Path) -> None:
+    rows = random_run(np.random.default_rng(1), 60, 0.02)
+    shard = searched(tmp_path, [rows, rows], present=[ALL, 1])  # the second clip has a head alone
+    example = Example(PoseFeatures(rows[:1], np.ones(15, np.bool_)), sample_offsets(0.0))
+    assert {hit.run for hit in search_windows([shard], example, published_metric(), 10)} == {0}
+    assert search_windows([], example, published_metric(), 10) == []
+    headless = Example(PoseFeatures(rows[:1], np.zeros(15, np.bool_)), sample_offsets(0.0))
+    with pytest.raises(MotionError, match="none of the joints"):
+        search_windows([shard], headless, published_metric(), 1)
+    metric = published_metric()
+    turned = PerceptualMetric("t", metric.components, metric.shares, root_alignment="kovar2d")
+    with pytest.raises(MotionError, match="superposes"):
+        search_windows([shard], example, turned, 1)
+    (tmp_path / "cut").write_bytes((tmp_path / "s").read_bytes()[:-4])
+    with pytest.raises(MotionError, match="is no shard"):
+        Shard.open(tmp_path / "cut", np.array([60, 60]), np.array([ALL, ALL]))
+
+
+def test_samples_of_a_window_are_whole_steps_apart() -> None:
+    for seconds in (0.0, 0.05, 0.1, 1.0, 3.1, 3.3, 60.0):
+        offsets = sample_offsets(seconds)
+        assert offsets[0] == 0
+        assert len(offsets) <= 32
+        assert set(np.diff(offsets) % 3) <= {0}
+        assert offsets[-1] <= seconds * INDEX_RATE_HZ + 1e-6
