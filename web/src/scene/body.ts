@@ -1,0 +1,80 @@
+/** Shape of a mannequin for any skeleton, derived from the lengths of its bones alone; no drawn asset is needed. */
+import { Clip } from "../motion/clip";
+import { Kinematics } from "../motion/kinematics";
+import type { Skeleton } from "../motion/skeleton";
+
+/** Part of a body between a point and its parent. */
+export interface Limb {
+  from: number;
+  to: number;
+  radius: number;
+}
+
+export interface Ball {
+  point: number;
+  radius: number;
+}
+
+export interface Body {
+  limbs: Limb[];
+  balls: Ball[];
+  /** Height of the body at rest, in metres. */
+  height: number;
+}
+
+const SHORTEST_LIMB = 1e-3;
+/** Radius of a limb that carries one metre of bones; limbs that carry more are thicker, like the branches of a tree. */
+const RADIUS_OF_A_METRE = 0.054;
+const STANDARD_HEIGHT = 1.75;
+
+/** Return the shape of a mannequin with the bones of a skeleton. */
+export function shapeBody(skeleton: Skeleton): Body {
+  const rest = restPositions(skeleton);
+  const heights = Array.from({ length: skeleton.pointCount }, (_, point) => rest[3 * point + 1]!);
+  const spread = [0, 1, 2].map((axis) => extent(rest, axis));
+  const height = Math.max(extent(rest, 1), 0.5 * Math.max(...spread), 1e-3);
+  const scale = height / STANDARD_HEIGHT;
+  const carried = skeleton.subtreeLengths();
+  const limbs: Limb[] = [];
+  for (let point = 1; point < skeleton.pointCount; point++) {
+    const length = skeleton.boneLength(point);
+    if (length < SHORTEST_LIMB * scale) continue;
+    const thickness = RADIUS_OF_A_METRE * Math.sqrt(carried[point]! / scale) * scale;
+    const radius = Math.min(thickness, 0.085 * scale, 0.42 * length + 0.01 * scale);
+    limbs.push({ from: skeleton.parents[point]!, to: point, radius: Math.max(radius, 0.007 * scale) });
+  }
+  const balls = limbs.filter((limb) => limb.to < skeleton.jointCount).map((limb) => ({ point: limb.to, radius: 0.82 * limb.radius }));
+  for (const hub of hubs(skeleton)) balls.push({ point: hub, radius: 0.095 * scale });
+  const top = skeleton.head >= 0 ? skeleton.head : heights.indexOf(Math.max(...heights));
+  const neck = skeleton.parents[top]!;
+  const crown = skeleton.parents.findIndex((parent, point) => parent === top && point > top);
+  balls.push({ point: crown >= 0 && skeleton.boneLength(crown) < 0.3 * scale ? crown : top, radius: 0.1 * scale });
+  if (neck >= 0 && crown >= 0) balls.push({ point: top, radius: 0.075 * scale });
+  return { limbs, balls, height };
+}
+
+/** Joints from which at least three bones branch off: pelvis and chest. */
+function hubs(skeleton: Skeleton): number[] {
+  const carried = skeleton.subtreeLengths();
+  const total = carried[0]!;
+  const branches = new Map<number, number>();
+  skeleton.parents.forEach((parent, point) => {
+    if (carried[point]! > 0.06 * total) branches.set(parent, (branches.get(parent) ?? 0) + 1);
+  });
+  return [...branches].filter(([joint, count]) => joint >= 0 && count >= 3).map(([joint]) => joint);
+}
+
+function restPositions(skeleton: Skeleton): Float64Array {
+  const poses = Float32Array.from([...skeleton.offsets.subarray(0, 3), ...skeleton.restRotations]);
+  return new Kinematics(new Clip("rest", skeleton, 1, skeleton.names, poses)).update(0);
+}
+
+function extent(positions: Float64Array, axis: number): number {
+  let least = Infinity;
+  let most = -Infinity;
+  for (let at = axis; at < positions.length; at += 3) {
+    least = Math.min(least, positions[at]!);
+    most = Math.max(most, positions[at]!);
+  }
+  return most - least;
+}
