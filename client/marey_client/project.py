@@ -39,6 +39,7 @@ from marey_client.requests import (
 from marey_client.transport import Params, as_json, read_model
 from marey_schemas.access import Project, ProjectChange, ProjectQuotaChange, ProjectQuotasInUse
 from marey_schemas.audit import AuditEntry
+from marey_schemas.browser_sessions import BrowserLink
 from marey_schemas.datasets.naming import MAIN
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.job_params import (
@@ -100,6 +101,10 @@ class ProjectHandle(ProjectItems):
     def restore(self) -> Project:
         """Restore the deleted project."""
         return self.transport.post(Project, f"{self.url}/restore")
+
+    def browser_link(self) -> BrowserLink:
+        """Create a code that signs one browser in, once, to read the project; append it to an address after `#`."""
+        return self.transport.post(BrowserLink, f"{self.url}/browser-links", repeatable=False)
 
     # -- what it holds -------------------------------------------------------------------------------------------------
 

@@ -2,8 +2,8 @@
 
 `marey_<prefix>_<secret>` belongs to a user; the prefix identifies the token's row in the database.
 `mareyjob_<secret>_<seal>` belongs to an attempt of a job; the seal shows that a server issued it (see `is_sealed`).
-`mareyinvite_<prefix>_<secret>` is the code of an invitation. The database stores the SHA-256 of the secret. A secret
-has 256 random bits, so a slow hash is not needed.
+`mareyinvite_<prefix>_<secret>` is the code of an invitation, `mareyview_<prefix>_<secret>` that of a link to a project.
+The database stores the SHA-256 of the secret. A secret has 256 random bits, so a slow hash is not needed.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import hmac
 import secrets
 from typing import NamedTuple
 
+from marey_schemas.browser_sessions import CODE_PREFIX as VIEW_PREFIX
 from marey_schemas.invitations import CODE_PREFIX
 
 _USER = "marey_"
@@ -130,6 +131,11 @@ def split_user_token(text: str) -> tuple[str, str] | None:
 def split_invitation(text: str) -> tuple[str, str] | None:
     """Return prefix and secret of the code of an invitation, or None if `text` is no such code."""
     return _split(text, CODE_PREFIX)
+
+
+def split_view_code(text: str) -> tuple[str, str] | None:
+    """Return prefix and secret of the code of a link to a project, or None if `text` is no such code."""
+    return _split(text, VIEW_PREFIX)
 
 
 def _split(text: str, start: str) -> tuple[str, str] | None:

@@ -5,6 +5,7 @@ from marey_server.handlers import (
     annotations,
     audit,
     blobs,
+    browser_sessions,
     collections,
     coverage_streams,
     documentation,
@@ -17,6 +18,7 @@ from marey_server.handlers import (
     imports,
     invitations,
     items,
+    pages,
     parts,
     projects,
     purges,
@@ -33,6 +35,7 @@ from marey_server.http.resource import Resource
 RESOURCES: tuple[type[Resource], ...] = (
     *access.RESOURCES,
     *identities.RESOURCES,
+    *browser_sessions.RESOURCES,
     *projects.RESOURCES,
     *invitations.RESOURCES,
     *collections.RESOURCES,
@@ -63,5 +66,6 @@ RESOURCES: tuple[type[Resource], ...] = (
     *audit.RESOURCES,
     *webhooks.RESOURCES,
     *documentation.RESOURCES,
+    *pages.RESOURCES,
     *health.RESOURCES,
 )

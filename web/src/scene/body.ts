@@ -35,21 +35,22 @@ export function shapeBody(skeleton: Skeleton): Body {
   const height = Math.max(extent(rest, 1), 0.5 * Math.max(...spread), 1e-3);
   const scale = height / STANDARD_HEIGHT;
   const carried = skeleton.subtreeLengths();
+  const top = skeleton.head >= 0 ? skeleton.head : heights.indexOf(Math.max(...heights));
+  const crown = skeleton.parents.findIndex((parent, point) => parent === top && skeleton.boneLength(point) > 0.02 * scale);
   const limbs: Limb[] = [];
   for (let point = 1; point < skeleton.pointCount; point++) {
     const length = skeleton.boneLength(point);
-    if (length < SHORTEST_LIMB * scale) continue;
+    if (length < SHORTEST_LIMB * scale || point === crown) continue;
+    const isTrunk = skeleton.sides[point] === "centre" && carried[point]! > 1.2 * scale;
     const thickness = RADIUS_OF_A_METRE * Math.sqrt(carried[point]! / scale) * scale;
-    const radius = Math.min(thickness, 0.085 * scale, 0.42 * length + 0.01 * scale);
+    const radius = isTrunk ? 0.1 * scale : Math.min(thickness, 0.075 * scale, 0.42 * length + 0.01 * scale);
     limbs.push({ from: skeleton.parents[point]!, to: point, radius: Math.max(radius, 0.007 * scale) });
   }
-  const balls = limbs.filter((limb) => limb.to < skeleton.jointCount).map((limb) => ({ point: limb.to, radius: 0.82 * limb.radius }));
-  for (const hub of hubs(skeleton)) balls.push({ point: hub, radius: 0.095 * scale });
-  const top = skeleton.head >= 0 ? skeleton.head : heights.indexOf(Math.max(...heights));
-  const neck = skeleton.parents[top]!;
-  const crown = skeleton.parents.findIndex((parent, point) => parent === top && point > top);
-  balls.push({ point: crown >= 0 && skeleton.boneLength(crown) < 0.3 * scale ? crown : top, radius: 0.1 * scale });
-  if (neck >= 0 && crown >= 0) balls.push({ point: top, radius: 0.075 * scale });
+  const balls: Ball[] = limbs
+    .filter((limb) => limb.to < skeleton.jointCount)
+    .map((limb) => ({ from: limb.to, to: limb.to, radius: 0.82 * limb.radius }));
+  for (const hub of hubs(skeleton)) balls.push({ from: hub, to: hub, radius: 0.11 * scale });
+  balls.push({ from: top, to: crown < 0 ? top : crown, radius: 0.105 * scale });
   return { limbs, balls, height };
 }
 

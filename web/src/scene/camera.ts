@@ -10,7 +10,7 @@ export class OrbitCamera {
   yaw = 35;
   pitch = 12;
   /** Distance from the figure in units of its height. */
-  distance = 2.6;
+  distance = 3;
   /** Shift of the point that the camera looks at, in metres. */
   shift: [number, number, number] = [0, 0, 0];
   /** Whether the camera moves along with the root of the figure. */

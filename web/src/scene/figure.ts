@@ -5,6 +5,7 @@ import {
 } from "three";
 import type { Side } from "../motion/skeleton";
 import type { Actor, Look } from "./actor";
+import type { Limb } from "./body";
 import type { Palette } from "./stage";
 
 const UP = new Vector3(0, 1, 0);
@@ -20,7 +21,7 @@ export class Figure {
   constructor(readonly actor: Actor) {
     this.looks = { skeleton: skeletonOf(actor), mannequin: mannequinOf(actor) };
     this.marks = actor.clip.skeleton.feet.map(() => {
-      const mark = new Mesh(new RingGeometry(0.05 * actor.body.height, 0.062 * actor.body.height, 28), new MeshBasicMaterial());
+      const mark = new Mesh(new RingGeometry(0.036 * actor.body.height, 0.046 * actor.body.height, 28), new MeshBasicMaterial());
       mark.rotation.x = -Math.PI / 2;
       return mark;
     });
@@ -58,12 +59,6 @@ export class Figure {
   }
 }
 
-interface Piece {
-  from: number;
-  to: number;
-  radius: number;
-}
-
 /** Limbs and balls of one look, with their shadow on the ground. */
 class Drawn {
   readonly group = new Group();
@@ -78,7 +73,7 @@ class Drawn {
   private readonly turned = new Quaternion();
 
   constructor(
-    limb: BufferGeometry, ball: BufferGeometry, private readonly limbPieces: Piece[], private readonly ballPieces: Piece[],
+    limb: BufferGeometry, ball: BufferGeometry, private readonly limbPieces: Limb[], private readonly ballPieces: Limb[],
     flat: boolean,
   ) {
     this.limbs = new InstancedMesh(limb, new MeshLambertMaterial({ flatShading: flat }), limbPieces.length);
@@ -105,7 +100,8 @@ class Drawn {
       this.limbs.setMatrixAt(index, this.matrix);
     });
     this.ballPieces.forEach((piece, index) => {
-      this.start.fromArray(positions, 3 * piece.to);
+      this.start.fromArray(positions, 3 * piece.from);
+      this.start.add(this.end.fromArray(positions, 3 * piece.to)).multiplyScalar(0.5);
       this.matrix.makeScale(piece.radius, piece.radius, piece.radius).setPosition(this.start);
       this.balls.setMatrixAt(index, this.matrix);
     });
@@ -134,14 +130,13 @@ class Drawn {
 function skeletonOf(actor: Actor): Drawn {
   const thick = 0.011 * actor.body.height;
   const limbs = actor.body.limbs.map((limb) => ({ ...limb, radius: Math.min(thick, 3 * limb.radius) }));
-  const { jointCount, parents } = actor.clip.skeleton;
-  const balls = Array.from({ length: jointCount }, (_, joint) => ({ from: parents[joint]!, to: joint, radius: 1.15 * thick }));
+  const { jointCount } = actor.clip.skeleton;
+  const balls = Array.from({ length: jointCount }, (_, joint) => ({ from: joint, to: joint, radius: 1.15 * thick }));
   const bone = new CylinderGeometry(0.35, 1, 1, 4, 1, true).translate(0, 0.5, 0);
   return new Drawn(bone, new OctahedronGeometry(1), limbs, balls, true);
 }
 
 function mannequinOf(actor: Actor): Drawn {
   const outline = OUTLINE.map(([radius, height]) => new Vector2(radius, height));
-  const balls = actor.body.balls.map((ball) => ({ from: ball.point, to: ball.point, radius: ball.radius }));
-  return new Drawn(new LatheGeometry(outline, 12), new SphereGeometry(1, 16, 12), actor.body.limbs, balls, false);
+  return new Drawn(new LatheGeometry(outline, 12), new SphereGeometry(1, 16, 12), actor.body.limbs, actor.body.balls, false);
 }
