@@ -10,8 +10,10 @@ export interface Limb {
   radius: number;
 }
 
+/** Ball halfway between two points. */
 export interface Ball {
-  point: number;
+  from: number;
+  to: number;
   radius: number;
 }
 

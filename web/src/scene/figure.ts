@@ -138,5 +138,5 @@ function skeletonOf(actor: Actor): Drawn {
 
 function mannequinOf(actor: Actor): Drawn {
   const outline = OUTLINE.map(([radius, height]) => new Vector2(radius, height));
-  return new Drawn(new LatheGeometry(outline, 12), new SphereGeometry(1, 16, 12), actor.body.limbs, actor.body.balls, false);
+  return new Drawn(new LatheGeometry(outline, 10), new SphereGeometry(1, 12, 9), actor.body.limbs, actor.body.balls, false);
 }

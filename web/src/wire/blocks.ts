@@ -48,8 +48,11 @@ export function decodeBlocks(data: Uint8Array): DecodedArray {
   if (end + 4 > data.length) throw new RangeError("the data ends inside the index of its tiles");
   if (crc32(data.subarray(0, end)) !== view.getUint32(end, true)) throw new RangeError("the checksum of the header is wrong");
 
-  const values = new Float32Array(frames * columns);
   let start = end + 4;
+  let total = start;
+  for (let tile = 0; tile < count; tile++) total += view.getUint32(table + 4 * tile, true);
+  if (total !== data.length) throw new RangeError(`the data has ${data.length} bytes, but its index requires ${total}`);
+  const values = new Float32Array(frames * columns);
   for (let tile = 0; tile < count; tile++) {
     const stop = start + view.getUint32(table + 4 * tile, true);
     const firstFrame = Math.floor(tile / groups) * blockFrames;
@@ -58,7 +61,6 @@ export function decodeBlocks(data: Uint8Array): DecodedArray {
       frames: Math.min(blockFrames, frames - firstFrame),
       columns: Math.min(groupColumns, columns - firstColumn),
     };
-    if (stop > data.length) throw new RangeError("the data is shorter than its index says");
     const rows = unpack(data.subarray(start, stop), size);
     for (let frame = 0; frame < size.frames; frame++) {
       const row = rows.subarray(frame * size.columns, (frame + 1) * size.columns);
@@ -66,7 +68,6 @@ export function decodeBlocks(data: Uint8Array): DecodedArray {
     }
     start = stop;
   }
-  if (start !== data.length) throw new RangeError("the data is longer than its index says");
   return { shape, values };
 }
 
