@@ -53,6 +53,7 @@ web: $(VENV)/.installed-dev ## The browser pages, which need Node 20.19 or newer
 
 web-test: web ## Types and tests of the browser pages
 	npm --prefix web run check
+	$(BIN)/python -m tests.support.web_cases web/tests/cases
 	npm --prefix web test
 	npm --prefix web run sizes
 

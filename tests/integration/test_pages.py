@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import httpx
 import numpy as np
 import pytest
 from hatch_build import SOURCES
+from tests.support.database_fixtures import copied_sqlite
 from tests.support.rest_server import Server, running
 from tests.support.tiers import chromium
 from tests.support.web_cases import write_cases
@@ -127,9 +129,9 @@ def test_pages_are_revalidated_their_files_kept_and_their_addresses_relative(
 
 
 @pytest.fixture
-def shown(sqlite_database: Database, tmp_path: Path) -> Iterator[tuple[Server, httpx.Client]]:
-    """A server for a browser, and its owner's client; one database is enough for tests of pages."""
-    with running(sqlite_database, tmp_path) as server:
+def shown(sqlite_template: Path, tmp_path: Path) -> Iterator[tuple[Server, httpx.Client]]:
+    """A server for a browser, and its owner's client; one kind of database is enough for tests of pages."""
+    with closing(Database(copied_sqlite(sqlite_template, tmp_path))) as database, running(database, tmp_path) as server:
         yield server, server.client(server.make_project())
 
 
@@ -153,10 +155,10 @@ def test_the_pages_work_in_a_browser(shown: tuple[Server, httpx.Client], tmp_pat
 def _takes(folder: Path) -> list[Path]:
     """Return a real take, if there is real motion capture, and a generated one."""
     walk = folder / "walk.bvh"
-    walk.write_text(write_bvh(generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.3, duration_s=3.0)))
+    walk.write_bytes(write_bvh(generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.3, duration_s=3.0)))
     real = Path(os.environ.get("MAREY_TEST_MOCAP", "")) / "cmu-bvh" / "10_01.bvh"
     turn = folder / "turn.bvh"
-    turn.write_text(write_bvh(generate_gait(speed_m_s=0.8, turn_rate_rad_s=-0.9, duration_s=2.0)))
+    turn.write_bytes(write_bvh(generate_gait(speed_m_s=0.8, turn_rate_rad_s=-0.9, duration_s=2.0)))
     return [real if real.is_file() else turn, walk]
 
 

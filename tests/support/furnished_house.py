@@ -226,8 +226,8 @@ def build_house(people: People) -> House:
     variables |= {
         "project": "lab", "kind": "clips", "part": "info", "revision": "1", "user": "reader", "job": running["job"],
         "fence": str(running["fence"]), "digest": SECRET_DIGEST, "job_kind": "import", "figure": "offsets",
-        "stream": stream.json()["id"], "asset": "file-of-nobody.js", "token": "token_of_nobody", "sign_in": "sign_in_of_nobody",
-        "identity": "identity_of_nobody", "upload": "upload_of_nobody",
+        "stream": stream.json()["id"], "token": "token_of_nobody", "sign_in": "sign_in_of_nobody",
+        "identity": "identity_of_nobody", "upload": "upload_of_nobody", "asset": "file-of-nobody.js",
     }  # fmt: skip
     return House(people, tokens, variables)
 

@@ -1,4 +1,7 @@
-"""Files with which the tests of the browser pages compare their decoder and their kinematics: `python -m ... FOLDER`."""
+"""Files with which the tests of the browser pages compare their decoder and their kinematics.
+
+`python -m tests.support.web_cases web/tests/cases` writes them for `npm test`.
+"""
 
 from __future__ import annotations
 

@@ -39,7 +39,8 @@ def view(
         typer.Option(help="Another clip of the project to show beside it, or `source`: the clip it was made from."),
     ] = None,
     browser: Annotated[
-        bool, typer.Option("--browser", help="Open the page in the browser of this machine; default: print its address.")
+        bool,
+        typer.Option("--browser", help="Open the page in a browser of this machine; default: print its address."),
     ] = False,
 ) -> None:
     """Show a clip in a browser. The address signs one browser in, once, within two minutes."""

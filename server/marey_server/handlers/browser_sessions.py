@@ -26,9 +26,7 @@ class BrowserLinks(Resource):
     @reads(access=Access.READER, answer=BrowserLink, status=201, public=False)
     async def post(self, project: str) -> Rendered:
         """Create a link that signs one browser in, once, within two minutes; the browser may then read the project."""
-        return await self.answer_with(
-            lambda made: Reply(made, headers=WITH_SECRET), browser_links.create_link, project
-        )
+        return await self.answer_with(lambda made: Reply(made, headers=WITH_SECRET), browser_links.create_link, project)
 
 
 class BrowserSessions(PasswordResource):
