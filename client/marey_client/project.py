@@ -39,7 +39,6 @@ from marey_client.requests import (
 from marey_client.transport import Params, as_json, read_model
 from marey_schemas.access import Project, ProjectChange, ProjectQuotaChange, ProjectQuotasInUse
 from marey_schemas.audit import AuditEntry
-from marey_schemas.browser_sessions import BrowserLink
 from marey_schemas.datasets.naming import MAIN
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.job_params import (
@@ -53,6 +52,7 @@ from marey_schemas.queue.job_params import (
 from marey_schemas.queue.jobs import CacheMode, Job, JobCreate
 from marey_schemas.queue.model_pipelines import model_pipeline
 from marey_schemas.queue.pipelines import PipelineCreate
+from marey_schemas.sign_ins import BrowserLink
 
 CommitTo = OutputsCommit | str | None
 """Branch and folder to which a job commits its results, as `OutputsCommit` or as `dataset[@branch][/folder]`."""

@@ -25,7 +25,7 @@ from marey_motion.formats import write_bvh
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree
-from marey_server.handlers import pages
+from marey_server.handlers.browser import pages
 from marey_server.store.database.connections import Database
 
 OWN_PAGE = {"Sec-Fetch-Site": "same-origin"}
@@ -174,8 +174,9 @@ def _positions(owner: httpx.Client, clip: str) -> dict[str, list[float]]:
     def read(path: str) -> Any:
         return decode_tree(owner.get(path, headers={"Accept": MSGPACK}).content, MSGPACK)
 
-    motion = MotionDocument.model_validate(read(f"/projects/lab/clips/{clip}/parts/motion"))
-    skeleton = owner.get(f"/projects/lab/skeletons/{motion.skeleton.item}/parts/hierarchy").json()
+    tree = read(f"/projects/lab/clips/{clip}/parts/motion")
+    motion = MotionDocument.model_validate(tree)
+    skeleton = owner.get(f"/projects/lab/skeletons/{tree['skeleton']['item']}/parts/hierarchy").json()
     take = clip_from_document(motion, skeleton_from_document(SkeletonHierarchy.model_validate(skeleton)))
     positions = global_positions(take).astype(np.float64)
     return {str(frame): positions[frame].ravel().tolist() for frame in (0, 17, take.frame_count - 1)}

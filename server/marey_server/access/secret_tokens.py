@@ -13,8 +13,8 @@ import hmac
 import secrets
 from typing import NamedTuple
 
-from marey_schemas.browser_sessions import CODE_PREFIX as VIEW_PREFIX
 from marey_schemas.invitations import CODE_PREFIX
+from marey_schemas.sign_ins import VIEW_PREFIX
 
 _USER = "marey_"
 _ATTEMPT = "mareyjob_"

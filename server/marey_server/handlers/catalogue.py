@@ -5,7 +5,6 @@ from marey_server.handlers import (
     annotations,
     audit,
     blobs,
-    browser_sessions,
     collections,
     coverage_streams,
     documentation,
@@ -18,7 +17,6 @@ from marey_server.handlers import (
     imports,
     invitations,
     items,
-    pages,
     parts,
     projects,
     purges,
@@ -28,6 +26,7 @@ from marey_server.handlers import (
     uploads,
     webhooks,
 )
+from marey_server.handlers.browser import pages, sessions
 from marey_server.handlers.queue import jobs, leases, pipelines, schedules, scripts
 from marey_server.handlers.versions import contents, datasets, differences, proposals
 from marey_server.http.resource import Resource
@@ -35,7 +34,7 @@ from marey_server.http.resource import Resource
 RESOURCES: tuple[type[Resource], ...] = (
     *access.RESOURCES,
     *identities.RESOURCES,
-    *browser_sessions.RESOURCES,
+    *sessions.RESOURCES,
     *projects.RESOURCES,
     *invitations.RESOURCES,
     *collections.RESOURCES,

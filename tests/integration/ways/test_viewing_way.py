@@ -25,7 +25,12 @@ def test_the_commands_of_the_page_give_addresses_whose_codes_open_the_project(
     clips = {clip.path: clip.id for clip in project_with_version.clips.list()}
     walk, turn, studio = (clips[f"gaits/{name}"] for name in ("raw/walk", "raw/turn", "studio/walk"))
     opened: list[Path] = []
-    monkeypatch.setattr(webbrowser, "open", lambda url: opened.append(Path(unquote(urlsplit(url).path))) or True)
+
+    def browse(url: str) -> bool:
+        opened.append(Path(unquote(urlsplit(url).path)))
+        return True
+
+    monkeypatch.setattr(webbrowser, "open", browse)
     lines = re.search(r"```sh\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     assert lines is not None
     with_browser, *others = (shlex.split(line, comments=True)[1:] for line in lines[1].splitlines())

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from sqlalchemy import and_, delete, func, insert, select, update
 
-from marey_schemas.browser_sessions import CODE_PREFIX, BrowserLink, BrowserSession
+from marey_schemas.sign_ins import VIEW_PREFIX, BrowserLink, BrowserSession
 from marey_server.access.scopes import projects_of
 from marey_server.access.secret_tokens import hash_secret, issue_prefix, issue_user_token, split_view_code
 from marey_server.errors import NotFoundProblem, QuotaExceededProblem
@@ -63,7 +63,7 @@ def create_link(tx: Transaction, project: str) -> BrowserLink:
     tx.execute(insert(token).values(**row))
     about = tx.principal.require_user_name()
     tx.audit("token.created", str(row["id"]), about=about, name=_NAME, scopes=row["scopes"], session=True)
-    return BrowserLink(code=f"{CODE_PREFIX}{prefix}_{secret}", expires_at=datetime_of(expires_us))
+    return BrowserLink(code=f"{VIEW_PREFIX}{prefix}_{secret}", expires_at=datetime_of(expires_us))
 
 
 def redeem_link(tx: Transaction, code: str, attempt: SignInTry) -> IssuedSession:
@@ -93,7 +93,7 @@ def redeem_link(tx: Transaction, code: str, attempt: SignInTry) -> IssuedSession
 
 def _hash(secret: str) -> str:
     """Return the stored hash of the secret of a code; it differs from that of a token with the same secret."""
-    return hash_secret(f"{CODE_PREFIX}{secret}")
+    return hash_secret(f"{VIEW_PREFIX}{secret}")
 
 
 def _invalid_link() -> NotFoundProblem:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from urllib.parse import urlsplit
 
-from marey_schemas.browser_sessions import BrowserLink, BrowserSession, BrowserSessionCreate
+from marey_schemas.sign_ins import BrowserLink, BrowserSession, BrowserSessionCreate
 from marey_server.access.secret_tokens import split_view_code
 from marey_server.handlers.access import MAX_LOGIN_BYTES, PasswordResource
 from marey_server.http.browser_cookies import cookie_name, require_own_page

@@ -24,7 +24,7 @@ from marey_server.http.declarations import Access, Bytes, reads
 from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
 
-FOLDER = Path(__file__).parents[1] / "webui"
+FOLDER = Path(__file__).parents[2] / "webui"
 """Folder that the build of `web/` writes."""
 _BASE = b'<base href="./" />'
 _POLICY = (
@@ -88,7 +88,7 @@ class WebPage(Resource):
 
 
 class ViewQuery(Request):
-    """What the page that shows clips reads from its address; the server does not read it."""
+    """Parameters in the address of the page that shows clips; only the page reads them."""
 
     model_config = ConfigDict(extra="ignore")
 
