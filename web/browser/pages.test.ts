@@ -69,7 +69,7 @@ async function picture(where: Page, name: string): Promise<void> {
 }
 
 async function faults(where: Page): Promise<string[]> {
-  await where.addScriptTag({ content: axe.source }).catch(() => where.evaluate(axe.source));
+  await where.evaluate(axe.source); // not as a script of the page, which the content security policy refuses
   const found = await where.evaluate(() => window.axe.run());
   return found.violations.map((one) => `${one.id}: ${one.nodes.map((node) => node.target.join(" ")).join(", ")}`);
 }
@@ -160,3 +160,79 @@ it("says what to do without a session, and for a link that was used", async () =
   expect(await faults(other)).toEqual([]);
   await stranger.close();
 });
+
+it("lets a participant give consent, compare four motions, reload and withdraw", async () => {
+  const study = await context.newPage();
+  const errors: string[] = [];
+  study.on("pageerror", (error) => errors.push(error.message));
+  const sent = await standIn(study);
+  await study.goto(`${new URL("/s/", page.url()).href}?test=1#mareystudy_abc_0123`);
+  await study.getByRole("heading", { name: "Walks" }).waitFor();
+  expect(study.url()).not.toContain("mareystudy_");
+  expect(await faults(study)).toEqual([]);
+  await picture(study, "study-consent");
+  await study.getByRole("button", { name: "I agree, begin" }).click();
+  await study.getByRole("button", { name: "Next (Space)" }).waitFor();
+  await picture(study, "study-between");
+  await study.keyboard.press("Space");
+  await study.getByRole("button", { name: "Figure 4" }).waitFor();
+  expect(await colours(study)).toBeGreaterThan(15);
+  expect(await faults(study)).toEqual([]);
+  await picture(study, "study-trial");
+  await study.setViewportSize({ width: 390, height: 844 });
+  await picture(study, "study-trial-390");
+  await study.keyboard.press("2");
+  await study.getByRole("button", { name: "Figure 3" }).click();
+  await study.getByText("comparison is left").waitFor();
+  expect(sent).toContainEqual(expect.objectContaining({ chosen: [1, 2] }));
+  await study.reload();
+  await study.getByText("comparison is left").waitFor();
+  await study.getByRole("button", { name: "Withdraw" }).click();
+  await study.getByRole("button", { name: "Delete them" }).click();
+  await study.getByText("Your answers are deleted").waitFor();
+  expect(await study.evaluate(() => localStorage.length)).toBe(0);
+  expect(errors).toEqual([]);
+  await study.close();
+});
+
+/** Answer the requests of a participant in place of the server, with the clips of the project; return the bodies sent. */
+async function standIn(where: Page): Promise<unknown[]> {
+  const sent: unknown[] = [];
+  const clips = ["clip", "beside"].map((name) => new URL(page.url()).searchParams.get(name)!.split("/") as [string, string]);
+  const server = new URL("/api/v1/", page.url()).href;
+  let answered = 0;
+  const state = () => ({
+    title: "Walks", clips: 2, trials: 2, answered, remaining: 2 - answered, shown: 4, seconds: 10, finished: answered === 2,
+  });
+  await where.route("**/api/v1/participation**", async (route) => {
+    const request = route.request();
+    const path = request.url().split("/participation")[1]!;
+    if (request.postData() !== null) sent.push(request.postDataJSON());
+    if (path === "/link") {
+      return route.fulfill({ json: { title: "Walks", consent_text: "One line.\nAnother.", clips: 2, trials: 2, shown: 4, seconds: 10 } });
+    }
+    if (path === "" && request.method() === "POST") return route.fulfill({ status: 201, json: { token: "mareyparticipant_a_b" } });
+    if (path === "" && request.method() === "DELETE") return route.fulfill({ status: 204 });
+    if (path === "/trials") {
+      return route.fulfill({ json: { finished: false, ...state(), trial: { number: 1, clips: [0, 1, 1, 0], seconds_left: 10 } } });
+    }
+    if (path.startsWith("/trials/")) {
+      answered += 1;
+      return route.fulfill({ json: { outcome: "answered", ...state() } });
+    }
+    const [, number, part] = /^\/clips\/(\d)\/(\w+)$/.exec(path) ?? [];
+    if (part === undefined) return route.fulfill({ json: state() });
+    return route.fulfill({ response: await context.request.get(await addressOf(server, clips[Number(number)]!, part), {
+      headers: { Accept: request.headers()["accept"]! },
+    }) });
+  });
+  return sent;
+}
+
+/** Return the address of a part of a clip of the project, or of its skeleton. */
+async function addressOf(server: string, [project, item]: [string, string], part: string): Promise<string> {
+  const motion = `${server}projects/${project}/clips/${item}/parts/motion`;
+  if (part === "motion") return motion;
+  const { skeleton } = (await (await context.request.get(`${motion}?frames=0:1`)).json()) as { skeleton: { item: string } };
+  return `${server}projects/${project}/skeletons/${skeleton.item}/parts/${part}`;
+}

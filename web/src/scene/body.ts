@@ -18,6 +18,9 @@ export interface Ball {
 }
 
 export interface Body {
+  /** All bones that have a length. */
+  bones: Limb[];
+  /** The limbs of a mannequin, which has a ball in place of the bone of the head. */
   limbs: Limb[];
   balls: Ball[];
   /** Height of the body at rest, in metres. */
@@ -39,21 +42,22 @@ export function shapeBody(skeleton: Skeleton): Body {
   const carried = skeleton.subtreeLengths();
   const top = skeleton.head >= 0 ? skeleton.head : heights.indexOf(Math.max(...heights));
   const crown = skeleton.parents.findIndex((parent, point) => parent === top && skeleton.boneLength(point) > 0.02 * scale);
-  const limbs: Limb[] = [];
+  const bones: Limb[] = [];
   for (let point = 1; point < skeleton.pointCount; point++) {
     const length = skeleton.boneLength(point);
-    if (length < SHORTEST_LIMB * scale || point === crown) continue;
+    if (length < SHORTEST_LIMB * scale) continue;
     const isTrunk = skeleton.sides[point] === "centre" && carried[point]! > 1.2 * scale;
     const thickness = RADIUS_OF_A_METRE * Math.sqrt(carried[point]! / scale) * scale;
     const radius = isTrunk ? 0.1 * scale : Math.min(thickness, 0.075 * scale, 0.42 * length + 0.01 * scale);
-    limbs.push({ from: skeleton.parents[point]!, to: point, radius: Math.max(radius, 0.007 * scale) });
+    bones.push({ from: skeleton.parents[point]!, to: point, radius: Math.max(radius, 0.007 * scale) });
   }
+  const limbs = bones.filter((bone) => bone.to !== crown);
   const balls: Ball[] = limbs
     .filter((limb) => limb.to < skeleton.jointCount)
     .map((limb) => ({ from: limb.to, to: limb.to, radius: 0.82 * limb.radius }));
   for (const hub of hubs(skeleton)) balls.push({ from: hub, to: hub, radius: 0.11 * scale });
   balls.push({ from: top, to: crown < 0 ? top : crown, radius: 0.105 * scale });
-  return { limbs, balls, height };
+  return { bones, limbs, balls, height };
 }
 
 /** Joints from which at least three bones branch off: pelvis and chest. */

@@ -129,7 +129,7 @@ class Drawn {
 /** Octahedra at the joints and four-sided bones: 16 triangles for each joint. */
 function skeletonOf(actor: Actor): Drawn {
   const thick = 0.011 * actor.body.height;
-  const limbs = actor.body.limbs.map((limb) => ({ ...limb, radius: Math.min(thick, 3 * limb.radius) }));
+  const limbs = actor.body.bones.map((bone) => ({ ...bone, radius: Math.min(thick, 3 * bone.radius) }));
   const { jointCount } = actor.clip.skeleton;
   const balls = Array.from({ length: jointCount }, (_, joint) => ({ from: joint, to: joint, radius: 1.15 * thick }));
   const bone = new CylinderGeometry(0.35, 1, 1, 4, 1, true).translate(0, 0.5, 0);

@@ -64,7 +64,7 @@ export class SideViewStage implements Stage {
     const ground = scale * (cy + camera.shift[1]);
     this.line(palette.grid, 1, [-wide, ground], [wide, ground]);
     context.lineCap = "round";
-    for (const limb of actor.body.limbs) {
+    for (const limb of actor.body.bones) {
       const side = skeleton.sides[limb.to];
       const colour = side === "left" ? palette.left : side === "right" ? palette.right : palette.bone;
       this.line(colour, Math.max(2, 0.5 * scale * limb.radius), place(limb.from), place(limb.to));
