@@ -214,7 +214,7 @@ async function standIn(where: Page): Promise<unknown[]> {
     if (path === "" && request.method() === "POST") return route.fulfill({ status: 201, json: { token: "mareyparticipant_a_b" } });
     if (path === "" && request.method() === "DELETE") return route.fulfill({ status: 204 });
     if (path === "/trials") {
-      return route.fulfill({ json: { finished: false, ...state(), trial: { number: 1, clips: [0, 1, 1, 0], seconds_left: 10 } } });
+      return route.fulfill({ json: { ...state(), trial: { number: 1, clips: [0, 1, 1, 0], seconds_left: 10 } } });
     }
     if (path.startsWith("/trials/")) {
       answered += 1;

@@ -87,10 +87,14 @@ class WebPage(Resource):
         return Reply(content, rev=rev, media_type=BROWSER, headers={"Content-Security-Policy": _POLICY})
 
 
-class ViewQuery(Request):
-    """Parameters in the address of the page that shows clips; only the page reads them."""
+class AnyQuery(Request):
+    """Parameters in the address of a page; the page reads them, and the server ignores them."""
 
     model_config = ConfigDict(extra="ignore")
+
+
+class ViewQuery(AnyQuery):
+    """Parameters in the address of the page that shows clips."""
 
     clip: str | None = Field(None, description="The clip: `project/item`, or `project/item@revision`.")
     beside: str | None = Field(None, description="Another clip, to be shown on the same clock.")
@@ -126,10 +130,10 @@ class ParticipantPage(WebPage):
     to_root = b"../"
 
     @reads(
-        access=Access.ANYONE, scope=None, answer=Bytes, answer_types=("text/html",), also=((404, None),),
-        for_browsers=True,
+        access=Access.ANYONE, scope=None, query=AnyQuery, answer=Bytes, answer_types=("text/html",),
+        also=((404, None),), for_browsers=True,
     )  # fmt: skip
-    async def get(self) -> Reply:
+    async def get(self, query: AnyQuery) -> Reply:  # noqa: ARG002 - the page itself reads it
         """Return the page on which a participant compares motions."""
         return await self.document()
 
