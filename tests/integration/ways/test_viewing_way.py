@@ -21,9 +21,9 @@ PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "look-at-motion.md"
 def test_the_commands_of_the_page_give_addresses_whose_codes_open_the_project(
     run: CommandLine, project_with_version: ProjectHandle, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run("retarget", "lab/gaits/raw/walk", "--to", "lab/skeletons/target", "--into", "gaits/studio")
+    run("retarget", "lab/gaits/raw/walk", "--to", "lab/skeletons/target", "--into", "studio")
     clips = {clip.path: clip.id for clip in project_with_version.clips.list()}
-    walk, turn, studio = (clips[f"gaits/{name}"] for name in ("raw/walk", "raw/turn", "studio/walk"))
+    walk, turn, studio = (clips[path] for path in ("gaits/raw/walk", "gaits/raw/turn", "studio/gaits/raw/walk"))
     opened: list[Path] = []
 
     def browse(url: str) -> bool:
