@@ -137,6 +137,7 @@ def shown(sqlite_template: Path, tmp_path: Path) -> Iterator[tuple[Server, httpx
 
 
 @pytest.mark.chromium
+@pytest.mark.slow
 def test_the_pages_work_in_a_browser(shown: tuple[Server, httpx.Client], tmp_path: Path) -> None:
     server, owner = shown
     names = [_upload(owner, file) for file in _takes(tmp_path)]

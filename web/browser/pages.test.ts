@@ -163,6 +163,7 @@ it("says what to do without a session, and for a link that was used", async () =
 
 it("lets a participant give consent, compare four motions, reload and withdraw", async () => {
   const study = await context.newPage();
+  await study.setViewportSize({ width: 640, height: 480 }); // four figures without a graphics processor
   const errors: string[] = [];
   study.on("pageerror", (error) => errors.push(error.message));
   const sent = await standIn(study);
