@@ -15,8 +15,11 @@ PYTEST := $(BIN)/python -m pytest -q --dist loadgroup $(ARGS)
 # One process more than two processors: tests of faults wait, for leases to end or processes to start. All others compute.
 PROCESSES ?= 3
 
+# Where npm is missing, or cannot install packages, tests that need the pages are left out and counted.
+PAGES_IF_POSSIBLE := command -v npm > /dev/null && $(BIN)/python hatch_build.py || true
+
 .DEFAULT_GOAL := help
-.PHONY: help installed demo check test soak lint format dev bench docs pins audit bom clean
+.PHONY: help installed web web-test demo check test soak lint format dev bench docs pins audit bom clean
 
 help: ## Show what can be made
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -45,14 +48,27 @@ demo: $(VENV)/.installed-all ## From takes to an evaluated, reported dataset; DA
 dev: $(VENV)/.installed-dev ## A server and a worker on this machine, with data in ./marey-data
 	$(BIN)/marey serve
 
+web: $(VENV)/.installed-dev ## The browser pages, which need Node 20.19 or newer
+	$(BIN)/python hatch_build.py
+
+web-test: web ## Types and tests of the browser pages
+	npm --prefix web run check
+	$(BIN)/python -m tests.support.web_cases web/tests/cases
+	npm --prefix web test
+	npm --prefix web run sizes
+
 check: $(VENV)/.installed-dev lint ## In 4 minutes: lint, types, units, REST on SQLite, one whole way
+	$(PAGES_IF_POSSIBLE)
 	$(PYTEST) -n auto --tier check tests
 
 test: $(VENV)/.installed-dev lint ## In 15 minutes: everything a change can break, on SQLite and on Postgres
+	$(PAGES_IF_POSSIBLE)
 	$(PYTEST) -n $(PROCESSES) --tier test tests
 
 soak: $(VENV)/.installed-dev lint ## Long forms of all tests, on both databases; EFFORT=20 for more examples, in hours
 	tests/support/install_slurm.sh
+	tests/support/install_chromium.sh
+	$(PAGES_IF_POSSIBLE)
 	$(PYTEST) -n $(PROCESSES) --tier soak --effort $(EFFORT) -o timeout=7200 --durations=25 tests
 	$(BIN)/python -m tests.support.motion_fuzz $$((300 * $(EFFORT)))
 	$(BIN)/python -m tests.support.hostile_figures
@@ -92,4 +108,4 @@ bom: $(VENV)/.installed-audit ## Bill of materials of what users run, as Cyclone
 	@echo marey-bom.json
 
 clean: ## Remove the environment and what tools leave behind
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis marey-demo marey-bom.json
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis marey-demo marey-bom.json web/node_modules server/marey_server/webui

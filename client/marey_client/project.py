@@ -56,6 +56,7 @@ from marey_schemas.queue.job_params import (
 from marey_schemas.queue.jobs import CacheMode, Job, JobCreate
 from marey_schemas.queue.model_pipelines import model_pipeline
 from marey_schemas.queue.pipelines import PipelineCreate
+from marey_schemas.sign_ins import BrowserLink
 
 CommitTo = OutputsCommit | str | None
 """Branch and folder to which a job commits its results, as `OutputsCommit` or as `dataset[@branch][/folder]`."""
@@ -104,6 +105,10 @@ class ProjectHandle(ProjectItems):
     def restore(self) -> Project:
         """Restore the deleted project."""
         return self.transport.post(Project, f"{self.url}/restore")
+
+    def browser_link(self) -> BrowserLink:
+        """Create a code that signs one browser in, once, to read the project; append it to an address after `#`."""
+        return self.transport.post(BrowserLink, f"{self.url}/browser-links", repeatable=False)
 
     # -- what it holds -------------------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Sign-in with the identity provider of a team, and the identities that are linked with users."""
+"""Sign-in with the identity provider of a team, the identities that are linked with users, and sessions of browsers."""
 
 from datetime import datetime
 from typing import Annotated
@@ -7,11 +7,18 @@ from pydantic import Field, SecretStr, StringConstraints
 
 from marey_schemas.access import LoginSeconds
 from marey_schemas.base import Answer, Request
+from marey_schemas.names import ProjectName
 from marey_schemas.sizes import DAY_S, LOGIN_DAYS
 
 VERIFIER_PATTERN = r"^[A-Za-z0-9_-]{43,128}$"
 CALLBACK_PATH = "/sign-ins/callback"
 """Path, below the root of the API, to which the identity provider sends the browser back."""
+
+VIEW_PREFIX = "mareyview_"
+"""Beginning of each code of a link that opens a project in a browser."""
+
+VIEW_PATH = "/view"
+"""Path, below the address of the server, of the page that shows clips."""
 
 Subject = Annotated[str, StringConstraints(min_length=1, max_length=255, pattern=r"^[\x20-\x7e]+$")]
 """Id of a person at an identity provider: at most 255 ASCII characters (OpenID Connect Core, section 2)."""
@@ -72,3 +79,24 @@ class Identity(Answer):
     subject: str
     created_at: datetime
     last_used_at: datetime | None = Field(None, description="Time of the last sign-in; null: none yet.")
+
+
+class BrowserLink(Answer):
+    """Code that signs one browser in, once. It belongs in the fragment of an address, which browsers do not send."""
+
+    code: str
+    path: str = Field(VIEW_PATH, description="Path of the page that accepts the code, as in `/view#<code>`.")
+    expires_at: datetime = Field(description="Time until which the code must be used.")
+
+
+class BrowserSessionCreate(Request):
+    """Request of a page to exchange the code of a link for a cookie."""
+
+    code: SecretStr = Field(max_length=200, description="Code of the link.")
+
+
+class BrowserSession(Answer):
+    """Session of a browser that may read one project, until it expires."""
+
+    project: ProjectName
+    expires_at: datetime

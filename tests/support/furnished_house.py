@@ -44,6 +44,7 @@ MULTIPART = b"--b\r\nContent-Disposition: form-data; name=files; filename=x.bvh\
 BODIES: dict[str, Any] = {
     "Login": {"name": "nobody", "password": "wrong wrong wrong"},
     "BrowserSignInCreate": {"challenge": "0" * 64},
+    "BrowserSessionCreate": {"code": "invented"},
     "BrowserSignInCode": {"code": "invented", "verifier": "v" * 43},
     "IdentityLink": {"subject": "sub-of-nobody", "issuer": "https://login.invalid"},
     "TokenCreate": {"name": "t", "scopes": ["read"]},
@@ -239,7 +240,7 @@ def build_house(people: People) -> House:
         "project": "lab", "kind": "clips", "part": "info", "revision": "1", "user": "reader", "job": running["job"],
         "fence": str(running["fence"]), "digest": SECRET_DIGEST, "job_kind": "import", "figure": "offsets",
         "stream": stream.json()["id"], "token": "token_of_nobody", "sign_in": "sign_in_of_nobody",
-        "identity": "identity_of_nobody", "upload": "upload_of_nobody",
+        "identity": "identity_of_nobody", "upload": "upload_of_nobody", "asset": "file-of-nobody.js",
     }  # fmt: skip
     return House(people, tokens, variables)
 

@@ -18,6 +18,8 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+from hatch_build import SOURCES as PAGE_SOURCES
+from hatch_build import pages_are_current
 from tests.support.database_fixtures import BACKENDS
 
 MOCAP_VARIABLE = "MAREY_TEST_MOCAP"
@@ -26,6 +28,9 @@ CLUSTER_VARIABLE = "MAREY_TEST_KUBECONFIG"
 """Environment variable with the kubeconfig of a real cluster, which has a namespace `marey`."""
 CLUSTER_IMAGE_VARIABLE = "MAREY_TEST_CLUSTER_IMAGE"
 """Environment variable with the image of the worker, named by its digest, as this cluster pulls it."""
+CHROMIUM_VARIABLE = "MAREY_TEST_CHROMIUM"
+"""Environment variable with the path of Chromium; without it, the program `chromium` is looked for."""
+NODE_PACKAGES = PAGE_SOURCES / "node_modules"
 SLURM_PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch")
 SYSTEM_PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
 """Folders in which daemons are looked for, also by users whose `PATH` does not contain them."""
@@ -91,6 +96,33 @@ def _soak_only(item: pytest.Item) -> bool:
 
 def _needs_slurm(item: pytest.Item) -> bool:
     return item.get_closest_marker("slurm") is not None
+
+
+def _needs_node(item: pytest.Item) -> bool:
+    return item.get_closest_marker("node") is not None
+
+
+def _needs_chromium(item: pytest.Item) -> bool:
+    return item.get_closest_marker("chromium") is not None
+
+
+def _missing_for_pages() -> str | None:
+    """Return why the tests of the browser pages cannot run, or None."""
+    if shutil.which("node") is None:
+        return "Node is not installed"
+    return None if (NODE_PACKAGES / ".package-lock.json").is_file() else "no node_modules"
+
+
+def _missing_for_chromium() -> str | None:
+    """Return why the tests in a browser cannot run, or None."""
+    if chromium() is None:
+        return "Chromium is not installed (tests/support/install_chromium.sh)"
+    return _missing_for_pages() or (None if pages_are_current() else "the pages are not built")
+
+
+def chromium() -> str | None:
+    """Return the path of Chromium: the value of the environment variable, or the program of this name."""
+    return os.environ.get(CHROMIUM_VARIABLE) or shutil.which("chromium")
 
 
 def _needs_kubectl(item: pytest.Item) -> bool:
@@ -208,6 +240,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         reasons = {"need real motion capture": _needs_mocap, **reasons}
     if missing := [name for name in SLURM_PROGRAMS if shutil.which(name, path=SYSTEM_PATH) is None]:
         reasons = {f"need Slurm (tests/support/install_slurm.sh): no {', '.join(missing)}": _needs_slurm, **reasons}
+    if lacks := _missing_for_chromium():
+        reasons = {f"need Chromium and the pages (make web): {lacks}": _needs_chromium, **reasons}
+    if lacks := _missing_for_pages():
+        reasons = {f"need Node and its packages (make web): {lacks}": _needs_node, **reasons}
     if shutil.which("kubectl") is None:
         reasons = {"need kubectl": _needs_kubectl, **reasons}
     if unset := [name for name in (CLUSTER_VARIABLE, CLUSTER_IMAGE_VARIABLE) if name not in os.environ]:

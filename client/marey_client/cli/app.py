@@ -26,6 +26,7 @@ from marey_client.cli import (
     searches,
     skeletons,
     tokens,
+    viewing,
     webhooks,
 )
 from marey_client.cli.datasets import archives, proposals, versions
@@ -100,6 +101,7 @@ for register in (
     records,
     diff,
     lineage,
+    viewing,
     versions,
     archives,
     proposals,

@@ -2,9 +2,10 @@
 
 `marey_<prefix>_<secret>` belongs to a user; the prefix identifies the token's row in the database.
 `mareyjob_<secret>_<seal>` belongs to an attempt of a job; the seal shows that a server issued it (see `is_sealed`).
-`mareyinvite_<prefix>_<secret>` is the code of an invitation, `mareystudy_<prefix>_<secret>` that of a link to a study,
-and `mareyparticipant_<prefix>_<secret>` belongs to a participant of a study. The database stores the SHA-256 of the
-secret. A secret has 256 random bits, so a slow hash is not needed.
+`mareyinvite_<prefix>_<secret>` is the code of an invitation, `mareyview_<prefix>_<secret>` that of a link to a project,
+`mareystudy_<prefix>_<secret>` that of a link to a study, and `mareyparticipant_<prefix>_<secret>` belongs to a
+participant of a study. The database stores the SHA-256 of the secret. A secret has 256 random bits, so a slow hash is
+not needed.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import secrets
 from typing import NamedTuple
 
 from marey_schemas.invitations import CODE_PREFIX
+from marey_schemas.sign_ins import VIEW_PREFIX
 from marey_schemas.studies.participation import LINK_PREFIX, PARTICIPANT_PREFIX
 
 _USER = "marey_"
@@ -161,6 +163,11 @@ def split_study_link(text: str) -> tuple[str, str] | None:
 def split_participant_token(text: str) -> tuple[str, str] | None:
     """Return prefix and secret of the token of a participant, or None if `text` is no such token."""
     return _split(text, PARTICIPANT_PREFIX)
+
+
+def split_view_code(text: str) -> tuple[str, str] | None:
+    """Return prefix and secret of the code of a link to a project, or None if `text` is no such code."""
+    return _split(text, VIEW_PREFIX)
 
 
 def _split(text: str, start: str) -> tuple[str, str] | None:

@@ -26,6 +26,7 @@ from marey_server.handlers import (
     uploads,
     webhooks,
 )
+from marey_server.handlers.browser import pages, sessions
 from marey_server.handlers.queue import jobs, leases, pipelines, schedules, scripts
 from marey_server.handlers.studies import conducting, participation
 from marey_server.handlers.versions import contents, datasets, differences, proposals
@@ -34,6 +35,7 @@ from marey_server.http.resource import Resource
 RESOURCES: tuple[type[Resource], ...] = (
     *access.RESOURCES,
     *identities.RESOURCES,
+    *sessions.RESOURCES,
     *projects.RESOURCES,
     *invitations.RESOURCES,
     *collections.RESOURCES,
@@ -66,5 +68,6 @@ RESOURCES: tuple[type[Resource], ...] = (
     *audit.RESOURCES,
     *webhooks.RESOURCES,
     *documentation.RESOURCES,
+    *pages.RESOURCES,
     *health.RESOURCES,
 )

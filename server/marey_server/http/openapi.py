@@ -47,6 +47,7 @@ PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
     "version": ("Branch, tag or commit; with ~n at its end, the version n commits earlier.", _NAME),
     "token": ("Id of the token.", _NAME),
     "upload": ("Id of the upload.", _NAME),
+    "asset": ("Name of the file.", _NAME),
     "digest": ("Digest of the blob.", {"type": "string", "pattern": DIGEST_PATTERN}),
     "job": ("Id of the job.", _NAME),
     "job_kind": ("Name of the kind of job.", _NAME),

@@ -39,6 +39,7 @@ from marey_server.errors import (
     TooLargeProblem,
 )
 from marey_server.http import negotiation
+from marey_server.http.browser_cookies import session_token
 from marey_server.http.calling import CallingExchange
 from marey_server.http.calls import (
     BodyTarget,
@@ -290,7 +291,10 @@ class Resource(CallingExchange):
         offers = self._offers(operation)
         chosen_otherwise = operation.answer is Bytes  # by the address: bytes have the one type they have
         self.media = offers[0] if chosen_otherwise else negotiation.choose(headers.get("Accept"), offers)
-        self.caller = Caller(negotiation.bearer_token(headers.get("Authorization")), operation)
+        token = negotiation.bearer_token(headers.get("Authorization"))
+        if token is None:
+            token = session_token(self.request, operation, self.path_kwargs.get("project"))
+        self.caller = Caller(token, operation)
         if self.caller.token is None:
             require_access(operation, ANONYMOUS)
         self.query = parse_query(operation.query, self.request.query_arguments)

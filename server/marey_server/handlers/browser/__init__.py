@@ -1,0 +1,1 @@
+"""Resources of the browser: its sign-in, and the pages."""

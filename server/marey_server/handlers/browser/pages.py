@@ -1,0 +1,161 @@
+"""Pages of the browser, and the files that they load: built from `web/` and part of the package.
+
+Addresses inside the pages are relative to `<base>`, which is set here to the way from the address of the page back to
+the root of the server. So pages work behind a proxy that serves the server below a path.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import mimetypes
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import ClassVar
+
+from pydantic import ConfigDict, Field
+
+from marey_schemas.base import Request
+from marey_server.errors import NotFoundProblem
+from marey_server.handlers.identities import BROWSER, page
+from marey_server.http.caching import IMMUTABLE, NOT_STORED
+from marey_server.http.declarations import Access, Bytes, reads
+from marey_server.http.reply import Reply
+from marey_server.http.resource import Resource
+
+FOLDER = Path(__file__).parents[2] / "webui"
+"""Folder that the build of `web/` writes."""
+_BASE = b'<base href="./" />'
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; base-uri 'self'; "
+    "form-action 'none'; frame-ancestors 'none'"
+)
+_MISSING = "This installation contains no pages. Install Node 20.19 or newer, and run `make web` in the source tree."
+_TEXTS = ("text/", "application/javascript", "image/svg+xml")
+
+
+@dataclass(frozen=True, slots=True)
+class WebFile:
+    """File of the pages, plain and compressed."""
+
+    media_type: str
+    content: bytes
+    compressed: bytes | None
+
+
+def built_files() -> dict[str, WebFile]:
+    """Return the built files by their path in the folder; nothing if the pages were not built.
+
+    They are read again after each build, so that a developer need not restart the server.
+    """
+    try:
+        return _read_folder((FOLDER / "index.html").stat().st_mtime_ns)
+    except FileNotFoundError:
+        return {}
+
+
+@lru_cache(maxsize=1)
+def _read_folder(_built_ns: int) -> dict[str, WebFile]:
+    found = sorted(file for file in FOLDER.rglob("*") if file.is_file())
+    return {file.relative_to(FOLDER).as_posix(): _read(file) for file in found}
+
+
+def _read(file: Path) -> WebFile:
+    kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
+    content = file.read_bytes()
+    is_text = kind.startswith(_TEXTS)
+    media_type = f"{kind}; charset=utf-8" if is_text else kind
+    return WebFile(media_type, content, gzip.compress(content, mtime=0) if is_text else None)
+
+
+class WebPage(Resource):
+    """Base class of pages: all have the same document, whose script chooses the page by the address."""
+
+    root = ""
+    to_root: ClassVar[bytes]
+    """Way from the address of the page to the root of the server."""
+
+    async def document(self) -> Reply:
+        """Return the document, or a page that names the command that builds the pages."""
+        found = (await self.compute(built_files)).get("index.html")
+        if found is None:
+            headers = {"Cache-Control": NOT_STORED, "Content-Security-Policy": "style-src 'unsafe-inline'"}
+            return Reply(page("No pages", _MISSING), status=404, media_type=BROWSER, headers=headers)
+        content = found.content.replace(_BASE, b'<base href="' + self.to_root + b'" />')
+        rev = hashlib.sha256(content).hexdigest()[:16]
+        return Reply(content, rev=rev, media_type=BROWSER, headers={"Content-Security-Policy": _POLICY})
+
+
+class AnyQuery(Request):
+    """Parameters in the address of a page; the page reads them, and the server ignores them."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+class ViewQuery(AnyQuery):
+    """Parameters in the address of the page that shows clips."""
+
+    clip: str | None = Field(None, description="The clip: `project/item`, or `project/item@revision`.")
+    beside: str | None = Field(None, description="Another clip, to be shown on the same clock.")
+    frame: str | None = Field(None, description="Number of the frame of the clip to begin with, from 0.")
+    camera: str | None = Field(
+        None, description="Yaw and pitch of the camera in degrees, and its distance in body heights, as in `35,12,2.6`."
+    )
+    look: str | None = Field(None, description="`mannequin` or `skeleton`.")
+    layout: str | None = Field(None, description="Of two clips: `beside`, `overlaid`, `left` or `right`.")
+
+
+class ViewPage(WebPage):
+    """Page that shows clips."""
+
+    path = "/view"
+    tag = "Pages"
+    to_root = b"./"
+
+    @reads(
+        access=Access.ANYONE, scope=None, query=ViewQuery, answer=Bytes, answer_types=("text/html",),
+        also=((404, None),), for_browsers=True,
+    )  # fmt: skip
+    async def get(self, query: ViewQuery) -> Reply:  # noqa: ARG002 - the page itself reads it
+        """Return the page that shows a clip, alone or beside another clip."""
+        return await self.document()
+
+
+class ParticipantPage(WebPage):
+    """Page of the participants of perceptual studies."""
+
+    path = "/s/"
+    tag = "Pages"
+    to_root = b"../"
+
+    @reads(
+        access=Access.ANYONE, scope=None, query=AnyQuery, answer=Bytes, answer_types=("text/html",),
+        also=((404, None),), for_browsers=True,
+    )  # fmt: skip
+    async def get(self, query: AnyQuery) -> Reply:  # noqa: ARG002 - the page itself reads it
+        """Return the page on which a participant compares motions."""
+        return await self.document()
+
+
+class PageAsset(Resource):
+    """File that the pages load; its name contains a hash of its content."""
+
+    root = ""
+    path = "/assets/{asset}"
+    tag = "Pages"
+
+    @reads(access=Access.ANYONE, scope=None, answer=Bytes)
+    async def get(self, asset: str) -> Reply:
+        """Return a script, a style sheet or an icon of the pages."""
+        found = (await self.compute(built_files)).get(f"assets/{asset}")
+        if found is None:
+            raise NotFoundProblem("The pages have no such file; reload the page.")
+        headers = {"Cache-Control": IMMUTABLE}
+        if found.compressed is None or "gzip" not in self.request.headers.get("Accept-Encoding", ""):
+            return Reply(found.content, media_type=found.media_type, headers=headers)
+        headers["Content-Encoding"] = "gzip"
+        return Reply(found.compressed, media_type=found.media_type, headers=headers)
+
+
+RESOURCES: tuple[type[Resource], ...] = (ViewPage, ParticipantPage, PageAsset)

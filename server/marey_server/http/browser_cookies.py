@@ -1,0 +1,57 @@
+"""Cookies of browser sessions: one for each project, sent only by pages of this server, accepted only for reading.
+
+A cookie contains the token of a session, which has only the scope `read` in its project. Other sites can neither send
+the cookie (`SameSite=Strict`) nor read answers (`Cross-Origin-Resource-Policy`, and no CORS). Pages cannot read it
+(`HttpOnly`). It is accepted only for declared GET operations of its project, so a forged request could change nothing.
+"""
+
+from __future__ import annotations
+
+from http.cookies import Morsel
+from typing import Any
+from urllib.parse import urlsplit
+
+from tornado.httputil import HTTPServerRequest
+
+from marey_server.errors import ForbiddenProblem
+from marey_server.http.declarations import Operation
+
+_NAME = "marey-view-"
+_OVER_HTTPS = "__Host-"
+"""Prefix with which browsers accept a cookie only from this host, over https, for all paths."""
+_SITE = "Sec-Fetch-Site"
+"""Header in which browsers state who has caused a request; they omit it without https, and pages cannot set it."""
+_OWN_SITES = ("same-origin", "none")
+"""Values of this header for requests that other sites have not caused."""
+
+
+def cookie_name(project: str, *, https: bool) -> str:
+    """Return the name of the cookie of a project."""
+    return f"{_OVER_HTTPS if https else ''}{_NAME}{project}"
+
+
+def require_own_page(request: HTTPServerRequest) -> None:
+    """Raise `ForbiddenProblem` if a page of another site has sent the request.
+
+    Programs, which send neither of the two headers, may send it.
+    """
+    site, origin = request.headers.get(_SITE), request.headers.get("Origin")
+    by_origin = site is None and origin is not None  # a proxy may have changed Host, so the other header goes first
+    foreign = urlsplit(origin or "").netloc != request.headers.get("Host") if by_origin else _is_foreign(request)
+    if foreign:
+        raise ForbiddenProblem("Only pages of this server may send this request.", code="other-site")
+
+
+def _is_foreign(request: HTTPServerRequest) -> bool:
+    """Return whether the browser states that another site has caused the request."""
+    return request.headers.get(_SITE, "none") not in _OWN_SITES
+
+
+def session_token(request: HTTPServerRequest, operation: Operation, project: str | None) -> str | None:
+    """Return the token of the browser's session, if the operation only reads the project of the session."""
+    reads_project = operation.method == "GET" and operation.scope == "read" and operation.access.role is not None
+    if project is None or not reads_project or "Cookie" not in request.headers or _is_foreign(request):
+        return None
+    sent: dict[str, Morsel[Any]] = dict(request.cookies)
+    names = (cookie_name(project, https=https) for https in (True, False))
+    return next((sent[name].value for name in names if name in sent and sent[name].value), None)

@@ -1,0 +1,200 @@
+"""The browser pages: sessions of browsers, the pages in a real Chromium, and the tests of their TypeScript."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from hatch_build import SOURCES
+from tests.support.database_fixtures import copied_sqlite
+from tests.support.rest_server import Server, running
+from tests.support.tiers import chromium
+from tests.support.web_cases import write_cases
+
+from marey_motion import generate_gait, global_positions
+from marey_motion.documents import clip_from_document, skeleton_from_document
+from marey_motion.formats import write_bvh
+from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.documents.skeletons import SkeletonHierarchy
+from marey_schemas.encoding.codecs import MSGPACK, decode_tree
+from marey_server.handlers.browser import pages
+from marey_server.store.database.connections import Database
+
+OWN_PAGE = {"Sec-Fetch-Site": "same-origin"}
+
+
+def exchange(server: Server, code: str, **headers: str) -> httpx.Response:
+    """Exchange the code of a link as a new browser does."""
+    return httpx.post(f"{server.api}/browser-sessions", json={"code": code}, headers=OWN_PAGE | headers)
+
+
+def cookie_of(answer: httpx.Response) -> dict[str, str]:
+    assert answer.status_code == 201, answer.text
+    return {"Cookie": answer.headers["Set-Cookie"].partition(";")[0]}
+
+
+def test_a_link_signs_one_browser_in_once_to_read_one_project(server: Server, owner: httpx.Client) -> None:
+    assert owner.post("/projects", json={"name": "other"}).is_success
+    made = owner.post("/projects/lab/browser-links")
+    assert made.status_code == 201
+    assert made.headers["Cache-Control"] == "no-store"
+    code = made.json()["code"]
+    assert owner.get("/me", headers={"Authorization": f"Bearer {code}"}).status_code == 401
+
+    answer = exchange(server, code)
+    assert exchange(server, code).json()["code"] == "link-invalid"
+    attributes = {part.strip() for part in answer.headers["Set-Cookie"].split(";")[1:]}
+    assert {"HttpOnly", "SameSite=Strict", "Path=/"} <= attributes
+    session = OWN_PAGE | cookie_of(answer)
+    with httpx.Client(base_url=server.api, headers=session) as browser:
+        assert browser.get("/projects/lab").status_code == 200
+        assert browser.get("/projects/lab/clips").status_code == 200
+        assert browser.get("/projects/other").status_code == 404
+        assert browser.get("/me").status_code == 401
+        assert browser.post("/projects/lab/collections", json={"path": "x"}).status_code == 401
+        assert browser.post("/projects/lab/browser-links").status_code == 401
+        for site in ("cross-site", "same-site"):  # a page of another site has sent it
+            assert browser.get("/projects/lab", headers={"Sec-Fetch-Site": site}).status_code == 404
+    token = session["Cookie"].partition("=")[2]
+    with httpx.Client(base_url=server.api, headers={"Authorization": f"Bearer {token}"}) as thief:
+        assert thief.get("/projects/other").status_code == 404
+        assert thief.post("/projects/lab/collections", json={"path": "x"}).status_code == 403
+
+
+def test_a_link_is_refused_to_pages_of_other_sites_and_ends_with_the_token_that_made_it(
+    server: Server, owner: httpx.Client
+) -> None:
+    code = owner.post("/projects/lab/browser-links").json()["code"]
+    assert exchange(server, code, **{"Sec-Fetch-Site": "cross-site"}).status_code == 403
+    origin = {"Origin": "https://elsewhere.example"}
+    assert httpx.post(f"{server.api}/browser-sessions", json={"code": code}, headers=origin).status_code == 403
+    guest = httpx.post(f"{server.api}/projects/lab/browser-links")
+    assert guest.status_code in (401, 404)
+
+    secure = exchange(server, code, Origin=server.address.replace("http:", "https:"))
+    assert secure.headers["Set-Cookie"].startswith("__Host-marey-view-lab=")
+    assert "Secure" in secure.headers["Set-Cookie"]
+    session = cookie_of(secure)
+    assert httpx.get(f"{server.api}/projects/lab", headers=session).status_code == 200
+    later = owner.post("/projects/lab/browser-links").json()["code"]
+    (own,) = (one for one in owner.get("/tokens").json()["items"] if one["name"] == "test")
+    assert owner.delete(f"/tokens/{own['id']}?with_created=true").is_success
+    assert httpx.get(f"{server.api}/projects/lab", headers=session).status_code == 401
+    assert exchange(server, later).status_code == 404
+
+
+def test_without_built_pages_a_page_names_the_command_that_builds_them(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pages, "FOLDER", tmp_path / "none")
+    missing = httpx.get(f"{server.address}/view?clip=lab/x")
+    assert (missing.status_code, missing.headers["Content-Type"]) == (404, "text/html; charset=utf-8")
+    assert "make web" in missing.text
+    assert httpx.get(f"{server.address}/assets/a.js").status_code == 404
+
+
+def test_pages_are_revalidated_their_files_kept_and_their_addresses_relative(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "webui"
+    (folder / "assets").mkdir(parents=True)
+    (folder / "index.html").write_text('<base href="./" /><script type="module" src="./assets/a.js"></script>')
+    (folder / "assets" / "a.js").write_text("export {};" * 100)
+    (folder / "secret.txt").write_text("not part of the pages")
+    monkeypatch.setattr(pages, "FOLDER", folder)
+    for path, base in (("/view?clip=lab/x&unknown=1", "./"), ("/s/", "../")):
+        page = httpx.get(server.address + path)
+        assert f'<base href="{base}" />' in page.text
+        assert page.headers["Cache-Control"] == "private, no-cache"
+        assert page.headers["X-Content-Type-Options"] == "nosniff"
+        policy = page.headers["Content-Security-Policy"]
+        assert "default-src 'none'; script-src 'self';" in policy
+        assert "unsafe" not in policy
+        again = httpx.get(server.address + path, headers={"If-None-Match": page.headers["ETag"]})
+        assert again.status_code == 304
+    script = httpx.get(f"{server.address}/assets/a.js")
+    assert (script.text, script.headers["Content-Encoding"]) == ("export {};" * 100, "gzip")
+    assert "immutable" in script.headers["Cache-Control"]
+    plain = httpx.get(f"{server.address}/assets/a.js", headers={"Accept-Encoding": "identity"})
+    assert "Content-Encoding" not in plain.headers
+    for path in ("..%2Fsecret.txt", "%2e%2e%2fsecret.txt", "../secret.txt", "index.html"):
+        assert httpx.get(f"{server.address}/assets/{path}").status_code == 404
+
+
+@pytest.fixture
+def shown(sqlite_template: Path, tmp_path: Path) -> Iterator[tuple[Server, httpx.Client]]:
+    """A server for a browser, and its owner's client; one kind of database is enough for tests of pages."""
+    with closing(Database(copied_sqlite(sqlite_template, tmp_path))) as database, running(database, tmp_path) as server:
+        yield server, server.client(server.make_project())
+
+
+@pytest.mark.chromium
+@pytest.mark.slow
+def test_the_pages_work_in_a_browser(shown: tuple[Server, httpx.Client], tmp_path: Path) -> None:
+    server, owner = shown
+    names = [_upload(owner, file) for file in _takes(tmp_path)]
+    items = {one["name"]: one["id"] for one in owner.get("/projects/lab/clips").json()["items"]}
+    first, second = (f"lab/{items[name]}" for name in names)
+    code = owner.post("/projects/lab/browser-links").json()["code"]
+    given = {
+        "chromium": chromium(),
+        "link": f"{server.address}/view?clip={first}&beside={second}#{code}",
+        "positions": _positions(owner, items[names[0]]),
+        "clips": names,
+        "pictures": os.environ.get("MAREY_WEB_PICTURES"),
+    }
+    _run_vitest("browser", MAREY_WEB_GIVEN=json.dumps(given))
+
+
+def _takes(folder: Path) -> list[Path]:
+    """Return a real take, if there is real motion capture, and a generated one."""
+    walk = folder / "walk.bvh"
+    walk.write_bytes(write_bvh(generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.3, duration_s=3.0)))
+    real = Path(os.environ.get("MAREY_TEST_MOCAP", "")) / "cmu-bvh" / "10_01.bvh"
+    turn = folder / "turn.bvh"
+    turn.write_bytes(write_bvh(generate_gait(speed_m_s=0.8, turn_rate_rad_s=-0.9, duration_s=2.0)))
+    return [real if real.is_file() else turn, walk]
+
+
+def _upload(owner: httpx.Client, file: Path) -> str:
+    answer = owner.post("/projects/lab/imports", files={"files": (file.name, file.read_bytes())})
+    assert answer.json()["entries"][0]["status"] == "created", answer.text
+    return file.stem
+
+
+def _positions(owner: httpx.Client, clip: str) -> dict[str, list[float]]:
+    """Return positions of all joints by forward kinematics of the server, at some frames of a stored clip."""
+
+    def read(path: str) -> Any:
+        return decode_tree(owner.get(path, headers={"Accept": MSGPACK}).content, MSGPACK)
+
+    tree = read(f"/projects/lab/clips/{clip}/parts/motion")
+    motion = MotionDocument.model_validate(tree)
+    skeleton = owner.get(f"/projects/lab/skeletons/{tree['skeleton']['item']}/parts/hierarchy").json()
+    take = clip_from_document(motion, skeleton_from_document(SkeletonHierarchy.model_validate(skeleton)))
+    positions = global_positions(take).astype(np.float64)
+    return {str(frame): positions[frame].ravel().tolist() for frame in (0, 17, take.frame_count - 1)}
+
+
+@pytest.mark.node
+@pytest.mark.slow
+def test_decoder_and_kinematics_in_typescript_agree_with_those_in_python(tmp_path: Path) -> None:
+    write_cases(tmp_path)
+    _run_vitest("unit", MAREY_WEB_CASES=str(tmp_path))
+
+
+def _run_vitest(project: str, **variables: str) -> None:
+    command = ["node", "node_modules/vitest/vitest.mjs", "run", "--project", project]
+    done = subprocess.run(
+        command, cwd=SOURCES, env=os.environ | variables | {"NO_COLOR": "1"}, check=False, capture_output=True,
+        text=True, timeout=240,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]

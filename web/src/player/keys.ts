@@ -1,0 +1,41 @@
+/** Keys of the viewer: one table for what they do and for the help that lists them. */
+
+export type Action =
+  | "play" | "back" | "forward" | "back10" | "forward10" | "start" | "end" | "slower" | "faster"
+  | "look" | "layout" | "follow" | "frame" | "camera" | "help";
+
+interface Key {
+  action: Action;
+  key: string;
+  shift?: boolean;
+  shown: string;
+  text: string;
+}
+
+export const KEYS: Key[] = [
+  { action: "play", key: " ", shown: "Space", text: "Play or pause" },
+  { action: "back", key: "ArrowLeft", shown: "←", text: "One frame back" },
+  { action: "forward", key: "ArrowRight", shown: "→", text: "One frame forward" },
+  { action: "back10", key: "ArrowLeft", shift: true, shown: "Shift ←", text: "Ten frames back" },
+  { action: "forward10", key: "ArrowRight", shift: true, shown: "Shift →", text: "Ten frames forward" },
+  { action: "start", key: "Home", shown: "Home", text: "Go to the start" },
+  { action: "end", key: "End", shown: "End", text: "Go to the end" },
+  { action: "slower", key: "-", shown: "−", text: "Play slower" },
+  { action: "faster", key: "=", shown: "=", text: "Play faster" },
+  { action: "look", key: "v", shown: "V", text: "Skeleton or mannequin" },
+  { action: "layout", key: "b", shown: "B", text: "Both side by side, overlaid, or one of them" },
+  { action: "camera", key: "c", shown: "C", text: "Camera from the front, the side or the top" },
+  { action: "frame", key: "f", shown: "F", text: "Bring the figure back into view" },
+  { action: "follow", key: "f", shift: true, shown: "Shift F", text: "Let the camera follow the figure, or stop it" },
+  { action: "help", key: "?", shown: "?", text: "Show this help" },
+];
+
+/** Return the action of a key press, or null if the press is for something else. */
+export function actionOf(event: KeyboardEvent): Action | null {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.isComposing) return null;
+  const target = event.target as HTMLElement | null;
+  const typed = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  if (target?.closest("select, textarea, dialog") || (typed === " " && target?.closest("button, a, summary"))) return null;
+  const shift = event.shiftKey && typed !== "?";
+  return KEYS.find((one) => one.key === typed && (one.shift ?? false) === shift)?.action ?? null;
+}

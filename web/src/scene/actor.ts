@@ -1,0 +1,61 @@
+/** One character of a scene: a clip, the pose that is shown, its body and its contacts with the ground. */
+import type { Clip } from "../motion/clip";
+import { findContacts } from "../motion/contacts";
+import { Kinematics } from "../motion/kinematics";
+import { type Body, shapeBody } from "./body";
+
+export type Look = "skeleton" | "mannequin";
+
+export class Actor {
+  readonly body: Body;
+  readonly contacts: Uint8Array[];
+  frame = 0;
+  private readonly kinematics: Kinematics;
+
+  constructor(readonly clip: Clip) {
+    this.body = shapeBody(clip.skeleton);
+    this.contacts = findContacts(clip);
+    this.kinematics = new Kinematics(clip);
+    this.kinematics.update(0);
+  }
+
+  /** Positions of all points in metres. */
+  get positions(): Float64Array {
+    return this.kinematics.positions;
+  }
+
+  /** Show the pose at a time of the common clock, in seconds. */
+  seek(seconds: number): void {
+    this.frame = this.clip.frameAt(seconds);
+    this.kinematics.update(this.frame);
+  }
+
+  /** Return the indices of the feet that touch the ground in this frame. */
+  standing(): number[] {
+    return this.clip.skeleton.feet.filter((_, index) => this.contacts[index]![this.frame] === 1);
+  }
+
+  /** Point that a camera looks at: above the root on the ground, at half the height of the body. */
+  centre(follows: boolean): [number, number, number] {
+    const { poses } = this.clip;
+    const [x, z] = follows ? [this.positions[0]!, this.positions[2]!] : [poses[0]!, poses[2]!];
+    return [x, 0.52 * this.body.height, z];
+  }
+}
+
+export interface Cell {
+  /** Indices of the actors that the cell shows. */
+  actors: number[];
+  /** Left, bottom, width and height as shares of the canvas. */
+  box: [number, number, number, number];
+}
+
+/** Return cells for actors side by side: in one row, or in two columns if the canvas is higher than wide. */
+export function arrange(count: number, aspect: number): Cell[] {
+  const columns = count <= 1 ? 1 : count <= 3 ? (aspect > 1 ? count : 1) : aspect > 2 ? count : 2;
+  const rows = Math.ceil(count / columns);
+  return Array.from({ length: count }, (_, index) => ({
+    actors: [index],
+    box: [(index % columns) / columns, 1 - (Math.floor(index / columns) + 1) / rows, 1 / columns, 1 / rows],
+  }));
+}

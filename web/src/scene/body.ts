@@ -1,0 +1,87 @@
+/** Shape of a mannequin for any skeleton, derived from the lengths of its bones alone; no drawn asset is needed. */
+import { Clip } from "../motion/clip";
+import { Kinematics } from "../motion/kinematics";
+import type { Skeleton } from "../motion/skeleton";
+
+/** Part of a body between a point and its parent. */
+export interface Limb {
+  from: number;
+  to: number;
+  radius: number;
+}
+
+/** Ball halfway between two points. */
+export interface Ball {
+  from: number;
+  to: number;
+  radius: number;
+}
+
+export interface Body {
+  /** All bones that have a length. */
+  bones: Limb[];
+  /** The limbs of a mannequin, which has a ball in place of the bone of the head. */
+  limbs: Limb[];
+  balls: Ball[];
+  /** Height of the body at rest, in metres. */
+  height: number;
+}
+
+const SHORTEST_LIMB = 1e-3;
+/** Radius of a limb that carries one metre of bones; limbs that carry more are thicker, like the branches of a tree. */
+const RADIUS_OF_A_METRE = 0.054;
+const STANDARD_HEIGHT = 1.75;
+
+/** Return the shape of a mannequin with the bones of a skeleton. */
+export function shapeBody(skeleton: Skeleton): Body {
+  const rest = restPositions(skeleton);
+  const heights = Array.from({ length: skeleton.pointCount }, (_, point) => rest[3 * point + 1]!);
+  const spread = [0, 1, 2].map((axis) => extent(rest, axis));
+  const height = Math.max(extent(rest, 1), 0.5 * Math.max(...spread), 1e-3);
+  const scale = height / STANDARD_HEIGHT;
+  const carried = skeleton.subtreeLengths();
+  const top = skeleton.head >= 0 ? skeleton.head : heights.indexOf(Math.max(...heights));
+  const crown = skeleton.parents.findIndex((parent, point) => parent === top && skeleton.boneLength(point) > 0.02 * scale);
+  const bones: Limb[] = [];
+  for (let point = 1; point < skeleton.pointCount; point++) {
+    const length = skeleton.boneLength(point);
+    if (length < SHORTEST_LIMB * scale) continue;
+    const isTrunk = skeleton.sides[point] === "centre" && carried[point]! > 1.2 * scale;
+    const thickness = RADIUS_OF_A_METRE * Math.sqrt(carried[point]! / scale) * scale;
+    const radius = isTrunk ? 0.1 * scale : Math.min(thickness, 0.075 * scale, 0.42 * length + 0.01 * scale);
+    bones.push({ from: skeleton.parents[point]!, to: point, radius: Math.max(radius, 0.007 * scale) });
+  }
+  const limbs = bones.filter((bone) => bone.to !== crown);
+  const balls: Ball[] = limbs
+    .filter((limb) => limb.to < skeleton.jointCount)
+    .map((limb) => ({ from: limb.to, to: limb.to, radius: 0.82 * limb.radius }));
+  for (const hub of hubs(skeleton)) balls.push({ from: hub, to: hub, radius: 0.11 * scale });
+  balls.push({ from: top, to: crown < 0 ? top : crown, radius: 0.105 * scale });
+  return { bones, limbs, balls, height };
+}
+
+/** Joints from which at least three bones branch off: pelvis and chest. */
+function hubs(skeleton: Skeleton): number[] {
+  const carried = skeleton.subtreeLengths();
+  const total = carried[0]!;
+  const branches = new Map<number, number>();
+  skeleton.parents.forEach((parent, point) => {
+    if (carried[point]! > 0.06 * total) branches.set(parent, (branches.get(parent) ?? 0) + 1);
+  });
+  return [...branches].filter(([joint, count]) => joint >= 0 && count >= 3).map(([joint]) => joint);
+}
+
+function restPositions(skeleton: Skeleton): Float64Array {
+  const poses = Float32Array.from([...skeleton.offsets.subarray(0, 3), ...skeleton.restRotations]);
+  return new Kinematics(new Clip("rest", skeleton, 1, skeleton.names, poses)).update(0);
+}
+
+function extent(positions: Float64Array, axis: number): number {
+  let least = Infinity;
+  let most = -Infinity;
+  for (let at = axis; at < positions.length; at += 3) {
+    least = Math.min(least, positions[at]!);
+    most = Math.max(most, positions[at]!);
+  }
+  return most - least;
+}

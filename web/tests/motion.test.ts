@@ -1,0 +1,71 @@
+import { describe, expect, it } from "vitest";
+import { type Clip, clipOf, skeletonOf } from "../src/motion/clip";
+import { findContacts } from "../src/motion/contacts";
+import { Kinematics } from "../src/motion/kinematics";
+import { type HierarchyDocument, type MappingDocument, Skeleton } from "../src/motion/skeleton";
+import { shapeBody } from "../src/scene/body";
+import { decodeMessagePack } from "../src/wire/messagepack";
+import { bytesOf, floatsOf, INDEX, jsonOf } from "./cases";
+
+const TOLERANCE_M = 1e-5;
+
+function loadCase(name: string): Clip {
+  const document = decodeMessagePack(bytesOf(`${name}.msgpack`));
+  expect(skeletonOf(document)).toEqual({ item: "skeleton_x", revision: 3 });
+  const skeleton = new Skeleton(jsonOf<HierarchyDocument>(`${name}.hierarchy.json`), jsonOf<MappingDocument>(`${name}.mapping.json`));
+  return clipOf(name, document, skeleton);
+}
+
+describe.each(INDEX.clips)("the clip %s", (name) => {
+  it("has joints and end sites where the server computes them", () => {
+    const clip = loadCase(name);
+    const expected = floatsOf(`${name}.positions`);
+    const kinematics = new Kinematics(clip);
+    const width = 3 * clip.skeleton.pointCount;
+    expect(expected.length).toBe(clip.frames * width);
+    let largest = 0;
+    for (let frame = 0; frame < clip.frames; frame++) {
+      kinematics.update(frame).forEach((value, at) => (largest = Math.max(largest, Math.abs(value - expected[frame * width + at]!))));
+    }
+    expect(largest).toBeLessThan(TOLERANCE_M);
+  });
+
+  it("touches the ground in the frames in which the server finds contacts", () => {
+    const clip = loadCase(name);
+    const expected = bytesOf(`${name}.contacts`);
+    const found = findContacts(clip);
+    const toes = ["LeftToeBase", "RightToeBase"].map((toe) => clip.skeleton.feet.indexOf(clip.skeleton.names.indexOf(toe)));
+    toes.forEach((toe, index) => {
+      const wanted = expected.subarray(index * clip.frames, (index + 1) * clip.frames);
+      const different = wanted.filter((flag, frame) => flag !== found[toe]![frame]).length;
+      expect(different).toBeLessThanOrEqual(1); // speeds at the limit, which rounding decides
+    });
+    if (name === "gait") expect(expected.some((flag) => flag === 1)).toBe(true);
+  });
+});
+
+describe("the body of a skeleton", () => {
+  it("has sides by the mapping, and a limb for each bone that has a length", () => {
+    const { skeleton } = loadCase("gait");
+    const side = (joint: string) => skeleton.sides[skeleton.names.indexOf(joint)];
+    expect([side("LeftFoot"), side("RightFoot"), side("Hips")]).toEqual(["left", "right", "centre"]);
+    const body = shapeBody(skeleton);
+    expect(body.height).toBeGreaterThan(1.5);
+    expect(body.limbs.every((limb) => limb.radius > 0 && limb.radius < 0.12)).toBe(true);
+  });
+
+  it("is derived for a skeleton with one joint, or with bones without length", () => {
+    const one = new Skeleton({ joints: [{ name: "Wurzel", parent: -1, offset: [0, 1, 0] }] });
+    expect(shapeBody(one).limbs).toEqual([]);
+    const chain = new Skeleton({
+      joints: [
+        { name: "a", parent: -1, offset: [0, 1, 0] },
+        { name: "b", parent: 0, offset: [0, 0.5, 0] },
+        { name: "c", parent: 1, offset: [0, 0, 0] },
+      ],
+      end_sites: [{ joint: 2, offset: [0.2, 0, 0] }],
+    });
+    expect(shapeBody(chain).limbs.length).toBeGreaterThan(0);
+    expect(chain.feet).toEqual([]);
+  });
+});
