@@ -20,14 +20,13 @@ from marey_schemas.documents.metrics import (
     MEASUREMENTS,
     METRIC_CODE,
     AngleMeasure,
-    JointClass,
     Measurement,
     MetricDocument,
     Shaping,
     classes_of,
 )
 
-JOINT_CLASSES: Mapping[JointClass, tuple[str, ...]] = {
+JOINT_CLASSES: Mapping[str, tuple[str, ...]] = {
     "head": ("head",),
     "clavicle": ("left_clavicle", "right_clavicle"),
     "upper_arm": ("left_shoulder", "right_shoulder"),

@@ -65,7 +65,7 @@ class ComponentFit:
 
 
 @dataclass(frozen=True, eq=False)
-class MetricFit:
+class FittedMetric:
     """A metric of several components with one shaping, whose shares were fitted to the table.
 
     Parameters
@@ -93,7 +93,7 @@ class StudyAnalysis:
     table : DifferenceTable    perceived differences
     violated, checked : int    triangle inequalities that the table violates, and all of them
     order : MotionOrder, optional    order and groups; None if some motion has no known difference
-    fits : tuple of MetricFit    one for each shaping that could be fitted, best first
+    fits : tuple of FittedMetric    one for each shaping that could be fitted, best first
     refusals : tuple of str    why something could not be computed
     """
 
@@ -102,7 +102,7 @@ class StudyAnalysis:
     violated: int
     checked: int
     order: MotionOrder | None
-    fits: tuple[MetricFit, ...]
+    fits: tuple[FittedMetric, ...]
     refusals: tuple[str, ...]
 
     @property
@@ -203,7 +203,7 @@ def _fit(
     draws: int,
     seed: int,
     refusals: list[str],
-) -> MetricFit | None:
+) -> FittedMetric | None:
     """Fit one component for each measurement, and then their shares; None if no component could be fitted."""
     perceived = table.differences[np.triu_indices(len(table.differences), 1)]
     parts = []
@@ -219,7 +219,7 @@ def _fit(
     quality = fit_quality(_mixed([part.predicted for part in parts], shares), perceived)
     held_out = [part.left_out for part in parts if part.left_out is not None]
     left_out = fit_quality(_mixed(held_out, shares), perceived).rmse if len(held_out) == len(parts) else None
-    return MetricFit(metric, tuple(parts), quality, left_out)
+    return FittedMetric(metric, tuple(parts), quality, left_out)
 
 
 def _mixed(predicted: Sequence[Floats], shares: Sequence[float]) -> Floats:
@@ -268,13 +268,13 @@ def _intervals(
 # -- documents ---------------------------------------------------------------------------------------------------------
 
 
-def metric_to_tree(analysis: StudyAnalysis, fit: MetricFit, study: Mapping[str, object]) -> dict[str, Any]:
+def metric_to_tree(analysis: StudyAnalysis, fit: FittedMetric, study: Mapping[str, object]) -> dict[str, Any]:
     """Return a fitted metric as a document of the schema `marey/perceptual-metric@1`.
 
     Parameters
     ----------
     analysis : StudyAnalysis    the analysis that made it
-    fit : MetricFit    the metric
+    fit : FittedMetric    the metric
     study : mapping    reference to the revision of the study
 
     Returns
@@ -356,7 +356,7 @@ def analysis_to_tree(analysis: StudyAnalysis, study: Mapping[str, object]) -> di
     }
 
 
-def _fit_to_tree(analysis: StudyAnalysis, fit: MetricFit, study: Mapping[str, object]) -> dict[str, Any]:
+def _fit_to_tree(analysis: StudyAnalysis, fit: FittedMetric, study: Mapping[str, object]) -> dict[str, Any]:
     return {
         "shaping": fit.parts[0].component.shaping,
         "metric": metric_to_tree(analysis, fit, study),

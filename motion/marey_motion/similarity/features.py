@@ -21,7 +21,8 @@ from marey_motion.kinematics import forward_directions, headings
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
 from marey_motion.perception.measuring import MeasuredClip, measure_motion
-from marey_motion.perception.metric import JOINT_CLASSES, WITHOUT_ANGLES
+from marey_motion.perception.metric import JOINT_CLASSES
+from marey_schemas.documents.metrics import WITHOUT_ANGLES
 
 INDEX_RATE_HZ = 30.0
 """Frames per second of all features: the velocities of the metric are per 1/30 s, and a fist moves 0.3 m in 1/30 s."""

@@ -9,8 +9,9 @@ import numpy as np
 from marey_motion.arrays import Flags, Floats, Ints
 from marey_motion.errors import MotionError
 from marey_motion.perception.maps import ANGLE_NUMBERS, SHAPING_NUMBERS
-from marey_motion.perception.metric import JOINT_CLASSES, Component, PerceptualMetric, classes_of
+from marey_motion.perception.metric import JOINT_CLASSES, Component, PerceptualMetric
 from marey_motion.similarity.features import JOINTS, ROTATED_JOINTS
+from marey_schemas.documents.metrics import classes_of
 
 
 class MetricTables(NamedTuple):

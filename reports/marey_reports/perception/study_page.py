@@ -9,7 +9,7 @@ import numpy as np
 
 from marey_motion.perception.metric import JOINT_CLASSES
 from marey_motion.perception.ordering import MotionOrder
-from marey_motion.perception.study_analysis import MetricFit, StudyAnalysis
+from marey_motion.perception.study_analysis import FittedMetric, StudyAnalysis
 from marey_motion.version import code_version
 from marey_reports.drawing.drawn import DrawnFigure, Sketch
 from marey_reports.drawing.markup import Content, element, joined
@@ -182,7 +182,7 @@ def _table_text(analysis: StudyAnalysis, names: Sequence[str]) -> Content:
     return folded("All pairs", table("Perceived differences of all pairs", heads, pairs, numbers=(2, 3)))
 
 
-def _shaping(fit: MetricFit) -> str:
+def _shaping(fit: FittedMetric) -> str:
     return fit.parts[0].component.shaping
 
 
@@ -206,7 +206,7 @@ def _weights_table(analysis: StudyAnalysis) -> Content:
     return table(caption, heads, rows, numbers=range(1, len(heads)))
 
 
-def _weights_row(analysis: StudyAnalysis, fit: MetricFit, at: int) -> Sequence[Cell]:
+def _weights_row(analysis: StudyAnalysis, fit: FittedMetric, at: int) -> Sequence[Cell]:
     part = fit.parts[at]
     component, total = part.component, sum(part.component.weights.values())
     name = f"{component.measurement}, {component.shaping}"
