@@ -17,7 +17,7 @@ from marey_server.store.jobs import reach
 from marey_server.store.jobs.fencing import require_attempt
 from marey_server.store.studies.conducting import pseudonym
 from marey_server.store.studies.designs import load_design, require_study
-from marey_server.store.tables import job, member, study_participant, study_trial, user
+from marey_server.store.tables import item, job, member, study_participant, study_trial, user
 from marey_server.store.transaction import Transaction
 
 
@@ -41,7 +41,8 @@ def list_for_attempt(
     `NotFoundProblem` or `ForbiddenProblem`.
     """
     require_attempt(tx.principal, job_id, fence)
-    if (item_id, revision) not in reach.pinned_places(tx):
+    is_study = select(item.c.id).where(item.c.id == item_id, item.c.kind == Kind.STUDY)
+    if (item_id, revision) not in reach.pinned_places(tx) or tx.execute(is_study).first() is None:
         raise NotFoundProblem("The job has no such study as its input.", code="no-item")
     _require_maintainer(tx, job_id)
     return _page(tx, item_id, revision, cursor, limit)
