@@ -179,7 +179,7 @@ def clips_in(marey: Marey, address: Address) -> list[Any]:
     clip = find_item(marey, address, [Kind.CLIP])
     found = [clip] if clip is not None else list(marey.project(address.project).clips.list(collection=address.path))
     if not found:
-        raise WrongUsage(f"there is no clip at {address}")
+        raise WrongUsage(f"there is no clip at {address}, nor below it; `marey ls {address.project}` lists the project")
     return found
 
 

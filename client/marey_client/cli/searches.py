@@ -194,7 +194,7 @@ def index(
 
 def _print_index(made: dict[str, Any]) -> None:
     typer.echo(
-        f"{counted(made['clips'], 'clip')} in {counted(made['shards'], 'shard')}, {made['new_clips']} of them new"
+        f"{counted(made['clips'], 'clip')}, {made['new_clips']} of them new, in {counted(made['shards'], 'shard')}"
     )
     if made["left_out"]:
         print_message(f"{counted(made['left_out'], 'clip')} cannot be compared; the log of the job names them.")

@@ -93,7 +93,7 @@ def _headline(subject: ComparedSet) -> Html:
     return facts(
         (
             ("clips", str(len(subject.clips)), f"{counted(cut, 'loop')} of one cycle" if cut else "compared whole"),
-            ("distances", span, "0: people would take them for the same"),
+            ("distances", span, "0: equal poses at all moments"),
             ("metric", subject.metric.name, subject.metric.origin),
         )
     )

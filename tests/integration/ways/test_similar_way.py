@@ -42,7 +42,7 @@ def test_similar_moments_are_found_and_the_index_follows_the_project(
     (walk,) = lab.clips.list(path="walks/walk 1.5 0")
     with pytest.raises(NotFound, match="marey index lab"):
         lab.similar(walk, (30, 60))
-    assert run("index", "lab").stdout == "9 clips in 1 shard, 9 of them new\n"
+    assert run("index", "lab").stdout == "9 clips, 9 of them new, in 1 shard\n"
 
     table = run("similar", "lab/walks/walk 1.5 0:30-60").stdout
     assert re.search(r"walks/walk \S+ \S+ +[0-9]+-[0-9]+ +[0-9.]+-[0-9.]+ +[0-9]\.[0-9]{3}", table), table
