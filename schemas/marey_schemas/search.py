@@ -8,9 +8,11 @@ from pydantic import Field, model_validator
 
 from marey_schemas.base import Answer, Request
 from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.documents.metrics import BuiltInMetric
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.names import ItemId
 from marey_schemas.old_units import in_centimetres, read_old_unit
+from marey_schemas.options.perception import DEFAULT_METRIC
 from marey_schemas.options.searching import (
     CANDIDATES,
     PASSES,
@@ -172,7 +174,6 @@ LONGEST_EXAMPLE_S = 60.0
 
 _MOST_NUMBER = 2**31 - 1
 
-SearchedMetric = Literal["published/sigmoid", "published/manhattan", "published/euclid"]
 FrameNumber = Annotated[int, Field(ge=0, le=_MOST_NUMBER)]
 
 
@@ -188,8 +189,9 @@ class SimilarOptions(Request):
         description="Which moments of the example's own clip are left out: those that overlap the example, all, or "
         "none.",
     )
-    metric: SearchedMetric = Field(
-        "published/sigmoid", description="Perceptual metric: the published weights with one of three shapings."
+    metric: BuiltInMetric = Field(
+        DEFAULT_METRIC,
+        description="Name of a built-in perceptual metric, such as `published/sigmoid`; `marey metric ls` lists them.",
     )
     index: ItemId | None = Field(
         None, description="Id of the index to search; absent: the index of the project that was updated last."

@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import Field, StringConstraints, model_validator
+from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from marey_schemas.base import Request
 from marey_schemas.documents.references import OutputRef, RevisionRef
@@ -67,7 +67,17 @@ PUBLISHED_ERROR = 0.05
 """Standard error of a published perceived difference: 1,827 trials show each of 210 pairs 52 times."""
 
 _BUILT_IN_PATTERN = r"^(published|uniform)/(?:(angles|positions|velocities)-)?(euclid|manhattan|sigmoid)$"
-BuiltInMetric = Annotated[str, StringConstraints(pattern=_BUILT_IN_PATTERN)]
+
+
+def _require_built_in(name: str) -> str:
+    if not is_built_in(name):
+        raise ValueError(f"{name!r} is not the name of a built-in metric; `marey metric ls` lists them")
+    return name
+
+
+BuiltInMetric = Annotated[
+    str, AfterValidator(_require_built_in), WithJsonSchema({"type": "string", "pattern": _BUILT_IN_PATTERN})
+]
 """Name of a metric that needs no item, such as `published/sigmoid` or `published/positions-manhattan`.
 
 `published/` uses the weights of the paper, `uniform/` equal weights, c = 0 and N = 1. Without a measurement, all three

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.documents.metrics import built_in_metric
 from marey_schemas.documents.motion_indexes import ShardClips
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
@@ -171,7 +172,7 @@ def search_index(packed: bytes) -> bytes:
 
 def _search(order: SimilarOrder) -> FoundWindows:
     from marey_motion.errors import MotionError
-    from marey_motion.perception.metric import published_metric
+    from marey_motion.perception.metric import metric_of
     from marey_motion.similarity.searching import search_windows
 
     lists = [_clips_of(files.clips) for files in order.shards]
@@ -179,7 +180,7 @@ def _search(order: SimilarOrder) -> FoundWindows:
     try:
         example, rate_hz = _example(order)
         shards = [_searched(order, *one, rate_hz, example) for one in zip(order.shards, lists, ranks, strict=True)]
-        metric = published_metric(order.request.metric.partition("/")[2])  # type: ignore[arg-type]
+        metric = metric_of(built_in_metric(order.request.metric))
         hits = search_windows(
             shards, example, metric, order.request.results, mirror=order.request.mirrored, threads=THREADS
         )  # fmt: skip

@@ -17,12 +17,13 @@ from marey_motion.mirroring import mirror_clip
 from marey_motion.motion import Motion
 from marey_motion.perception.maps import paired_distances
 from marey_motion.perception.measuring import measure_motion
-from marey_motion.perception.metric import PerceptualMetric, published_metric
+from marey_motion.perception.metric import PerceptualMetric, metric_of, published_metric
 from marey_motion.retargeting import plan_retarget, retarget
 from marey_motion.rigs import guess_axes, map_joints
 from marey_motion.similarity.features import INDEX_RATE_HZ, JOINTS, WIDTH, PoseFeatures, clip_features, mirrored
 from marey_motion.similarity.searching import Example, Hit, SearchedShard, sample_offsets, search_windows
 from marey_motion.similarity.shards import Shard, presence, write_shard
+from marey_schemas.documents.metrics import built_in_metric
 
 ALL = (1 << len(JOINTS)) - 1
 
@@ -92,16 +93,16 @@ def random_run(rng: np.random.Generator, count: int, step: float) -> np.ndarray:
     seed=st.integers(0, 2**32 - 1),
     step=st.sampled_from([0.0, 1e-3, 0.02, 0.5]),
     seconds=st.sampled_from([0.0, 0.3, 1.0]),
-    shaping=st.sampled_from(["sigmoid", "manhattan", "euclid"]),
+    name=st.sampled_from(["sigmoid", "manhattan", "euclid", "positions-sigmoid", "angles-manhattan"]),
     count=st.integers(1, 12),
 )
 def test_a_search_finds_what_brute_force_finds(
-    tmp_path_factory: pytest.TempPathFactory, seed: int, step: float, seconds: float, shaping: str, count: int
+    tmp_path_factory: pytest.TempPathFactory, seed: int, step: float, seconds: float, name: str, count: int
 ) -> None:
     rng = np.random.default_rng(seed)
     runs = [random_run(rng, int(rng.integers(1, 60)), step) for _ in range(4)]
     runs.append(runs[int(rng.integers(4))].copy())  # equal distances
-    metric, offsets = published_metric(shaping), sample_offsets(seconds)  # type: ignore[arg-type]
+    metric, offsets = metric_of(built_in_metric(f"published/{name}")), sample_offsets(seconds)
     source = random_run(rng, 40, step) if seed % 2 else np.concatenate([*runs, runs[0]])[-40:]
     example = Example(PoseFeatures(source[:1].repeat(len(offsets), 0) if step == 0 else source[offsets % len(source)],
                                    np.ones(15, np.bool_)), offsets)  # fmt: skip
