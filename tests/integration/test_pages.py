@@ -151,7 +151,7 @@ def test_the_pages_work_in_a_browser(shown: tuple[Server, httpx.Client], tmp_pat
         "positions": _positions(owner, items[names[0]]),
         "clips": names,
     }
-    _run_vitest("browser", "pages", MAREY_WEB_GIVEN=json.dumps(given))
+    _run_vitest("browser", "browser/pages.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
 
 
 @pytest.mark.chromium
@@ -181,7 +181,7 @@ def test_exactly_the_trials_that_a_participant_answers_in_a_browser_are_recorded
             "trials": 10,
             "answers": str(tmp_path / "answers.json"),
         }
-        _run_vitest("browser", "study", MAREY_WEB_GIVEN=json.dumps(given))
+        _run_vitest("browser", "browser/study.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
 
         answers = json.loads((tmp_path / "answers.json").read_text())
         judged = {one.participant: one for one in calm.judgements()}
