@@ -19,6 +19,7 @@ from tests.support.rest_server import Server, running
 from tests.support.tiers import chromium
 from tests.support.web_cases import write_cases
 
+from marey_client import Marey
 from marey_motion import generate_gait, global_positions
 from marey_motion.documents import clip_from_document, skeleton_from_document
 from marey_motion.formats import write_bvh
@@ -149,9 +150,51 @@ def test_the_pages_work_in_a_browser(shown: tuple[Server, httpx.Client], tmp_pat
         "link": f"{server.address}/view?clip={first}&beside={second}#{code}",
         "positions": _positions(owner, items[names[0]]),
         "clips": names,
-        "pictures": os.environ.get("MAREY_WEB_PICTURES"),
     }
-    _run_vitest("browser", MAREY_WEB_GIVEN=json.dumps(given))
+    _run_vitest("browser", "browser/pages.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
+
+
+@pytest.mark.chromium
+@pytest.mark.slow
+def test_exactly_the_trials_that_a_participant_answers_in_a_browser_are_recorded(
+    shown: tuple[Server, httpx.Client], tmp_path: Path
+) -> None:
+    server, owner = shown
+    for file in _takes(tmp_path):
+        _upload(owner, file)
+    for number in range(3):
+        file = tmp_path / f"gait {number}.bvh"
+        file.write_bytes(write_bvh(generate_gait(speed_m_s=0.7 + 0.4 * number, turn_rate_rad_s=0.0, duration_s=2.0)))
+        _upload(owner, file)
+    token = owner.headers["Authorization"].removeprefix("Bearer ")
+    with Marey(server.address, token) as marey:
+        studies, clips = marey.project("lab").studies, list(marey.project("lab").clips.list())
+        calm = studies.design(
+            "Walks", clips, consent_text="I take part.\nI may stop at any time.", trials=10, seconds=120
+        )
+        hurried = studies.design("Hurried", clips, consent_text="I take part.", trials=1, seconds=1)
+        codes = [link.code for study, count in ((calm, 3), (hurried, 1)) for link in study.invite(count).links]
+        given = {
+            "chromium": chromium(),
+            "page": f"{server.address}/s/",
+            "codes": dict(zip(("whole", "withdrawn", "slow", "hurried"), codes, strict=True)),
+            "trials": 10,
+            "answers": str(tmp_path / "answers.json"),
+        }
+        _run_vitest("browser", "browser/study.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
+
+        answers = json.loads((tmp_path / "answers.json").read_text())
+        judged = {one.participant: one for one in calm.judgements()}
+        recorded = judged["p1"].trials
+        assert [(one.number, list(one.shown), list(one.chosen or ())) for one in recorded] == [
+            (one["number"], one["shown"], one["chosen"]) for one in answers
+        ]
+        assert [one.number for one in recorded] == list(range(1, 11))
+        assert {(one.client_fps, one.timeouts_before) for one in recorded} == {(60.0, 0)}
+        progress = calm.progress()
+        assert (progress.finished, progress.withdrawn, progress.answered, progress.timeouts) == (1, 1, 10, 0)
+        assert "p2" not in judged
+        assert (hurried.progress().answered, hurried.progress().timeouts) == (0, 1)
 
 
 def _takes(folder: Path) -> list[Path]:
@@ -191,8 +234,8 @@ def test_decoder_and_kinematics_in_typescript_agree_with_those_in_python(tmp_pat
     _run_vitest("unit", MAREY_WEB_CASES=str(tmp_path))
 
 
-def _run_vitest(project: str, **variables: str) -> None:
-    command = ["node", "node_modules/vitest/vitest.mjs", "run", "--project", project]
+def _run_vitest(project: str, *files: str, **variables: str) -> None:
+    command = ["node", "node_modules/vitest/vitest.mjs", "run", "--project", project, *files]
     done = subprocess.run(
         command, cwd=SOURCES, env=os.environ | variables | {"NO_COLOR": "1"}, check=False, capture_output=True,
         text=True, timeout=240,

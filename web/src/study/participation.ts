@@ -38,6 +38,7 @@ export interface TrialStep {
 }
 
 export interface TrialOutcome {
+  outcome: "answered" | "timed_out";
   remaining: number;
   finished: boolean;
 }
