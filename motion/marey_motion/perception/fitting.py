@@ -245,27 +245,34 @@ def bootstrap_weights(
     return np.stack([_solve(means, each, None) for each in perceived])
 
 
-def leave_one_motion_out(differences: PairDifferences, perceived: Floats, shaping: Shaping) -> Floats:
-    """Predict the pairs of each motion by a fit to the pairs without it.
+def leave_one_motion_out(parts: Sequence[PairDifferences], perceived: Floats, shaping: Shaping) -> Floats:
+    """Predict the pairs of each motion by a fit to the pairs without it: of components, and then of their shares.
 
     To leave out single pairs would not do: the other pairs of both motions would give them away.
 
     Parameters
     ----------
-    differences : PairDifferences    R pairs
+    parts : sequence of PairDifferences    the same R pairs by the measurement of each component
     perceived : (R,) float64    perceived differences
     shaping : str    F
 
     Returns
     -------
     (R,) float64    mean of the two predictions of each pair
+
+    Raises
+    ------
+    MotionError    if too few pairs are known without some motion
     """
-    means = differences.means(shaping)
-    total = np.zeros(len(means))
-    for motion in np.unique(differences.pairs):
-        of_motion = (differences.pairs == motion).any(axis=1)
-        raw = _solve(means, np.where(of_motion, np.nan, perceived), None)
-        total[of_motion] += 0.5 * _predicted(means[of_motion], raw)
+    means = [part.means(shaping) for part in parts]
+    pairs = parts[0].pairs
+    total = np.zeros(len(pairs))
+    for motion in np.unique(pairs):
+        of_motion = (pairs == motion).any(axis=1)
+        others = np.where(of_motion, np.nan, perceived)
+        predicted = [_predicted(each, _solve(each, others, None)) for each in means]
+        shares = fit_shares(predicted, others)
+        total[of_motion] += 0.5 * (np.column_stack(predicted) @ shares)[of_motion]
     return total
 
 

@@ -206,10 +206,11 @@ def _fit(
 ) -> FittedMetric | None:
     """Fit one component for each measurement, and then their shares; None if no component could be fitted."""
     perceived = table.differences[np.triu_indices(len(table.differences), 1)]
-    parts = []
+    parts, fitted = [], []
     for differences in pairs:
         try:
             parts.append(_fit_component(judgements, differences, perceived, shaping, draws, seed))
+            fitted.append(differences)
         except MotionError as error:
             refusals.append(f"{differences.measurement} with {shaping}: {error}")
     if not parts:
@@ -217,9 +218,9 @@ def _fit(
     shares = fit_shares([part.predicted for part in parts], perceived)
     metric = PerceptualMetric(f"{name}, {shaping}", tuple(part.component for part in parts), shares)
     quality = fit_quality(_mixed([part.predicted for part in parts], shares), perceived)
-    held_out = [part.left_out for part in parts if part.left_out is not None]
-    left_out = fit_quality(_mixed(held_out, shares), perceived).rmse if len(held_out) == len(parts) else None
-    return FittedMetric(metric, tuple(parts), quality, left_out)
+    left_out = None if shaping == "power" else _left_out(fitted, perceived, shaping)
+    left_out_rmse = None if left_out is None else fit_quality(left_out, perceived).rmse
+    return FittedMetric(metric, tuple(parts), quality, left_out_rmse)
 
 
 def _mixed(predicted: Sequence[Floats], shares: Sequence[float]) -> Floats:
@@ -234,15 +235,15 @@ def _fit_component(
         left_out, intervals = None, dict[str, tuple[float, float]]()
     else:
         component = fit_component(differences, perceived, shaping)
-        left_out = _left_out(differences, perceived, shaping)
+        left_out = _left_out([differences], perceived, shaping)
         intervals = _intervals(judgements, differences, shaping, draws, seed)
     predicted = predict(component, differences)
     return ComponentFit(component, fit_quality(predicted, perceived), predicted, left_out, intervals)
 
 
-def _left_out(differences: PairDifferences, perceived: Floats, shaping: Shaping) -> Floats | None:
+def _left_out(parts: Sequence[PairDifferences], perceived: Floats, shaping: Shaping) -> Floats | None:
     try:
-        return leave_one_motion_out(differences, perceived, shaping)
+        return leave_one_motion_out(parts, perceived, shaping)
     except MotionError:  # without a motion, too few pairs are left for a fit
         return None
 

@@ -1,7 +1,10 @@
 """Difference tables of judgements, the order of motions, and weights fitted to tables."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 from scipy.stats import spearmanr
 
 from marey_motion.arrays import Floats, Ints
@@ -26,6 +29,7 @@ from marey_motion.perception.judging import (
 )
 from marey_motion.perception.metric import Component
 from marey_motion.perception.ordering import order_motions
+from marey_motion.perception.study_analysis import analyse_study
 from marey_schemas.documents.metrics import classes_of
 
 MOTIONS = 21
@@ -188,9 +192,30 @@ def test_uncertainty_comes_from_participants_and_validation_from_motions() -> No
     assert draws.std(axis=0).max() > 0
     noisy = truth + np.random.default_rng(1).normal(0.0, 0.2, len(truth))
     fitted = predict(fit_component(pairs, noisy, "manhattan"), pairs)
-    left_out = leave_one_motion_out(pairs, noisy, "manhattan")
+    left_out = leave_one_motion_out([pairs], noisy, "manhattan")
     assert fit_quality(left_out, noisy).rss > fit_quality(fitted, noisy).rss
-    np.testing.assert_allclose(leave_one_motion_out(pairs, truth, "manhattan"), truth, atol=1e-9)
+    np.testing.assert_allclose(leave_one_motion_out([pairs], truth, "manhattan"), truth, atol=1e-9)
+
+
+def test_the_error_for_new_motions_contains_no_share_fitted_to_them() -> None:
+    judgements = simulate_judgements(grouped(), 4, seed=6, noise=0.1)
+    perceived = difference_table(judgements).differences[PAIRS]
+    parts = [pair_differences(1), replace(pair_differences(2), measurement="velocities")]
+    means = [np.column_stack((np.ones(len(perceived)), part.means("manhattan"))) for part in parts]
+    expected = np.zeros(len(perceived))
+    for motion in range(MOTIONS):
+        of_motion = (parts[0].pairs == motion).any(axis=1)
+        rest = ~of_motion & np.isfinite(perceived)
+        one, other = (each @ nnls(each[rest], perceived[rest])[0] for each in means)
+        step = one - other
+        share = np.clip(step[rest] @ (perceived - other)[rest] / (step[rest] @ step[rest]), 0.0, 1.0)
+        expected[of_motion] += 0.5 * (other + share * step)[of_motion]
+    (fit,) = [
+        each
+        for each in analyse_study(judgements, parts, name="t", draws=0, seed=0).fits
+        if each.parts[0].component.shaping == "manhattan"
+    ]
+    assert fit.left_out_rmse == pytest.approx(fit_quality(expected, perceived).rmse, rel=1e-9)
 
 
 def test_shares_are_the_optimum_on_the_simplex() -> None:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
+from marey_motion.formats import read_motion
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.mirroring import mirror_clip
@@ -123,6 +124,24 @@ def test_the_distance_is_the_perceptual_metric_of_the_clips(tmp_path: Path) -> N
     at_one, at_other = ((row + offsets).astype(np.float64) for row in (30, hit.row))
     exact = paired_distances(one.at(at_one), other.at(at_other), metric)
     assert hit.distance == pytest.approx(float(exact.mean()), abs=2e-5)
+
+
+def test_searches_of_real_clips_find_all_of_the_ten_nearest(tmp_path: Path, mocap: Path) -> None:
+    moves = ("bow_normal", "run_normal", "walk_normal", "walk_tired")
+    files = [mocap / "bandai-namco-1" / f"dataset-1_{move}_001.bvh" for move in moves]
+    clips = [read_motion(file.read_bytes(), file.name).clip for file in files]
+    features = [features_of(clip) for clip in clips if clip is not None]
+    runs = [each.rows[:60] for each in features]
+    shard, offsets = searched(tmp_path, runs), sample_offsets(0.1)
+    last = len(runs[2]) - 1 - int(offsets[-1])
+    for start, shaping in ((0, "sigmoid"), (last, "euclid")):  # windows at both ends of a walk
+        example = Example(PoseFeatures(runs[2][start + offsets], features[2].present), offsets)
+        metric = published_metric(shaping)  # type: ignore[arg-type]
+        found = search_windows([shard], example, metric, 10)
+        expected = by_brute_force(runs, example, metric, 10)
+        assert found[0][1:4] == (2, start, 0.0)
+        assert [hit[:3] for hit in found] == [hit[:3] for hit in expected]
+        np.testing.assert_allclose([hit.distance for hit in found], [hit.distance for hit in expected], atol=1e-6)
 
 
 def test_shards_and_their_number_make_no_difference(tmp_path: Path) -> None:
