@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -12,6 +12,8 @@ from marey_schemas.names import ItemId
 
 MOST_SHARDS = 2000
 """Greatest number of shards of an index: about 1,200 hours of motion."""
+_MOST_NUMBER = 2**31 - 1
+_Number = Annotated[int, Field(ge=0, le=_MOST_NUMBER)]
 INDEX_VERSION = 1
 """Number of the form of shards; a server searches only indexes with this number."""
 
@@ -22,7 +24,7 @@ class IndexShard(Request):
     clips: StoredFile = Field(description="List of the clips, a `ShardClips` as JSON.")
     poses: StoredFile = Field(description="Features of the poses of these clips.")
     rows: int = Field(ge=1, description="Number of poses.")
-    dropped: tuple[int, ...] = Field(
+    dropped: tuple[_Number, ...] = Field(
         (), max_length=100_000, description="Numbers of clips in the list that no longer belong to the index."
     )
 
@@ -42,11 +44,13 @@ class ShardClips(Request):
     """Clips of a shard, in the order of their poses; the lists have equal lengths."""
 
     items: tuple[ItemId, ...] = Field(description="Ids of the clips.")
-    revisions: tuple[int, ...] = Field(description="Revisions of the clips.")
-    rows: tuple[int, ...] = Field(description="Number of poses of each clip, 30 per second.")
-    joints: tuple[int, ...] = Field(description="Which of the compared joints each clip has, as bits.")
-    frames: tuple[int, ...] = Field(description="Number of frames of each clip.")
-    rates_hz: tuple[float, ...] = Field(description="Frames per second of each clip.")
+    revisions: tuple[_Number, ...] = Field(description="Revisions of the clips.")
+    rows: tuple[_Number, ...] = Field(description="Number of poses of each clip, 30 per second.")
+    joints: tuple[_Number, ...] = Field(description="Which of the compared joints each clip has, as bits.")
+    frames: tuple[_Number, ...] = Field(description="Number of frames of each clip.")
+    rates_hz: tuple[Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)], ...] = Field(
+        description="Frames per second of each clip."
+    )
 
     @model_validator(mode="after")
     def _check_lengths(self) -> Self:

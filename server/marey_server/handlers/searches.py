@@ -115,8 +115,8 @@ class SimilarMoments(Resource):
         missing = await self.compute(files.missing, index.document)
         if missing:
             self.services.disk.require()
-        for digest in missing:
-            await self.look_up(files.copy, digest)
+        for file in missing:
+            await self.look_up(files.copy, file)
         return tuple(
             ShardFiles(
                 clips=str(files.path(shard.clips.blob)),

@@ -130,12 +130,12 @@ def render(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Rendered:
     """
     if reply.rev is not None and isinstance(reply.content, BaseModel):
         reply = _with_digest(reply, encode(reply.content, form.media), form.media)
-    headers = {"Vary": "Accept, Accept-Encoding", **reply.headers}
+    # Without this header, a cache on the way could keep what it has got for the cookie of a browser.
+    headers = {"Vary": "Accept, Accept-Encoding", "Cache-Control": REVALIDATED, **reply.headers}
     if reply.location is not None:
         headers["Location"] = API + reply.location
     if reply.rev is not None:
         headers["ETag"] = entity_tag(reply.rev, form.media.form)
-        headers.setdefault("Cache-Control", REVALIDATED)
         if matches(form.if_none_match, headers["ETag"]):
             return Rendered(304, headers, b"")
     if reply.content is None:

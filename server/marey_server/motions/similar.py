@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic import ValidationError
+
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.metrics import built_in_metric
 from marey_schemas.documents.motion_indexes import ShardClips
@@ -159,7 +161,8 @@ _CLIPS: LruCache[str, ShardClips] = LruCache(max_bytes=_CLIPS_CACHE_BYTES, size_
 def search_index(packed: bytes) -> bytes:
     """Carry out a `SimilarOrder` and return packed `FoundWindows`.
 
-    Raises `InvalidProblem` if the example cannot be compared, and `NotFoundProblem` if files of the index are missing.
+    Raises `InvalidProblem` if the example cannot be compared, and `NotFoundProblem` if files of the index are missing
+    or damaged.
     """
     order = SimilarOrder.unpack(packed)
     try:
@@ -175,7 +178,7 @@ def _search(order: SimilarOrder) -> FoundWindows:
     from marey_motion.perception.metric import metric_of
     from marey_motion.similarity.searching import search_windows
 
-    lists = [_clips_of(files.clips) for files in order.shards]
+    lists = [_clips_of(files) for files in order.shards]
     ranks = _ranks(lists)
     try:
         example, rate_hz = _example(order)
@@ -194,8 +197,20 @@ def _search(order: SimilarOrder) -> FoundWindows:
     return FoundWindows(windows=windows, searched_clips=searched, behind=behind)
 
 
-def _clips_of(path: str) -> ShardClips:
-    return _CLIPS.get_or_make(path, lambda: ShardClips.model_validate_json(Path(path).read_bytes()))
+def _clips_of(files: ShardFiles) -> ShardClips:
+    """Read the list of clips of a shard, which anybody may have written. Raises `NotFoundProblem` if it is no list."""
+    path = files.clips
+    try:
+        clips = _CLIPS.get_or_make(path, lambda: ShardClips.model_validate_json(Path(path).read_bytes()))
+    except ValidationError as error:
+        raise _damaged() from error
+    if any(number >= len(clips.items) for number in files.dropped):
+        raise _damaged()
+    return clips
+
+
+def _damaged() -> NotFoundProblem:
+    return NotFoundProblem("A list of clips in the index is damaged; build the index again.", code="no-index")
 
 
 def _ranks(lists: list[ShardClips]) -> list[Any]:

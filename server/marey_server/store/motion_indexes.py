@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from sqlalchemy import or_, select
 
 from marey_schemas.documents.motion_indexes import INDEX_VERSION, MotionIndexDocument
+from marey_schemas.documents.reports import StoredFile
 from marey_schemas.kinds import Kind
 from marey_schemas.sizes import GIB
 from marey_server.errors import ConflictProblem, NotFoundProblem, TooLargeProblem
@@ -124,8 +125,8 @@ class IndexFiles:
         """Return the path of the copy of a blob, whether or not it exists."""
         return self._folder / digest.removeprefix("sha256:")
 
-    def missing(self, document: MotionIndexDocument) -> list[str]:
-        """List the digests of the files of an index that have no copy; remove old copies if they do not fit.
+    def missing(self, document: MotionIndexDocument) -> list[StoredFile]:
+        """List the files of an index that have no copy; remove old copies if they do not fit.
 
         Raises `TooLargeProblem` if the index is too large to be searched.
         """
@@ -145,14 +146,21 @@ class IndexFiles:
                 missing.append(file)
         if missing:
             self._make_room(self._most_bytes - sum(file.size_bytes for file in missing), {file.blob for file in files})
-        return [file.blob for file in missing]
+        return missing
 
-    def copy(self, tx: Transaction, digest: str) -> None:
-        """Copy a blob of an index that the caller may read; a copy appears only when it is complete.
+    def copy(self, tx: Transaction, stored: StoredFile) -> None:
+        """Copy a file of an index that the caller may read; a copy appears only when it is complete.
 
-        Raises `NotFoundProblem` if bytes of the blob are missing.
+        Raises `NotFoundProblem` if bytes are missing, or if the file has another size than the index states: anybody
+        may write an index, and `missing` has made room for the stated size.
         """
+        digest = stored.blob
         size = tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar_one()
+        if size != stored.size_bytes:
+            raise NotFoundProblem(
+                f"A file of the index has {size:,} bytes instead of {stored.size_bytes:,}; build the index again.",
+                code="no-index",
+            )
         handle, name = tempfile.mkstemp(dir=self._folder)
         try:
             with os.fdopen(handle, "wb") as file:

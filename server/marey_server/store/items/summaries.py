@@ -32,7 +32,7 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
     if kind is Kind.MODEL:
         return _learned(bodies["model"])
     if kind is Kind.INDEX:
-        return Summary({name: bodies["index"][name] for name in ("clips", "rows", "left_out")})
+        return Summary({name: bodies["index"].get(name, 0) for name in ("clips", "rows", "left_out")})
     if kind is Kind.ANNOTATION:
         return Summary(_said(bodies["annotation"]))
     if kind is Kind.CLIP:

@@ -1,0 +1,80 @@
+"""Searches by example in indexes that somebody has written by hand: their files may be anything."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from tests.support.studying import make_study
+
+from marey_schemas.documents.motion_indexes import IndexShard, ShardClips
+from marey_schemas.search import SimilarRequest
+from marey_server.errors import NotFoundProblem
+from marey_server.motions.similar import ShardFiles, SimilarOrder, search_index
+
+ONE = {"items": ["clip_a"], "revisions": [1], "rows": [60], "joints": [1], "frames": [60], "rates_hz": [30.0]}
+
+
+def stored(owner: httpx.Client, content: bytes) -> dict[str, Any]:
+    digest = f"sha256:{hashlib.sha256(content).hexdigest()}"
+    assert owner.put(f"/blobs/{digest}", content=content).is_success
+    return {"blob": digest, "size_bytes": len(content)}
+
+
+def searched(owner: httpx.Client, clip: str, **shard: Any) -> tuple[int, str]:
+    """Store an index of one shard without the fields that may be absent, and search it."""
+    index = {"schema": "marey/motion-index@1", "clips": 1, "rows": 60, "shards": [{"rows": 60, **shard}]}
+    made = owner.post("/projects/lab/indexes", json={"name": "index", "parts": {"index": index}})
+    assert made.status_code == 201, made.text
+    assert made.json()["summary"]["left_out"] == 0
+    item = made.json()["id"]
+    answer = owner.post("/projects/lab/similar", json={"clip": clip, "frames": [0, 1], "index": item})
+    assert owner.delete(f"/projects/lab/indexes/{item}", headers={"If-Match": "*"}).is_success
+    return answer.status_code, answer.json()["code"]
+
+
+def test_a_search_refuses_an_index_whose_files_have_other_sizes(owner: httpx.Client) -> None:
+    make_study(owner, 4)
+    listed = owner.get("/projects/lab/clips")
+    assert listed.headers["Cache-Control"] == "private, no-cache", "no cache may keep what a cookie has shown"
+    clip = listed.json()["items"][0]["id"]
+    poses, clips = stored(owner, b"no poses"), stored(owner, json.dumps(ONE).encode())
+    wrong = {**poses, "size_bytes": 0}
+    assert searched(owner, clip, clips=clips, poses=wrong) == (404, "no-index"), "a stated size is no promise"
+
+
+@pytest.mark.parametrize(
+    ("content", "dropped"),
+    [
+        (b"{", ()),
+        (b"\xff\xfe", ()),
+        (json.dumps({**ONE, "rows": [-60]}).encode(), ()),
+        (json.dumps(ONE).encode(), (1,)),
+    ],
+)
+def test_a_search_refuses_damaged_lists_of_clips(tmp_path: Path, content: bytes, dropped: tuple[int, ...]) -> None:
+    (tmp_path / "clips").write_bytes(content)
+    shard = ShardFiles(clips=str(tmp_path / "clips"), poses=str(tmp_path / "poses"), dropped=dropped)
+    request = SimilarRequest(clip="clip_a", frames=(0, 1))
+    order = SimilarOrder(
+        request=request, revision=1, motion=b"", first=0, hierarchy=b"", mapping=None, shards=(shard,), heads={}
+    )  # fmt: skip
+    with pytest.raises(NotFoundProblem, match="damaged"):
+        search_index(order.pack())
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("rows", -1), ("rows", 2**63), ("joints", -1), ("revisions", 2**70), ("frames", -1), ("rates_hz", 0.0)],
+)
+def test_lists_of_clips_contain_only_possible_numbers(name: str, value: float) -> None:
+    assert ShardClips.model_validate(ONE).rows == (60,)
+    with pytest.raises(ValueError, match=name):
+        ShardClips.model_validate({**ONE, name: [value]})
+    file = {"blob": f"sha256:{'0' * 64}", "size_bytes": 1}
+    with pytest.raises(ValueError, match="dropped"):
+        IndexShard.model_validate({"clips": file, "poses": file, "rows": 1, "dropped": [-1]})
