@@ -1,8 +1,9 @@
 import { describe, expect, it } from "vitest";
-import { type Clip, clipOf, skeletonOf } from "../src/motion/clip";
+import { Clip, clipOf, skeletonOf } from "../src/motion/clip";
 import { findContacts } from "../src/motion/contacts";
 import { Kinematics } from "../src/motion/kinematics";
 import { type HierarchyDocument, type MappingDocument, Skeleton } from "../src/motion/skeleton";
+import { Actor } from "../src/scene/actor";
 import { shapeBody } from "../src/scene/body";
 import { decodeMessagePack } from "../src/wire/messagepack";
 import { bytesOf, floatsOf, INDEX, jsonOf } from "./cases";
@@ -67,5 +68,32 @@ describe("the body of a skeleton", () => {
     });
     expect(shapeBody(chain).limbs.length).toBeGreaterThan(0);
     expect(chain.feet).toEqual([]);
+  });
+});
+
+describe("a skeleton whose root carries the body through space", () => {
+  const joints: HierarchyDocument["joints"] = [
+    { name: "joint_Root", parent: -1, offset: [0, 0, 0] },
+    { name: "Hips", parent: 0, offset: [0, 0.95, 0] },
+    { name: "Spine", parent: 1, offset: [0, 0.5, 0] },
+    { name: "LeftUpLeg", parent: 1, offset: [0.1, 0, 0] },
+    { name: "LeftLeg", parent: 3, offset: [0, -0.45, 0] },
+  ];
+
+  it.each([["mapped", { joints: { left_hip: "LeftUpLeg" } }], ["not mapped", null]])("has no bone to its hips, %s", (_, mapping) => {
+    const skeleton = new Skeleton({ joints }, mapping);
+    expect(skeleton.hips).toBe(1);
+    expect(shapeBody(skeleton).bones.map((bone) => bone.to)).toEqual([2, 3, 4]);
+  });
+
+  it("is looked at where its hips are", () => {
+    const poses = new Float32Array(2 * (3 + 4 * joints.length));
+    poses.forEach((_, at) => (poses[at] = at % (3 + 4 * joints.length) >= 3 && ((at % (3 + 4 * joints.length)) - 3) % 4 === 0 ? 1 : 0));
+    const names = joints.map((joint) => joint.name);
+    const moved = Float32Array.from([1, 0.95, 2, 5, 0.95, 6]);
+    const actor = new Actor(new Clip("moved", new Skeleton({ joints }), 1, names, poses, ["Hips"], moved));
+    actor.seek(1);
+    expect(actor.centre(true)).toEqual([5, expect.any(Number), 6]);
+    expect(actor.centre(false)).toEqual([1, expect.any(Number), 2]);
   });
 });

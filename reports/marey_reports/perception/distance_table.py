@@ -23,7 +23,7 @@ MOST_WRITTEN = 24
 """Greatest number of clips for which each cell contains its number."""
 MOST_NAMED = 60
 _CELL, _SMALL_CELL, _SIGN, _BAR = 0.34, 0.13, 0.075, 0.14
-_DARK_FROM = 0.55
+_DARK_FROM = 0.43
 
 
 def draw_distance_table(subject: ComparedSet) -> Sketch:

@@ -86,7 +86,7 @@ def draw_registration(
     _bar(figure, images[-1], len(maps) - 1)
     caption += (
         f"{one.name} and {other.name}; the curve joins moments of the same phase, with a mean distance of "
-        f"{curve.mean_cost:.2f}."
+        f"{curve.mean_cost:.2f} along the curve."
     )
     tables["curve"] = {"first_s": frames / rate, "second_s": curve.times / rate}
     return Sketch(figure, tables, caption)

@@ -103,12 +103,14 @@ def _pairs(subject: ComparedSet) -> Html:
     ranked = subject.distances.pairs_by_distance()
     names = labels_of([clip.name for clip in subject.clips])
     listed = ranked if len(ranked) <= MOST_LISTED_PAIRS else ranked[:MOST_LISTED_PAIRS]
-    measured = [component.measurement for component in subject.metric.components]
+    several = len(subject.metric.components) > 1  # of one, the distances are those of the metric
+    measured = [component.measurement for component in subject.metric.components] if several else []
+    parts = subject.distances.by_component if several else ()
     rows: list[Sequence[Cell]] = [
         (
             f"{names[i]} – {names[j]}",
             number(float(subject.distances.totals[i, j]), 3),
-            *(number(float(part[i, j]), 3) for part in subject.distances.by_component),
+            *(number(float(part[i, j]), 3) for part in parts),
         )
         for i, j in listed
     ]

@@ -157,7 +157,10 @@ def _summary(analysis: StudyAnalysis) -> Content:
         ),
     ]
     if best is not None:
-        tiles.append(("best fit", number(best.quality.rmse, 3).written, f"root mean square error, {_shaping(best)}"))
+        r2 = best.quality.r2
+        explains = f"; it explains {share(max(r2, 0.0)).written} of the variance" if np.isfinite(r2) else ""
+        note = f"root mean square error, {_shaping(best)}{explains}"
+        tiles.append(("best fit", number(best.quality.rmse, 3).written, note))
     return facts(tiles)
 
 
@@ -195,7 +198,15 @@ def _fits(analysis: StudyAnalysis, refusals: Sequence[str]) -> Content:
 
 
 def _weights_table(analysis: StudyAnalysis) -> Content:
-    heads = ("measurement and shaping", "error", "R²", "left out", "constant", "N", *JOINT_CLASSES)
+    heads = (
+        "measurement and shaping",
+        "error",
+        "R²",
+        "left out",
+        "constant",
+        "N",
+        *(name.replace("_", " ") for name in JOINT_CLASSES),
+    )
     rows: list[Sequence[Cell]] = []
     measurements = list(dict.fromkeys(part.component.measurement for fit in analysis.fits for part in fit.parts))
     for measurement in measurements:

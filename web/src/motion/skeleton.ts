@@ -30,6 +30,8 @@ export class Skeleton {
   /** Joints that touch the ground, by which contacts are detected. */
   readonly feet: number[];
   readonly head: number;
+  /** Joint at which the body begins; the bones that lead to it only carry the body through space, and are not drawn. */
+  readonly hips: number;
 
   constructor(hierarchy: HierarchyDocument, mapping: MappingDocument | null = null) {
     const joints = hierarchy.joints;
@@ -44,6 +46,15 @@ export class Skeleton {
     this.sides = this.findSides(standard);
     this.feet = this.findFeet(standard);
     this.head = standard.get("head") ?? this.names.findIndex((name) => /head/i.test(name));
+    const leg = standard.get("left_hip") ?? -1;
+    this.hips = leg > 0 ? this.parents[leg]! : this.firstBranching();
+  }
+
+  /** The joints above the hips, which are no part of the body. */
+  carriers(): Set<number> {
+    const above = new Set<number>();
+    for (let joint = this.parents[this.hips]!; joint >= 0; joint = this.parents[joint]!) above.add(joint);
+    return above;
   }
 
   /** Length of the bone from the parent to a point, in metres. */
@@ -56,6 +67,12 @@ export class Skeleton {
     const lengths = Float64Array.from({ length: this.pointCount }, (_, point) => (point === 0 ? 0 : this.boneLength(point)));
     for (let point = this.pointCount - 1; point > 0; point--) lengths[this.parents[point]!]! += lengths[point]!;
     return lengths;
+  }
+
+  private firstBranching(): number {
+    const children = (joint: number) => this.parents.reduce((count, parent) => count + (parent === joint ? 1 : 0), 0);
+    const found = this.names.findIndex((_, joint) => children(joint) > 1);
+    return Math.max(found, 0);
   }
 
   private findSides(standard: Map<string, number>): Side[] {

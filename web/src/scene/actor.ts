@@ -11,12 +11,15 @@ export class Actor {
   readonly contacts: Uint8Array[];
   frame = 0;
   private readonly kinematics: Kinematics;
+  /** Place of the hips in the first frame. */
+  private readonly start: [number, number];
 
   constructor(readonly clip: Clip) {
     this.body = shapeBody(clip.skeleton);
     this.contacts = findContacts(clip);
     this.kinematics = new Kinematics(clip);
     this.kinematics.update(0);
+    this.start = this.place();
   }
 
   /** Positions of all points in metres. */
@@ -35,11 +38,15 @@ export class Actor {
     return this.clip.skeleton.feet.filter((_, index) => this.contacts[index]![this.frame] === 1);
   }
 
-  /** Point that a camera looks at: above the root on the ground, at half the height of the body. */
+  /** Point that a camera looks at: below or above the hips, at half the height of the body. */
   centre(follows: boolean): [number, number, number] {
-    const { poses } = this.clip;
-    const [x, z] = follows ? [this.positions[0]!, this.positions[2]!] : [poses[0]!, poses[2]!];
+    const [x, z] = follows ? this.place() : this.start;
     return [x, 0.52 * this.body.height, z];
+  }
+
+  private place(): [number, number] {
+    const { hips } = this.clip.skeleton;
+    return [this.positions[3 * hips]!, this.positions[3 * hips + 2]!];
   }
 }
 

@@ -35,9 +35,11 @@ const STANDARD_HEIGHT = 1.75;
 /** Return the shape of a mannequin with the bones of a skeleton. */
 export function shapeBody(skeleton: Skeleton): Body {
   const rest = restPositions(skeleton);
+  const carriers = skeleton.carriers();
   const heights = Array.from({ length: skeleton.pointCount }, (_, point) => rest[3 * point + 1]!);
-  const spread = [0, 1, 2].map((axis) => extent(rest, axis));
-  const height = Math.max(extent(rest, 1), 0.5 * Math.max(...spread), 1e-3);
+  const ofBody = rest.filter((_, at) => !carriers.has(Math.floor(at / 3)));
+  const spread = [0, 1, 2].map((axis) => extent(ofBody, axis));
+  const height = Math.max(spread[1]!, 0.5 * Math.max(...spread), 1e-3);
   const scale = height / STANDARD_HEIGHT;
   const carried = skeleton.subtreeLengths();
   const top = skeleton.head >= 0 ? skeleton.head : heights.indexOf(Math.max(...heights));
@@ -45,7 +47,7 @@ export function shapeBody(skeleton: Skeleton): Body {
   const bones: Limb[] = [];
   for (let point = 1; point < skeleton.pointCount; point++) {
     const length = skeleton.boneLength(point);
-    if (length < SHORTEST_LIMB * scale) continue;
+    if (length < SHORTEST_LIMB * scale || point === skeleton.hips || carriers.has(point)) continue;
     const isTrunk = skeleton.sides[point] === "centre" && carried[point]! > 1.2 * scale;
     const thickness = RADIUS_OF_A_METRE * Math.sqrt(carried[point]! / scale) * scale;
     const radius = isTrunk ? 0.1 * scale : Math.min(thickness, 0.075 * scale, 0.42 * length + 0.01 * scale);

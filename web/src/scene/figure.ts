@@ -130,8 +130,9 @@ class Drawn {
 function skeletonOf(actor: Actor): Drawn {
   const thick = 0.011 * actor.body.height;
   const limbs = actor.body.bones.map((bone) => ({ ...bone, radius: Math.min(thick, 3 * bone.radius) }));
-  const { jointCount } = actor.clip.skeleton;
-  const balls = Array.from({ length: jointCount }, (_, joint) => ({ from: joint, to: joint, radius: 1.15 * thick }));
+  const carriers = actor.clip.skeleton.carriers();
+  const joints = actor.clip.skeleton.names.map((_, joint) => joint).filter((joint) => !carriers.has(joint));
+  const balls = joints.map((joint) => ({ from: joint, to: joint, radius: 1.15 * thick }));
   const bone = new CylinderGeometry(0.35, 1, 1, 4, 1, true).translate(0, 0.5, 0);
   return new Drawn(bone, new OctahedronGeometry(1), limbs, balls, true);
 }

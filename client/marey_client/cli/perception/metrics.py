@@ -204,6 +204,8 @@ def _document(context: typer.Context, name: str) -> MetricDocument:
 def _print_distances(document: Mapping[str, Any]) -> None:
     names = [clip["name"] for clip in document["clips"]]
     table, parts = document["distances"], document["components"]
+    if len(parts) == 1:  # its distances are those of the metric
+        parts = {}
     pairs = sorted(
         ((i, j) for i in range(len(names)) for j in range(i + 1, len(names))), key=lambda pair: float(table[pair])
     )

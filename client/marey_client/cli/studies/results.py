@@ -111,7 +111,13 @@ def _save_metric(found: Findings, path: Path) -> None:
 
 
 def _print_analysis(summary: Mapping[str, object], document: Mapping[str, object]) -> None:
-    print_pairs([(name.replace("_", " "), str(value)) for name, value in summary.items()])
+    shown = {name: value for name, value in summary.items() if name != "outputs"}
+    print_pairs(
+        [
+            (name.replace("_", " "), f"{value:.3g}" if isinstance(value, float) else str(value))
+            for name, value in shown.items()
+        ]
+    )
     refusals = document["refusals"]
     assert isinstance(refusals, list)
     for text in refusals:
