@@ -39,7 +39,7 @@ export function shapeBody(skeleton: Skeleton): Body {
   const heights = Array.from({ length: skeleton.pointCount }, (_, point) => rest[3 * point + 1]!);
   const ofBody = rest.filter((_, at) => !carriers.has(Math.floor(at / 3)));
   const spread = [0, 1, 2].map((axis) => extent(ofBody, axis));
-  const height = Math.max(spread[1]!, 0.5 * Math.max(...spread), 1e-3);
+  const height = uprightHeight(skeleton) ?? Math.max(spread[1]!, 0.5 * Math.max(...spread), 1e-3);
   const scale = height / STANDARD_HEIGHT;
   const carried = skeleton.subtreeLengths();
   const top = skeleton.head >= 0 ? skeleton.head : heights.indexOf(Math.max(...heights));
@@ -60,6 +60,20 @@ export function shapeBody(skeleton: Skeleton): Body {
   for (const hub of hubs(skeleton)) balls.push({ from: hub, to: hub, radius: 0.11 * scale });
   balls.push({ from: top, to: crown < 0 ? top : crown, radius: 0.105 * scale });
   return { bones, limbs, balls, height };
+}
+
+/** Length of a leg and of the bones from the hips to the head; undefined if feet or head are unknown.
+ *
+ * The pose at rest need not stand: in some files, all its bones lie along one axis.
+ */
+function uprightHeight(skeleton: Skeleton): number | undefined {
+  const lengthTo = (point: number) => {
+    let length = 0;
+    for (; point >= 0 && point !== skeleton.hips; point = skeleton.parents[point]!) length += skeleton.boneLength(point);
+    return length;
+  };
+  const legs = skeleton.feet.map(lengthTo);
+  return legs.length > 0 && skeleton.head > 0 ? Math.max(...legs) + lengthTo(skeleton.head) : undefined;
 }
 
 /** Joints from which at least three bones branch off: pelvis and chest. */
