@@ -16,7 +16,7 @@ FigureName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,63
 
 
 class StoredFile(Request):
-    """File stored as a blob, with its name and media type."""
+    """File stored as a blob."""
 
     blob: Digest
     size_bytes: int = Field(ge=0)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from marey_motion import documents
 from marey_motion.errors import MotionError
@@ -44,7 +45,10 @@ LEFT_OUT_NAMED = 100
 
 
 def run(context: Context, params: IndexParams) -> dict[str, Any]:
-    """Stage the index of the input clips. Raises `JobRefused` if the index would have too many shards."""
+    """Stage the index of the input clips.
+
+    Raises `JobRefused` if the earlier index is damaged, or if the new one would have too many shards.
+    """
     started = time.monotonic()
     pins = {(pin.item, pin.revision): pin for pin in context.inputs["clips"]}
     earlier = context.inputs.get("index", ())
@@ -98,13 +102,23 @@ def _stage(context: Context, params: IndexParams, document: MotionIndexDocument)
 
 
 def _earlier_shards(context: Context, pin: PinnedInput) -> list[tuple[IndexShard, ShardClips]]:
-    """Read the shards of an earlier index and their clips; none if the index has another form."""
+    """Read the shards of an earlier index and their clips; none if the index has another form.
+
+    Raises `JobRefused` if the index is damaged, for example because somebody wrote it by hand.
+    """
     document = MotionIndexDocument.model_validate(context.document(Kind.INDEX, pin.item, pin.revision, "index"))
     if document.version != INDEX_VERSION:
         return []
-    return [
-        (shard, ShardClips.model_validate_json(context.blob(shard.clips.blob))) for shard in document.shards
-    ]  # fmt: skip
+    try:
+        return [(shard, ShardClips.model_validate_json(context.blob(shard.clips.blob))) for shard in document.shards]
+    except ValidationError as error:
+        raise _damaged(pin) from error
+
+
+def _damaged(pin: PinnedInput) -> JobRefused:
+    return JobRefused(
+        "index-damaged", f"the index {pin.name} is damaged and cannot be updated; delete it, and index the clips again"
+    )
 
 
 def _needed(shard: IndexShard, clips: ShardClips, pins: Mapping[tuple[str, int], PinnedInput]) -> list[int]:
@@ -122,12 +136,15 @@ def _places(clips: ShardClips, runs: Sequence[int]) -> Iterator[tuple[str, int]]
 
 
 def _copy(context: Context, writer: _Writer, shard: IndexShard, clips: ShardClips, runs: Sequence[int]) -> None:
-    """Add the poses of some clips of an earlier shard."""
+    """Add the poses of some clips of an earlier shard. Raises `JobRefused` if the shard is damaged."""
     if not runs:
         return
     file = context.scratch / "earlier"
     file.write_bytes(context.blob(shard.poses.blob))
-    opened = Shard.open(file, np.array(clips.rows), np.array(clips.joints))
+    try:
+        opened = Shard.open(file, np.array(clips.rows), np.array(clips.joints))
+    except MotionError as error:
+        raise _damaged(context.inputs["index"][0]) from error
     for run in runs:
         first, last = opened.runs.starts[run : run + 2]
         facts = {name: getattr(clips, name)[run] for name in ShardClips.model_fields}
