@@ -26,7 +26,7 @@ from marey_motion.perception.registration import clip_distance
 from marey_motion.retargeting import plan_retarget, retarget
 from marey_motion.rigs import guess_axes, map_joints
 from marey_reports.perception.compared import ComparedSet
-from marey_reports.perception.page import draw_distance_figures
+from marey_reports.perception.page import draw_distance_figures, render_distances
 from marey_schemas.documents.metrics import (
     MetricComponent,
     MetricDocument,
@@ -134,6 +134,23 @@ def test_whole_clips_of_different_lengths_are_drawn_at_one_rate_or_refused() -> 
     assert any("Whole clips" in claim for claim in subject.claims())
     with pytest.raises(MotionError, match="clips 1 and 2 have 1260 and 240 frames"):
         compare_clips([long.compared, comparable(gait, cycles="whole").compared], METRIC)
+
+
+@pytest.mark.parametrize(("name", "columns"), [("published/positions-sigmoid", 0), ("published/manhattan", 3)])
+def test_a_report_lists_all_pairs_and_parts_only_of_metrics_with_several(name: str, columns: int) -> None:
+    document = built_in_metric(name)
+    metric = metric_of(document)
+    clips = [prepare_comparison(gait, body_of(gait), metric, 60.0, name=f"<{at}>") for at, gait in enumerate(gaits())]
+    found = compare_clips([clip.compared for clip in clips], metric)
+    subject = ComparedSet(document, clips, found, DistanceOptions())
+    figures = draw_distance_figures(subject)
+    assert ("nearest-components" in figures) == (columns > 0)
+    page = render_distances(subject, figures, title="Gaits <of> mine")
+    assert "Gaits &lt;of&gt; mine" in page
+    listed = page.partition("Pairs, the nearest first")[2].partition("</table>")[0]
+    assert [one in listed for one in ("angles", "positions", "velocities")] == [columns > 0] * 3
+    assert listed.index("&lt;1&gt; – &lt;2&gt;") < listed.index("&lt;0&gt; – &lt;2&gt;")
+    assert "Of 3 clips" in page
 
 
 def test_a_person_who_stands_first_gives_a_loop_of_walking() -> None:

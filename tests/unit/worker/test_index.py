@@ -6,12 +6,12 @@ from typing import Any, cast
 
 import pytest
 
-from marey_schemas.documents.motion_indexes import IndexShard, MotionIndexDocument
+from marey_schemas.documents.motion_indexes import IndexShard, MotionIndexDocument, ShardClips
 from marey_schemas.documents.reports import StoredFile
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import Context, JobRefused
-from marey_worker.kinds.index import _earlier_shards
+from marey_worker.kinds.index import FULL_SHARD_ROWS, _earlier_shards, _is_worth_keeping, _needed, _places
 
 DIGEST = f"sha256:{'0' * 64}"
 
@@ -37,3 +37,20 @@ def test_a_damaged_earlier_index_refuses_the_job_and_names_the_remedy(clips: byt
     with pytest.raises(JobRefused, match="the index motion is damaged and cannot be updated; delete it") as caught:
         _earlier_shards(cast(Context, StoredIndex(clips)), pin)
     assert caught.value.code == "index-damaged"
+
+
+def test_a_shard_is_kept_if_half_of_a_full_one_is_still_needed() -> None:
+    half = FULL_SHARD_ROWS // 2 + 1
+    clips = ShardClips(
+        items=("clip_a", "clip_b", "clip_c"), revisions=(1, 2, 1), rows=(half, half, 5), joints=(1, 1, 1),
+        frames=(9, 9, 9), rates_hz=(30.0, 30.0, 30.0),
+    )  # fmt: skip
+    file = StoredFile(blob=DIGEST, size_bytes=1)
+    shard = IndexShard(clips=file, poses=file, rows=2 * half + 5, dropped=(2,))
+    pin = PinnedInput(item="clip", revision=1, kind=Kind.CLIP, name="walk", collection="")
+    wanted = {("clip_a", 1): pin, ("clip_b", 1): pin, ("clip_c", 1): pin}
+    needed = _needed(shard, clips, wanted)
+    assert needed == [0], "clip_b has changed, and clip_c was dropped before"
+    assert list(_places(clips, needed)) == [("clip_a", 1)]
+    assert _is_worth_keeping(clips, needed)
+    assert not _is_worth_keeping(clips, [2])
