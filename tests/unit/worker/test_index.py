@@ -6,12 +6,13 @@ from typing import Any, cast
 
 import pytest
 
+from marey_motion.similarity.shards import FULL_SHARD_ROWS
 from marey_schemas.documents.motion_indexes import IndexShard, MotionIndexDocument, ShardClips
 from marey_schemas.documents.reports import StoredFile
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import Context, JobRefused
-from marey_worker.kinds.index import FULL_SHARD_ROWS, _earlier_shards, _is_worth_keeping, _needed, _places
+from marey_worker.kinds.index import _earlier_shards, _is_worth_keeping, _needed, _places
 
 DIGEST = f"sha256:{'0' * 64}"
 
