@@ -12,8 +12,8 @@ ARGS   ?=
 unexport PYTHONDONTWRITEBYTECODE
 EFFORT ?= 4
 PYTEST := $(BIN)/python -m pytest -q --dist loadgroup $(ARGS)
-# One process more than two processors: tests of faults wait, for leases to end or processes to start. All others compute.
-PROCESSES ?= 3
+# Two processes more than two processors: tests of faults wait, for leases to end or processes to start; others compute.
+PROCESSES ?= 4
 
 # Where npm is missing, or cannot install packages, tests that need the pages are left out and counted.
 PAGES_IF_POSSIBLE := command -v npm > /dev/null && $(BIN)/python hatch_build.py || true
