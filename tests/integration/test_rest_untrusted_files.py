@@ -48,8 +48,8 @@ def npz_bomb(megabytes: int) -> bytes:
 
 @pytest.fixture
 def small(database: Database, tmp_path: Path) -> Iterator[Server]:
-    """A server that allows little memory for reading a file."""
-    with running(database, tmp_path, child_memory_mb=MEMORY_MB) as server:
+    """A server that allows little memory for reading a file: too little to load kernels for the file as well."""
+    with running(database, tmp_path, child_memory_mb=MEMORY_MB, warm_up=True) as server:
         yield server
 
 
