@@ -8,7 +8,6 @@ from itertools import combinations
 
 import numpy as np
 from scipy.optimize import minimize_scalar, nnls
-from scipy.stats import spearmanr
 
 from marey_motion.arrays import Floats, Ints
 from marey_motion.errors import MotionError
@@ -204,6 +203,8 @@ def fit_quality(fitted: Floats, perceived: Floats) -> FitQuality:
     -------
     FitQuality    measures
     """
+    from scipy.stats import spearmanr  # takes a second to load, which no other job of a worker shall wait for
+
     known = np.isfinite(perceived) & np.isfinite(fitted)
     one, other = fitted[known], perceived[known]
     rss = float(np.sum((one - other) ** 2))
