@@ -76,6 +76,29 @@ class ClipDistances:
         return pairs[np.argsort(self.totals[tuple(pairs.T)], kind="stable")]
 
 
+def measure_clip(clip: Clip, body: MatchingBody, rate_hz: float, *, loop: bool) -> tuple[Motion, MeasuredClip]:
+    """Measure a whole clip at the rate of a metric.
+
+    Parameters
+    ----------
+    clip : Clip    the clip
+    body : MatchingBody    body of its skeleton
+    rate_hz : float    frame rate at which the metric measures clips
+    loop : bool    whether the clip is a loop
+
+    Returns
+    -------
+    Motion    the motion at this rate
+    MeasuredClip    its measurements
+    """
+    motion, seam = Motion.of(clip), None
+    if loop:
+        root = raw_root(motion.positions(body.skeleton), body)
+        seam = loop_seam(root.positions, np.unwrap(root.headings))
+    motion = resample_motion(motion, clip.frame_rate_hz, rate_hz, seam=seam)
+    return motion, measure_motion(motion, body, rate_hz, seam=seam)
+
+
 def prepare_comparison(
     clip: Clip,
     body: MatchingBody,
@@ -113,12 +136,7 @@ def prepare_comparison(
             "compared; cut it first",
             code="too-many-frames",
         )
-    motion, seam = Motion.of(clip), None
-    if loop:
-        root = raw_root(motion.positions(body.skeleton), body)
-        seam = loop_seam(root.positions, np.unwrap(root.headings))
-    motion = resample_motion(motion, clip.frame_rate_hz, rate_hz, seam=seam)
-    recorded = measure_motion(motion, body, rate_hz, seam=seam)
+    motion, recorded = measure_clip(clip, body, rate_hz, loop=loop)
     if loop or cycles == "whole":
         return ComparableClip(name, recorded, recorded, motion, None)
     period = find_period(recorded, metric)

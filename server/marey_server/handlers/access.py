@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
-from pydantic import Field
+from pydantic import Field, SecretStr
 
 from marey_schemas.access import (
     Login,
@@ -123,6 +123,18 @@ class PasswordResource(Resource):
         except TooManyRequestsProblem as refusal:
             self.services.refused_tries.note(attempt, refusal)
             raise
+
+    async def count_code(self, code: SecretStr, try_of: Callable[[str, str, int], SignInTry]) -> SignInTry:
+        """Count a try to use the code of a link or an invitation, whether or not it is valid, and return the try.
+
+        `try_of` returns the try for the code, the address of the client, and the number of tries per minute. Raises
+        `TooManyRequestsProblem`.
+        """
+        per_minute = self.services.settings.login_tries_per_minute
+        attempt = try_of(code.get_secret_value(), limited_address(self.client_address), per_minute)
+        self.services.refused_tries.check(attempt)
+        await self.count(sign_ins.count, attempt)
+        return attempt
 
     async def hash_password(self, password: str) -> str:
         """Return the hash of a new password; call this only for a caller who may set the password."""

@@ -6,8 +6,6 @@ creates the invitation.
 
 from __future__ import annotations
 
-from pydantic import SecretStr
-
 from marey_schemas.invitations import (
     AcceptedInvitation,
     AccountInvitationCreate,
@@ -24,9 +22,6 @@ from marey_server.http.declarations import Access, RequestBody, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
-from marey_server.process.password_lanes import limited_address
-from marey_server.store.credentials import sign_ins
-from marey_server.store.credentials.sign_ins import SignInTry
 from marey_server.store.invitations import accepting, issuing
 
 
@@ -97,22 +92,7 @@ class ServerInvitation(Resource):
         return await self.answer(issuing.withdraw_account_invitation, invitation)
 
 
-class CodeResource(PasswordResource):
-    """Base class of resources that check codes of invitations."""
-
-    async def count_code(self, code: SecretStr) -> SignInTry:
-        """Count a try to use a code, whether or not it is valid, and return the try.
-
-        Raises `TooManyRequestsProblem`.
-        """
-        address, per_minute = limited_address(self.client_address), self.services.settings.login_tries_per_minute
-        attempt = accepting.try_of(code.get_secret_value(), address, per_minute)
-        self.services.refused_tries.check(attempt)
-        await self.count(sign_ins.count, attempt)
-        return attempt
-
-
-class InvitationAcceptances(CodeResource):
+class InvitationAcceptances(PasswordResource):
     """Acceptance of invitations by users."""
 
     path = "/invitations/accept"
@@ -129,11 +109,11 @@ class InvitationAcceptances(CodeResource):
 
         If you have the same or a higher role already, nothing changes, and the invitation is not used.
         """
-        attempt = await self.count_code(body.code)
+        attempt = await self.count_code(body.code, accepting.try_of)
         return await self.answer(accepting.accept_invitation, body.code.get_secret_value(), attempt)
 
 
-class SignUps(CodeResource):
+class SignUps(PasswordResource):
     """Creation of accounts by invited people."""
 
     path = "/sign-up"
@@ -154,7 +134,7 @@ class SignUps(CodeResource):
         The answer contains a new token, shown only once. A repeated request with the same name and password gets the
         same membership and another token.
         """
-        attempt = await self.count_code(body.code)
+        attempt = await self.count_code(body.code, accepting.try_of)
         password = body.password.get_secret_value()
         if await self.look_up(accepting.needs_password_check, body.code.get_secret_value(), body.name):
             login, verified_hash = await self.check_password(body.name, password)

@@ -12,13 +12,11 @@ import numpy as np
 
 from marey_motion import documents
 from marey_motion.errors import MotionError
-from marey_motion.looping import loop_seam
 from marey_motion.matching.body import MatchingBody
-from marey_motion.matching.simulation_root import raw_root
-from marey_motion.motion import Motion
+from marey_motion.perception.comparing import MOST_TABLE_CELLS, measure_clip
 from marey_motion.perception.fitting import PairDifferences
 from marey_motion.perception.judging import Judgements
-from marey_motion.perception.measuring import MeasuredClip, measure_motion
+from marey_motion.perception.measuring import MeasuredClip
 from marey_motion.perception.study_analysis import (
     StudyAnalysis,
     analyse_study,
@@ -26,9 +24,9 @@ from marey_motion.perception.study_analysis import (
     measure_pairs,
     metric_to_tree,
 )
-from marey_motion.resampling import resample_motion
 from marey_reports.perception.study_page import render_study_report
 from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.documents.metrics import METRIC_RATE_HZ
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.studies import StudyDocument
 from marey_schemas.items import LOOP_TAG
@@ -39,11 +37,6 @@ from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.evaluated_set import store_document, store_file
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 from marey_worker.job_io.skeleton_cache import Rig, read_rigged
-
-RATE_HZ = 60.0
-"""Frame rate at which clips are measured."""
-MOST_CELLS = 2_000_000_000
-"""Greatest number of cells in the motion maps of all pairs."""
 
 
 def run(context: Context, params: AnalyseStudyParams) -> dict[str, Any]:
@@ -99,7 +92,7 @@ def _measured(context: Context, study: StudyDocument) -> tuple[list[PairDifferen
     try:
         clips = [_measure(context, one.clip) for one in study.motions]  # type: ignore[arg-type]
         counts = np.array([clip.frame_count for clip in clips])
-        if (cells := int(counts.sum()) ** 2 // 2) > MOST_CELLS:
+        if (cells := int(counts.sum()) ** 2 // 2) > MOST_TABLE_CELLS:
             raise MotionError(f"the motion maps of all pairs have {cells:,} cells; use shorter motions")
         return measure_pairs(clips, context.progress), []
     except MotionError as error:
@@ -112,12 +105,8 @@ def _measure(context: Context, ref: RevisionRef) -> MeasuredClip:
     rigged = read_rigged(context, Rig.as_stored(RevisionRef.model_validate(document.skeleton.model_dump())))
     body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
     clip = documents.clip_from_document(document, rigged.skeleton)
-    motion, seam = Motion.of(clip), None
-    if LOOP_TAG in info.get("tags", ()):
-        root = raw_root(motion.positions(rigged.skeleton), body)
-        seam = loop_seam(root.positions, np.unwrap(root.headings))
-    motion = resample_motion(motion, clip.frame_rate_hz, RATE_HZ, seam=seam)
-    return measure_motion(motion, body, RATE_HZ, seam=seam)
+    _, measured = measure_clip(clip, body, METRIC_RATE_HZ, loop=LOOP_TAG in info.get("tags", ()))
+    return measured
 
 
 def _names(context: Context, study: StudyDocument) -> list[str]:

@@ -5,16 +5,13 @@ from __future__ import annotations
 from urllib.parse import urlsplit
 
 from marey_schemas.sign_ins import BrowserLink, BrowserSession, BrowserSessionCreate
-from marey_server.access.secret_tokens import split_view_code
 from marey_server.handlers.access import MAX_LOGIN_BYTES, PasswordResource
 from marey_server.http.browser_cookies import cookie_name, require_own_page
 from marey_server.http.caching import WITH_SECRET
 from marey_server.http.declarations import Access, RequestBody, reads, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
-from marey_server.process.password_lanes import limited_address
-from marey_server.store.credentials import browser_links, sign_ins
-from marey_server.store.credentials.sign_ins import SignInTry
+from marey_server.store.credentials import browser_links
 
 
 class BrowserLinks(Resource):
@@ -47,13 +44,8 @@ class BrowserSessions(PasswordResource):
     async def post(self, body: BrowserSessionCreate) -> Reply:
         """Exchange the code of a link for a cookie, with which the browser may read one project for twelve hours."""
         require_own_page(self.request)
-        code = body.code.get_secret_value()
-        prefix, _ = split_view_code(code) or ("", "")
-        address, per_minute = limited_address(self.client_address), self.services.settings.login_tries_per_minute
-        attempt = SignInTry(f"view {prefix}", address, per_minute)
-        self.services.refused_tries.check(attempt)
-        await self.count(sign_ins.count, attempt)
-        made = await self.change(browser_links.redeem_link, code, attempt)
+        attempt = await self.count_code(body.code, browser_links.try_of)
+        made = await self.change(browser_links.redeem_link, body.code.get_secret_value(), attempt)
         https = self._is_https()
         self.set_cookie(
             cookie_name(made.session.project, https=https), made.secret, path="/", expires=made.session.expires_at,

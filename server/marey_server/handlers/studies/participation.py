@@ -9,8 +9,6 @@ from __future__ import annotations
 from functools import partial
 from typing import get_args
 
-from pydantic import SecretStr
-
 from marey_schemas.studies.participation import (
     NewParticipation,
     Participation,
@@ -27,10 +25,7 @@ from marey_server.http.caching import IMMUTABLE, WITH_SECRET
 from marey_server.http.declarations import Access, Document, RequestBody, reads, writes
 from marey_server.http.reply import Lasting, Rendered, Reply
 from marey_server.http.resource import Resource
-from marey_server.process.password_lanes import limited_address
 from marey_server.store import items
-from marey_server.store.credentials import sign_ins
-from marey_server.store.credentials.sign_ins import SignInTry
 from marey_server.store.studies import participants, poses, trials
 from marey_server.store.studies.poses import ShownPart
 from marey_server.store.transaction import Transaction
@@ -38,22 +33,7 @@ from marey_server.store.transaction import Transaction
 TAG = "Study participation"
 
 
-class LinkResource(PasswordResource):
-    """Base of resources that check codes of links."""
-
-    async def count_code(self, code: SecretStr) -> SignInTry:
-        """Count a try to use a code, whether or not it is valid, and return the try.
-
-        Raises `TooManyRequestsProblem`.
-        """
-        address, per_minute = limited_address(self.client_address), self.services.settings.login_tries_per_minute
-        attempt = participants.try_of(code.get_secret_value(), address, per_minute)
-        self.services.refused_tries.check(attempt)
-        await self.count(sign_ins.count, attempt)
-        return attempt
-
-
-class StudyLinkWelcome(LinkResource):
+class StudyLinkWelcome(PasswordResource):
     """Study to which a link leads."""
 
     path = "/participation/link"
@@ -71,11 +51,11 @@ class StudyLinkWelcome(LinkResource):
 
         All links that are not valid get the same answer (404 `study-link-invalid`).
         """
-        attempt = await self.count_code(body.code)
+        attempt = await self.count_code(body.code, participants.try_of)
         return await self.answer(participants.welcome, body.code.get_secret_value(), attempt)
 
 
-class OwnParticipation(LinkResource):
+class OwnParticipation(PasswordResource):
     """Participation of the caller in a study."""
 
     path = "/participation"
@@ -94,7 +74,7 @@ class OwnParticipation(LinkResource):
 
         A repeated request with the same key gets the same token. With another key, the link is not valid any more.
         """
-        attempt = await self.count_code(body.code)
+        attempt = await self.count_code(body.code, participants.try_of)
         return await self.answer_with(lambda made: Reply(made, headers=WITH_SECRET), participants.begin, body, attempt)
 
     @reads(access=Access.PARTICIPANT, scope=None, answer=Participation)

@@ -66,6 +66,12 @@ def create_link(tx: Transaction, project: str) -> BrowserLink:
     return BrowserLink(code=f"{VIEW_PREFIX}{prefix}_{secret}", expires_at=datetime_of(expires_us))
 
 
+def try_of(code: str, address: str, per_minute: int) -> SignInTry:
+    """Return the try that is to be counted before the code of a link is checked."""
+    prefix, _ = split_view_code(code) or ("", "")
+    return SignInTry(f"view {prefix}", address, per_minute)
+
+
 def redeem_link(tx: Transaction, code: str, attempt: SignInTry) -> IssuedSession:
     """Begin the session of a link, which cannot be used again. `attempt` is the counted try.
 
