@@ -42,7 +42,8 @@ class ProcessSettings(BaseSettings):
     warm_up: bool = Field(
         True,
         description="Compile missing kernels and start the child processes when the server starts. If false, the first "
-        "requests that need kernels or child processes wait until these are ready.",
+        "requests that need kernels or child processes wait until these are ready, and each child needs memory "
+        "(`child_memory_mb`) for its kernels.",
     )
     child_requests: int = Field(
         32,
