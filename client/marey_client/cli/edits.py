@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import shlex
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
+from marey_client.cli.edit_commands import command_text, object_types, parameter_rows, parse_command
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import JOB, Into, Sources, Wait, clips_at, follow, print_ended
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_pairs, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
-from marey_client.cli.terminal.typed_values import Schema, is_frame, parameters_of, read_json, read_value, type_text
+from marey_client.cli.terminal.typed_values import is_frame, read_json
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
-    from pydantic import BaseModel
-
     from marey_client.handles.edits import EditHandle
     from marey_client.marey import Marey
     from marey_schemas.editing.edits import EditDocument
@@ -172,7 +169,11 @@ def list_commands(
             ],
         )
     typer.echo(_summary(wanted[name]))
-    print_table(("parameter", "type", "default", "meaning"), parameter_rows(wanted[name]))
+    columns = ("parameter", "type", "default", "meaning")
+    print_table(columns, parameter_rows(wanted[name]))
+    for heading, rows in object_types(wanted[name]):
+        typer.echo(heading)
+        print_table(columns, rows)
     typer.echo("Examples:")
     for example in wanted[name].examples:
         typer.echo(f"  --do {shlex.quote(command_text({'command': name, **example}))}")
@@ -236,76 +237,6 @@ def _range(text: str) -> slice:
     if not colon or not all(not bound or is_frame(bound) for bound in (start, stop)):
         raise WrongUsage(f"--frames {text!r}: write a range such as 100:200, 100: or :200")
     return slice(int(start or 0), int(stop) if stop else None)
-
-
-# -- commands as people type them --
-
-
-def parse_command(text: str) -> dict[str, Any]:
-    """Return a command with its parameters. Raises `WrongUsage`, which lists the valid commands or parameters."""
-    from marey_schemas.editing.edits import COMMAND_MODELS
-
-    try:
-        name, *assigned = shlex.split(text) or [""]
-    except ValueError as error:
-        raise WrongUsage(
-            f"{text!r} cannot be read as a command ({error}); write a command and its parameters, as in 'trim start=10'"
-        ) from None
-    if name not in COMMAND_MODELS:
-        raise WrongUsage(f"there is no command {name!r}; the commands are {', '.join(COMMAND_MODELS)}")
-    parameters = _parameters(COMMAND_MODELS[name])
-    command: dict[str, Any] = {"command": name}
-    for assignment in assigned:
-        key, equals, value = assignment.partition("=")
-        if not equals:
-            raise WrongUsage(f"{name}: {assignment!r} is not a parameter with a value; write parameter=value")
-        if key not in parameters:
-            raise WrongUsage(f"{name} has no parameter {key!r}; it has {', '.join(parameters) or 'none'}")
-        command[key] = read_value(value, parameters[key])
-    return command
-
-
-def command_text(command: dict[str, Any]) -> str:
-    """Return a command as text that `parse_command` reads."""
-    values = (f"{name}={_value_text(value)}" for name, value in command.items() if name != "command")
-    return " ".join((command["command"], *map(_quoted, values)))
-
-
-def _quoted(text: str) -> str:
-    """Quote a text so that `shlex.split` reads it as one word.
-
-    Only double quotes are added, because people put single quotes around whole commands.
-    """
-    if shlex.quote(text) == text:
-        return text
-    name, _, value = text.partition("=")
-    escaped = value.replace("\\", r"\\").replace('"', r"\"")
-    return f'{name}="{escaped}"'
-
-
-def _value_text(value: Any) -> str:
-    if isinstance(value, str):
-        return value
-    if isinstance(value, list) and value and all(_is_plain(one) for one in value):
-        return ",".join(map(str, value))
-    return json.dumps(value, separators=(",", ":"))
-
-
-def _is_plain(value: Any) -> bool:
-    return value.isalnum() if isinstance(value, str) else isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def parameter_rows(model: type[BaseModel]) -> Iterator[tuple[str, str, str, str]]:
-    """Return name, type, default and description of each parameter of a command."""
-    required = model.model_json_schema().get("required", ())
-    for name, schema in _parameters(model).items():
-        default = "required" if name in required else json.dumps(schema.get("default"))
-        yield name, type_text(schema), default, schema.get("description", "")
-
-
-def _parameters(model: type[BaseModel]) -> dict[str, Schema]:
-    """Return the schema of each parameter of a command, by name."""
-    return {name: schema for name, schema in parameters_of(model).items() if name != "command"}
 
 
 # -- output --

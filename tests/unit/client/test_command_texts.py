@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from tests.support.edit_examples import commands_of_all
 
-from marey_client.cli.edits import command_text, parameter_rows, parse_command
+from marey_client.cli.edit_commands import command_text, object_types, parameter_rows, parse_command
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_schemas.editing.edits import COMMAND_MODELS, EditDocument
 
@@ -34,6 +34,13 @@ from marey_schemas.editing.edits import COMMAND_MODELS, EditDocument
         ("flip_axes up=-y forward=+z", {"command": "flip_axes", "up": "-y", "forward": "+z"}),
         ("constrain constraints='[{\"kind\": \"position\", \"joint\": \"Head\"}]'", {
             "command": "constrain", "constraints": [{"kind": "position", "joint": "Head"}],
+        }),
+        ('constrain constraints=[{"kind": "position", "joint": "Left Hand"}] limits=[] blend_s=0.5', {
+            "command": "constrain", "constraints": [{"kind": "position", "joint": "Left Hand"}], "limits": [],
+            "blend_s": 0.5,
+        }),
+        ('plant_feet contacts=[{"foot":"left","frames":[10,20]}]', {
+            "command": "plant_feet", "contacts": [{"foot": "left", "frames": [10, 20]}],
         }),
     ],
 )  # fmt: skip
@@ -65,6 +72,7 @@ def test_the_text_of_a_command_is_read_as_the_same_command(command: dict[str, An
         ("mirror left=1", "mirror has no parameter 'left'; it has none"),
         ("trim 3", "write parameter=value"),
         ("smooth joints='Head", "No closing quotation"),
+        ("plant_feet contacts=[{foot:left}]", "is not a parameter with a value in JSON"),
     ],
 )
 def test_what_cannot_be_read_is_told_with_what_there_is(text: str, told: str) -> None:
@@ -78,3 +86,12 @@ def test_every_parameter_is_listed_with_its_type_and_default(name: str) -> None:
     rows = {row[0]: row for row in parameter_rows(COMMAND_MODELS[name])}
     assert set(rows) == set(COMMAND_MODELS[name].model_fields) - {"command"}
     assert all(kind and default for _, kind, default, _ in rows.values())
+
+
+def test_objects_in_lists_are_described_with_their_fields() -> None:
+    tables = {heading.partition(":")[0]: list(rows) for heading, rows in object_types(COMMAND_MODELS["constrain"])}
+    kinds = ("position", "orientation", "look_at")
+    assert list(tables) == [*(f"constraints, kind {kind}" for kind in kinds), "limits, kind hinge", "limits, kind cone"]
+    assert ("joint", "text", "required") in [row[:3] for row in tables["limits, kind hinge"]]
+    types = {row[0]: row[1] for row in parameter_rows(COMMAND_MODELS["constrain"])}
+    assert types["constraints"] == "list of objects"

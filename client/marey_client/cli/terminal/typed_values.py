@@ -72,8 +72,10 @@ def type_text(schema: Schema) -> str:
         if "const" in one or "enum" in one:
             names.append(" or ".join(map(str, one.get("enum", (one.get("const"),)))))
         elif one.get("type") == "array":
-            inner = one.get("prefixItems") or [one.get("items", {})]
-            names.append(f"list of {type_text(inner[0])}")
+            inner = type_text((one.get("prefixItems") or [one.get("items", {})])[0])
+            names.append(f"list of {inner}s" if inner.endswith(("number", "object")) else f"list of {inner}")
+        elif "oneOf" in one:
+            names.append("object")
         elif one.get("type") != "null":
             names.append(
                 {"integer": "whole number", "string": "text", "boolean": "true or false"}.get(
