@@ -2,6 +2,7 @@ from .clip import Clip as Clip
 from .difference.clips import compare_clips as compare_clips
 from .errors import AmbiguousUnits as AmbiguousUnits
 from .errors import ClipError as ClipError
+from .errors import ContradictedOption as ContradictedOption
 from .errors import FormatError as FormatError
 from .errors import FormatLimit as FormatLimit
 from .errors import MappingError as MappingError

@@ -231,6 +231,25 @@ class AmbiguousUnits(FormatError):
     default_code = "units-ambiguous"
 
 
+class ContradictedOption(FormatError):
+    """A unit, an upward axis or a frame rate was given that the motion in the file contradicts.
+
+    Examples
+    --------
+    >>> from marey_motion import ContradictedOption, ImportOptions, generate_gait, read_motion, write_motion
+    >>> data = write_motion(generate_gait(1.2, 0.0, 2.0), "bvh", unit="cm")
+    >>> try:
+    ...     read_motion(data, "walk.bvh", options=ImportOptions(unit="m"))
+    ... except ContradictedOption as error:
+    ...     print(error.code)
+    option-contradicted
+    >>> read_motion(data, "walk.bvh", options=ImportOptions(unit="m", trust_options=True)).source.unit_scale_m
+    1.0
+    """
+
+    default_code = "option-contradicted"
+
+
 class FormatLimit(FormatError):
     r"""The file has more joints, frames or bytes than a reader accepts.
 

@@ -95,7 +95,9 @@ def read_broken(seed: Seed, source: random.Random) -> str:
         companion = broken(companion, source)
     else:
         data = broken(data, source)
-    options = ImportOptions(unit_scale_m=source.choice([None, 0.01]), trim_rest_pose=True, align_floor=True)
+    options = ImportOptions(
+        unit_scale_m=source.choice([None, 0.01]), trust_options=True, trim_rest_pose=True, align_floor=True
+    )
     try:
         read_motion(data, name, companion=companion, options=options)
     except MotionError as error:

@@ -9,11 +9,9 @@ import typer
 
 from marey_client.cli import (
     accounts,
-    annotating,
     audit,
     clip_jobs,
     doctor,
-    edits,
     evaluations,
     improvements,
     invitations,
@@ -31,6 +29,7 @@ from marey_client.cli import (
 )
 from marey_client.cli.datasets import archives, proposals, versions
 from marey_client.cli.difference import diff
+from marey_client.cli.editing import annotating, edits
 from marey_client.cli.files import downloading, listing, records, uploading
 from marey_client.cli.operation import bench, capacity, costs
 from marey_client.cli.perception import metrics

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.clip import Clip
-from marey_motion.errors import ClipError, FormatError, SkeletonError
+from marey_motion.errors import ClipError, ContradictedOption, FormatError, SkeletonError
 from marey_motion.importing import checks
 from marey_motion.importing.anatomy import Anatomy, anatomy_of
 from marey_motion.importing.checks import CheckWarning
@@ -24,6 +24,9 @@ from marey_schemas.options.imports import ImportOptions, UpAxis
 Real = TypeVar("Real", np.float32, np.float64)
 
 _LARGEST_LENGTH = 1e12
+_FASTEST_BODY_M_S = 30.0
+"""Greatest typical speed of a body, which no animal on the ground exceeds for long."""
+_USUAL_RATES_HZ = (10.0, 1000.0)
 
 # Rows are the file's axes that become x, y, z; each matrix is a rotation.
 _TO_Y_UP: dict[UpAxis, list[list[int]]] = {
@@ -58,6 +61,7 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
     ------
     AmbiguousUnits    if neither the file nor the options state the unit or the upward axis, and the size and pose of
         the body do not determine it
+    ContradictedOption    if the motion clearly contradicts a given unit, upward axis or frame rate
     """
     _check_range(source, file)
     try:
@@ -73,6 +77,8 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
         )
         warnings = [*source.warnings, *found.warnings, *_notices(source, found.up_axis)]
         clip = _converted_clip(source, skeleton, axes, found.unit_scale_m)
+        if options.frame_rate_hz is not None and clip is not None and not options.trust_options:
+            _compare_rate_with_speed(clip, file)
     except (SkeletonError, ClipError) as error:
         raise FormatError(str(error), code=error.code, file=file) from error
     trimmed, floor_shift_m = (0, 0), 0.0
@@ -113,6 +119,18 @@ def _check_range(source: SourceMotion, file: str) -> None:
             largest = np.abs(values).max()
             message = f"the file contains a length of {largest:.3g} units; the limit is {_LARGEST_LENGTH:.0e}"
             raise FormatError(message, code="value-range", file=file)
+
+
+def _compare_rate_with_speed(clip: Clip, file: str) -> None:
+    """Refuse a given frame rate with which the body is faster than any person or animal, most of the time."""
+    speeds_m_s = np.linalg.norm(np.diff(clip.root_translations, axis=0), axis=1) * clip.frame_rate_hz
+    if len(speeds_m_s) and (typical := float(np.median(speeds_m_s))) > _FASTEST_BODY_M_S:
+        raise ContradictedOption(
+            f"the frame rate of {clip.frame_rate_hz:g} Hz contradicts the motion: the body would move at "
+            f"{typical:.0f} m/s half of the time; give the right rate with --fps (frame_rate_hz), or confirm this one "
+            "with --trust-options (trust_options)",
+            file=file,
+        )
 
 
 def _converted_skeleton(source: SourceMotion, axes: NDArray[np.float64], scale: float) -> Skeleton:
@@ -173,6 +191,10 @@ def _notices(source: SourceMotion, up_axis: UpAxis) -> list[CheckWarning]:
     if up_axis != "y":
         message = f"the file has {up_axis} up; it was turned to y up"
         notices.append(CheckWarning("up-axis-converted", message, values={"up_axis": up_axis}))
+    rate_hz = source.frame_rate_hz
+    if source.rotations is not None and rate_hz is not None and not _USUAL_RATES_HZ[0] <= rate_hz <= _USUAL_RATES_HZ[1]:
+        message = f"the frame rate is {rate_hz:g} Hz, so the motion takes {len(source.rotations) / rate_hz:.4g} s"
+        notices.append(CheckWarning("frame-rate-doubtful", message, values={"frame_rate_hz": rate_hz}))
     listed = _rotation_orders(source.channels)
     if len(listed) > 1:
         message = f"rotation orders differ between joints ({', '.join(listed)}); each joint is read in its own order"

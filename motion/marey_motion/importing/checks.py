@@ -25,6 +25,7 @@ CODES = {
     "no-frames": "The file contains no motion; only its skeleton was imported.",
     "frame-time-snapped": "The frame time in the file is rounded; the nearest usual frame rate was used.",
     "frame-rate-unusual": "The frame rate is close to a usual one, but not equal to it; it was not changed.",
+    "frame-rate-doubtful": "The frame rate is below 10 Hz or above 1,000 Hz, which hardly any recording has.",
     "frame-rate-assumed": "The file contains no frame rate; the usual rate of its source was assumed.",
     "frame-number-gap": "The frame numbers have gaps; the frames were joined without gaps.",
     "mixed-rotation-orders": "The order of Euler angles differs between joints; each joint was read in its own order.",
@@ -37,8 +38,10 @@ CODES = {
     "sign-flips-unrolled": "Rotations jumped between a quaternion and its negative; the signs were made continuous.",
     # What was inferred.
     "unit-inferred": "The unit of length is unusual; it was inferred from the size of the body.",
-    "unit-doubtful": "The unit of length that the file states gives legs of another length than an adult's.",
+    "unit-doubtful": "The unit of length that the file states, or that was given, gives legs of another length than an "
+    "adult's.",
     "up-axis-assumed": "The file does not show which axis points up; y was assumed.",
+    "up-axis-doubtful": "The body points along another axis than the upward axis that was given.",
     "up-axis-converted": "The upward axis of the file is not y; the motion was rotated.",
     "left-handed": "Left and right joints seem to be exchanged: the axes of the file may be left-handed.",
     # What the motion shows.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.errors import AmbiguousUnits, MotionError
+from marey_motion.errors import AmbiguousUnits, ContradictedOption, MotionError
 from marey_motion.importing.anatomy import Anatomy
 from marey_motion.importing.body_measures import (
     BodyMeasures,
@@ -91,6 +91,7 @@ def infer_conversion(source: SourceMotion, anatomy: Anatomy, file: str, options:
     Raises
     ------
     AmbiguousUnits    naming the option to set and the candidates, when the body does not decide
+    ContradictedOption    when the body clearly contradicts a given unit or axis
     """
     body = measure_body(source, anatomy, file)
     up_axis = choose_up_axis(source, body, options)
@@ -105,6 +106,7 @@ def infer_conversion(source: SourceMotion, anatomy: Anatomy, file: str, options:
 def _choose_unit(source: SourceMotion, body: BodyMeasures, options: ImportOptions, up_axis: UpAxis) -> float:
     hip_height = hip_height_of(body, up_axis)
     if (given := options.metres_per_unit) is not None:
+        _compare_with_legs(given, body, trusted=options.trust_options)
         body.evidence.append(f"unit {given:g} m: given by the user{_as_hips(hip_height, given)}")
         return given
     if (stated := source.unit_scale_m) is not None:
@@ -113,7 +115,7 @@ def _choose_unit(source: SourceMotion, body: BodyMeasures, options: ImportOption
             why = "; ".join(source.declared) or "fixed by the format"
             body.evidence.append(f"unit {stated:g} m: {why}{_as_hips(hip_height, stated)}")
             if legs_m is not None and not _within(LEG_LENGTH_M, legs_m):
-                body.warnings.append(_doubtful_unit(stated, legs_m))
+                body.warnings.append(_doubtful_unit(stated, legs_m, "that the file states"))
             return stated
     if body.leg is None:
         raise AmbiguousUnits(
@@ -124,13 +126,30 @@ def _choose_unit(source: SourceMotion, body: BodyMeasures, options: ImportOption
     return _unit_of_leg(body, hip_height, up_axis, stated)
 
 
-def _doubtful_unit(stated: float, legs_m: float) -> CheckWarning:
+def _compare_with_legs(given: float, body: BodyMeasures, *, trusted: bool) -> None:
+    """Refuse a given unit with which no body has such legs; warn if only an adult has no such legs."""
+    if body.leg is None:
+        return
+    legs_m = body.leg * given
+    if not _within(ANY_LEG_LENGTH_M, legs_m) and not trusted:
+        fitting = [name for name, size in UNITS_M.items() if _within(LEG_LENGTH_M, body.leg * size)]
+        reading = "".join(f"; with {name}, they are {body.leg * UNITS_M[name]:.2f} m long" for name in fitting)
+        raise ContradictedOption(
+            f"the unit of {given:.5g} m contradicts the body: its legs would be {legs_m:.3g} m long{reading}; name the "
+            "right unit with --unit (unit), or confirm this one with --trust-options (trust_options)",
+            file=body.file,
+        )
+    if body.landmarks.by_names and not _within(LEG_LENGTH_M, legs_m):
+        body.warnings.append(_doubtful_unit(given, legs_m, "that was given"))
+
+
+def _doubtful_unit(unit_m: float, legs_m: float, origin: str) -> CheckWarning:
     low, high = LEG_LENGTH_M
     return CheckWarning(
         "unit-doubtful",
-        f"with the unit that the file states ({stated:.5g} m), the legs are {legs_m:.2f} m long (adults have {low} to "
+        f"with the unit {origin} ({unit_m:.5g} m), the legs are {legs_m:.2f} m long (adults have {low} to "
         f"{high} m); if the body is an adult's, name the right unit with --unit (unit_scale_m)",
-        values={"unit_scale_m": stated, "leg_length_m": legs_m},
+        values={"unit_scale_m": unit_m, "leg_length_m": legs_m},
     )
 
 

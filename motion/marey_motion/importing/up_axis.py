@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.errors import AmbiguousUnits
+from marey_motion.errors import AmbiguousUnits, ContradictedOption
 from marey_motion.importing.body_measures import (
     BodyMeasures,
     heights_along,
@@ -44,8 +44,10 @@ def choose_up_axis(source: SourceMotion, body: BodyMeasures, options: ImportOpti
     Raises
     ------
     AmbiguousUnits    naming the option to set and the candidates, when the body does not decide
+    ContradictedOption    when the body clearly stands along another axis than the given one
     """
     if options.up_axis is not None:
+        _compare_with_body(options.up_axis, body, trusted=options.trust_options)
         body.evidence.append(f"up axis {options.up_axis}: given by the user")
         return options.up_axis
     if source.up_axis is not None:
@@ -67,6 +69,30 @@ def choose_up_axis(source: SourceMotion, body: BodyMeasures, options: ImportOpti
         )
         return "y"
     return _settle_up_axis(body, *standing, flat)
+
+
+def _compare_with_body(given: UpAxis, body: BodyMeasures, *, trusted: bool) -> None:
+    """Refuse a given axis that the motion and the rest pose or the ground contradict; warn if only the motion does.
+
+    A body may lie or do a handstand in the whole motion, so the motion alone is weak evidence.
+    """
+    if body.leg is None:
+        return
+    axis, cosine = _body_axis(body.positions, body.landmarks)
+    rest_axis, rest_cosine = _body_axis(body.rest[:, None], body.landmarks)
+    flat = _flat_axis(body)
+    others = {rest_axis} if rest_cosine >= _CLEAR_COSINE else set()
+    others |= {flat[0]} if flat is not None else set()
+    if axis == given or cosine < _CLEAR_COSINE or given in others:
+        return
+    reason = f"from feet to head, the body points along {axis} (mean cosine {cosine:.2f}), not along {given}"
+    if axis in others and not trusted:
+        raise ContradictedOption(
+            f"the up axis {given} contradicts the motion: {reason}; name the right one with --up-axis (up_axis), "
+            "or confirm this one with --trust-options (trust_options)",
+            file=body.file,
+        )
+    body.warnings.append(CheckWarning("up-axis-doubtful", reason, values={"up_axis": axis, "cosine": cosine}))
 
 
 def _settle_up_axis(body: BodyMeasures, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:

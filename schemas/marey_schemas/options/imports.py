@@ -50,6 +50,11 @@ class ImportOptions(Options):
     frame_rate_hz: float | None = Field(
         None, gt=0, le=100_000, description="Frame rate of the clips, in hertz. Absent: the rate in the files."
     )
+    trust_options: bool = Field(
+        False,
+        description="Use unit, up axis and frame rate as given, even if the motion contradicts them; otherwise such "
+        "files are refused.",
+    )
     trim_rest_pose: bool = Field(False, description="Remove rest poses at the beginning and at the end of each clip.")
     tags: tuple[Tag, ...] = Field((), max_length=MOST_TAGS, description="Tags that every clip gets.")
     subject: str | None = Field(None, max_length=255, description="The performer.")

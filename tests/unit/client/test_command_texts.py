@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from tests.support.edit_examples import commands_of_all
 
-from marey_client.cli.edit_commands import command_text, object_types, parameter_rows, parse_command
+from marey_client.cli.editing.edit_commands import command_text, object_types, parameter_rows, parse_command
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_schemas.editing.edits import COMMAND_MODELS, EditDocument
 

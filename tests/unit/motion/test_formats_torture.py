@@ -24,7 +24,7 @@ from marey_motion.formats import ImportOptions, read_motion, write_bvh
 from marey_motion.kinematics import global_positions
 from marey_motion.skeleton import EndSite, Skeleton
 
-CENTIMETRES = ImportOptions(unit_scale_m=0.01, up_axis="y")
+CENTIMETRES = ImportOptions(unit_scale_m=0.01, up_axis="y", trust_options=True)
 
 
 @pytest.mark.slow

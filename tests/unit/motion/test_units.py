@@ -10,7 +10,7 @@ from tests.support.motion_files import body_asf, bvh
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
-from marey_motion.errors import AmbiguousUnits, MotionError
+from marey_motion.errors import AmbiguousUnits, ContradictedOption, MotionError
 from marey_motion.formats import ImportedMotion, ImportOptions, read_motion, write_bvh
 from marey_motion.formats.npz import write_npz
 from marey_motion.gait import game_skeleton, generate_gait
@@ -214,7 +214,7 @@ def test_what_has_no_legs_is_asked_about() -> None:
 
 
 def test_the_users_word_counts_more_than_the_body(walk: Clip) -> None:
-    motion = imported(walk, unit_scale_m=0.02, up_axis="z")
+    motion = imported(walk, unit_scale_m=0.02, up_axis="z", trust_options=True)
     assert (motion.source.unit_scale_m, motion.source.up_axis) == (0.02, "z")
     assert any("given by the user" in sentence for sentence in motion.source.evidence)
 
@@ -225,7 +225,7 @@ def test_the_users_word_counts_more_than_the_body(walk: Clip) -> None:
     ids=["by its name", "by its size, which counts before the name"],
 )
 def test_a_unit_is_given_by_name_or_by_size(walk: Clip, options: dict[str, Any], metres: float) -> None:
-    motion = read_motion(write_bvh(walk), "walk.bvh", options=ImportOptions(**options))
+    motion = read_motion(write_bvh(walk), "walk.bvh", options=ImportOptions(**options, trust_options=True))
     assert motion.source.unit_scale_m == metres
     assert any(sentence.startswith(f"unit {metres:g} m: given by the user") for sentence in motion.source.evidence)
 
@@ -266,3 +266,50 @@ def test_what_is_no_unit_is_refused(unit: str | float) -> None:
 def test_impossible_options_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
         ImportOptions(**options)
+
+
+# -- facts that the user gives and the motion contradicts --
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"unit": "mm"}, r"legs would be 0\.0\d+ m long; with cm, they are 0\.\d+ m long.*--trust-options"),
+        ({"unit": "m"}, r"legs would be \d+\.?\d* m long; with cm"),
+        ({"up_axis": "x"}, r"points along y \(mean cosine 1\.00\), not along x.*--trust-options"),
+        ({"up_axis": "-y"}, "not along -y"),
+        ({"frame_rate_hz": 12_000.0}, r"would move at \d+ m/s.*--trust-options"),
+    ],
+)
+def test_a_given_fact_that_the_motion_contradicts_is_refused_unless_it_is_confirmed(
+    walk: Clip, options: dict[str, Any], told: str
+) -> None:
+    file = write_bvh(walk, unit="cm")
+    with pytest.raises(ContradictedOption, match=told) as refused:
+        read_motion(file, "walk.bvh", options=ImportOptions(**options))
+    assert refused.value.code == "option-contradicted"
+    confirmed = read_motion(file, "walk.bvh", options=ImportOptions(**options, trust_options=True)).source
+    [(name, value)] = options.items()
+    assert {"unit": confirmed.unit_scale_m, "up_axis": confirmed.up_axis, "frame_rate_hz": confirmed.frame_rate_hz}[
+        name
+    ] == (UNITS_M[value] if name == "unit" else value)
+
+
+def test_weak_evidence_against_a_given_fact_gives_a_warning(walk: Clip) -> None:
+    file = write_bvh(walk, unit="cm")
+
+    def warned(**options: Any) -> set[str]:
+        return codes(read_motion(file, "walk.bvh", options=ImportOptions(**options)))
+
+    assert "unit-doubtful" in warned(unit_scale_m=0.006)
+    assert "frame-rate-doubtful" in warned(frame_rate_hz=1.0)
+    assert warned(unit="cm", up_axis="y", frame_rate_hz=60.0) == warned()
+
+
+def test_a_body_that_lies_does_not_contradict_the_axis_of_its_rest_pose(walk: Clip) -> None:
+    turned = quaternions.from_axis_angle(np.array([1.0, 0.0, 0.0]), np.pi / 2).astype(np.float32)
+    poses = walk.poses[:30].copy()
+    poses[:, :3] = (0.0, 0.2, 0.0)
+    poses[:, 3:7] = quaternions.multiply(turned, poses[:, 3:7])
+    file = write_bvh(Clip(walk.skeleton, 30.0, poses), unit="cm")
+    assert "up-axis-doubtful" not in codes(read_motion(file, "lies.bvh", options=ImportOptions(up_axis="y")))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
-from marey_client.cli.edit_commands import command_text, object_types, parameter_rows, parse_command
+from marey_client.cli.editing.edit_commands import command_text, object_types, parameter_rows, parse_command
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import JOB, Into, Sources, Wait, clips_at, follow, print_ended
 from marey_client.cli.terminal.invocation import AsJson, connect

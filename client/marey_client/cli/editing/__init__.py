@@ -1,0 +1,1 @@
+"""Commands that edit and annotate clips."""
