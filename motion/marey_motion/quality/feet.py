@@ -1,7 +1,7 @@
 """Feet of a clip: foot skate after three published definitions, skate ratio, and consistency of contacts.
 
 Positions are in the world, Y up, in metres. A step is the interval from one frame to the next; it has the speed of the
-straight line between them, and the height of its first frame.
+straight line between them, and, if nothing else is said, the height of its first frame.
 """
 
 from __future__ import annotations
@@ -108,10 +108,12 @@ def weighted_skate(feet: Feet, options: QualityOptions) -> float:
 
     Notes
     -----
-    s = v (2 - 2^(h / H)), with the horizontal speed v, and the height h limited to [0, H]; mean over frames and toes.
+    s = v (2 - 2^(h / H)), with the horizontal speed v, and the height h limited to [0, H]; mean over steps and toes.
     Zhang, Starke, Komura and Saito (2018), Mode-adaptive neural networks for quadruped motion control, with H = 2.5 cm.
+    h is the mean of the heights at both ends of the step, so that a step in which a toe leaves the floor weighs less.
     """
-    share = np.clip(feet.heights[:-1, _TOES] / options.weighted_height_m, 0.0, 1.0)
+    heights = 0.5 * (feet.heights[:-1, _TOES] + feet.heights[1:, _TOES])
+    share = np.clip(heights / options.weighted_height_m, 0.0, 1.0)
     return float(np.mean(feet.ground_speeds[:, _TOES] * (2.0 - 2.0**share)))
 
 

@@ -113,7 +113,8 @@ def _draw_column(panel: Axes, bars: Sequence[_Bar], name: str) -> None:
             panel.axvline(value, color=COLOURS[1], lw=1.0, ls=(0, (4, 3)), zorder=0.5)
     panel.set_ylim(len(bars) - 0.4, -0.6)
     panel.set_xlim(0.0, 1.05 * highest)
-    panel.locator_params(axis="x", nbins=3)
+    panel.locator_params(axis="x", nbins=3, prune="upper")
+    panel.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     panel.grid(visible=False, axis="y")
     title = f"{measure.title} ({measure.unit})" if measure.unit else measure.title
     panel.set_title("\n".join(wrap(title, _TITLE_LETTERS)), fontsize=SMALL, color=INK, loc="left", pad=6)
