@@ -194,7 +194,8 @@ def test_totals_weigh_by_duration_and_draw_whole_takes() -> None:
     values = {"a": [1.0, 3.0, None, 2.0], "b": [None, None, 5.0, None]}
     drawn = total_over_clips(values, [1.0, 3.0, 10.0, 1.0], ["x", "y", "z", "w"], draws=500, seed=3)
     a, b = drawn.totals["a"], drawn.totals["b"]
-    assert (a.value, a.clips, a.takes, a.seconds) == (pytest.approx(12.0 / 5.0), 3, 3, 5.0)
+    assert a.value == pytest.approx(12.0 / 5.0)
+    assert (a.clips, a.takes, a.seconds) == (3, 3, 5.0)
     assert a.low is not None
     assert a.high is not None
     assert 1.0 <= a.low < 2.4 < a.high <= 3.0
