@@ -342,6 +342,7 @@ class ProjectHandle(ProjectItems):
         clips: Clips,
         *,
         reference: Clips | None = None,
+        contacts: Annotations | None = None,
         seed: int = 0,
         priority: int = 0,
         cache: CacheMode = "use",
@@ -349,11 +350,12 @@ class ProjectHandle(ProjectItems):
     ) -> Job:
         """Submit a job that measures foot skate, contacts, penetration, jitter, joint limits, speed and turn rate.
 
-        `reference` are recorded clips, which are measured in the same way and shown beside the others; `options` are
-        those of `QualityParams`, for example `rate_hz=60`. `handles.findings.Quality` reads the result. The numbers are
-        also facets of the clips.
+        `reference` are recorded clips, which are measured in the same way and shown beside the others; `contacts` are
+        annotations of all clips with segments `contact_left`, `contact_right` or `contact_both`; `options` are those of
+        `QualityParams`, for example `rate_hz=60`. `handles.findings.Quality` reads the result. The numbers are also
+        facets of the clips.
         """
-        request = quality_request(self, clips, reference, QualityParams.model_validate(options))
+        request = quality_request(self, clips, reference, contacts, QualityParams.model_validate(options))
         return self.submit(request.model_copy(update={"seed": seed, "priority": priority, "cache": cache}))
 
     def evaluation(self, job: Job, *, on_progress: OnProgress | None = None) -> EvaluationHandle:

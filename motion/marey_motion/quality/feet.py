@@ -41,7 +41,9 @@ class Feet:
     rate_hz: float
 
     @classmethod
-    def of(cls, ankles: Floats, toes: Floats, rate_hz: float, options: QualityOptions) -> Feet:
+    def of(
+        cls, ankles: Floats, toes: Floats, rate_hz: float, options: QualityOptions, contacts: Mask | None = None
+    ) -> Feet:
         """Measure heights from the floor of the options, and label the contacts.
 
         Parameters
@@ -49,6 +51,8 @@ class Feet:
         ankles, toes : (F, 2, 3) float64    left and right, metres
         rate_hz : float    frames per second
         options : QualityOptions    the floor
+        contacts : (F, 2) bool, optional    labelled contacts of the left and the right foot; None to detect those of
+            each point by its speed
 
         Returns
         -------
@@ -58,7 +62,8 @@ class Feet:
         heights = points[..., 1]
         if options.floor == "planted":
             heights = heights - np.percentile(heights, PLANTED_PERCENTILE, axis=0)
-        return cls(points, heights, contact_labels(points, rate_hz), rate_hz)
+        labels = contact_labels(points, rate_hz) if contacts is None else np.tile(contacts, 2)
+        return cls(points, heights, labels, rate_hz)
 
     @property
     def speeds(self) -> Floats:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from marey_motion import kinematics
 from marey_motion.arrays import Floats
@@ -100,7 +101,9 @@ class ClipQuality:
     turn_seconds: Floats
 
 
-def measure_quality(clip: Clip, body: QualityBody, options: QualityOptions) -> ClipQuality:
+def measure_quality(
+    clip: Clip, body: QualityBody, options: QualityOptions, contacts: NDArray[np.bool_] | None = None
+) -> ClipQuality:
     """Measure the quality of a clip.
 
     Parameters
@@ -108,6 +111,7 @@ def measure_quality(clip: Clip, body: QualityBody, options: QualityOptions) -> C
     clip : Clip    F frames
     body : QualityBody    joints of its skeleton
     options : QualityOptions    frame rate, floor and limits
+    contacts : (F, 2) bool, optional    labelled contacts of the left and the right foot; None to detect them
 
     Returns
     -------
@@ -122,7 +126,10 @@ def measure_quality(clip: Clip, body: QualityBody, options: QualityOptions) -> C
     points = _points(clip, motion)
     joints = points[:, : skeleton.joint_count]
     ankles, toes = joints[:, list(body.body.feet)], joints[:, list(body.body.toes)]
-    feet = of_feet.Feet.of(ankles, toes, rate, options)
+    if contacts is not None:
+        sampled = np.round(np.arange(motion.frame_count) * max(clip.frame_rate_hz / rate, 1.0)).astype(np.intp)
+        contacts = contacts[np.minimum(sampled, clip.frame_count - 1)]
+    feet = of_feet.Feet.of(ankles, toes, rate, options, contacts)
     depth = np.maximum(-points[..., 1].min(axis=1), 0.0)
     jerks = jerk(joints[:, list(body.judged)], rate)
     rotations = np.asarray(kinematics.as_global_rotations(skeleton, motion.rotations), dtype=np.float64)

@@ -13,6 +13,10 @@ from marey_schemas.options.quality import QualityOptions
 
 QUALITY_CODE = "quality@1"
 """Version of the computation; it changes whenever the same clip and options may give other numbers."""
+CONTACT_LABELS: Mapping[str, tuple[bool, bool]] = MappingProxyType(
+    {"contact_left": (True, False), "contact_right": (False, True), "contact_both": (True, True)}
+)
+"""Labels of segments in which the left and the right foot are in contact with the floor."""
 LEAST_TAKES = 3
 """Least number of takes for an interval of a total."""
 SPEED_EDGES_M_S = tuple(0.25 * step for step in range(33))
@@ -146,6 +150,9 @@ class QualityConditions(Request):
 
     code: str = Field(QUALITY_CODE, max_length=64, description="Version of the computation.")
     options: QualityOptions
+    contacts: Literal["detected", "annotated"] = Field(
+        "detected", description="Origin of the contact labels: detected by speed, or annotations of the clips."
+    )
     grouping: Literal["take"] = Field(
         "take", description="What is drawn for intervals: takes; a clip without a recorded take is a take of its own."
     )
@@ -230,4 +237,7 @@ def command_with(conditions: QualityConditions) -> str:
     usual = QualityOptions().model_dump()
     chosen = {name: value for name, value in conditions.options.model_dump().items() if value != usual[name]}
     stated = {**chosen, "draws": conditions.draws, "seed": conditions.seed}
-    return " ".join(["marey quality …", *(f"--{name.replace('_', '-')} {value}" for name, value in stated.items())])
+    contacts = ["--contacts …"] if conditions.contacts == "annotated" else []
+    return " ".join(
+        ["marey quality …", *contacts, *(f"--{name.replace('_', '-')} {value}" for name, value in stated.items())]
+    )

@@ -97,6 +97,13 @@ QUALITY = KindDeclaration(
             required=False,
             description="Recorded clips (ground truth), which are measured in the same way and shown beside the clips.",
         ),
+        "contacts": InputSpec(
+            kind=Kind.ANNOTATION,
+            many=True,
+            required=False,
+            description="Annotations of all clips with segments labelled contact_left, contact_right or contact_both; "
+            "without them, contacts are detected by speed.",
+        ),
         "rigs": RIGS,
     },
     outputs={"document": "file", "table": "file", "report": "file"},

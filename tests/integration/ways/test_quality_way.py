@@ -40,7 +40,7 @@ def test_the_commands_and_the_example_of_the_page_run(
     listed = [float(value) for value in re.findall(r" (0\.\d+) ", done[2].stdout)]
     assert listed == sorted(listed, reverse=True)
     assert "smoothed" in done[3].stdout
-    document = json.loads(done[5].stdout)
+    document = json.loads(done[4].stdout)
     assert document["conditions"]["options"]["rate_hz"] == 25.0
     assert document["reference"] is None
 
@@ -50,7 +50,14 @@ def test_the_commands_and_the_example_of_the_page_run(
     assert "value=" in capsys.readouterr().out
 
     slow = next(job for job in lab.jobs() if job.kind == "quality" and job.params["rate_hz"] == 25.0)
-    told = run("quality", "lab/walks", "--no-report", "--against", slow.id, status=1)
+    clip = next(iter(lab.clips.list(collection="walks")))
+    segments = [{"label": "contact_both", "start": 0, "end": 30}]
+    labels = {"clip": {"item": clip.id, "revision": clip.item.revision}, "segments": segments}
+    lab.annotations.create("contacts", {"annotation": {"schema": "marey/annotation@1", **labels}}, collection="labels")
+    told = run(
+        "quality", f"lab/{clip.path}", "--contacts", "lab/labels", "--no-report", "--against", slow.id, status=1
+    )  # fmt: skip
+    assert "contacts is detected and annotated" in told.stderr
     assert "rate_hz is 25.0 and 30.0" in told.stderr
     assert "`marey quality … --rate-hz 25.0 --floor zero --draws 1000 --seed 0`" in told.stderr
     same = run("quality", "lab/walks", "--no-report", "--rate-hz", 25, "--floor", "zero", "--against", slow.id)

@@ -7,6 +7,7 @@ from math import radians
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from tests.support.project_in_memory import ProjectInMemory, add_clip
 
@@ -24,9 +25,11 @@ from marey_schemas.documents.quality import (
     differing_conditions,
 )
 from marey_schemas.encoding.codecs import JSON, decode_tree
+from marey_schemas.kinds import Kind
 from marey_schemas.options.quality import QualityOptions
 from marey_schemas.queue.facets import MOST_FACETS
 from marey_schemas.queue.job_params import QualityParams
+from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import JobRefused
 from marey_worker.kinds import quality
 
@@ -143,3 +146,31 @@ def test_results_under_other_conditions_are_not_compared_and_the_command_is_told
         found(other).changes_since(found(one))
     changes = found(one, skate_ratio=0.5, jitter_m_s3=None).changes_since(found(one, skate_ratio=0.2, jitter_m_s3=9.0))
     assert changes == {"skate_ratio": (0.2, 0.5)}
+
+
+def test_annotated_contacts_replace_detected_ones(project: ProjectInMemory) -> None:
+    """Marey detects no contact in a fast glide; an annotation says that there is one."""
+    fast = replace(generate_gait(0.0, 0.0, 2.0), frame_rate_hz=60.0)
+    poses = fast.poses.copy()
+    poses[:, 2] += 2.0 / 60.0 * np.arange(len(poses))
+    project.inputs = {}
+    add_clip(project, "fast", replace(fast, poses=poses))
+    (clip,) = project.inputs["clips"]
+    ref = {"item": clip.item, "revision": 1}
+    segments = [{"label": "contact_both", "start": 0, "end": 60}, {"label": "contact_left", "start": 60, "end": 120}]
+    project.parts["notes", 1, "annotation"] = {"schema": "marey/annotation@1", "clip": ref, "segments": segments}
+    params = QualityParams(report=False, draws=0)
+    found = document_of(project, quality.run(project, params)).measured.clips[0].values
+    assert found["skate_contact_m_s"] is None
+    project.inputs["contacts"] = (
+        PinnedInput(item="notes", revision=1, kind=Kind.ANNOTATION, name="notes", collection="walks"),
+    )
+    document = document_of(project, quality.run(project, params))
+    labelled = document.measured.clips[0].values
+    assert labelled["skate_contact_m_s"] == pytest.approx(2.0, rel=0.05)
+    assert labelled["contact_consistency"] == pytest.approx(0.25, abs=0.02), "only the right foot is free, for half"
+    assert document.conditions.contacts == "annotated"
+    assert command_with(document.conditions).startswith("marey quality … --contacts … --draws 0")
+    del segments[0:2]
+    with pytest.raises(JobRefused, match="contact_left or contact_right or contact_both"):
+        quality.run(project, params)

@@ -7,14 +7,18 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from marey_motion import documents
+from marey_motion.errors import AnnotationError
 from marey_motion.quality.measuring import ClipQuality, QualityBody, measure_quality
 from marey_motion.quality.totals import DrawnTotals, changes_from, total_over_clips
 from marey_motion.version import code_version
 from marey_reports.quality.page import draw_quality_figures, quality_csv, render_quality
+from marey_schemas.documents.annotations import Annotation, SegmentDocument
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.quality import (
+    CONTACT_LABELS,
     MAIN_MEASURE,
     MEASURES,
     MeasuredSet,
@@ -85,6 +89,7 @@ class _Measuring:
         self._options = QualityOptions.of(params)
         self._rigs = {pin.item: pin for pin in context.inputs.get("rigs", ())}
         self._bodies: dict[Rig, QualityBody] = {}
+        self._contacts = _read_contacts(context)
 
     @property
     def facets(self) -> list[ItemFacets]:
@@ -111,7 +116,7 @@ class _Measuring:
         motion = MotionDocument.model_validate(present(pin, tree))
         rigged, body = self._body(motion)
         clip = documents.clip_from_document(motion, rigged.skeleton)
-        quality = measure_quality(clip, body, self._options)
+        quality = measure_quality(clip, body, self._options, self._contacts_of(pin, clip.frame_count))
         row = QualityRow(
             item=pin.item,
             revision=pin.revision,
@@ -127,6 +132,22 @@ class _Measuring:
         self._facets[pin.item] = ItemFacets(item=pin.item, revision=pin.revision, values=known)
         return row, quality
 
+    def _contacts_of(self, pin: PinnedInput, frames: int) -> NDArray[np.bool_] | None:
+        """Return the annotated contacts (frames, 2), or None if they are to be detected."""
+        if self._contacts is None:
+            return None
+        segments = self._contacts.get((pin.item, pin.revision), ())
+        if not segments:
+            raise AnnotationError(
+                f"no given annotation of revision {pin.revision} has a segment {' or '.join(CONTACT_LABELS)}; "
+                "annotate the contacts, or measure the clip in another job",
+                code="no-annotation",
+            )
+        labelled = np.zeros((frames, 2), dtype=np.bool_)
+        for segment in segments:
+            labelled[segment.start : segment.end] |= CONTACT_LABELS[segment.label]
+        return labelled
+
     def _body(self, motion: MotionDocument) -> tuple[Rigged, QualityBody]:
         used = RevisionRef.model_validate(motion.skeleton.model_dump())
         edited = self._rigs.get(used.item)
@@ -135,6 +156,20 @@ class _Measuring:
         if rig not in self._bodies:
             self._bodies[rig] = QualityBody.of(rigged.skeleton, rigged.mapping, rigged.axes)
         return rigged, self._bodies[rig]
+
+
+def _read_contacts(context: Context) -> dict[tuple[str, int], list[SegmentDocument]] | None:
+    """Return the segments with contacts by clip and revision, or None if the job has no annotations of contacts."""
+    pins = context.inputs.get("contacts", ())
+    if not pins:
+        return None
+    found: dict[tuple[str, int], list[SegmentDocument]] = {}
+    for _, tree in context.documents(pins, "annotation"):
+        annotation = Annotation.model_validate(tree)
+        clip = RevisionRef.model_validate(annotation.clip.model_dump())
+        segments = [one for one in annotation.segments if one.label in CONTACT_LABELS]
+        found.setdefault((clip.item, clip.revision), []).extend(segments)
+    return found
 
 
 def _take_of(pin: PinnedInput, info: Mapping[str, Any]) -> str:
@@ -152,7 +187,12 @@ def _document(
     changes = {} if other is None else changes_from(own, other)
     return QualityDocument(
         code_version=code_version(),
-        conditions=QualityConditions(options=QualityOptions.of(params), draws=params.draws, seed=context.seed),
+        conditions=QualityConditions(
+            options=QualityOptions.of(params),
+            contacts="annotated" if context.inputs.get("contacts") else "detected",
+            draws=params.draws,
+            seed=context.seed,
+        ),
         units={name: measure.unit for name, measure in MEASURES.items()},
         measured=_set(measured, own),
         reference=None if reference is None or other is None else _set(reference, other),

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.addresses import addresses_in_one_project
+from marey_client.cli.addresses import Address, addresses_in_one_project
 from marey_client.cli.terminal.failures import Refused, WrongUsage
-from marey_client.cli.terminal.following import Sources, Wait, clips_at, follow
+from marey_client.cli.terminal.following import Sources, Wait, clips_at, follow, input_at
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_refused, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
@@ -42,6 +42,13 @@ def quality(
             "may be repeated."
         ),
     ] = None,
+    contacts: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Annotation, or folder of annotations, with segments contact_left, contact_right or contact_both of "
+            "all clips; may be repeated. Without it, contacts are detected by speed."
+        ),
+    ] = None,
     against: Annotated[
         str | None,
         typer.Option(metavar="JOB", help="Id of an earlier job of this kind; print how the totals changed since."),
@@ -56,18 +63,20 @@ def quality(
 ) -> None:
     """Measure defects of clips: foot skate, contacts, penetration of the floor, jitter, excess of joint limits."""
     from marey_client.handles.findings import Quality
+    from marey_schemas.kinds import Kind
 
     if not wait and (out or csv or figures or against):
         raise WrongUsage(
             "--out, --csv, --figures and --against use the result of the job, but --no-wait does not wait for it; "
             "leave out --no-wait"
         )
-    addresses = addresses_in_one_project([*sources, *(reference or ())])
+    addresses = addresses_in_one_project([*sources, *(reference or ()), *(contacts or ())])
     with connect(context) as marey:
         project = marey.project(addresses[0].project)
-        places = [clips_at(marey, address) for address in addresses]
-        clips, recorded = places[: len(sources)], places[len(sources) :]
-        submitted = project.quality(clips, reference=recorded or None, **job, **params)
+        clips = [clips_at(marey, Address.parse(place)) for place in sources]
+        recorded = [clips_at(marey, Address.parse(place)) for place in reference or ()]
+        labelled = [input_at(marey, Address.parse(place), Kind.ANNOTATION) for place in contacts or ()]
+        submitted = project.quality(clips, reference=recorded or None, contacts=labelled or None, **job, **params)
         ended = follow(marey, submitted, wait=wait, as_json=as_json)
         if ended is None:
             return
