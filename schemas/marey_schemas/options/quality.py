@@ -28,7 +28,7 @@ class QualityOptions(Options):
         ge=5,
         le=1000,
         allow_inf_nan=False,
-        description="Frames per second at which clips are measured. Clips of a higher rate are resampled; clips of a "
+        description="Frame rate in hertz at which clips are measured. Clips of a higher rate are resampled; clips of a "
         "lower rate are refused.",
     )
     floor: Literal["planted", "zero"] = Field(

@@ -122,6 +122,9 @@ def test_a_job_that_measures_nothing_fails_with_the_first_reason(project: Projec
         quality.run(project, QualityParams(rate_hz=120.0))
     assert refused.value.code == "nothing-measured"
     assert not project.facets
+    project.inputs["reference"] = project.inputs["clips"][-1:]
+    with pytest.raises(JobRefused, match="none of 1 clip of the reference can be measured; walks/slow: "):
+        quality.run(project, QualityParams())
 
 
 def test_results_under_other_conditions_are_not_compared_and_the_command_is_told() -> None:

@@ -106,9 +106,9 @@ class _Measuring:
             except UNUSABLE as error:
                 self.refusals.add(pin, error)
         if not found.rows:
-            what = "clip" if name == "clips" else "clip of the reference"
+            what = "" if name == "clips" else " of the reference"
             raise JobRefused(
-                "nothing-measured", f"none of {counted(len(pins), what)} can be measured{self.refusals.first}"
+                "nothing-measured", f"none of {counted(len(pins), 'clip')}{what} can be measured{self.refusals.first}"
             )
         return found
 
