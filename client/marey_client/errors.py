@@ -94,6 +94,10 @@ class CannotBisect(MareyError):
     """A search for the first bad version between two versions is not possible; the text gives the reason."""
 
 
+class NotComparable(MareyError):
+    """The numbers of two results mean different things; the text gives the reason and what to do."""
+
+
 class FileChanged(MareyError):
     """A file changed while it was being sent."""
 

@@ -37,6 +37,7 @@ from marey_client.requests import (
     index_request,
     model_request,
     plan_model,
+    quality_request,
     retarget_request,
 )
 from marey_client.transport import Params, as_json, read_model
@@ -51,6 +52,7 @@ from marey_schemas.queue.job_params import (
     EvaluateParams,
     IndexParams,
     ModelParams,
+    QualityParams,
     RetargetParams,
 )
 from marey_schemas.queue.jobs import CacheMode, Job, JobCreate
@@ -334,6 +336,27 @@ class ProjectHandle(ProjectItems):
         """
         request = distances_request(self, clips, metric, options)
         return self.submit(request.model_copy(update={"priority": priority, "cache": cache}))
+
+    def quality(
+        self,
+        clips: Clips,
+        *,
+        reference: Clips | None = None,
+        contacts: Annotations | None = None,
+        seed: int = 0,
+        priority: int = 0,
+        cache: CacheMode = "use",
+        **options: Any,
+    ) -> Job:
+        """Submit a job that measures foot skate, contacts, penetration, jitter, joint limits, speed and turn rate.
+
+        `reference` are recorded clips, which are measured in the same way and shown beside the others; `contacts` are
+        annotations of all clips with segments `contact_left`, `contact_right` or `contact_both`; `options` are those of
+        `QualityParams`, for example `rate_hz=60`. `handles.findings.Quality` reads the result. The numbers are also
+        facets of the clips.
+        """
+        request = quality_request(self, clips, reference, contacts, QualityParams.model_validate(options))
+        return self.submit(request.model_copy(update={"seed": seed, "priority": priority, "cache": cache}))
 
     def evaluation(self, job: Job, *, on_progress: OnProgress | None = None) -> EvaluationHandle:
         """Wait for a job, and return the evaluation that it created. Raises `JobUnsuccessful` if the job failed."""

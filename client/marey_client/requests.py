@@ -31,6 +31,7 @@ from marey_schemas.queue.job_params import (
     EvaluateParams,
     IndexParams,
     ModelParams,
+    QualityParams,
     RetargetParams,
 )
 from marey_schemas.queue.jobs import ItemInput, JobCreate
@@ -157,6 +158,25 @@ def distances_request(
     if len(edited := project.edited_rigs(found)) == 1:
         (inputs["rig"],) = edited
     return job_request("distances", inputs, params)
+
+
+def quality_request(
+    project: ProjectItems, clips: Clips, reference: Clips | None, contacts: Annotations | None, params: QualityParams
+) -> JobCreate:
+    """Return the job request to measure the quality of clips, beside that of a reference if it is given.
+
+    `contacts` are annotations of all clips; if they are None, contacts are detected.
+    """
+    inputs: dict[str, Any] = {"clips": as_inputs(clips)}
+    found = list(items_at(project.clips, clips))
+    if reference is not None:
+        inputs["reference"] = as_inputs(reference)
+        found += items_at(project.clips, reference)
+    if contacts is not None:
+        inputs["contacts"] = as_inputs(contacts)
+    if edited := project.edited_rigs(found):
+        inputs["rigs"] = edited
+    return job_request("quality", inputs, params)
 
 
 def index_request(project: ProjectItems, clips: Clips, params: IndexParams) -> JobCreate:

@@ -36,6 +36,7 @@ class ProjectInMemory(Context):
     facets: list[Any] = field(default_factory=list)
     told: list[Any] = field(default_factory=list)
     into: str = ""
+    seed: int = 0
 
     def document(self, kind: Kind, item: str, revision: int, part: str, *, required: bool = True) -> Any:
         if required and (item, revision, part) not in self.parts:

@@ -32,7 +32,7 @@ from marey_client.cli.difference import diff
 from marey_client.cli.editing import annotating, edits
 from marey_client.cli.files import downloading, listing, records, uploading
 from marey_client.cli.operation import bench, capacity, costs
-from marey_client.cli.perception import metrics
+from marey_client.cli.perception import metrics, quality
 from marey_client.cli.queue import jobs, pipelines, schedules, scripts
 from marey_client.cli.studies import conducting, results
 from marey_client.cli.terminal.invocation import Invocation
@@ -111,6 +111,7 @@ for register in (
     evaluations,
     improvements,
     metrics,
+    quality,
     models,
     searches,
     jobs,

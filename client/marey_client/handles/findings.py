@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from marey_client.blobs import Blobs
+from marey_client.downloads import safe_file_name
+from marey_client.errors import NotComparable
+from marey_client.handles.reports import saved
 from marey_client.transport import Transport
+from marey_schemas.documents.quality import QualityConditions, QualityDocument, command_with, differing_conditions
+from marey_schemas.documents.reports import StoredFigure
 from marey_schemas.encoding.codecs import JSON, decode_tree
 from marey_schemas.queue.jobs import Job
 
-FILES = ("document", "report", "maps", "figures", "fitted")
+FILES = ("document", "report", "maps", "figures", "fitted", "table")
 """Members of a result that refer to files."""
 
 
@@ -43,8 +49,67 @@ class Findings:
         """Write a file of the result, such as `report`; return its path. Raises `LookupError` without such a file."""
         return Blobs(self.transport).fetch_to(self._blob(name), Path(path))
 
+    def figures(self) -> tuple[StoredFigure, ...]:
+        """Return the figures of the report; without a report, there are none."""
+        return tuple(StoredFigure.model_validate(figure) for figure in (self.job.result or {}).get("figures", ()))
+
+    def save_figures(self, folder: str | Path) -> list[Path]:
+        """Write every figure to a folder, as PNG and SVG, with its data as JSON and CSV; return all paths."""
+        return [
+            saved(Path(folder) / safe_file_name(name), Blobs(self.transport).fetch(blob))
+            for figure in self.figures()
+            for name, blob in _files_of(figure)
+        ]
+
     def _blob(self, name: str) -> str:
         result = self.job.result or {}
         if name not in result:
             raise LookupError(f"the result of the job {self.job.id} has no {name}")
         return str(result[name]["blob"])
+
+
+@dataclass(frozen=True)
+class Quality(Findings):
+    """Quality of clips, with totals, beside that of a reference if there is one."""
+
+    @property
+    def conditions(self) -> QualityConditions:
+        """Conditions that must be equal in two results whose numbers are compared."""
+        return QualityConditions.model_validate((self.job.result or {})["conditions"])
+
+    def measured(self) -> QualityDocument:
+        """Return all numbers, by clip and in total."""
+        return QualityDocument.model_validate(self.document())
+
+    def changes_since(self, earlier: Quality) -> Mapping[str, tuple[float, float]]:
+        """Return the totals of an earlier result and of this one, by measure, without measures that one of both lacks.
+
+        Raises `NotComparable` if they were measured under different conditions; the error has the command that measures
+        under the conditions of the earlier result.
+        """
+        if different := differing_conditions(earlier.conditions, self.conditions):
+            told = ", ".join(f"{name} is {before} and {now}" for name, (before, now) in different.items())
+            advice = "measure both sets of clips again" if "code" in different else "measure these clips again"
+            raise NotComparable(
+                f"the results of {earlier.job.id} and {self.job.id} cannot be compared, because their numbers mean "
+                f"different things: {told}; {advice}, with `{command_with(earlier.conditions)}`"
+            )
+        before, now = (one.summary["totals"] for one in (earlier, self))
+        return {
+            name: (before[name], value)
+            for name, value in now.items()
+            if value is not None and before.get(name) is not None
+        }
+
+    def save_table(self, path: str | Path) -> Path:
+        """Write one row for each clip to a file, as CSV; return the path."""
+        return self.save_file("table", path)
+
+
+def _files_of(figure: StoredFigure) -> Iterator[tuple[str, str]]:
+    """Yield the name and the digest of each file of a figure."""
+    yield f"{figure.name}.png", figure.png.blob
+    yield f"{figure.name}.svg", figure.svg.blob
+    yield f"{figure.name}.json", figure.json_.blob
+    for table, file in figure.csv.items():
+        yield f"{figure.name}-{table}.csv", file.blob

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -12,12 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_client.blobs import Blobs
-from marey_client.downloads import safe_file_name
 from marey_client.handles.findings import Findings
-from marey_client.handles.reports import saved
 from marey_client.items import ItemHandle, Items
 from marey_schemas.documents.metrics import MetricDocument, built_in_metric, is_built_in
-from marey_schemas.documents.reports import StoredFigure
 from marey_schemas.queue.jobs import ItemInput
 
 
@@ -75,24 +71,3 @@ class Distances(Findings):
     def save_maps(self, path: str | Path) -> Path:
         """Write the arrays of `maps` to a file, as a NumPy archive; return the path."""
         return Blobs(self.transport).fetch_to(self._blob("maps"), Path(path))
-
-    def figures(self) -> tuple[StoredFigure, ...]:
-        """Return the figures of the report."""
-        return tuple(StoredFigure.model_validate(figure) for figure in (self.job.result or {}).get("figures", ()))
-
-    def save_figures(self, folder: str | Path) -> list[Path]:
-        """Write every figure to a folder, as PNG and SVG, with its data as JSON and CSV; return all paths."""
-        return [
-            saved(Path(folder) / safe_file_name(name), Blobs(self.transport).fetch(blob))
-            for figure in self.figures()
-            for name, blob in _files_of(figure)
-        ]
-
-
-def _files_of(figure: StoredFigure) -> Iterator[tuple[str, str]]:
-    """Yield the name and the digest of each file of a figure."""
-    yield f"{figure.name}.png", figure.png.blob
-    yield f"{figure.name}.svg", figure.svg.blob
-    yield f"{figure.name}.json", figure.json_.blob
-    for table, file in figure.csv.items():
-        yield f"{figure.name}-{table}.csv", file.blob

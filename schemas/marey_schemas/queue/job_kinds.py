@@ -12,39 +12,28 @@ from importlib.metadata import entry_points
 from types import MappingProxyType
 from typing import Any
 
-from marey_schemas.documents.evaluations import REMOVAL_FACETS, USAGE_FACETS
 from marey_schemas.formats import IMPORTED
 from marey_schemas.kinds import Kind
 from marey_schemas.queue import job_params
 from marey_schemas.queue.jobs import InputSpec
 from marey_schemas.queue.kind_declaration import EVERY_INPUT, KindDeclaration
+from marey_schemas.queue.measuring_kinds import (
+    COMPARE,
+    DISTANCES,
+    EVALUATE,
+    METRIC,
+    OPTIMISE,
+    QUALITY,
+    RIG,
+    RIGS,
+    SUGGEST,
+    SWEEP,
+)
 from marey_schemas.queue.scripts import SCRIPT, ScriptDeclaration, ScriptParams
 
 ENTRY_POINT_GROUP = "marey.job_kinds"
 MOST_TASKS = 1000
 """Greatest number of tasks of a job, if the parameters of the job determine the number."""
-
-
-_RIG = InputSpec(
-    kind=Kind.SKELETON,
-    required=False,
-    description="The revision of the clips' skeleton whose joint mapping is used; needed only if the mapping was "
-    "edited after the import of the clips.",
-)
-_RIGS = InputSpec(
-    kind=Kind.SKELETON,
-    many=True,
-    required=False,
-    description="The revisions of the clips' skeletons whose joint mappings are used; needed only for mappings that "
-    "were edited after the import of the clips.",
-)
-
-
-_METRIC = InputSpec(
-    kind=Kind.METRIC,
-    required=False,
-    description="A stored perceptual metric; alternatively, the parameter `metric` names a built-in one.",
-)
 
 
 def _may_hold_graphs(params: Mapping[str, Any]) -> bool:
@@ -76,7 +65,7 @@ RETARGET = KindDeclaration(
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to retarget."),
         "skeleton": InputSpec(kind=Kind.SKELETON, description="The skeleton to retarget to."),
-        "rigs": _RIGS,
+        "rigs": RIGS,
     },
     outputs={"clips": Kind.CLIP},
     fan_out="clips",
@@ -96,104 +85,6 @@ EXPORT = KindDeclaration(
     exports="clips",
 )
 
-EVALUATE = KindDeclaration(
-    name="evaluate",
-    description="Measures the quality of a set of locomotion clips by simulated motion matching.",
-    params=job_params.EvaluateParams,
-    implementation="marey_worker.kinds.evaluate:run",
-    gathering="marey_worker.kinds.evaluate:gather",
-    task_count=job_params.count_evaluation_tasks,
-    version=3,
-    inputs={
-        "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to evaluate, all of one skeleton."),
-        "rig": _RIG,
-        "normaliser": InputSpec(
-            kind=Kind.EVALUATION,
-            required=False,
-            description="The evaluation whose normaliser (scaling of features) is used, so that the results of "
-            "both evaluations can be compared.",
-        ),
-        "metric": _METRIC,
-    },
-    outputs={"evaluation": Kind.EVALUATION},
-    facets=USAGE_FACETS,
-)
-
-COMPARE = KindDeclaration(
-    name="compare",
-    description="Compares two evaluations trial by trial, with confidence intervals of the changes.",
-    params=job_params.CompareParams,
-    implementation="marey_worker.kinds.compare:run",
-    version=1,
-    inputs={
-        "before": InputSpec(kind=Kind.EVALUATION, description="The evaluation before the change."),
-        "after": InputSpec(
-            kind=Kind.EVALUATION,
-            description="The evaluation after the change, with the same trials and the same normaliser.",
-        ),
-    },
-    outputs={"document": "file", "report": "file"},
-)
-
-DISTANCES = KindDeclaration(
-    name="distances",
-    description="Measures how different clips look to people: perceptual distances of all pairs, motion maps, and "
-    "registration curves.",
-    params=job_params.DistancesParams,
-    implementation="marey_worker.kinds.distances:run",
-    version=1,
-    inputs={
-        "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to compare, all of one skeleton."),
-        "metric": _METRIC,
-        "rig": _RIG,
-    },
-    outputs={"document": "file", "maps": "file", "report": "file"},
-)
-
-_EVALUATED = InputSpec(
-    kind=Kind.EVALUATION, description="The evaluation; its clips are read at the revisions that it used."
-)
-_CANDIDATES = InputSpec(
-    kind=Kind.CLIP,
-    many=True,
-    required=False,
-    description="Clips that may be added; those of the evaluated set are ignored.",
-)
-
-SUGGEST = KindDeclaration(
-    name="suggest",
-    description="Finds the clips of an evaluated set that can be removed, and other clips that would fill gaps in its "
-    "coverage.",
-    params=job_params.SuggestParams,
-    implementation="marey_worker.kinds.suggest:run",
-    version=2,
-    inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES, "metric": _METRIC},
-    outputs={"document": "file"},
-    facets=REMOVAL_FACETS,
-)
-
-OPTIMISE = KindDeclaration(
-    name="optimise",
-    description="Removes clips from an evaluated set and adds others, step by step, as long as the set improves.",
-    params=job_params.OptimiseParams,
-    implementation="marey_worker.kinds.optimise:run",
-    version=1,
-    inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES},
-    outputs={"document": "file"},
-)
-
-SWEEP = KindDeclaration(
-    name="sweep",
-    description="Evaluates a set again with other weights of the features, and ranks the features by their effect.",
-    params=job_params.SweepParams,
-    implementation="marey_worker.kinds.sweep:run",
-    gathering="marey_worker.kinds.sweep:gather",
-    task_count=job_params.count_sweep_tasks,
-    version=1,
-    inputs={"evaluation": _EVALUATED},
-    outputs={"document": "file"},
-)
-
 EDIT = KindDeclaration(
     name="edit",
     description="Applies the commands of an edit to clips: trims, joins, smooths, places and repairs them.",
@@ -210,7 +101,7 @@ EDIT = KindDeclaration(
         "sources": InputSpec(
             kind=Kind.CLIP, many=True, required=False, description="Other clips that the commands refer to by id."
         ),
-        "rigs": _RIGS,
+        "rigs": RIGS,
     },
     outputs={"clips": Kind.CLIP},
     fan_out="clips",
@@ -229,7 +120,7 @@ ANNOTATE = KindDeclaration(
     version=1,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to annotate."),
-        "rigs": _RIGS,
+        "rigs": RIGS,
     },
     outputs={"annotations": Kind.ANNOTATION},
     fan_out="clips",
@@ -275,8 +166,8 @@ ALIGN = KindDeclaration(
             description="Annotations of these clips; their segments and keyframes cut the clips into parts, "
             "which are aligned one by one.",
         ),
-        "metric": _METRIC,
-        "rig": _RIG,
+        "metric": METRIC,
+        "rig": RIG,
     },
     outputs={"processed": Kind.PROCESSED},
     named_after="clips",
@@ -382,8 +273,8 @@ def kind_of_job(name: str, params: Mapping[str, Any]) -> KindDeclaration:
 
 
 BUILT_IN = (
-    IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, DISTANCES, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT, ALIGN, MODEL,
-    TREE, ANALYSE_STUDY, INDEX, RUN_SCRIPT,
+    IMPORT, RETARGET, EXPORT, EVALUATE, COMPARE, DISTANCES, QUALITY, SUGGEST, OPTIMISE, SWEEP, EDIT, ANNOTATE, CUT,
+    ALIGN, MODEL, TREE, ANALYSE_STUDY, INDEX, RUN_SCRIPT,
 )  # fmt: skip
 
 

@@ -31,6 +31,7 @@ from marey_schemas.options.improvement import OptimisationOptions, SuggestionOpt
 from marey_schemas.options.matching import FeatureWeights
 from marey_schemas.options.modelling import ModelOptions, TreeOptions
 from marey_schemas.options.perception import DistanceOptions, MetricChoice
+from marey_schemas.options.quality import QualityOptions
 
 
 class TaggedResults(Request):
@@ -221,6 +222,16 @@ class DistancesParams(DistanceOptions, MetricChoice):
         (), max_length=MOST_COMPARED_CLIPS, description="Clips that are loops, in addition to those tagged `loop`."
     )
     title: str = Field("", max_length=200, description="Title of the report; default: the names of the clips.")
+    report: bool = Field(True, description="Write the report, a self-contained HTML page, and its figures.")
+
+
+class QualityParams(QualityOptions):
+    """Parameters of jobs of the kind `quality`."""
+
+    draws: int = Field(
+        1000, ge=0, le=10_000, description="Number of times that takes are drawn with replacement, for intervals."
+    )
+    title: str = Field("", max_length=200, description="Title of the report; default: the number of clips.")
     report: bool = Field(True, description="Write the report, a self-contained HTML page, and its figures.")
 
 

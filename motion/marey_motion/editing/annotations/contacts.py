@@ -42,7 +42,7 @@ def find_stances(clip: Clip, body: MatchingBody, options: ContactOptions | None 
     positions = kinematics.global_positions(clip)
     feet = [positions[:, list(pair)] for pair in zip(body.feet, body.toes, strict=True)]
     rate = clip.frame_rate_hz
-    return tuple(_stances(foot_speed(foot, rate), rate, options or ContactOptions()) for foot in feet)
+    return tuple(stances_of(foot_speed(foot, rate), rate, options or ContactOptions()) for foot in feet)
 
 
 def foot_speed(points: NDArray[np.floating], frame_rate_hz: float) -> Floats:
@@ -67,7 +67,19 @@ def foot_speed(points: NDArray[np.floating], frame_rate_hz: float) -> Floats:
     return np.asarray(median_filter(speed.astype(np.float64), size=width, mode="nearest"))
 
 
-def _stances(speed: Floats, frame_rate_hz: float, options: ContactOptions) -> list[Stance]:
+def stances_of(speed: Floats, frame_rate_hz: float, options: ContactOptions) -> list[Stance]:
+    """Find the stances of one foot, or of one point of a foot, by its speed.
+
+    Parameters
+    ----------
+    speed : (F,) float64    metres per second
+    frame_rate_hz : float    frames per second
+    options : ContactOptions    limits of speed and duration
+
+    Returns
+    -------
+    list of Stance    in the order of time
+    """
     standing = _with_hysteresis(speed, options.speed_m_s, LEAVING_FACTOR * options.speed_m_s)
     standing = ~without_short(~standing, options.shortest_swing_s * frame_rate_hz)
     return [Stance(*one) for one in runs(without_short(standing, options.shortest_stance_s * frame_rate_hz))]

@@ -1,0 +1,65 @@
+"""Options that determine what the numbers of a job of the kind `quality` mean."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from marey_schemas.base import Options
+from marey_schemas.options.contacts import TOE_SPEED_M_S
+
+QUALITY_RATE_HZ = 30.0
+"""Frame rate at which clips are measured; the rates of common recordings are multiples of it."""
+
+_Height = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
+_Speed = Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)]
+_Bend = Annotated[float, Field(ge=-180, le=180, allow_inf_nan=False)]
+
+
+class QualityOptions(Options):
+    """Frame rate, floor and limits of the measures of motion quality.
+
+    The defaults are those of the publications that `marey_schemas.documents.quality.MEASURES` names.
+    """
+
+    rate_hz: float = Field(
+        QUALITY_RATE_HZ,
+        ge=5,
+        le=1000,
+        allow_inf_nan=False,
+        description="Frame rate in hertz at which clips are measured. Clips of a higher rate are resampled; clips of a "
+        "lower rate are refused.",
+    )
+    floor: Literal["planted", "zero"] = Field(
+        "planted",
+        description="Height from which the heights of feet are counted. planted: the height of the same joint while "
+        "it stands on the floor, which is the 5th percentile of its heights in the clip; zero: height 0, as published. "
+        "Penetration is always counted from height 0.",
+    )
+    weighted_height_m: _Height = Field(
+        0.025, description="Height in metres at which the weight of the weighted foot skate has fallen to 0."
+    )
+    near_height_m: _Height = Field(
+        0.05, description="Height in metres below which a toe counts as near the floor, for foot skate by height."
+    )
+    skate_speed_m_s: _Speed = Field(
+        0.2, description="Speed in metres per second above which a toe near the floor counts as skating, for the ratio."
+    )
+    contact_height_m: _Height = Field(
+        0.1, description="Height in metres below which a slow joint counts as touching the floor, for the consistency."
+    )
+    contact_speed_m_s: _Speed = Field(
+        TOE_SPEED_M_S,
+        description="Speed in metres per second below which a low joint counts as touching the floor, for the "
+        "consistency.",
+    )
+    knee_least_deg: _Bend = Field(-10.0, description="Least bend of a knee in degrees; negative: bent forwards.")
+    knee_most_deg: _Bend = Field(135.0, description="Greatest bend of a knee in degrees.")
+    elbow_most_deg: _Bend = Field(150.0, description="Greatest bend of an elbow in degrees.")
+
+    @model_validator(mode="after")
+    def _check_range(self) -> Self:
+        if self.knee_least_deg >= self.knee_most_deg:
+            raise ValueError("knee_least_deg must be less than knee_most_deg")
+        return self
