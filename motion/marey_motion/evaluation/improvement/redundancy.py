@@ -44,7 +44,7 @@ class Removal:
 
 @dataclass(frozen=True)
 class Appearance:
-    """What removals are judged by besides the trials: the poses that they lose, and the price of a second of them."""
+    """Part of the harm of removals besides the trials: the poses that they lose, and the price of a second of them."""
 
     poses: LostPoses
     price_m_per_s: float

@@ -123,11 +123,7 @@ def suggest(
     seen = None if metric is None else PerceivedRows(database, metric)
     unused = find_unused(database, trials, records, result.options, index=simulation.index)
     duplicates = find_near_duplicates(
-        database,
-        threshold_cm=how.duplicate_cm,
-        seen=seen,
-        threads=threads,
-        **stages.watch("duplicates"),
+        database, threshold_cm=how.duplicate_cm, seen=seen, threads=threads, **stages.watch("duplicates")
     )
     ticks = {use.uid: use.ticks for use in sum_by_source(database.clips, result.usage)}
     threshold = _threshold(how, result, seen)
@@ -136,10 +132,7 @@ def suggest(
         database, result.coverage, others, result.options, threshold, seen=seen, **stages.watch("filling")
     )
     gone = frozenset(clip.source for clip in unused.clips)
-    appearance = None
-    if seen is not None:
-        lost = LostPoses(database, seen, threshold, **stages.watch("lost poses"))
-        appearance = Appearance(lost, how.lost_pose)
+    appearance = _appearance(database, how, seen, threshold, stages)
     redundant, plan = _redundancy(simulation, how, gone, appearance, stages)
     return Suggestions(
         result=result,
@@ -164,6 +157,15 @@ def _threshold(how: SuggestionOptions, result: EvaluationResult, seen: Perceived
     if seen is None:
         return how.blendable_m or accepted_distance(result.records) or USUAL_BLENDABLE_M
     return how.blendable_distance or seen.transitions(result.switches).median or indistinguishable(seen.document)
+
+
+def _appearance(
+    database: MatchingDatabase, how: SuggestionOptions, seen: PerceivedRows | None, threshold: float, stages: _Stages
+) -> Appearance | None:
+    """Compare the poses of all clips by the metric, if one was chosen."""
+    if seen is None:
+        return None
+    return Appearance(LostPoses(database, seen, threshold, **stages.watch("lost poses")), how.lost_pose)
 
 
 def _redundancy(

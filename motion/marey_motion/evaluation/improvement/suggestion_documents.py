@@ -152,7 +152,7 @@ def _removal_to_tree(removal: Removal) -> Tree:
 def _similarity_to_tree(similarity: PoseSimilarity) -> Tree:
     """Convert a similarity to plain values. NaN, in cells without frames or with only one source, is written as 0.
 
-    Distances in metres have names that say so; those of a metric stand beside its name and digest.
+    The names of distances in metres say so; distances of a metric come with its name and digest.
     """
     values = {field.name: getattr(similarity, field.name) for field in fields(similarity)}
     metric = values.pop("metric")
