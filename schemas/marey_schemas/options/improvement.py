@@ -76,7 +76,7 @@ class SuggestionOptions(ObjectiveChoice):
         "blended; absent: the median over the transitions of the trials.",
     )
     lost_pose: _Price = Field(
-        0.001,
+        0.01,
         description="With a metric: metres that each second of poses that look like no pose of the remaining clips "
         "adds to the harm of a removal.",
     )

@@ -120,7 +120,8 @@ def clips_of(project: str, condition: Likeness, found: AlikeClips) -> frozenset[
         )
     if len(found.clips) > MOST_ALIKE:
         raise _bad(condition, f"More than {MOST_ALIKE:,} clips meet {condition.source}; give a smaller distance.")
-    return frozenset(found.clips)
+    # Somebody may have written the index by hand, and databases refuse some characters.
+    return frozenset(one for one in found.clips if one.isascii() and one.isprintable())
 
 
 # -- in the child ------------------------------------------------------------------------------------------------------

@@ -266,6 +266,26 @@ def test_a_query_that_cannot_be_read_is_refused_with_its_place(queried: QueriedL
         assert refused.value.error_code == "bad-query"
 
 
+def test_clips_that_an_index_found_are_selected_beside_other_conditions(
+    queried: QueriedLab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "like(a:1) < 1 and not like(b:1) < 1 and frames > 2"
+    first, second = ({clip.id for clip in queried.clips[start::2]} for start in (0, 3))
+    alike = {"like(a:1) < 1": frozenset(first), "like(b:1) < 1": frozenset([*second, *map(str, range(9_000))])}
+    filters = ItemFilters(query=text, alike=alike)
+    expected = {clip.id for clip in queried.clips if clip.summary["frames"] > 2} & first - second
+    assert expected
+    for few in (0, 1000):
+        monkeypatch.setattr(narrowing, "MOST_ITEMS", few)
+        found = queried.read(items.list_items, "lab", Kind.CLIP, filters, limit=100, count=True)
+        assert {clip.id for clip in found.items} == expected
+        assert found.count == len(expected)
+    told = queried.read(items.explain_query, "lab", Kind.CLIP, ItemFilters(alike=alike), text)
+    assert (told.items, told.selected) == (len(queried.clips), len(expected))
+    with pytest.raises(BadRequestProblem, match=r"column 1: like.* only lists of clips accept it"):
+        queried.read(items.list_items, "lab", Kind.CLIP, ItemFilters(query=text))
+
+
 def test_a_cursor_belongs_to_its_query(queried: QueriedLab) -> None:
     page = queried.read(items.list_items, "lab", Kind.CLIP, ItemFilters(query="frames > 2"), limit=2)
     with pytest.raises(BadRequestProblem):
