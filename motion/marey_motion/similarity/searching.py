@@ -250,21 +250,29 @@ class _WindowSearch:
     def clips_within(self, most: float, count: int) -> list[tuple[int, int]]:
         """Find the shard and run of up to `count` clips that have a window up to a distance.
 
-        Steps with the lowest bounds come first; the steps of clips that were found are not compared any more.
+        For each clip, the step with the lowest bound comes first, then its next two, its next four, and so on. The
+        steps of clips that were found are not compared any more.
         """
         left = np.flatnonzero(self._bounds <= most)
-        left = left[np.argsort(self._bounds[left], kind="stable")]
-        places = self._places(left, np.zeros_like(left))[:, :2]
-        found: set[tuple[int, int]] = set()
+        offsets = np.cumsum([0, *(len(runs.starts) - 1 for runs in self._runs)])
+        places = self._places(left, np.zeros_like(left))
+        clips = offsets[places[:, 0]] + places[:, 1]
+        by_clip = np.lexsort((self._bounds[left], clips))
+        left, clips = left[by_clip], clips[by_clip]
+        rounds = np.log2(np.arange(len(clips)) - np.searchsorted(clips, clips) + 1).astype(np.int64)
+        order = np.argsort(rounds, kind="stable")
+        left, clips = left[order], clips[order]
+        found: list[int] = []
         while len(left) and len(found) < count:
-            steps, here = left[:_CLIP_STEPS], places[:_CLIP_STEPS]
+            steps, here = left[:_CLIP_STEPS], clips[:_CLIP_STEPS]
             self._compare(np.sort(steps), most)
-            near = self._distances[steps].min(axis=1) <= most
-            found |= set(map(tuple, here[near].tolist()))
-            left, places = left[_CLIP_STEPS:], places[_CLIP_STEPS:]
-            unknown = np.array([(shard, run) not in found for shard, run in places.tolist()], np.bool_)
-            left, places = left[unknown], places[unknown]
-        return sorted(found)[:count]
+            new = np.unique(here[self._distances[steps].min(axis=1) <= most])
+            found += new.tolist()
+            unknown = ~np.isin(clips[_CLIP_STEPS:], new)
+            left, clips = left[_CLIP_STEPS:][unknown], clips[_CLIP_STEPS:][unknown]
+        chosen = np.sort(found).astype(np.int64)[:count]
+        shards = np.searchsorted(offsets, chosen, side="right") - 1
+        return list(zip(shards.tolist(), (chosen - offsets[shards]).tolist(), strict=True))
 
     def _bound(self, searched: SearchedShard) -> tuple[NDArray[np.float32], Runs]:
         """Compute the bounds of a shard's steps: infinity where no window starts, or none may."""
