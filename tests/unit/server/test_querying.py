@@ -18,7 +18,7 @@ from tests.support.tiers import examples
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.queries.fields import FIELDS, OPERATORS, field_names, find_field
-from marey_schemas.queries.grammar import Condition, Negation, Query, parse
+from marey_schemas.queries.grammar import Condition, Junction, Negation, Query, parse
 from marey_schemas.queries.matching import QueriedFacts, matches
 from marey_server.errors import BadRequestProblem
 from marey_server.store import items, projects
@@ -149,8 +149,9 @@ def selects(lab: QueriedLab, query: Query, clip: Item) -> bool:
     """Return whether a query selects a clip."""
     if isinstance(query, Negation):
         return not selects(lab, query.query, clip)
-    if not isinstance(query, Condition):
+    if isinstance(query, Junction):
         return (all if query.word == "and" else any)(selects(lab, part, clip) for part in query.queries)
+    assert isinstance(query, Condition)
     values = values_of(lab, clip, query.field)
     if query.operator == "has":
         return bool(values)
