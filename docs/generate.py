@@ -20,7 +20,13 @@ from marey_client.cli.app import app
 from marey_motion.importing import checks
 from marey_schemas.documents.evaluations import HEADLINE_METRICS
 from marey_schemas.queries.fields import FACET_PREFIX, FIELDS, OPERATORS, declared_facets
-from marey_schemas.queries.grammar import MOST_CHARACTERS, MOST_COMPARED_VALUES, MOST_CONDITIONS
+from marey_schemas.queries.grammar import (
+    MOST_ALIKE,
+    MOST_CHARACTERS,
+    MOST_COMPARED_VALUES,
+    MOST_CONDITIONS,
+    MOST_LIKENESSES,
+)
 from marey_schemas.queue.job_kinds import job_kinds
 from marey_schemas.tracing.declared import ATTRIBUTES, SPANS
 from marey_server import errors
@@ -112,19 +118,44 @@ query.
 * Values with spaces or special characters are written between quotation marks: `action = "walk, slow"`. Within the
   quotation marks, a quotation mark is written with a backslash before it, and so is a backslash.
 * A date is written as a day, 2026-11-23, or as a time, 2026-11-23T15:04:05Z. A day means the whole day, in UTC.
+* `like("walks/a:30-90") < 0.2` selects clips that move like frames 30 to 89 of the clip `walks/a`, as explained below.
 * A query has at most {MOST_CHARACTERS:,} characters, {MOST_CONDITIONS} conditions and {MOST_COMPARED_VALUES} values.
 
 """
     text += _table(("field", "type", "operators", "meaning"), rows)
-    text += f"""## Facets
+    text += (
+        _motion_conditions()
+        + f"""## Facets
 
 Jobs publish numbers about their inputs, which are called facets; [job kinds](job-kinds.md) declare them. A query
 compares them as numbers: `{FACET_PREFIX}used_frames > 0.5`. A facet belongs to the revision from which it was computed:
 if a clip has a newer revision, every condition on the facet is false, until a job measures the clip again.
 
 """
+    )
     facets = [(f"`{FACET_PREFIX}{name}`", meaning) for name, meaning in declared_facets().items()]
     return NOTE + text + _table(("facet", "meaning"), facets).rstrip() + "\n"
+
+
+def _motion_conditions() -> str:
+    """Return the section on conditions that compare motions."""
+    return f"""## Motion
+
+`like(CLIP:FIRST-END) < DISTANCE` selects the clips that have a moment which looks like some frames of a clip of the
+project: `like("walks/a:30-90") < 0.2 and folder = studio and not warning = foot-slide`. `:30` means a single pose.
+Moments have the length of the example. The distance is that of [searches by
+example](../how-to/find-similar-motion.md), by the default metric. `like("walks/a:30-90", published/sigmoid) < 0.5`
+chooses another built-in metric, or a stored one by its path. Use `<` or `<=`.
+
+* The index that `marey index` updated last is searched. Without an index, or if clips have changed since the update,
+  the query is refused: a list cannot say which clips are missing. Clips that the index left out meet no such condition.
+* Only lists of existing clips accept the condition. An index has the newest revisions, and neither the older ones that
+  versions of datasets contain, nor deleted clips. So checkouts, purges and lists of deleted items refuse it. Items of
+  other kinds do not meet it.
+* A query has at most {MOST_LIKENESSES} such conditions. Each may select at most {MOST_ALIKE:,} clips, and is evaluated
+  again for every page of a list.
+
+"""
 
 
 def declared_metrics() -> list[MetricWrapperBase]:

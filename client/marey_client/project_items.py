@@ -98,11 +98,13 @@ class ProjectItems:
     def similar(self, clip: ClipHandle | str, frames: int | tuple[int, int], **options: Any) -> SimilarAnswer:
         """Find the moments of the project's clips that resemble a pose, or a window of frames, of a clip.
 
-        `clip` is a handle or an id, `frames` one frame or a half-open range. `options` are those of `SimilarOptions`.
-        The project needs an index of motions, which `ProjectHandle.index` builds.
+        `clip` is a handle or an id, `frames` one frame or a half-open range. `options` are those of `SimilarOptions`;
+        `metric` may also be a handle. The project needs an index of motions, which `ProjectHandle.index` builds.
         """
         name, revision = (clip, None) if isinstance(clip, str) else (clip.id, clip.item.revision)
         first, end = (frames, frames + 1) if isinstance(frames, int) else frames
+        if isinstance(options.get("metric"), ItemHandle):
+            options["metric"] = options["metric"].id
         request = SimilarRequest.model_validate(
             {"clip": name, "revision": revision, "frames": (first, end), **options}
         )  # fmt: skip

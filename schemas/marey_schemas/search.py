@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from marey_schemas.base import Answer, Request
 from marey_schemas.documents.clips import MotionDocument
-from marey_schemas.documents.metrics import BuiltInMetric
+from marey_schemas.documents.metrics import MetricIdentity
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.names import ItemId
 from marey_schemas.old_units import in_centimetres, read_old_unit
@@ -189,9 +189,10 @@ class SimilarOptions(Request):
         description="Which moments of the example's own clip are left out: those that overlap the example, all, or "
         "none.",
     )
-    metric: BuiltInMetric = Field(
+    metric: ItemId = Field(
         DEFAULT_METRIC,
-        description="Name of a built-in perceptual metric, such as `published/sigmoid`; `marey metric ls` lists them.",
+        description="Perceptual metric: the name of a built-in one, such as `published/sigmoid`, or the id of a stored "
+        "one.",
     )
     index: ItemId | None = Field(
         None, description="Id of the index to search; absent: the index of the project that was updated last."
@@ -237,3 +238,4 @@ class SimilarAnswer(Answer):
     behind: int = Field(
         description="Number of clips that were created or changed since the index was updated, and were not searched."
     )
+    metric: MetricIdentity | None = Field(None, description="The metric of the distances. Null: the server is too old.")

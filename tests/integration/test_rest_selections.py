@@ -140,6 +140,7 @@ def test_a_selection_that_is_behind_its_branch_is_named(owner: httpx.Client, gai
     [
         ({"query": "tag = day"}, 422, "empty-selection"),
         ({"query": "tag ="}, 400, "bad-query"),
+        ({"query": "like(a:1) < 1"}, 400, "bad-query"),
         ({"paths": ["raw", "ra"]}, 404, "no-entry"),
         ({"paths": [f"{number:03}{'x' * 130}" for number in range(500)]}, 422, "invalid-body"),
         ({"paths": ["raw", "raw/z"]}, 404, "no-entry"),

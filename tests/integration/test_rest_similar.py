@@ -11,6 +11,7 @@ import httpx
 import pytest
 from tests.support.studying import make_study
 
+from marey_schemas.documents.metrics import built_in_metric
 from marey_schemas.documents.motion_indexes import IndexShard, ShardClips
 from marey_schemas.search import SimilarRequest
 from marey_server.errors import NotFoundProblem
@@ -61,7 +62,8 @@ def test_a_search_refuses_damaged_lists_of_clips(tmp_path: Path, content: bytes,
     shard = ShardFiles(clips=str(tmp_path / "clips"), poses=str(tmp_path / "poses"), dropped=dropped)
     request = SimilarRequest(clip="clip_a", frames=(0, 1))
     order = SimilarOrder(
-        request=request, revision=1, motion=b"", first=0, hierarchy=b"", mapping=None, shards=(shard,), heads={}
+        request=request, metric=built_in_metric(request.metric), revision=1, motion=b"", first=0, hierarchy=b"",
+        mapping=None, shards=(shard,), heads={},
     )  # fmt: skip
     with pytest.raises(NotFoundProblem, match="damaged"):
         search_index(order.pack())

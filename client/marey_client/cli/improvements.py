@@ -271,6 +271,7 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
             if len(entries) > SHOWN:
                 typer.echo(f"  … and {len(entries) - SHOWN} more; --json has all.")
             typer.echo("")
+    _print_similarity(document["similarity"])
     if (metric := document["near_duplicates"].get("metric")) is not None:
         typer.echo(
             f"Near-duplicates whose perceptual distance exceeds {document['near_duplicates']['most_perceived']:.2f} "
@@ -282,6 +283,17 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
         )
     if not any(entries for _, entries in sections):
         typer.echo("No clip was found that can be removed or that would fill a hole.")
+
+
+def _print_similarity(similarity: Mapping[str, Any]) -> None:
+    """Print how many poses can be blended, by metres or by the metric that was chosen."""
+    if similarity["share"] is None:
+        return
+    limit = f"{similarity['threshold_m']:.2f} m" if "threshold_m" in similarity else f"{similarity['threshold']:.2f}"
+    typer.echo(
+        f"{100 * similarity['share']:.0f} % of the poses have a pose of another clip of the same speed and turn rate "
+        f"within {limit}, so they can be blended."
+    )
 
 
 def _seconds(entries: Sequence[Mapping[str, Any]]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +10,7 @@ import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
 from marey_client.cli.models import model_at
+from marey_client.cli.perception.metrics import MetricName, metric_at
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.following import (
     FINDINGS_JOB,
@@ -29,6 +29,7 @@ from marey_schemas.formats import DEFAULT_FORMAT, MOTION_FORMATS
 from marey_schemas.wording import counted, one_of
 
 if TYPE_CHECKING:
+    from marey_client.marey import Marey
     from marey_schemas.search import SearchAnswer, SimilarAnswer
 
 TREE = OptionsOf("marey_schemas.queue.job_params:TreeParams")
@@ -37,8 +38,7 @@ SEARCH = OptionsOf("marey_schemas.search:SearchRequest", without=("constraints",
 
 INDEX = OptionsOf("marey_schemas.queue.job_params:IndexParams")
 
-SIMILAR = OptionsOf("marey_schemas.search:SimilarOptions", short={"results": "-n"})
-_MOMENT = re.compile(r"(?P<clip>.+):(?P<first>[0-9]{1,9})(?:[-:](?P<end>[0-9]{1,9}))?")
+SIMILAR = OptionsOf("marey_schemas.search:SimilarOptions", short={"results": "-n"}, without=("metric",))
 
 Many = list[str] | None
 
@@ -210,23 +210,32 @@ def similar(
         ),
     ],
     params: Chosen,
+    metric: MetricName = None,
     as_json: AsJson = False,
 ) -> None:
     """Find the moments of a project's clips that resemble some frames of a clip, the most similar first."""
     from marey_schemas.kinds import Kind
+    from marey_schemas.queries.moments import read_moment
 
-    parsed = _MOMENT.fullmatch(example)
-    if parsed is None:
-        raise WrongUsage(f"{example!r} names no frames; write project/folder/name:120-180, or :120 for a single pose")
-    first = int(parsed["first"])
-    end = first + 1 if parsed["end"] is None else int(parsed["end"])
-    if end <= first:
-        raise WrongUsage(f"{example!r}: the end, frame {end}, must be after the start, frame {first}")
-    place = Address.parse(parsed["clip"])
+    try:
+        moment = read_moment(example)
+    except ValueError as error:
+        raise WrongUsage(str(error)) from None
+    place = Address.parse(moment.clip)
     with connect(context) as marey:
         clip = require_item(marey, place, [Kind.CLIP])
-        found = marey.project(place.project).similar(clip, (first, end), **params)
+        chosen = {} if metric is None else {"metric": _metric_of(marey, place.project, metric)}
+        found = marey.project(place.project).similar(clip, moment.frames, **params, **chosen)
     return print_json(found) if as_json else _print_similar(found)
+
+
+def _metric_of(marey: Marey, project: str, metric: str) -> str:
+    """Return the name or id of the metric of a search. Raises `WrongUsage` if it is stored in another project."""
+    from marey_schemas.documents.metrics import is_built_in
+
+    if not is_built_in(metric) and (other := Address.parse(metric).project) != project:
+        raise WrongUsage(f"the metric is in the project {other}; store it in {project}, where the clip is")
+    return str(metric_at(marey, metric))
 
 
 # -- reading what is asked ---------------------------------------------------------------------------------------------
@@ -313,6 +322,8 @@ def _print_similar(found: SimilarAnswer) -> None:
         for one in found.moments
     ]
     print_table(("clip", "frames", "s", "distance", ""), rows, right=("frames", "s", "distance"))
+    if found.metric is not None:
+        typer.echo(f"metric: {found.metric.name}")
     if found.behind:
         print_message(
             f"{counted(found.behind, 'clip')} changed since the index was updated, and {found.searched_clips:,} were "

@@ -18,6 +18,8 @@ PER_RIG = 10_000_000
 PER_PLANTED_NUMBER = 600
 PER_TAP, MOST_OF_TAPS = 0.35, 200.0
 """Work of a moving mean for each number of the motion, in nanoseconds: per frame of the window, and at most."""
+PER_COMPARED_POSES = 4_000
+"""Work of the perceptual distance of two poses, in nanoseconds."""
 PER_MEETING, PER_MET_NUMBER = 1_000_000, 10
 """Work of applying a group of constraints without the solver, and additional work for each number of the rotations.
 

@@ -5,14 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from marey_motion.arrays import Floats
+from marey_motion.editing.compute_budget import PER_COMPARED_POSES
 from marey_motion.editing.offsets import VELOCITY_S, add_offset, dying_away, offset_to, step_of
 from marey_motion.editing.placement import body_track, carried, moved_over
-from marey_motion.editing.take import Take
+from marey_motion.editing.take import EditFinding, Take
 from marey_motion.errors import EditError
 from marey_motion.looping import LoopSeam, about_vertical, loop_seam, rotated
 from marey_motion.motion import Motion
+from marey_motion.perception import cycles
+from marey_motion.perception.measuring import measure_motion
+from marey_motion.perception.metric import metric_of
 from marey_motion.root_carrier import body_first, root_first, root_stands
-from marey_schemas.editing.commands import CloseLoop
+from marey_schemas.documents.metrics import built_in_metric
+from marey_schemas.editing.commands import CloseLoop, CutLoop
 
 FEWEST_FRAMES = 4
 
@@ -57,6 +62,38 @@ def close_loop(take: Take, command: CloseLoop) -> Take:
         life = min(life, max(1.0, command.blend_s * take.frame_rate_hz))
     closed = _closed(motion, seam, life, min(life, max(1.0, VELOCITY_S * take.frame_rate_hz)))
     return take.moved(root_first(closed, body, carrier, root_stays=stays))
+
+
+def cut_loop(take: Take, command: CutLoop) -> Take:
+    """Replace a periodic motion by one cycle that repeats without a seam.
+
+    Parameters
+    ----------
+    take : Take    F frames, at least two cycles of 0.6 to 2 s
+    command : CutLoop    the metric by which the cycle is found
+
+    Returns
+    -------
+    Take    the frames of one cycle, with the place of the cycle in the clip and the movement to the next round
+
+    Raises
+    ------
+    MotionError    if there is no cycle, or the joints that the metric compares are not known
+    """
+    lags = (cycles.LONGEST_PERIOD_S - cycles.SHORTEST_PERIOD_S) * take.frame_rate_hz
+    take.budget.spend(PER_COMPARED_POSES * lags * take.frame_count)
+    metric = metric_of(built_in_metric(command.metric))
+    measured = measure_motion(take.motion, take.body.matching, take.frame_rate_hz)
+    period = cycles.find_period(measured, metric)
+    motion, seam = cycles.cut_loop(take.motion, take.body.matching, period)
+    values = {
+        "frames": [period.start, period.start + period.frames],
+        "period_s": period.frames / take.frame_rate_hz,
+        "turn_deg": float(np.degrees(seam.turn_rad)),
+        "travel_m": float(np.hypot(*seam.shift_m)),
+        "metric": command.metric,
+    }
+    return take.moved(motion).with_finding(EditFinding("cut_loop", values))
 
 
 def _in_place(motion: Motion, places: Floats, seam: LoopSeam) -> Motion:

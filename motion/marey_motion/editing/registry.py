@@ -20,7 +20,7 @@ from marey_motion.editing.constraint_commands import constrain, plant_feet
 from marey_motion.editing.frames import concatenate, resample, retime, split, trim
 from marey_motion.editing.ground import find_contacts, find_ground, move_to_ground
 from marey_motion.editing.joints import paste, rotate_joint
-from marey_motion.editing.loops import close_loop
+from marey_motion.editing.loops import close_loop, cut_loop
 from marey_motion.editing.placement import face, fix_drift, flip_axes, mirror, move_to_origin, rotate, scale, translate
 from marey_motion.editing.smoothing import smooth
 from marey_motion.editing.take import MOST_NUMBERS, EditedBody, EditFinding, Take, motion_of, require_finite, settled
@@ -38,6 +38,7 @@ COMMANDS: Mapping[str, Callable[..., Take | tuple[Take, ...]]] = {
         resample,
         retime,
         close_loop,
+        cut_loop,
         translate,
         rotate,
         face,

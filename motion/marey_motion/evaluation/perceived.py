@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from marey_motion.arrays import Indices, Ints
+from marey_motion.arrays import Floats, Indices, Ints
 from marey_motion.errors import MotionError
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 from marey_motion.motion import Motion
-from marey_motion.perception.maps import paired_distances
+from marey_motion.perception.maps import map_blocks, paired_distances
 from marey_motion.perception.measuring import MeasuredClip, measure_motion
 from marey_motion.perception.metric import metric_of
 from marey_motion.perception.registration import clip_distance
@@ -75,7 +75,7 @@ class PerceivedRows:
                 f"{database.options.rate_hz:g} Hz; choose a metric or a database of the same rate",
                 code="metric-of-other-rate",
             )
-        self._database, self._metric, self._document = database, metric_of(metric), metric
+        self._database, self._metric, self.document = database, metric_of(metric), metric
 
     def transitions(self, switches: Ints) -> PerceivedTransitions:
         """Compare the poses that jumps entered with the poses that would have followed.
@@ -91,7 +91,7 @@ class PerceivedRows:
         successors = self._database.root_motion.successors[switches[:, 0]]
         following = np.where(successors < 0, switches[:, 0], successors)
         found = np.repeat(paired_distances(self._at(following), self._at(switches[:, 1]), self._metric), switches[:, 2])
-        known = MetricIdentity.of(self._document)
+        known = MetricIdentity.of(self.document)
         if not len(found):
             return PerceivedTransitions(known.name, known.digest, 0, None, None, None)
         median, p95 = (float(each) for each in np.quantile(found, (0.5, 0.95)))
@@ -110,12 +110,48 @@ class PerceivedRows:
         """
         try:
             first, second = (self._at(np.arange(each.start, each.stop)) for each in (one, other))
-            first, second = (self._at(np.arange(each.start, each.stop)) for each in (one, other))
             return clip_distance(first, second, self._metric).total
         except MotionError as error:
             if error.code != "alignment-impossible":
                 raise
             return np.inf
+
+    def blocks(self, rows: Ints, others: PerceivedRows, other_rows: Ints) -> Iterator[tuple[int, Floats]]:
+        """Compute the distances of rows from rows of this or of another database, in blocks.
+
+        Parameters
+        ----------
+        rows : (n,) int64    rows of this database
+        others : PerceivedRows    rows of a database with the same skeleton
+        other_rows : (m,) int64    rows of that database
+
+        Yields
+        ------
+        start : int    place of the block's first row in `rows`
+        block : (r, m) float64    distances, without unit
+        """
+        return map_blocks(self._at(rows), others._at(other_rows), self._metric)
+
+    def nearest(self, rows: Ints, groups: Ints, others: PerceivedRows, other_rows: Ints, other_groups: Ints) -> Floats:
+        """Compute the distance of each row from the nearest row of another group.
+
+        Parameters
+        ----------
+        rows, groups : (n,) int64    rows of this database, and their groups
+        others : PerceivedRows    rows of a database with the same skeleton
+        other_rows, other_groups : (m,) int64    rows of that database, and their groups
+
+        Returns
+        -------
+        (n,) float64    without unit; infinite if there is no other group
+        """
+        found = np.full(len(rows), np.inf)
+        if len(rows) and len(other_rows):
+            for start, block in self.blocks(rows, others, other_rows):
+                here = slice(start, start + len(block))
+                block[groups[here, None] == other_groups] = np.inf
+                found[here] = block.min(axis=1)
+        return found
 
     def _at(self, rows: Indices) -> MeasuredClip:
         return self._measured.at(rows.astype(np.float64))

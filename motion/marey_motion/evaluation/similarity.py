@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.selection import clips_by_source
+from marey_motion.evaluation.perceived import PerceivedRows
 from marey_motion.evaluation.result import Coverage
 from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import Status, TrialRecord
+from marey_schemas.documents.metrics import MetricIdentity
 
 ProgressCallback = Callable[[int, int, str], None]
 
@@ -36,25 +38,27 @@ class PoseSimilarity:
 
     Parameters
     ----------
-    threshold_m : largest distance of two frames that can be blended: the sum of the distances between their pose
-        joints, in metres
+    threshold : largest distance of two frames that can be blended
     frames, sources : (V, O) int64    numbers of frames and of sources in the cell; a clip and its mirrored copy are one
         source
     measured : (V, O) int64    number of frames compared; if a cell has more than `MOST_FRAMES`, evenly spaced frames
         are chosen
-    distance_m : (V, O) median distance; NaN with fewer than two sources
+    distance : (V, O) median distance; NaN with fewer than two sources
     blendable_share : (V, O) share of the measured frames within the threshold; 0 if the cell has one source, NaN if it
         has no frames
     share : mean of `blendable_share`, weighted by the frames of each cell; None if there are no frames
+    metric : the perceptual metric of the distances; if None, a distance is the sum of the distances between pose joints
+        in metres
     """
 
-    threshold_m: float
+    threshold: float
     frames: NDArray[np.int64]
     sources: NDArray[np.int64]
     measured: NDArray[np.int64]
-    distance_m: Floats
+    distance: Floats
     blendable_share: Floats
     share: float | None
+    metric: MetricIdentity | None = None
 
 
 def accepted_distance(records: Sequence[TrialRecord]) -> float | None:
@@ -76,8 +80,9 @@ def accepted_distance(records: Sequence[TrialRecord]) -> float | None:
 def measure_similarity(
     database: MatchingDatabase,
     coverage: Coverage,
-    threshold_m: float,
+    threshold: float,
     *,
+    seen: PerceivedRows | None = None,
     most_frames: int = MOST_FRAMES,
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
@@ -90,7 +95,9 @@ def measure_similarity(
     ----------
     database : MatchingDatabase    the clips
     coverage : Coverage    coverage of the clips
-    threshold_m : float    distance up to which a frame can be blended, usually `accepted_distance`; metres
+    threshold : float    distance up to which a frame can be blended, usually `accepted_distance`; metres, or the
+        distance of a metric
+    seen : PerceivedRows, optional    the rows under a perceptual metric, which is used instead of metres
     most_frames : int    frames compared per cell
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
@@ -104,8 +111,8 @@ def measure_similarity(
     MotionError    if the threshold is not above 0
     EvaluationCancelled    if cancelled
     """
-    if not (np.isfinite(threshold_m) and threshold_m > 0.0):
-        raise MotionError("the threshold must be a distance in metres above 0", where="threshold_m")
+    if not (np.isfinite(threshold) and threshold > 0.0):
+        raise MotionError("the threshold must be a distance above 0", where="threshold")
     shape = coverage.seconds.shape
     rows, cells = window_rows(database, coverage), window_cells(coverage)
     groups = source_of_rows(database)
@@ -117,16 +124,30 @@ def measure_similarity(
             raise EvaluationCancelled(f"the comparison of grid cells was stopped after {done} of {len(filled)} cells")
         own, place = rows[cells == cell], divmod(cell, shape[1])
         chosen = every_kth(own, most_frames)
-        found = nearest_poses(database.pose_points[chosen], groups[chosen], database.pose_points[own], groups[own])
+        found = _nearest_rows(database, seen, chosen, own, groups)
         frames[place], sources[place], measured[place] = len(own), len(np.unique(groups[own])), len(chosen)
-        share[place] = np.mean(found <= threshold_m)
+        share[place] = np.mean(found <= threshold)
         if sources[place] > 1:
             distance[place] = np.median(found)
         if progress is not None:
             progress(done + 1, len(filled), "")
     total = int(frames.sum())
     overall = float(np.nansum(share * frames) / total) if total else None
-    return PoseSimilarity(threshold_m, frames, sources, measured, distance, share, overall)
+    metric = None if seen is None else MetricIdentity.of(seen.document)
+    return PoseSimilarity(threshold, frames, sources, measured, distance, share, overall, metric)
+
+
+def _nearest_rows(
+    database: MatchingDatabase,
+    seen: PerceivedRows | None,
+    chosen: NDArray[np.int64],
+    own: NDArray[np.int64],
+    groups: NDArray[np.int64],
+) -> Floats:
+    """Compute the distance of each row of `chosen` from the nearest row of `own` that is in another group."""
+    if seen is not None:
+        return seen.nearest(chosen, groups[chosen], seen, own, groups[own])
+    return nearest_poses(database.pose_points[chosen], groups[chosen], database.pose_points[own], groups[own])
 
 
 def every_kth(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:

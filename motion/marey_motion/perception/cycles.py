@@ -140,8 +140,7 @@ def cut_loop(motion: Motion, body: MatchingBody, period: Period) -> tuple[Motion
 
 def _lagged(clip: MeasuredClip, lag: int, metric: PerceptualMetric) -> Floats:
     """Compute the distances (F - lag,) of frames that are `lag` frames apart."""
-    frames = np.arange(clip.frame_count - lag, dtype=np.float64)
-    return paired_distances(clip.at(frames), clip.at(frames + lag), metric)
+    return paired_distances(clip.sliced(0, clip.frame_count - lag), clip.sliced(lag, clip.frame_count), metric)
 
 
 def _mixed(late: Floats, early: Floats, share: Floats) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,6 +51,26 @@ class MeasuredClip:
     def frame_count(self) -> int:
         """Number of frames F."""
         return len(self.positions)
+
+    def sliced(self, start: int, stop: int) -> MeasuredClip:
+        """Take a range of frames.
+
+        Parameters
+        ----------
+        start, stop : int    half-open range
+
+        Returns
+        -------
+        MeasuredClip    stop - start frames of a clip that is no loop, as views
+        """
+        frames = slice(start, stop)
+        return replace(
+            self,
+            rotations=self.rotations[frames],
+            positions=self.positions[frames],
+            velocities=self.velocities[frames],
+            cyclic=False,
+        )
 
     def at(self, times: Floats) -> MeasuredClip:
         """Interpolate between frames.

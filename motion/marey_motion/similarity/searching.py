@@ -31,6 +31,7 @@ SHORTEST_SEPARATION_ROWS = 15
 _FIRST_STEPS = 256
 _STEPS_PER_HIT = 16
 _MORE_STEPS = 8
+_CLIP_STEPS = 4_096
 
 Windows = Mapping[int, tuple[int, int]]
 """Half-open ranges of rows, by run, in which no hit may start."""
@@ -149,15 +150,55 @@ def search_windows(
     ------
     MotionError    if the metric superposes pairs of poses, or needs joints that the example does not have
     """
+    _require_comparable(example, metric)
+    examples = [example] if not mirror else [example, Example(mirrored(example.poses), example.offsets)]
+    with ThreadPoolExecutor(threads) as pool:
+        search = _WindowSearch(shards, examples, metric, pool)
+        return [search.told(*hit) for hit in search.best(count)]
+
+
+def search_clips(
+    shards: Sequence[SearchedShard],
+    example: Example,
+    metric: PerceptualMetric,
+    distance: float,
+    count: int,
+    *,
+    below: bool = False,
+    threads: int = 1,
+) -> list[tuple[int, int]]:
+    """Find the clips that have a window with at most a certain mean distance from an example.
+
+    Parameters
+    ----------
+    shards : sequence of SearchedShard    what is searched
+    example : Example    window to search for
+    metric : PerceptualMetric    metric of poses
+    distance : float    greatest distance
+    count : int    greatest number of clips; the search ends when so many are found
+    below : bool    exclude the distance itself
+    threads : int    number of threads
+
+    Returns
+    -------
+    list of tuple of int    shard and run of each clip, ascending; the same as without bounds
+
+    Raises
+    ------
+    MotionError    as for `search_windows`
+    """
+    most = float(np.nextafter(distance, -np.inf)) if below else distance
+    _require_comparable(example, metric)
+    with ThreadPoolExecutor(threads) as pool:
+        return _WindowSearch(shards, [example], metric, pool).clips_within(most, count)
+
+
+def _require_comparable(example: Example, metric: PerceptualMetric) -> None:
     require_searchable(metric)
     if metric_tables(metric, example.poses.present) is None:
         raise MotionError(
             "the skeleton of the example has none of the joints that the metric compares", code="mapping-invalid"
         )
-    examples = [example] if not mirror else [example, Example(mirrored(example.poses), example.offsets)]
-    with ThreadPoolExecutor(threads) as pool:
-        search = _WindowSearch(shards, examples, metric, pool)
-        return [search.told(*hit) for hit in search.best(count)]
 
 
 class _Place(NamedTuple):
@@ -205,6 +246,33 @@ class _WindowSearch:
         """Describe a hit, and find whether the example or its mirrored copy is nearer."""
         apart = [self._exactly(one, place) for one in self._examples]
         return Hit(*place, distance, len(apart) > 1 and apart[1] < apart[0])
+
+    def clips_within(self, most: float, count: int) -> list[tuple[int, int]]:
+        """Find the shard and run of up to `count` clips that have a window up to a distance.
+
+        For each clip, the step with the lowest bound comes first, then its next two, its next four, and so on. The
+        steps of clips that were found are not compared any more.
+        """
+        left = np.flatnonzero(self._bounds <= most)
+        offsets = np.cumsum([0, *(len(runs.starts) - 1 for runs in self._runs)])
+        places = self._places(left, np.zeros_like(left))
+        clips = offsets[places[:, 0]] + places[:, 1]
+        by_clip = np.lexsort((self._bounds[left], clips))
+        left, clips = left[by_clip], clips[by_clip]
+        rounds = np.log2(np.arange(len(clips)) - np.searchsorted(clips, clips) + 1).astype(np.int64)
+        order = np.argsort(rounds, kind="stable")
+        left, clips = left[order], clips[order]
+        found: list[int] = []
+        while len(left) and len(found) < count:
+            steps, here = left[:_CLIP_STEPS], clips[:_CLIP_STEPS]
+            self._compare(np.sort(steps), most)
+            new = np.unique(here[self._distances[steps].min(axis=1) <= most])
+            found += new.tolist()
+            unknown = ~np.isin(clips[_CLIP_STEPS:], new)
+            left, clips = left[_CLIP_STEPS:][unknown], clips[_CLIP_STEPS:][unknown]
+        chosen = np.sort(found).astype(np.int64)[:count]
+        shards = np.searchsorted(offsets, chosen, side="right") - 1
+        return list(zip(shards.tolist(), (chosen - offsets[shards]).tolist(), strict=True))
 
     def _bound(self, searched: SearchedShard) -> tuple[NDArray[np.float32], Runs]:
         """Compute the bounds of a shard's steps: infinity where no window starts, or none may."""

@@ -13,8 +13,10 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from marey_schemas.base import Tagged, require_tag
+from marey_schemas.documents.metrics import BuiltInMetric
 from marey_schemas.names import ItemId, JointName
 from marey_schemas.options.annotations import ContactOptions
+from marey_schemas.options.perception import DEFAULT_METRIC
 
 MOST_FRAME = 100_000_000
 MOST_LISTED = 4096
@@ -154,6 +156,19 @@ class CloseLoop(NamedCommand):
         None,
         description="Distance from either end, in seconds, within which poses may change; absent: up to the "
         "middle of the clip.",
+    )
+
+
+class CutLoop(NamedCommand):
+    """Find a cycle of a periodic motion, and blend two successive cycles into a loop without a seam.
+
+    The loop begins at the origin and faces +z. Its frames are those of the clip, so it has its frame rate.
+    """
+
+    examples: ClassVar[Examples] = ({}, {"metric": "published/sigmoid"})
+    command: Literal["cut_loop"] = "cut_loop"
+    metric: BuiltInMetric = Field(
+        DEFAULT_METRIC, description="Built-in perceptual metric by which frames a cycle apart are compared."
     )
 
 
@@ -360,6 +375,7 @@ MotionCommand = (
     | Resample
     | Retime
     | CloseLoop
+    | CutLoop
     | Translate
     | Rotate
     | Face

@@ -67,6 +67,19 @@ class SuggestionOptions(ObjectiveChoice):
         description="Greatest distance between poses that can be blended, summed over joints, in metres; "
         "absent: the median over the transitions of the trials.",
     )
+    blendable_distance: float | None = Field(
+        None,
+        gt=0,
+        le=1000,
+        allow_inf_nan=False,
+        description="With a metric, instead of `blendable_m`: greatest perceptual distance between poses that can be "
+        "blended; absent: the median over the transitions of the trials.",
+    )
+    lost_pose: _Price = Field(
+        0.01,
+        description="With a metric: metres that each second of poses that look like no pose of the remaining clips "
+        "adds to the harm of a removal.",
+    )
 
 
 class OptimisationOptions(ObjectiveChoice):

@@ -6,14 +6,15 @@ for an item. A condition about a value that the item does not have is false, and
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime
 from difflib import get_close_matches
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal
 
 from marey_schemas.queries.fields import OPERATORS, QueryField, field_names, find_field
+from marey_schemas.queries.moments import Moment, read_moment
 from marey_schemas.wording import one_of
 
 if TYPE_CHECKING:
@@ -23,6 +24,10 @@ MOST_CHARACTERS = 2_000
 MOST_CONDITIONS = 50
 MOST_COMPARED_VALUES = 200
 """Greatest number of values in all conditions of a query together."""
+MOST_LIKENESSES = 3
+"""Greatest number of conditions `like(...)` in a query; each of them searches an index of motions."""
+MOST_ALIKE = 10_000
+"""Greatest number of clips that may meet one condition `like(...)`; the statement of the list contains their ids."""
 DEEPEST = 30
 """Greatest depth of nested brackets and negations."""
 
@@ -38,6 +43,7 @@ _GRAMMAR = r"""
     comparison: WORD OPERATOR _value
         | WORD _IN "(" _value ("," _value)* ")" -> membership
         | _HAS WORD -> presence
+        | _LIKE _value ["," _value] ")" OPERATOR _value -> likeness
     _value: WORD | TEXT
     OPERATOR: "!=" | "<=" | ">=" | "=" | "~" | "<" | ">"
     TEXT: /"([^"\\]|\\.)*"/s | /'([^'\\]|\\.)*'/s
@@ -46,6 +52,7 @@ _GRAMMAR = r"""
     _NOT: /not(?![^\s()"',=~<>!\\])/i
     _IN: /in(?![^\s()"',=~<>!\\])/i
     _HAS: /has(?![^\s()"',=~<>!\\])/i
+    _LIKE: /like\s*\(/i
     WORD.-1: /[^\s()"',=~<>!\\]+/
     %ignore /\s+/
 """
@@ -75,6 +82,25 @@ class Condition:
 
 
 @dataclass(frozen=True, slots=True)
+class Likeness:
+    """Condition that a clip has a moment that looks like some frames of a clip: `like("walks/a:30-90") < 0.2`.
+
+    The database cannot evaluate it: an index of motions is searched before, and `with_clips` adds the clips found.
+    """
+
+    moment: Moment
+    metric: str | None
+    """Name of a built-in metric, or path of a stored one; None: the default."""
+    distance: float
+    below: bool
+    """Whether the distance itself is excluded (`<`), or included (`<=`)."""
+    source: str
+    column: int
+    clips: frozenset[str] | None = None
+    """Ids of the clips that meet the condition; None: not searched."""
+
+
+@dataclass(frozen=True, slots=True)
 class Negation:
     """Query that selects the items that another query does not select."""
 
@@ -91,7 +117,7 @@ class Junction:
     source: str
 
 
-Query = Condition | Negation | Junction
+Query = Condition | Likeness | Negation | Junction
 
 
 def parse(text: str) -> Query:
@@ -118,6 +144,8 @@ def parse(text: str) -> Query:
         raise QueryError(
             f"at most {MOST_CONDITIONS} conditions with {MOST_COMPARED_VALUES} values together are accepted", 1
         )
+    if len(alike := list(likenesses_of(query))) > MOST_LIKENESSES:
+        raise QueryError(f"at most {MOST_LIKENESSES} conditions like(...) are accepted", alike[-1].column)
     return query
 
 
@@ -127,9 +155,31 @@ def conditions_of(query: Query) -> Iterator[Condition]:
         yield query
     elif isinstance(query, Negation):
         yield from conditions_of(query.query)
-    else:
+    elif isinstance(query, Junction):
         for part in query.queries:
             yield from conditions_of(part)
+
+
+def likenesses_of(query: Query) -> Iterator[Likeness]:
+    """Yield all conditions `like(...)` of a query."""
+    if isinstance(query, Likeness):
+        yield query
+    elif isinstance(query, Negation):
+        yield from likenesses_of(query.query)
+    elif isinstance(query, Junction):
+        for part in query.queries:
+            yield from likenesses_of(part)
+
+
+def with_clips(query: Query, found: Mapping[str, frozenset[str]]) -> Query:
+    """Return a query whose conditions `like(...)` have the clips that were found for them, by their source."""
+    if isinstance(query, Likeness):
+        return replace(query, clips=found.get(query.source))
+    if isinstance(query, Negation):
+        return replace(query, query=with_clips(query.query, found))
+    if isinstance(query, Junction):
+        return replace(query, queries=tuple(with_clips(part, found) for part in query.queries))
+    return query
 
 
 def parts_of(query: Query) -> tuple[Query, ...]:
@@ -183,6 +233,7 @@ _EXPECTED = {
     "_NOT": "'not'",
     "_IN": "'in'",
     "_HAS": "'has'",
+    "_LIKE": "'like('",
     "$END": "the end",
 }
 
@@ -214,6 +265,8 @@ class _Reader:
         if tree.data in ("conjunction", "disjunction"):
             word: Literal["and", "or"] = "and" if tree.data == "conjunction" else "or"
             return Junction(word, tuple(self.read(child) for child in tree.children), source)
+        if tree.data == "likeness":
+            return _likeness(tree, source)
         return self._condition(tree, source)
 
     def _condition(self, tree: Any, source: str) -> Query:
@@ -234,6 +287,21 @@ class _Reader:
         return Condition(field, operator.value, (value,), source)
 
 
+def _likeness(tree: Any, source: str) -> Likeness:
+    moment, *metric, operator, limit = tree.children
+    if operator not in ("<", "<="):
+        raise QueryError("like(...) is a distance of motions; compare it with < or <=", _column(operator))
+    try:
+        parsed = read_moment(_text(moment))
+    except ValueError as error:
+        raise QueryError(str(error), _column(moment)) from None
+    distance = _number(_text(limit), _column(limit))
+    if distance < 0:
+        raise QueryError("a distance is at least 0", _column(limit))
+    named = _text(metric[0]) if metric else None
+    return Likeness(parsed, named, distance, operator == "<", source, int(tree.meta.start_pos) + 1)
+
+
 def _column(token: Any) -> int:
     """Return the place of a word in the whole query, counted from 1."""
     return int(token.start_pos) + 1
@@ -243,6 +311,8 @@ def _require_field(token: Any) -> QueryField:
     name = str(token).lower()
     if (field := find_field(name)) is not None:
         return field
+    if name == "like":
+        raise QueryError('write like("walks/take-01:30-90") < 0.2, with a clip and its frames', _column(token))
     names = field_names()
     near = get_close_matches(name, names, n=1)
     hint = f"did you mean {near[0]!r}?" if near else f"the fields are {', '.join(names)}"
@@ -250,14 +320,16 @@ def _require_field(token: Any) -> QueryField:
 
 
 def _value(field: QueryField, token: Any) -> str | float | date | datetime:
-    text = str(token)
-    if token.type == "TEXT":
-        text = _unquoted(text[1:-1])
+    text = _text(token)
     if field.type == "text":
         return text
     if field.type == "number":
         return _number(text, _column(token))
     return _date(text, _column(token))
+
+
+def _text(token: Any) -> str:
+    return _unquoted(str(token)[1:-1]) if token.type == "TEXT" else str(token)
 
 
 def _unquoted(text: str) -> str:

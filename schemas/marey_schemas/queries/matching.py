@@ -13,7 +13,7 @@ from string import ascii_lowercase, ascii_uppercase
 from typing import Any
 
 from marey_schemas.queries.fields import FACET_PREFIX, FIELDS
-from marey_schemas.queries.grammar import Condition, Negation, Query
+from marey_schemas.queries.grammar import Condition, Likeness, Negation, Query
 
 _TO_LOWER = str.maketrans(ascii_uppercase, ascii_lowercase)
 _ORDERS: dict[str, Callable[[Any, Any], bool]] = {"<": lt, "<=": le, ">": gt, ">=": ge}
@@ -42,11 +42,13 @@ class QueriedFacts:
 
 
 def matches(query: Query, facts: QueriedFacts) -> bool:
-    """Return whether a query selects a revision with these facts."""
+    """Return whether a query selects a revision with these facts. Raises `ValueError` for a query with `like(...)`."""
     if isinstance(query, Condition):
         if query.field.startswith(FACET_PREFIX):
             return _number(facts.facets.get(query.field.removeprefix(FACET_PREFIX)), query)
         return _COMPARISONS[query.field](facts, query)
+    if isinstance(query, Likeness):
+        raise ValueError("motions are compared by an index, not by facts")
     if isinstance(query, Negation):
         return not matches(query.query, facts)
     join = all if query.word == "and" else any

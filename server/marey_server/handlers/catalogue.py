@@ -22,12 +22,12 @@ from marey_server.handlers import (
     purges,
     reports,
     samples,
-    searches,
     uploads,
     webhooks,
 )
 from marey_server.handlers.browser import pages, sessions
 from marey_server.handlers.queue import jobs, leases, pipelines, schedules, scripts
+from marey_server.handlers.searching import models, similar
 from marey_server.handlers.studies import conducting, participation
 from marey_server.handlers.versions import contents, datasets, differences, proposals
 from marey_server.http.resource import Resource
@@ -52,7 +52,8 @@ RESOURCES: tuple[type[Resource], ...] = (
     *exports.RESOURCES,
     *reports.RESOURCES,
     *samples.RESOURCES,
-    *searches.RESOURCES,
+    *models.RESOURCES,
+    *similar.RESOURCES,
     *coverage_streams.RESOURCES,
     *conducting.RESOURCES,
     *participation.RESOURCES,

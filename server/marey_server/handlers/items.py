@@ -11,6 +11,7 @@ from marey_schemas.lineage import LineageGraph, LineageRequest
 from marey_schemas.queries.grammar import MOST_CHARACTERS
 from marey_schemas.sizes import MIB
 from marey_server.errors import NotFoundProblem
+from marey_server.handlers.searching.similar import IndexSearcher
 from marey_server.http.declarations import Access, RequestBody, reads, writes
 from marey_server.http.queries import MAX_INTEGER, CommaSeparated, CountedPageQuery, PageQuery
 from marey_server.http.reply import Rendered, Reply
@@ -87,7 +88,7 @@ def kind_of(plural: str) -> Kind:
         ) from None
 
 
-class ItemsOfKind(Resource):
+class ItemsOfKind(IndexSearcher):
     """Items of a kind in a project."""
 
     path = "/projects/{project}/{kind}"
@@ -96,11 +97,12 @@ class ItemsOfKind(Resource):
     @reads(access=Access.READER, query=ItemsQuery, answer=Item, paged=True, attempts=True)
     async def get(self, project: str, kind: str, query: ItemsQuery) -> Rendered:
         """List items of a kind, filtered and sorted."""
+        filters = await self.searched(project, kind_of(kind), query.filters())
         return await self.answer(
             items.list_items,
             project,
             kind_of(kind),
-            query.filters(),
+            filters,
             sort=query.sort,
             cursor=query.cursor,
             limit=query.limit,
@@ -267,7 +269,7 @@ class ExplanationQuery(Request):
     )
 
 
-class ExplanationResource(Resource):
+class ExplanationResource(IndexSearcher):
     """Effect of a query on the items of a kind."""
 
     path = "/projects/{project}/explanations/{kind}"
@@ -276,7 +278,8 @@ class ExplanationResource(Resource):
     @reads(access=Access.READER, query=ExplanationQuery, answer=QueryExplanation)
     async def get(self, project: str, kind: str, query: ExplanationQuery) -> Rendered:
         """Return the number of items that a query selects, and how many items each of its conditions excludes."""
-        filters = ItemFilters(collection=query.collection)
+        found = await self.searched(project, kind_of(kind), ItemFilters(query=query.query))
+        filters = ItemFilters(collection=query.collection, alike=found.alike)
         return await self.answer(items.explain_query, project, kind_of(kind), filters, query.query)
 
 

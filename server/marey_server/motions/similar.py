@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from marey_schemas.documents.clips import MotionDocument
-from marey_schemas.documents.metrics import built_in_metric
+from marey_schemas.documents.metrics import MetricDocument, MetricIdentity, built_in_metric, is_built_in
 from marey_schemas.documents.motion_indexes import ShardClips
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
@@ -26,6 +28,7 @@ from marey_server.store.motion_indexes import FoundClip, FoundIndex
 from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:  # numeric modules are loaded by children alone
+    from marey_motion.perception.metric import PerceptualMetric
     from marey_motion.similarity.searching import Example, Hit, SearchedShard
 
 Tree = dict[str, Any]
@@ -63,6 +66,7 @@ class SimilarOrder(Message):
     """Message that asks a child process to search an index."""
 
     request: SimilarRequest
+    metric: MetricDocument
     revision: int
     motion: bytes
     first: int
@@ -117,12 +121,29 @@ def read_example(tx: Transaction, project: str, request: SimilarRequest) -> Foun
     return FoundExample(request.clip, part.revision, cut, start - first, request.frames, hierarchy, mapping)
 
 
+def read_metric(tx: Transaction, project: str, name: str) -> MetricDocument:
+    """Return a built-in metric by its name, or a stored one by its id.
+
+    Raises `InvalidProblem` if there is no such built-in metric, and `NotFoundProblem` if there is no such item.
+    """
+    if is_built_in(name):
+        return built_in_metric(name)
+    if "/" in name:
+        raise _invalid("/metric", f"There is no built-in metric {name!r}; `marey metric ls` lists them.", "no-metric")
+    return MetricDocument.model_validate(items.read_part(tx, project, Kind.METRIC, name, "metric").tree)
+
+
 def search_order(
-    request: SimilarRequest, found: FoundExample, index: FoundIndex, shards: tuple[ShardFiles, ...]
-) -> bytes:
-    """Return the packed message that asks a child process to search an index."""
+    request: SimilarRequest,
+    metric: MetricDocument,
+    found: FoundExample,
+    index: FoundIndex,
+    shards: tuple[ShardFiles, ...],
+) -> SimilarOrder:
+    """Return the message that asks a child process to search an index."""
     return SimilarOrder(
         request=request,
+        metric=metric,
         revision=found.revision,
         motion=pack_tree(found.motion),
         first=found.first,
@@ -130,10 +151,12 @@ def search_order(
         mapping=None if found.mapping is None else pack_tree(found.mapping),
         shards=shards,
         heads=index.heads,
-    ).pack()
+    )
 
 
-def answer_of(found: FoundWindows, index: FoundIndex, clips: dict[str, FoundClip]) -> SimilarAnswer:
+def answer_of(
+    found: FoundWindows, metric: MetricDocument, index: FoundIndex, clips: dict[str, FoundClip]
+) -> SimilarAnswer:
     """Return the answer; a clip that was changed or deleted during the search is left out."""
     moments = [
         SimilarMoment(path=clips[one.clip].path, **one.model_dump())
@@ -142,6 +165,7 @@ def answer_of(found: FoundWindows, index: FoundIndex, clips: dict[str, FoundClip
     ]
     return SimilarAnswer(
         moments=tuple(moments),
+        metric=MetricIdentity.of(metric),
         index=RevisionRef(item=index.item, revision=index.revision),
         searched_clips=found.searched_clips,
         behind=found.behind,
@@ -165,36 +189,68 @@ def search_index(packed: bytes) -> bytes:
     or damaged.
     """
     order = SimilarOrder.unpack(packed)
+    with opened(order) as search:
+        return _search(order, search).pack()
+
+
+@dataclass(frozen=True, slots=True)
+class OpenedSearch:
+    """Input of a search in a child process: the shards, the clips of each, the example and the metric."""
+
+    lists: list[ShardClips]
+    shards: list[SearchedShard]
+    example: Example
+    rate_hz: float
+    metric: PerceptualMetric
+
+    def behind(self, heads: dict[str, int]) -> int:
+        """Count the clips that were created or changed since the index was updated, and that it does not have."""
+        known = {place for clips in self.lists for place in zip(clips.items, clips.revisions, strict=True)}
+        return sum(head > 0 and (clip, head) not in known for clip, head in heads.items())
+
+
+@contextmanager
+def opened(order: SimilarOrder) -> Iterator[OpenedSearch]:
+    """Open the files of an index, and compute the features of the example.
+
+    Raises `InvalidProblem` if the example cannot be compared, and `NotFoundProblem` if files of the index are missing
+    or damaged.
+    """
+    from marey_motion.errors import MotionError
+    from marey_motion.perception.metric import metric_of
+    from marey_motion.similarity.weighing import require_searchable
+
     try:
-        return _search(order).pack()
+        metric = metric_of(order.metric)
+        require_searchable(metric)
+    except MotionError as error:
+        raise _invalid("/metric", f"The index cannot be searched by this metric: {error}", error.code) from error
+    try:
+        lists = [_clips_of(files) for files in order.shards]
+        example, rate_hz = _example(order)
+        parts = zip(order.shards, lists, _ranks(lists), strict=True)
+        yield OpenedSearch(lists, [_searched(order, *one, rate_hz, example) for one in parts], example, rate_hz, metric)
+    except MotionError as error:
+        raise _invalid("/clip", f"The example cannot be searched for: {error}", error.code) from error
     except FileNotFoundError as error:  # a search of another index needed the space
         raise NotFoundProblem(
             "The copies of the index were removed during the search; repeat the request.", code="no-index"
         ) from error
 
 
-def _search(order: SimilarOrder) -> FoundWindows:
-    from marey_motion.errors import MotionError
-    from marey_motion.perception.metric import metric_of
+def _search(order: SimilarOrder, search: OpenedSearch) -> FoundWindows:
     from marey_motion.similarity.searching import search_windows
 
-    lists = [_clips_of(files) for files in order.shards]
-    ranks = _ranks(lists)
-    try:
-        example, rate_hz = _example(order)
-        shards = [_searched(order, *one, rate_hz, example) for one in zip(order.shards, lists, ranks, strict=True)]
-        metric = metric_of(built_in_metric(order.request.metric))
-        hits = search_windows(
-            shards, example, metric, order.request.results, mirror=order.request.mirrored, threads=THREADS
-        )  # fmt: skip
-    except MotionError as error:
-        raise _invalid("/clip", f"The example cannot be searched for: {error}", error.code) from error
-    length_s = (order.request.frames[1] - order.request.frames[0] - 1) / rate_hz
-    searched = sum(int((~shard.closed).sum()) for shard in shards)
-    known = {place for clips in lists for place in zip(clips.items, clips.revisions, strict=True)}
-    behind = sum(head > 0 and (clip, head) not in known for clip, head in order.heads.items())
-    windows = tuple(_window(hit, lists[hit.shard], length_s) for hit in hits)
-    return FoundWindows(windows=windows, searched_clips=searched, behind=behind)
+    request = order.request
+    hits = search_windows(
+        search.shards, search.example, search.metric, request.results, mirror=request.mirrored, threads=THREADS
+    )
+    length_s = (request.frames[1] - request.frames[0] - 1) / search.rate_hz
+    return FoundWindows(
+        windows=tuple(_window(hit, search.lists[hit.shard], length_s) for hit in hits),
+        searched_clips=sum(int((~shard.closed).sum()) for shard in search.shards),
+        behind=search.behind(order.heads),
+    )
 
 
 def _clips_of(files: ShardFiles) -> ShardClips:

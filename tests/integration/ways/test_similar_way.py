@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from tests.support.command_line import CommandLine
 
-from marey_client.errors import NotFound, RequestFailed
+from marey_client.errors import Conflict, Invalid, NotFound, RequestFailed
 from marey_client.imports import find_files
 from marey_client.jobs import Jobs
 from marey_client.project import ProjectHandle
@@ -18,6 +18,7 @@ from marey_motion.gait import generate_gait
 from marey_motion.mirroring import mirror_clip
 from marey_motion.rigs import map_joints
 from marey_motion.rigs.mapping import symmetric_joints
+from marey_schemas.documents.metrics import MetricIdentity, built_in_metric
 from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
 from marey_schemas.queue.jobs import Job
@@ -42,6 +43,8 @@ def test_similar_moments_are_found_and_the_index_follows_the_project(
     (walk,) = lab.clips.list(path="walks/walk 1.5 0")
     with pytest.raises(NotFound, match="marey index lab"):
         lab.similar(walk, (30, 60))
+    with pytest.raises(NotFound, match="marey index lab"):
+        list(lab.clips.list(query="like('walks/walk 1.5 0:3') < 1"))
     assert run("index", "lab").stdout == "9 clips, 9 of them new, in 1 shard\n"
 
     table = run("similar", "lab/walks/walk 1.5 0:30-60").stdout
@@ -56,6 +59,47 @@ def test_similar_moments_are_found_and_the_index_follows_the_project(
     assert all(abs(first - 30) >= 30 for first in own), "the example's own surroundings are left out"
     assert all(one.clip != walk.id for one in lab.similar(walk, 45, leave_out="clip").moments)
 
+    # The same comparison is a condition of queries, beside others.
+    moments = lab.similar(walk, (30, 60), results=100, leave_out="clip").moments
+    nearest = {one.path: one.distance for one in reversed(moments)}
+    limit = (sorted(nearest.values())[2] + sorted(nearest.values())[3]) / 2
+    alike = sorted(path for path, distance in nearest.items() if distance < limit)
+    condition = f'like("walks/walk 1.5 0:30-60") < {limit:.6f}'
+    assert len(alike) == 3
+    assert sorted(one.path for one in lab.clips.list(query=condition)) == sorted([walk.path, *alike])
+    rest = {one.path for one in lab.clips.list(query=f"not {condition} and frames > 0")}
+    assert rest == {one.path for one in lab.clips.list()} - {walk.path, *alike}
+    assert "walk 1.5 0" in run("ls", "lab", "--query", condition).stdout
+    for query, reason in (
+        ('like("walks/none:1") < 1', "column 1: There is no clip 'walks/none'"),
+        ('like("walks/walk 1.5 0:1", metrics/none) < 1', "There is no metric 'metrics/none'"),
+        ('like("walks/walk 1.5 0:0-999") < 1', "ends at frame 999"),
+    ):
+        assert reason in run("ls", "lab", "--query", query, status=1).stderr
+    with pytest.raises(RequestFailed, match="only lists of clips accept it"):
+        list(lab.clips.list(query=condition, deleted=True))
+
+    # Stored metrics measure like built-in ones, and the answer names them.
+    run("metric", "store", "published/angles-manhattan", "lab/metrics/paper")
+    stored = lab.similar(walk, (30, 60), metric=next(iter(lab.metrics.list())))
+    assert stored == lab.similar(walk, (30, 60), metric="published/angles-manhattan")
+    assert stored.metric == MetricIdentity.of(built_in_metric("published/angles-manhattan"))
+    by_stored = run("similar", "lab/walks/walk 1.5 0:30-60", "--metric", "lab/metrics/paper").stdout
+    assert "metric: published/angles-manhattan" in by_stored
+    by_name, by_path = (
+        sorted(one.path for one in lab.clips.list(query=f'like("walks/walk 1.5 0:30-60", {metric}) < 1.2'))
+        for metric in ("published/angles-manhattan", "metrics/paper")
+    )
+    assert by_name == by_path
+    document = built_in_metric("uniform/manhattan").model_copy(update={"root_alignment": "kovar2d"})
+    superposing = lab.metrics.store(document, "superposing")
+    with pytest.raises(Invalid, match="so use a metric with root_alignment mean_heading"):
+        lab.similar(walk, (30, 60), metric=superposing)
+    with pytest.raises(Invalid, match="no built-in metric 'published/none'"):
+        lab.similar(walk, (30, 60), metric="published/none")
+    with pytest.raises(NotFound):
+        lab.similar(walk, (30, 60), metric=walk)
+
     # A mirrored copy of the walk: only a mirrored search sees that it is the same.
     clip = generate_gait(1.9, 0.5, 3.0)
     (tmp_path / "left.bvh").write_bytes(write_bvh(clip))
@@ -63,6 +107,8 @@ def test_similar_moments_are_found_and_the_index_follows_the_project(
     (tmp_path / "right.bvh").write_bytes(write_bvh(mirror_clip(clip, partners)))
     left, right = (upload(lab, tmp_path / f"{name}.bvh", "turns") for name in ("left", "right"))
     assert lab.similar(left, (60, 90)).behind == 2
+    with pytest.raises(Conflict, match=r"2 clips changed since .*marey index lab"):
+        list(lab.clips.list(query=condition))
     told = indexed(lab)
     assert (told["clips"], told["new_clips"], told["written_shards"]) == (11, 2, 1)
     plain = {one.clip: one for one in lab.similar(left, (60, 90), leave_out="clip").moments}

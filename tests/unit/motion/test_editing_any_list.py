@@ -41,6 +41,7 @@ COMMAND = st.one_of(
     named("resample", frame_rate_hz=st.sampled_from([12.0, 24.0, 59.94, 120.0])),
     named("retime", speed=st.floats(0.3, 3.0)),
     named("close_loop", in_place=st.booleans(), blend_s=st.none() | SECONDS),
+    named("cut_loop", metric=st.sampled_from(["published/positions-sigmoid", "uniform/manhattan"])),
     named("translate", shift_m=SHIFTS),
     named("rotate", angle_deg=ANGLES, axis=AXES, pivot=st.sampled_from(["origin", "body"])),
     named("face", heading_deg=ANGLES, frame=st.integers(0, 5)),
@@ -85,6 +86,7 @@ EXPECTED_REFUSALS = {
     "frames-missing",
     "edit-invalid",
     "heading-undefined",
+    "no-period",
     "window-too-short",
     "window-too-long",
 }
@@ -103,7 +105,7 @@ def frames_after(clip: Clip, commands: list[AnyCommand]) -> int | None:
     for command in commands:
         if isinstance(command, Trim):
             frames = (frames if command.stop is None else command.stop) - command.start
-        elif command.command in ("concatenate", "resample", "retime"):
+        elif command.command in ("concatenate", "resample", "retime", "cut_loop"):
             return None
     return frames
 

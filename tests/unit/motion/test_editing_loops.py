@@ -6,14 +6,15 @@ from tests.support.edited_takes import make_breathing_walk, make_walk, require_s
 
 from marey_motion import kinematics
 from marey_motion.clip import Clip
-from marey_motion.editing.registry import apply_edit
-from marey_motion.errors import EditError
+from marey_motion.editing.registry import apply_edit, edit_clip
+from marey_motion.errors import EditError, MotionError
+from marey_motion.gait import generate_gait
 from marey_motion.kinematics import global_positions
 from marey_motion.looping import LoopSeam, continue_motion, loop_seam
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
 from marey_motion.rigs import map_joints
-from marey_schemas.editing.commands import CloseLoop
+from marey_schemas.editing.commands import CloseLoop, CutLoop
 
 
 def seam_of(clip: Clip) -> LoopSeam:
@@ -84,3 +85,26 @@ def test_a_body_under_a_static_root_is_looped_as_a_body_that_is_the_root(in_plac
     require_sound(closed)
     assert np.abs(global_positions(closed)[:, 1:] - global_positions(own)).max() < 1e-4
     assert np.abs(closed.rotations[:, 0] - (1.0, 0.0, 0.0, 0.0)).max() < 1e-5
+
+
+@pytest.mark.parametrize("turn_rate_rad_s", [0.0, 0.5])
+def test_one_cycle_of_a_walk_is_cut_into_a_loop_that_closes(turn_rate_rad_s: float) -> None:
+    walk = generate_gait(1.4, turn_rate_rad_s, 6.0, frame_rate_hz=60.0)
+    (cut,) = edit_clip(walk, [CutLoop()])
+    (finding,) = cut.findings
+    first, end = finding.values["frames"]
+    assert cut.clip.frame_count == end - first == round(60 * finding.values["period_s"])
+    assert 0.6 <= finding.values["period_s"] <= 2.0
+    require_sound(cut.clip)
+    usual = np.linalg.norm(np.diff(global_positions(walk).astype(np.float64), n=2, axis=0), axis=-1).max()
+    assert accelerations_around_the_seam(cut.clip, seam_of(cut.clip)).max() < 1.2 * usual
+    turned = finding.values["turn_deg"] / finding.values["period_s"]
+    assert turned == pytest.approx(np.degrees(turn_rate_rad_s), abs=3.0)
+    assert finding.values["travel_m"] / finding.values["period_s"] == pytest.approx(1.4, rel=0.1)
+
+
+def test_a_clip_without_a_cycle_is_left_alone_with_a_reason() -> None:
+    with pytest.raises(MotionError, match="two periods"):
+        apply_edit(make_walk().sliced(0, 40), [CutLoop()])
+    with pytest.raises(EditError, match="more computing time"):
+        apply_edit(generate_gait(1.4, 0.0, 6.0), [CutLoop()], most_work=1e7)

@@ -50,7 +50,7 @@ def test_the_nearest_pose_of_another_clip_is_found_for_every_frame() -> None:
 def test_each_cell_is_measured_by_its_own_frames_alone() -> None:
     database = synthetic_database(wandering_tracks(12))
     coverage = measure_coverage(database, OPTIONS)
-    found = measure_similarity(database, coverage, threshold_m=4.0)
+    found = measure_similarity(database, coverage, threshold=4.0)
     rows, cells = window_rows(database, coverage), window_cells(coverage)
     assert len(np.unique(cells[cells >= 0])) > 2
     for cell in np.unique(cells[cells >= 0]).tolist():
@@ -61,9 +61,9 @@ def test_each_cell_is_measured_by_its_own_frames_alone() -> None:
         assert found.sources[place] == len(np.unique(source_of_rows(database)[own]))
         assert found.blendable_share[place] == np.mean(distances <= 4.0)
         if found.sources[place] > 1:
-            assert found.distance_m[place] == pytest.approx(np.median(distances))
+            assert found.distance[place] == pytest.approx(np.median(distances))
         else:
-            assert np.isnan(found.distance_m[place])
+            assert np.isnan(found.distance[place])
             assert found.blendable_share[place] == 0.0
     assert np.isnan(found.blendable_share[found.frames == 0]).all()
 
@@ -78,10 +78,10 @@ def test_frames_within_the_threshold_are_counted_as_blendable() -> None:
     database = synthetic_database(straight_walks())
     coverage = measure_coverage(database, OPTIONS)
     cell = np.unravel_index(np.argmax(coverage.seconds), coverage.seconds.shape)
-    assert measure_similarity(database, coverage, threshold_m=1e3).blendable_share[cell] == 1.0
-    assert measure_similarity(database, coverage, threshold_m=1e-9).blendable_share[cell] == 0.0
-    middle = measure_similarity(database, coverage, threshold_m=1.0).distance_m[cell]
-    assert measure_similarity(database, coverage, threshold_m=middle).blendable_share[cell] == pytest.approx(
+    assert measure_similarity(database, coverage, threshold=1e3).blendable_share[cell] == 1.0
+    assert measure_similarity(database, coverage, threshold=1e-9).blendable_share[cell] == 0.0
+    middle = measure_similarity(database, coverage, threshold=1.0).distance[cell]
+    assert measure_similarity(database, coverage, threshold=middle).blendable_share[cell] == pytest.approx(
         0.5, abs=0.02
     )
 
@@ -90,9 +90,9 @@ def test_a_cell_with_one_clip_has_nothing_to_blend_with_and_neither_has_its_mirr
     alone = synthetic_database(straight_walks(1))
     twins = with_mirrored(straight_walks(1))
     for database in (alone, twins):
-        found = measure_similarity(database, measure_coverage(database, OPTIONS), threshold_m=1e3)
+        found = measure_similarity(database, measure_coverage(database, OPTIONS), threshold=1e3)
         assert found.share == 0.0
-        assert np.isnan(found.distance_m).all()
+        assert np.isnan(found.distance).all()
 
 
 def test_dense_data_that_does_not_meet_is_told_from_data_that_does() -> None:
@@ -135,7 +135,7 @@ def test_the_usual_threshold_is_the_median_cost_of_the_switches_that_were_made()
 def test_thresholds_that_are_no_distance_are_refused_and_the_work_can_be_stopped() -> None:
     database = synthetic_database(straight_walks())
     coverage = measure_coverage(database, OPTIONS)
-    with pytest.raises(MotionError, match="threshold_m"):
+    with pytest.raises(MotionError, match="threshold"):
         measure_similarity(database, coverage, 0.0)
     with pytest.raises(EvaluationCancelled):
         measure_similarity(database, coverage, 1.0, cancelled=lambda: True)

@@ -62,13 +62,13 @@ def test_every_kind_of_suggestion_is_made(found: Suggestions) -> None:
     assert {(pair.first, pair.second) for pair in found.duplicates.pairs} == {("clip_000", "copy_of_clip_000")}
     assert [source for source, _ in found.spared] == ["copy_of_clip_000"]
     assert {filling.source for filling in found.fillings} <= {"turn_000", "turn_001"}
-    assert found.similarity.threshold_m == 3.0
+    assert found.similarity.threshold == 3.0
 
 
 def test_the_threshold_is_the_suites_own_when_none_is_given(database: MatchingDatabase) -> None:
     result = evaluated(database)
     found = suggest(database, result, options=SuggestionOptions(removals=0, consider=0))
-    assert found.similarity.threshold_m == accepted_distance(result.records)
+    assert found.similarity.threshold == accepted_distance(result.records)
     assert (found.plan, found.redundant, found.fillings) == ((), (), ())
 
 

@@ -22,7 +22,7 @@ from marey_motion.perception.metric import PerceptualMetric, metric_of, publishe
 from marey_motion.retargeting import plan_retarget, retarget
 from marey_motion.rigs import guess_axes, map_joints
 from marey_motion.similarity.features import INDEX_RATE_HZ, JOINTS, WIDTH, PoseFeatures, clip_features, mirrored
-from marey_motion.similarity.searching import Example, Hit, SearchedShard, sample_offsets, search_windows
+from marey_motion.similarity.searching import Example, Hit, SearchedShard, sample_offsets, search_clips, search_windows
 from marey_motion.similarity.shards import Shard, presence, write_shard
 from marey_schemas.documents.metrics import built_in_metric
 
@@ -111,6 +111,23 @@ def test_a_search_finds_what_brute_force_finds(
     expected = by_brute_force(runs, example, metric, count)
     assert [hit[:3] for hit in found] == [hit[:3] for hit in expected]
     np.testing.assert_allclose([hit.distance for hit in found], [hit.distance for hit in expected], atol=1e-6)
+
+
+def test_clips_with_a_window_within_a_distance_are_found(tmp_path: Path) -> None:
+    rng = np.random.default_rng(7)
+    runs = [random_run(rng, int(rng.integers(1, 90)), 0.02) for _ in range(40)]
+    metric, offsets = metric_of(built_in_metric("published/sigmoid")), sample_offsets(0.3)
+    example = Example(PoseFeatures(runs[3][offsets], np.ones(15, np.bool_)), offsets)
+    parts = [searched(tmp_path, runs[:25], name="a"), searched(tmp_path, runs[25:], name="b")]
+    least: dict[tuple[int, int], float] = {}
+    for hit in by_brute_force(runs, example, metric, 10_000):
+        least.setdefault(divmod(hit.run, 25), hit.distance)
+    assert least[0, 3] == 0.0
+    for distance in (0.0, *np.quantile(list(least.values()), (0.2, 0.7)), 1e6):
+        expected = sorted(run for run, apart in least.items() if apart <= distance)
+        assert search_clips(parts, example, metric, distance + 1e-5, 100, threads=2) == expected
+    assert search_clips(parts, example, metric, 0.0, 100, below=True) == []
+    assert len(search_clips(parts, example, metric, 1e6, 5)) == 5
 
 
 def test_the_distance_is_the_perceptual_metric_of_the_clips(tmp_path: Path) -> None:

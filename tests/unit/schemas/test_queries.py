@@ -16,17 +16,22 @@ from marey_schemas.queries.grammar import (
     MOST_CONDITIONS,
     Condition,
     Junction,
+    Likeness,
     Negation,
     Query,
     QueryError,
+    likenesses_of,
     parse,
     parts_of,
+    with_clips,
 )
 from marey_schemas.queries.matching import QueriedFacts, matches
 
 
 def plain(query: Query) -> object:
     """Return a query without the source texts of its conditions."""
+    if isinstance(query, Likeness):
+        return ("like", *query.moment, query.metric, "<" if query.below else "<=", query.distance)
     if isinstance(query, Condition):
         return (query.field, query.operator, *query.values)
     if isinstance(query, Negation):
@@ -57,6 +62,9 @@ def test_and_binds_stronger_than_or_and_not_stronger_than_both() -> None:
         ('action ~ "say \\"hi\\""', ("action", "~", 'say "hi"')),
         ("select != best", ("not", ("select", "=", "best"))),
         ("name = and", ("name", "=", "and")),
+        ('LIKE ("a b/c:30-90") < 0.2', ("like", "a b/c", (30, 90), None, "<", 0.2)),
+        ("like(c:3, published/sigmoid) <= 1", ("like", "c", (3, 4), "published/sigmoid", "<=", 1.0)),
+        ("name = like", ("name", "=", "like")),
         ("action = order", ("action", "=", "order")),
         ("path = walks/take-01.a", ("path", "=", "walks/take-01.a")),
         ("name ~ Übung", ("name", "~", "Übung")),
@@ -137,3 +145,25 @@ def test_any_text_is_read_or_refused(words: list[str], between: str) -> None:
 def test_any_value_can_be_quoted(value: str) -> None:
     quoted = value.replace("\\", "\\\\").replace('"', '\\"')
     assert plain(parse(f'subject = "{quoted}"')) == ("subject", "=", value)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("like(a) < 1", "column 6: 'a' names no frames"),
+        ("like(a:9-3) < 1", "column 6: 'a:9-3': the end, frame 3, must be after"),
+        ("like(a:1) > 2", "column 11: like(...) is a distance of motions; compare it with < or <="),
+        ("like(a:1) < -2", "column 13: a distance is at least 0"),
+        ("like = 3", "column 1: write like("),
+        (" or ".join(["like(a:1) < 1"] * 4), "at most 3 conditions like"),
+    ],
+)
+def test_a_comparison_of_motions_says_what_is_wrong(text: str, reason: str) -> None:
+    with pytest.raises(QueryError) as refused:
+        parse(text)
+    assert reason in str(refused.value)
+
+
+def test_clips_that_were_found_are_added_to_their_conditions() -> None:
+    query = with_clips(parse("frames > 3 and not (like(a:1) < 1 or like(b:1) < 1)"), {"like(a:1) < 1": frozenset("x")})
+    assert [one.clips for one in likenesses_of(query)] == [frozenset("x"), None]

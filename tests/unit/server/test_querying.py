@@ -18,7 +18,7 @@ from tests.support.tiers import examples
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.queries.fields import FIELDS, OPERATORS, field_names, find_field
-from marey_schemas.queries.grammar import Condition, Negation, Query, parse
+from marey_schemas.queries.grammar import Condition, Junction, Negation, Query, parse
 from marey_schemas.queries.matching import QueriedFacts, matches
 from marey_server.errors import BadRequestProblem
 from marey_server.store import items, projects
@@ -149,8 +149,9 @@ def selects(lab: QueriedLab, query: Query, clip: Item) -> bool:
     """Return whether a query selects a clip."""
     if isinstance(query, Negation):
         return not selects(lab, query.query, clip)
-    if not isinstance(query, Condition):
+    if isinstance(query, Junction):
         return (all if query.word == "and" else any)(selects(lab, part, clip) for part in query.queries)
+    assert isinstance(query, Condition)
     values = values_of(lab, clip, query.field)
     if query.operator == "has":
         return bool(values)
@@ -264,6 +265,26 @@ def test_a_query_that_cannot_be_read_is_refused_with_its_place(queried: QueriedL
         with pytest.raises(BadRequestProblem, match="query, column 9") as refused:
             queried.read(function, "lab", Kind.CLIP, ItemFilters(query="frames >"), *more)
         assert refused.value.error_code == "bad-query"
+
+
+def test_clips_that_an_index_found_are_selected_beside_other_conditions(
+    queried: QueriedLab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "like(a:1) < 1 and not like(b:1) < 1 and frames > 2"
+    first, second = ({clip.id for clip in queried.clips[start::2]} for start in (0, 3))
+    alike = {"like(a:1) < 1": frozenset(first), "like(b:1) < 1": frozenset([*second, *map(str, range(9_000))])}
+    filters = ItemFilters(query=text, alike=alike)
+    expected = {clip.id for clip in queried.clips if clip.summary["frames"] > 2} & first - second
+    assert expected
+    for few in (0, 1000):
+        monkeypatch.setattr(narrowing, "MOST_ITEMS", few)
+        found = queried.read(items.list_items, "lab", Kind.CLIP, filters, limit=100, count=True)
+        assert {clip.id for clip in found.items} == expected
+        assert found.count == len(expected)
+    told = queried.read(items.explain_query, "lab", Kind.CLIP, ItemFilters(alike=alike), text)
+    assert (told.items, told.selected) == (len(queried.clips), len(expected))
+    with pytest.raises(BadRequestProblem, match=r"column 1: like.* only lists of clips accept it"):
+        queried.read(items.list_items, "lab", Kind.CLIP, ItemFilters(query=text))
 
 
 def test_a_cursor_belongs_to_its_query(queried: QueriedLab) -> None:

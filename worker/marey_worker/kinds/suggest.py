@@ -46,13 +46,16 @@ def facets_of(found: Suggestions) -> list[ItemFacets]:
 
 
 def _counts(found: Suggestions) -> dict[str, Any]:
+    known = found.similarity.metric
     return {
         "unused_clips": len(found.unused.clips),
         "unused_s": found.unused.seconds,
         "removals": len(found.plan),
         "near_duplicates": len(found.duplicates.pairs),
+        "blendable_share": found.similarity.share,
         "fillings": len(found.fillings),
         "needing_retarget": sum(one.needs_retarget for one in found.fillings),
         "coverage_index": found.result.coverage.index,
         "coverage_index_filled": found.additions[-1].coverage_index if found.additions else found.result.coverage.index,
+        **({} if known is None else {"metric": known.model_dump(mode="json")}),
     }

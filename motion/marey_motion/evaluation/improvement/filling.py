@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from marey_motion.arrays import Floats
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.improvement.selection import clips_by_source, same_skeleton
+from marey_motion.evaluation.perceived import PerceivedRows
 from marey_motion.evaluation.result import Coverage
 from marey_motion.evaluation.similarity import every_kth, nearest_poses, window_cells, window_rows
 from marey_motion.evaluation.suite import CancelCallback, EvaluationCancelled
@@ -83,8 +84,9 @@ def rank_fillings(
     coverage: Coverage,
     collections: Mapping[str, MatchingDatabase],
     options: EvaluationOptions,
-    threshold_m: float,
+    threshold: float,
     *,
+    seen: PerceivedRows | None = None,
     most_frames: int = MOST_FRAMES,
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
@@ -97,7 +99,8 @@ def rank_fillings(
     coverage : Coverage    coverage of the set
     collections : mapping of str to MatchingDatabase    databases by name, of any skeleton, at the set's frame rate
     options : EvaluationOptions    grid and minimum seconds per cell
-    threshold_m : float    distance up to which a frame can be blended, metres, as in `similarity`
+    threshold : float    distance up to which a frame can be blended, as in `similarity`
+    seen : PerceivedRows, optional    the rows of the set under a perceptual metric, which is used instead of metres
     most_frames : int    frames compared per source
     progress : callable, optional    called as progress(sources done, total, name)
     cancelled : callable, optional    returns True to stop
@@ -116,6 +119,7 @@ def rank_fillings(
     for name, other in collections.items():
         comparable = same_skeleton(database, other)
         present = set(clips_by_source(database.clips)) if comparable else set()
+        nearest = _nearest_of_set(database, other, seen)
         for source, (own, rows, cells) in seconds[name].items():
             if cancelled is not None and cancelled():
                 raise EvaluationCancelled(f"the comparison was stopped after {done} of {total} candidates")
@@ -123,7 +127,7 @@ def rank_fillings(
             if source not in present and filled.any():
                 useful = rows[np.isin(cells, np.flatnonzero(filled))]
                 chosen = every_kth(useful, most_frames) if comparable else useful[:0]
-                share = _blendable_share(database, other, chosen, threshold_m) if comparable else None
+                share = float(np.mean(nearest(chosen) <= threshold)) if comparable else None
                 found.append(_filling(name, other, source, own, coverage, options, share, len(chosen)))
             done += 1
             if progress is not None:
@@ -210,14 +214,16 @@ def _less(missing: Floats, seconds: Floats, options: EvaluationOptions) -> Float
     return left
 
 
-def _blendable_share(
-    database: MatchingDatabase, other: MatchingDatabase, rows: NDArray[np.int64], threshold_m: float
-) -> float:
-    nothing = np.zeros(len(rows), dtype=np.int64)
-    distances = nearest_poses(
-        other.pose_points[rows], nothing, database.pose_points, np.ones(database.row_count, dtype=np.int64)
-    )
-    return float(np.mean(distances <= threshold_m))
+def _nearest_of_set(
+    database: MatchingDatabase, other: MatchingDatabase, seen: PerceivedRows | None
+) -> Callable[[NDArray[np.int64]], Floats]:
+    """Return a function that computes the distances of rows of another database from the nearest row of the set."""
+    everything, ones = np.arange(database.row_count), np.ones(database.row_count, dtype=np.int64)
+    if seen is None:
+        points = other.pose_points
+        return lambda rows: nearest_poses(points[rows], np.zeros_like(rows), database.pose_points, ones)
+    theirs = PerceivedRows(other, seen.document)
+    return lambda rows: theirs.nearest(rows, np.zeros_like(rows), seen, everything, ones)
 
 
 def _filling(

@@ -62,16 +62,19 @@ def why_redundant(removal: Removal, trials: int) -> str:
     else:
         direction = "increases" if change > 0 else "decreases"
         effect = f"the mean distance from the path {direction} by {100 * abs(change):.1f} cm"
+    if removal.replaced_share is not None:
+        effect += f"; {100 * removal.replaced_share:.0f} % of its poses look like poses of clips that remain"
     return f"Without “{removal.name}” ({removal.seconds:.1f} s, used in {removal.trials} of {trials} trials), {effect}."
 
 
-def why_duplicate(source: str, pair: NearDuplicate) -> str:
+def why_duplicate(source: str, pair: NearDuplicate, most_perceived: float | None = None) -> str:
     """Explain why one clip of a pair is enough.
 
     Parameters
     ----------
     source : str    uid of the clip to remove
     pair : NearDuplicate    the pair
+    most_perceived : float, optional    greatest perceptual distance of motions that look the same, if a metric was used
 
     Returns
     -------
@@ -81,7 +84,10 @@ def why_duplicate(source: str, pair: NearDuplicate) -> str:
     if pair.same_content:
         return f"“{gone}” has the same content as “{stays}”: one of them is enough."
     alike = "nearly the mirror image of the motion of" if pair.mirrored else "nearly the same motion as"
-    return f"“{gone}” shows {alike} “{stays}” (mean distance {pair.distance_cm:.1f} cm): one of them may be enough."
+    distances = f"mean distance {pair.distance_cm:.1f} cm"
+    if pair.perceived is not None and most_perceived is not None:
+        distances += f"; perceptual distance {pair.perceived:.2f}, up to {most_perceived:.2f} looks the same"
+    return f"“{gone}” shows {alike} “{stays}” ({distances}): one of them may be enough."
 
 
 def why_filling(filling: Filling) -> str:

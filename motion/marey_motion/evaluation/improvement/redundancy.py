@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
+from marey_motion.evaluation.improvement.lost_poses import LostPoses
 from marey_motion.evaluation.improvement.objective import headline_changes, headline_means, objective_value
 from marey_motion.evaluation.improvement.resimulation import NONE, Resimulation
 from marey_schemas.options.improvement import ObjectiveOptions
@@ -22,8 +23,12 @@ class Removal:
     seconds : seconds of data saved
     trials : number of trials that need the clip; all other trials stay identical
     changes : changes of the suite's headline metrics, after minus before
-    harm : change of the objective without its term for the amount of data, metres; negative if the removal helps
+    harm : change of the objective without its term for the amount of data, metres; negative if the removal helps. With
+        a perceptual metric, the price of the poses that the removal loses is added
     harm_per_s : `harm` per second of data saved; removals are ranked by this number, the least harmful first
+    lost_s : seconds of poses, of this clip and of those removed before, that look like a pose of this clip, but of no
+        clip that remains; None without a metric
+    replaced_share : share of the clip's poses that look like a pose of the clips that remain; None without a metric
     """
 
     source: str
@@ -33,6 +38,16 @@ class Removal:
     changes: Mapping[str, float]
     harm: float
     harm_per_s: float
+    lost_s: float | None = None
+    replaced_share: float | None = None
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """Part of the harm of removals besides the trials: the poses that they lose, and the price of a second of them."""
+
+    poses: LostPoses
+    price_m_per_s: float
 
 
 @dataclass(frozen=True)
@@ -57,6 +72,7 @@ def leave_one_out(
     *,
     removed: Collection[str] = NONE,
     consider: int | None = None,
+    appearance: Appearance | None = None,
     progress: ProgressCallback | None = None,
 ) -> tuple[Removal, ...]:
     """Measure the effect of leaving out each source clip that a trial needs; the least harm per second comes first.
@@ -68,6 +84,7 @@ def leave_one_out(
     removed : collection of str    sources that are removed already
     consider : int, optional    number of sources to try; sources that fewer trials need come first, then the order is
         that of the uids; all if None
+    appearance : Appearance, optional    poses whose loss adds to the harm
     progress : callable, optional    called as progress(sources done, total, uid)
 
     Returns
@@ -88,7 +105,12 @@ def leave_one_out(
         harm = objective_value(objective, results, 0.0) - value
         changes = headline_changes(before, headline_means(results))
         name = name_of(simulation, source)
-        found.append(Removal(source, name, seconds, counts[source], changes, harm, harm / seconds))
+        lost = replaced = None
+        if appearance is not None:
+            lost = appearance.poses.seconds(gone | {source}) - appearance.poses.seconds(gone)
+            replaced = appearance.poses.replaced_share(source, gone)
+            harm += appearance.price_m_per_s * lost
+        found.append(Removal(source, name, seconds, counts[source], changes, harm, harm / seconds, lost, replaced))
         if progress is not None:
             progress(done + 1, len(candidates), source)
     return tuple(sorted(found, key=lambda removal: (removal.harm_per_s, removal.source)))
@@ -101,6 +123,7 @@ def plan_removals(
     *,
     removed: Collection[str] = NONE,
     consider: int | None = None,
+    appearance: Appearance | None = None,
     progress: ProgressCallback | None = None,
 ) -> tuple[PlannedRemoval, ...]:
     """Plan removals: each step removes the source clip whose removal harms least per second of data saved.
@@ -114,7 +137,7 @@ def plan_removals(
     count : int    largest number of removals
     objective : ObjectiveOptions    measure of harm
     removed : collection of str    sources that are removed already
-    consider : int, optional    as for `leave_one_out`
+    consider, appearance : optional    as for `leave_one_out`
     progress : callable, optional    called as progress(steps done, total, uid)
 
     Returns
@@ -124,7 +147,7 @@ def plan_removals(
     gone = frozenset(removed)
     steps: list[PlannedRemoval] = []
     while len(steps) < count:
-        ranked = leave_one_out(simulation, objective, removed=gone, consider=consider)
+        ranked = leave_one_out(simulation, objective, removed=gone, consider=consider, appearance=appearance)
         if not ranked:
             break
         gone |= {ranked[0].source}

@@ -19,7 +19,14 @@ from marey_motion.evaluation.improvement.duplicates import (
     spared_sources,
 )
 from marey_motion.evaluation.improvement.filling import Addition, Filling, plan_fillings, rank_fillings
-from marey_motion.evaluation.improvement.redundancy import PlannedRemoval, Removal, leave_one_out, plan_removals
+from marey_motion.evaluation.improvement.lost_poses import LostPoses
+from marey_motion.evaluation.improvement.redundancy import (
+    Appearance,
+    PlannedRemoval,
+    Removal,
+    leave_one_out,
+    plan_removals,
+)
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.unused import Unused, find_unused
 from marey_motion.evaluation.perceived import PerceivedRows, indistinguishable
@@ -54,7 +61,7 @@ class Suggestions:
     fillings, additions : clips of other collections that fill holes. In `fillings`, each is measured alone; `additions`
         is a sequence in which each is measured after all earlier clips were added
     tried : number of clips that were left out one at a time, and number of all clips that a trial needs
-    metric : perceptual metric by which near-duplicates were measured, too
+    metric : perceptual metric by which poses and near-duplicates were compared
     """
 
     result: EvaluationResult
@@ -91,7 +98,8 @@ def suggest(
     collections : mapping of str to MatchingDatabase, optional    other collections to search for clips, by name; of any
         skeleton
     options : SuggestionOptions, optional    options
-    metric : MetricDocument, optional    perceptual metric: near-duplicates that look different are kept
+    metric : MetricDocument, optional    perceptual metric: poses are compared by it instead of metres, removals are
+        also judged by the poses that are lost, and near-duplicates that look different are kept
     threads : int, optional    threads to use, one per processor if None
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
@@ -112,20 +120,20 @@ def suggest(
     simulation = Resimulation(
         database, result.options, trials=trials, records=records, threads=threads, cancelled=cancelled
     )
+    seen = None if metric is None else PerceivedRows(database, metric)
     unused = find_unused(database, trials, records, result.options, index=simulation.index)
     duplicates = find_near_duplicates(
-        database,
-        threshold_cm=how.duplicate_cm,
-        seen=None if metric is None else PerceivedRows(database, metric),
-        threads=threads,
-        **stages.watch("duplicates"),
+        database, threshold_cm=how.duplicate_cm, seen=seen, threads=threads, **stages.watch("duplicates")
     )
     ticks = {use.uid: use.ticks for use in sum_by_source(database.clips, result.usage)}
-    threshold = how.blendable_m or accepted_distance(records) or USUAL_BLENDABLE_M
-    similarity = measure_similarity(database, result.coverage, threshold, **stages.watch("similarity"))
-    fillings = rank_fillings(database, result.coverage, others, result.options, threshold, **stages.watch("filling"))
+    threshold = _threshold(how, result, seen)
+    similarity = measure_similarity(database, result.coverage, threshold, seen=seen, **stages.watch("similarity"))
+    fillings = rank_fillings(
+        database, result.coverage, others, result.options, threshold, seen=seen, **stages.watch("filling")
+    )
     gone = frozenset(clip.source for clip in unused.clips)
-    redundant, plan = _redundancy(simulation, how, gone, stages)
+    appearance = _appearance(database, how, seen, threshold, stages)
+    redundant, plan = _redundancy(simulation, how, gone, appearance, stages)
     return Suggestions(
         result=result,
         options=how,
@@ -144,15 +152,40 @@ def suggest(
     )
 
 
+def _threshold(how: SuggestionOptions, result: EvaluationResult, seen: PerceivedRows | None) -> float:
+    """Return the greatest distance of poses that can be blended: in metres, or that of the metric."""
+    if seen is None:
+        return how.blendable_m or accepted_distance(result.records) or USUAL_BLENDABLE_M
+    return how.blendable_distance or seen.transitions(result.switches).median or indistinguishable(seen.document)
+
+
+def _appearance(
+    database: MatchingDatabase, how: SuggestionOptions, seen: PerceivedRows | None, threshold: float, stages: _Stages
+) -> Appearance | None:
+    """Compare the poses of all clips by the metric, if one was chosen."""
+    if seen is None:
+        return None
+    return Appearance(LostPoses(database, seen, threshold, **stages.watch("lost poses")), how.lost_pose)
+
+
 def _redundancy(
-    simulation: Resimulation, how: SuggestionOptions, gone: frozenset[str], stages: _Stages
+    simulation: Resimulation,
+    how: SuggestionOptions,
+    gone: frozenset[str],
+    appearance: Appearance | None,
+    stages: _Stages,
 ) -> tuple[tuple[Removal, ...], tuple[PlannedRemoval, ...]]:
     """Rank the clips by the harm of their removal, and plan several removals.
 
     Both computations start from the set without the unused clips; `gone` contains the uids of these clips.
     """
     found = leave_one_out(
-        simulation, how.objective, removed=gone, consider=how.consider, progress=stages.within("leaving out")
+        simulation,
+        how.objective,
+        removed=gone,
+        consider=how.consider,
+        appearance=appearance,
+        progress=stages.within("leaving out"),
     )
     plan = plan_removals(
         simulation,
@@ -160,6 +193,7 @@ def _redundancy(
         how.objective,
         removed=gone,
         consider=how.consider,
+        appearance=appearance,
         progress=stages.within("planning"),
     )
     return found, plan
@@ -181,7 +215,7 @@ def _require_same(database: MatchingDatabase, result: EvaluationResult) -> None:
 class _Stages:
     """Progress over several stages as one count, with a thousand units for each stage."""
 
-    NAMES = ("duplicates", "similarity", "filling", "leaving out", "planning")
+    NAMES = ("duplicates", "similarity", "filling", "lost poses", "leaving out", "planning")
 
     def __init__(self, progress: ProgressCallback | None, cancelled: CancelCallback | None) -> None:
         self._tell = progress or (lambda _done, _total, _note: None)

@@ -12,7 +12,7 @@ from marey_motion.evaluation.compare import Comparison
 from marey_motion.evaluation.improvement import reasons
 from marey_motion.evaluation.improvement.duplicates import NearDuplicate
 from marey_motion.evaluation.improvement.optimise import Optimisation
-from marey_motion.evaluation.improvement.redundancy import PlannedRemoval, Removal
+from marey_motion.evaluation.improvement.redundancy import Removal
 from marey_motion.evaluation.improvement.suggest import Suggestions
 from marey_motion.evaluation.perceived import indistinguishable
 from marey_motion.evaluation.similarity import PoseSimilarity
@@ -77,14 +77,7 @@ def suggestions_to_tree(suggestions: Suggestions) -> Tree:
             "seconds": found.unused.seconds,
         },
         "redundant": _redundant_to_tree(found),
-        "near_duplicates": {
-            "threshold_cm": found.duplicates.threshold_cm,
-            "pairs": [_pair_to_tree(pair) for pair in found.duplicates.pairs],
-            **_metric_to_tree(found.metric),
-            "spared": [
-                {"source": source, "reason": reasons.why_duplicate(source, pair)} for source, pair in found.spared
-            ],
-        },
+        "near_duplicates": _duplicates_to_tree(found),
         "similarity": _similarity_to_tree(found.similarity),
         "fillings": [{**_plain(one), "reason": reasons.why_filling(one)} for one in found.fillings],
         "additions": [
@@ -96,6 +89,19 @@ def suggestions_to_tree(suggestions: Suggestions) -> Tree:
                 "reason": reasons.why_addition(step),
             }
             for step in found.additions
+        ],
+    }
+
+
+def _duplicates_to_tree(suggestions: Suggestions) -> Tree:
+    limits = _metric_to_tree(suggestions.metric)
+    return {
+        "threshold_cm": suggestions.duplicates.threshold_cm,
+        "pairs": [_pair_to_tree(pair) for pair in suggestions.duplicates.pairs],
+        **limits,
+        "spared": [
+            {"source": source, "reason": reasons.why_duplicate(source, pair, limits.get("most_perceived"))}
+            for source, pair in suggestions.spared
         ],
     }
 
@@ -112,29 +118,49 @@ def _pair_to_tree(pair: NearDuplicate) -> Tree:
 
 def _metric_to_tree(metric: MetricDocument | None) -> Tree:
     """Describe the metric, and the greatest distance of near-duplicates to remove; empty without a metric."""
-    if metric is None:
-        return {}
-    known = MetricIdentity.of(metric).model_dump(mode="json")
-    return {"metric": known, "most_perceived": indistinguishable(metric)}
+    return {} if metric is None else {**_identity_to_tree(metric), "most_perceived": indistinguishable(metric)}
+
+
+def _identity_to_tree(metric: MetricDocument | None) -> Tree:
+    return {} if metric is None else {"metric": MetricIdentity.of(metric).model_dump(mode="json")}
 
 
 def _redundant_to_tree(suggestions: Suggestions) -> Tree:
     trials = len(suggestions.result.trials)
 
-    def told(entry: Removal | PlannedRemoval, removal: Removal) -> Tree:
-        return {**_plain(entry), "reason": reasons.why_redundant(removal, trials)}
+    def told(removal: Removal) -> Tree:
+        return {"reason": reasons.why_redundant(removal, trials)}
 
     return {
         "tried": suggestions.tried[0],
         "needed": suggestions.tried[1],
-        "clips": [told(removal, removal) for removal in suggestions.redundant],
-        "plan": [told(step, step.removal) for step in suggestions.plan],
+        "clips": [{**_removal_to_tree(removal), **told(removal)} for removal in suggestions.redundant],
+        "plan": [
+            {**_plain(step), "removal": _removal_to_tree(step.removal), **told(step.removal)}
+            for step in suggestions.plan
+        ],
+        **_identity_to_tree(suggestions.metric),
     }
 
 
+def _removal_to_tree(removal: Removal) -> Tree:
+    """Convert a removal; without a metric, it has no lost poses."""
+    tree: Tree = _plain(removal)
+    return {name: value for name, value in tree.items() if value is not None}
+
+
 def _similarity_to_tree(similarity: PoseSimilarity) -> Tree:
-    """Convert a similarity to plain values. NaN, in cells without frames or with only one source, is written as 0."""
+    """Convert a similarity to plain values. NaN, in cells without frames or with only one source, is written as 0.
+
+    The names of distances in metres say so; distances of a metric come with its name and digest.
+    """
     values = {field.name: getattr(similarity, field.name) for field in fields(similarity)}
+    metric = values.pop("metric")
+    named = {"threshold_m": values.pop("threshold"), "distance_m": values.pop("distance")}
+    if metric is not None:
+        named = {name.removesuffix("_m"): value for name, value in named.items()}
+        named["metric"] = metric.model_dump(mode="json")
+    values |= named
     return {name: np.nan_to_num(value) if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
 

@@ -12,7 +12,7 @@ from sqlalchemy import Row, Select, and_, select
 from marey_schemas.datasets.checkouts import CheckoutRequest
 from marey_schemas.kinds import Kind
 from marey_schemas.queries.fields import FACET_PREFIX
-from marey_schemas.queries.grammar import Query, conditions_of, operands_of
+from marey_schemas.queries.grammar import Query, conditions_of, likenesses_of, operands_of
 from marey_schemas.queries.matching import QueriedFacts, matches
 from marey_schemas.sizes import batched
 from marey_server.errors import InvalidProblem, NotFoundProblem
@@ -24,7 +24,7 @@ from marey_server.store.datasets.history import tree_of
 from marey_server.store.datasets.naming import find_dataset, resolve
 from marey_server.store.items.facets import facets_of_contents
 from marey_server.store.items.listing import read_query
-from marey_server.store.items.querying import sql_of
+from marey_server.store.items.querying import clips_like, sql_of
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.items.summaries import Summary, summarise
 from marey_server.store.purge_lock import last_purge
@@ -72,7 +72,10 @@ def select_entries(tx: Transaction, project: str, name: str, request: CheckoutRe
     last, commit, store = last_purge(tx, project_row.id), resolve(tx, found.id, request.version), StoredChunks(tx)
     entries = _at_paths(Tree(ChunkReader(store), tree_of(tx, found.id, commit)), request.paths)
     if request.query is not None:
-        entries = _matching(tx, project_row.id, found.path or "", read_query(request.query), entries)
+        query = read_query(request.query)
+        for likeness in likenesses_of(query):
+            clips_like(likeness)  # an index has no older revisions, which versions contain
+        entries = _matching(tx, project_row.id, found.path or "", query, entries)
     chosen = list(entries)
     if not chosen:
         raise InvalidProblem(

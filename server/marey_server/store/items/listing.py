@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
 
 from sqlalchemy import ColumnElement, and_, case, func, not_, select, true
@@ -11,7 +12,7 @@ from sqlalchemy import ColumnElement, and_, case, func, not_, select, true
 from marey_schemas.access import Role
 from marey_schemas.items import HidingCondition, Item, Page, QueryExplanation
 from marey_schemas.kinds import Kind
-from marey_schemas.queries.grammar import Query, QueryError, parse, parts_of
+from marey_schemas.queries.grammar import Query, QueryError, parse, parts_of, with_clips
 from marey_server.errors import BadRequestProblem, ForbiddenProblem
 from marey_server.store import collections, listing, projects
 from marey_server.store.items import narrowing
@@ -54,6 +55,8 @@ class ItemFilters:
     """Part of the name, without regard to case."""
     query: str | None = None
     """Query of `marey_schemas.queries`."""
+    alike: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    """Ids of the clips that meet each condition `like(...)` of the query, by its source."""
     deleted: bool = False
 
     @property
@@ -88,7 +91,7 @@ def list_items(
         )
     project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if filters.deleted else Role.READER)
     order = listing.parse_order(sort, SORT_KEYS)
-    identity = [project_row.id, kind.value, asdict(filters)]
+    identity = [project_row.id, kind.value, asdict(replace(filters, alike={}))]
     conditions = _fast_conditions(tx, project_row.id, filters, kind, order)
     total = None
     if count:
@@ -114,7 +117,7 @@ def _fast_conditions(
     """Return the conditions of `conditions_of`, in a form that lets the database use an index for the query."""
     if filters.query is None or filters.deleted:
         return conditions_of(project_id, filters, kind)
-    few, ordered = narrowing.narrow(tx, project_id, kind, read_query(filters.query))
+    few, ordered = narrowing.narrow(tx, project_id, kind, read_query(filters.query, filters.alike))
     if few is None:
         # In other orders, Postgres would find and sort all items with the value, although a page has only a few.
         usable = [] if ordered is None or order.columns[0][0] is not item.c.created_us else [ordered]
@@ -166,14 +169,17 @@ def _filter_conditions(project_id: str, filters: ItemFilters) -> list[ColumnElem
     if filters.q:
         conditions.append(item.c.name_folded.contains(filters.q.casefold(), autoescape=True))
     if filters.query is not None:
-        conditions.append(sql_of(read_query(filters.query), project_id))
+        conditions.append(sql_of(read_query(filters.query, filters.alike), project_id))
     return conditions
 
 
-def read_query(text: str) -> Query:
-    """Parse the text of a query. Raises `BadRequestProblem`, which gives the column of the first fault."""
+def read_query(text: str, alike: Mapping[str, frozenset[str]] = MappingProxyType({})) -> Query:
+    """Parse the text of a query; `alike` is as in `ItemFilters`.
+
+    Raises `BadRequestProblem`, which gives the column of the first fault.
+    """
     try:
-        return parse(text)
+        return with_clips(parse(text), alike)
     except QueryError as error:
         raise BadRequestProblem(str(error), code="bad-query", context={"column": error.column}) from None
 
@@ -184,7 +190,7 @@ def explain_query(tx: Transaction, project: str, kind: Kind, filters: ItemFilter
     The conditions are the operands of the outermost `and` of the query, or else the whole query.
     """
     project_row = projects.require(tx, project)
-    parts = parts_of(read_query(query))
+    parts = parts_of(read_query(query, filters.alike))
     met = [sql_of(part, project_row.id) for part in parts]
     columns: list[ColumnElement[int]] = [func.count(), func.count(case((and_(*met), 1)))]
     for number, one in enumerate(met):

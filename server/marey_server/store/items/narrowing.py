@@ -15,8 +15,16 @@ from sqlalchemy import ColumnElement, Select, func, null, select
 
 from marey_schemas.kinds import Kind
 from marey_schemas.queries.fields import FACET_PREFIX
-from marey_schemas.queries.grammar import Condition, Query, operands_of
-from marey_server.store.items.querying import COMPARISONS, Comparison, facet_meets, frames_in_range, stored_text
+from marey_schemas.queries.grammar import Condition, Likeness, Query, operands_of
+from marey_server.store.items.querying import (
+    COMPARISONS,
+    Comparison,
+    clips_like,
+    facet_meets,
+    frames_in_range,
+    is_like,
+    stored_text,
+)
 from marey_server.store.tables import INDEXED_CHARACTERS, INDEXED_FACTS, MemberStart, item, item_facet, item_tag
 from marey_server.store.transaction import Transaction
 
@@ -57,6 +65,9 @@ def narrow(tx: Transaction, project_id: str, kind: Kind, query: Query) -> Narrow
     """
     fewest, few = MOST_ITEMS + 1, None
     oldest_us, ordered = None, None
+    for likeness in operands_of(query):
+        if isinstance(likeness, Likeness) and len(clips := clips_like(likeness)) < fewest:
+            fewest, few = len(clips), is_like(likeness)
     for condition, candidates in _indexed(query):
         found = candidates(condition, project_id, kind)
         newest = found.limit(MOST_ITEMS + 1).subquery()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from datetime import date, datetime, timedelta
@@ -18,6 +19,7 @@ from sqlalchemy import (
     exists,
     false,
     func,
+    literal,
     literal_column,
     not_,
     or_,
@@ -29,7 +31,8 @@ from sqlalchemy.sql.compiler import SQLCompiler
 from sqlalchemy.sql.functions import FunctionElement
 
 from marey_schemas.queries.fields import FACET_PREFIX, FIELDS
-from marey_schemas.queries.grammar import Condition, Negation, Query
+from marey_schemas.queries.grammar import Condition, Likeness, Negation, Query
+from marey_server.errors import BadRequestProblem
 from marey_server.store import collections
 from marey_server.store.database.clock import DAY_US, micros_of
 from marey_server.store.tables import collection, item, item_facet, item_tag
@@ -46,10 +49,48 @@ def sql_of(query: Query, project_id: str) -> ColumnElement[bool]:
     if isinstance(query, Condition):
         compare = _facet if query.field.startswith(FACET_PREFIX) else COMPARISONS[query.field]
         return compare(query, project_id)
+    if isinstance(query, Likeness):
+        return is_like(query)
     if isinstance(query, Negation):
         return not_(sql_of(query.query, project_id))
     join = and_ if query.word == "and" else or_
     return join(*(sql_of(part, project_id) for part in query.queries))
+
+
+def clips_like(condition: Likeness) -> list[str]:
+    """Return the ids of the clips that meet a condition. Raises `BadRequestProblem` if they were not searched for."""
+    if condition.clips is None:
+        raise BadRequestProblem(
+            f"query, column {condition.column}: like(...) compares the newest revisions of existing clips, so only "
+            "lists of clips accept it; list the clips first, and give their names or paths here",
+            code="bad-query",
+            context={"column": condition.column},
+        )
+    return sorted(condition.clips)
+
+
+def is_like(condition: Likeness) -> ColumnElement[bool]:
+    """Return the SQL condition that an item is one of the clips that meet a condition. Raises as `clips_like`."""
+    listed = _TextsOf(literal(json.dumps(clips_like(condition)), Text()))
+    found: ColumnElement[bool] = item.c.id.op("IN", is_comparison=True, return_type=Boolean())(listed)
+    return found
+
+
+class _TextsOf(FunctionElement[str]):
+    """SQL expression for the texts in a JSON list, which is one parameter of the statement, however long it is."""
+
+    type = Text()
+    inherit_cache = True
+
+
+@compiles(_TextsOf)
+def _texts_of(element: _TextsOf, compiler: SQLCompiler, **options: Any) -> str:
+    return f"(SELECT value FROM json_each({compiler.process(element.clauses, **options)}))"  # noqa: S608 (a parameter)
+
+
+@compiles(_TextsOf, "postgresql")
+def _texts_of_on_postgres(element: _TextsOf, compiler: SQLCompiler, **options: Any) -> str:
+    return f"(SELECT jsonb_array_elements_text(CAST({compiler.process(element.clauses, **options)} AS jsonb)))"
 
 
 def _any(made: list[ColumnElement[bool]]) -> ColumnElement[bool]:

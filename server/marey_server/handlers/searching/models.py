@@ -1,14 +1,12 @@
-"""Resources that search models for motions that meet constraints, and clips for moments that resemble an example."""
+"""Resources that search models for motions that meet constraints."""
 
 from __future__ import annotations
-
-from functools import partial
 
 from pydantic import Field
 
 from marey_schemas.base import Request
 from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, MOTION_MEDIA_TYPES, MotionFormat, WrittenUnit
-from marey_schemas.search import SearchRequest, SimilarAnswer, SimilarRequest
+from marey_schemas.search import SearchRequest
 from marey_server.handlers.items import kind_of
 from marey_server.handlers.samples import ModelUser
 from marey_server.http.caching import REVALIDATED
@@ -16,13 +14,10 @@ from marey_server.http.declarations import Access, Bytes, Document, reads
 from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
 from marey_server.http.streaming import attachment
-from marey_server.motions import search_answers, searching, similar
+from marey_server.motions import search_answers, searching
 from marey_server.motions.child import ComputedFile
 from marey_server.motions.search_answers import SearchAnswerOrder, SearchFileOrder
 from marey_server.motions.searching import SearchedModels
-from marey_server.motions.similar import FoundWindows, ShardFiles
-from marey_server.store import motion_indexes
-from marey_server.store.motion_indexes import FoundIndex
 
 
 class FoundFileQuery(Request):
@@ -87,44 +82,4 @@ class SearchFile(Searcher):
         return Reply(file.data, media_type=file.media_type, headers=headers)
 
 
-class SimilarMoments(Resource):
-    """Search for moments that resemble an example."""
-
-    path = "/projects/{project}/similar"
-    tag = "Items"
-
-    @reads(access=Access.READER, body=SimilarRequest, answer=SimilarAnswer)
-    async def post(self, project: str, body: SimilarRequest) -> Reply:
-        """Return the moments of the project's clips that resemble some frames of a clip, the most similar first.
-
-        An index of motions is searched, which a job of the kind `index` builds and updates. The result is that of a
-        comparison with all windows of all clips in the index. Clips that were deleted or changed since the update are
-        left out; `behind` counts those that the index does not have.
-        """
-        example = await self.look_up(similar.read_example, project, body)
-        index = await self.look_up(motion_indexes.find_index, project, body.index)
-        shards = await self._files_of(index)
-        order = partial(similar.search_order, body, example, index, shards)
-        found = await self.compute_apart(similar.SEARCH_INDEX, order, FoundWindows.unpack)
-        clips = await self.look_up(motion_indexes.name_clips, project, {one.clip for one in found.windows})
-        return Reply(similar.answer_of(found, index, clips))
-
-    async def _files_of(self, index: FoundIndex) -> tuple[ShardFiles, ...]:
-        """Copy the files of an index to this server, as far as they are not here yet."""
-        files = self.services.index_files
-        missing = await self.compute(files.missing, index.document)
-        if missing:
-            self.services.disk.require()
-        for file in missing:
-            await self.look_up(files.copy, file)
-        return tuple(
-            ShardFiles(
-                clips=str(files.path(shard.clips.blob)),
-                poses=str(files.path(shard.poses.blob)),
-                dropped=shard.dropped,
-            )
-            for shard in index.document.shards
-        )
-
-
-RESOURCES: tuple[type[Resource], ...] = (Search, SearchFile, SimilarMoments)
+RESOURCES: tuple[type[Resource], ...] = (Search, SearchFile)

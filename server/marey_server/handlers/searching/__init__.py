@@ -1,0 +1,1 @@
+"""Searches in models for motions that meet constraints, and in indexes for motions that resemble an example."""
