@@ -16,7 +16,7 @@ import pytest
 from hatch_build import SOURCES
 from tests.support.database_fixtures import copied_sqlite
 from tests.support.rest_server import Server, running
-from tests.support.studying import analysis_of, store_analysis
+from tests.support.studying import analysis_of, files_of
 from tests.support.tiers import chromium
 from tests.support.web_cases import write_cases
 
@@ -221,7 +221,7 @@ def test_exactly_the_trials_that_a_participant_answers_in_a_browser_are_recorded
             "study": f"projects/lab/studies/{calm.id}",
             "item": calm.id,
             "worker": server.make_user("wanda", administrator=True, scopes=("work",)),
-            "result": store_analysis(owner, analysis_of(7), {"item": calm.id, "revision": 1}),
+            "files": _written(files_of(analysis_of(7), {"item": calm.id, "revision": 1}), tmp_path),
             "answers": str(tmp_path / "answers.json"),
         }
         _run_vitest("browser", "browser/study.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
@@ -238,6 +238,13 @@ def test_exactly_the_trials_that_a_participant_answers_in_a_browser_are_recorded
         assert (progress.finished, progress.withdrawn, progress.answered, progress.timeouts) == (1, 1, 10, 0)
         assert "p2" not in judged
         assert (hurried.progress().answered, hurried.progress().timeouts) == (0, 1)
+
+
+def _written(files: dict[str, bytes], folder: Path) -> dict[str, str]:
+    """Write files, and return their paths by name."""
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    return {name: str(folder / name) for name in files}
 
 
 def _study_page(server: Server, reader: httpx.Client, study: str) -> str:

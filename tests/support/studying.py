@@ -120,21 +120,14 @@ def analysis_of(motions: int) -> StudyAnalysis:
     return analyse_study(simulate_judgements(table, 6, seed=1, noise=0.1), [measured], name="walks", draws=0, seed=3)
 
 
-def store_analysis(owner: httpx.Client, analysis: StudyAnalysis, study: dict[str, Any]) -> dict[str, Any]:
-    """Store the files of an analysis as its job does, and return the result of the job."""
+def files_of(analysis: StudyAnalysis, study: dict[str, Any]) -> dict[str, bytes]:
+    """Return the files that a job stores for an analysis of a revision of a study, by name."""
     names = [f"motion {number}" for number in range(analysis.judgements.motion_count)]
-    files = {
+    return {
         "document": json.dumps(analysis_to_tree(analysis, study)).encode(),
         "fitted": json.dumps(metric_to_tree(analysis, analysis.fits[0], study)).encode(),
         "report": render_study_report(analysis, names, title="Walks").encode(),
     }
-    result: dict[str, Any] = {"participants": analysis.participants}
-    for name, content in files.items():
-        digest = f"sha256:{hashlib.sha256(content).hexdigest()}"
-        stored = owner.put(f"/blobs/{digest}", content=content, headers={"Content-Type": "application/octet-stream"})
-        assert stored.is_success, stored.text
-        result[name] = {"blob": digest, "size_bytes": len(content)}
-    return result
 
 
 def finish_analysis(owner: httpx.Client, worker: httpx.Client, study: str) -> str:
@@ -143,11 +136,13 @@ def finish_analysis(owner: httpx.Client, worker: httpx.Client, study: str) -> st
     assert owner.post("/projects/lab/jobs", json=body).status_code == 202
     claim = {"worker": "w", "kinds": ["analyse_study"], "max": 1}
     (lease,) = worker.post("/leases", json=claim).json()["leases"]
-    result = store_analysis(owner, analysis_of(7), {"item": study, "revision": 1})
-    ended = worker.post(
-        f"/jobs/{lease['job']}/attempts/{lease['fence']}/complete",
-        json={"write_id": "12345678", "result": result},
-        headers={"Authorization": f"Bearer {lease['attempt_token']}"},
-    )
+    own = {"Authorization": f"Bearer {lease['attempt_token']}"}
+    result = {}
+    for name, content in files_of(analysis_of(7), {"item": study, "revision": 1}).items():
+        digest = f"sha256:{hashlib.sha256(content).hexdigest()}"
+        assert worker.put(f"/blobs/{digest}", content=content, headers=own).is_success
+        result[name] = {"blob": digest, "size_bytes": len(content)}
+    address = f"/jobs/{lease['job']}/attempts/{lease['fence']}/complete"
+    ended = worker.post(address, json={"write_id": "12345678", "result": result}, headers=own)
     assert ended.is_success, ended.text
     return str(lease["job"])

@@ -2,7 +2,8 @@
  *
  * pytest compares what is recorded (tests/integration/test_pages.py).
  */
-import { writeFileSync } from "node:fs";
+import { createHash } from "node:crypto";
+import { readFileSync, writeFileSync } from "node:fs";
 import { type Browser, type BrowserContext, type Page } from "playwright-core";
 import { afterAll, beforeAll, expect, it, vi } from "vitest";
 import type { Differences } from "../src/study/conducting";
@@ -24,9 +25,9 @@ interface Given {
   token: string;
   study: string;
   item: string;
-  /** Token of a worker, and the result of the analysis that it returns. */
+  /** Token of a worker, and the files of the analysis that it returns, by name. */
   worker: string;
-  result: Record<string, unknown>;
+  files: Record<string, string>;
   /** File for the answers that were given. */
   answers: string;
 }
@@ -107,11 +108,30 @@ async function portraits(page: Page, name: string): Promise<void> {
   await page.setViewportSize(SIZES[1280]);
 }
 
-async function ask<T>(path: string, body?: unknown, token = GIVEN.token): Promise<T> {
-  const headers = { Authorization: `Bearer ${token}`, "Content-Type": "application/json" };
-  const answer = await fetch(`${GIVEN.api}/${path}`, body === undefined ? { headers } : { headers, method: "POST", body: JSON.stringify(body) });
-  expect(answer.ok, path).toBe(true);
-  return (await answer.json()) as T;
+async function ask<T>(method: string, path: string, body: unknown = undefined, token = GIVEN.token): Promise<T> {
+  const type = body instanceof Uint8Array ? "application/octet-stream" : "application/json";
+  const content = body instanceof Uint8Array ? new Blob([new Uint8Array(body)]) : JSON.stringify(body);
+  const headers = { Authorization: `Bearer ${token}`, "Content-Type": type };
+  const answer = await fetch(`${GIVEN.api}/${path}`, { method, headers, body: body === undefined ? null : content });
+  const text = await answer.text();
+  expect(answer.ok, `${path}: ${text}`).toBe(true);
+  return (text === "" ? null : JSON.parse(text)) as T;
+}
+
+/** Analyse the study as a worker does. */
+async function analyse(): Promise<void> {
+  await ask("POST", "projects/lab/jobs", { kind: "analyse_study", inputs: { study: { item: GIVEN.item } } });
+  const claim = { worker: "w", kinds: ["analyse_study"], max: 1 };
+  const { leases } = await ask<{ leases: { job: string; fence: number; attempt_token: string }[] }>("POST", "leases", claim, GIVEN.worker);
+  const { job, fence, attempt_token } = leases[0]!;
+  const result: Record<string, { blob: string; size_bytes: number }> = {};
+  for (const [name, file] of Object.entries(GIVEN.files)) {
+    const content = readFileSync(file);
+    const blob = `sha256:${createHash("sha256").update(content).digest("hex")}`;
+    await ask("PUT", `blobs/${blob}`, content, attempt_token);
+    result[name] = { blob, size_bytes: content.length };
+  }
+  await ask("POST", `jobs/${job}/attempts/${fence}/complete`, { write_id: "12345678", result }, attempt_token);
 }
 
 it("tells its owner that nobody has answered yet, and shows readers nothing of participants", async () => {
@@ -125,7 +145,7 @@ it("tells its owner that nobody has answered yet, and shows readers nothing of p
   const asked: string[] = [];
   page.on("request", (request) => asked.push(request.url()));
   await page.goto(GIVEN.reader);
-  await page.getByText("What participants answered is shown to owners and maintainers").waitFor();
+  await page.getByText("What participants answer is shown to owners and maintainers").waitFor();
   await page.getByText("I may stop at any time.").waitFor({ state: "attached" });
   expect(asked.filter((url) => /participants|differences|judgements/.test(url))).toEqual([]);
   expect(await faults(page)).toEqual([]);
@@ -234,7 +254,7 @@ it("shows its owner what participants perceived, and both motions of a pair", as
   const { page } = owner;
   await page.getByRole("row", { name: /^p1 .*finished/ }).waitFor(); // without a reload
   await page.getByRole("row", { name: /^p2 .*withdrawn .*deleted/ }).waitFor();
-  const found = await ask<Differences>(`${GIVEN.study}/differences?revision=1`);
+  const found = await ask<Differences>("GET", `${GIVEN.study}/differences?revision=1`);
   expect(found.trials).toBe(GIVEN.trials);
   const pairs = found.shown.flatMap((row, one) => row.slice(one + 1));
   const missing = pairs.filter((count) => count === 0).length;
@@ -264,11 +284,7 @@ it("shows its owner what participants perceived, and both motions of a pair", as
 
 it("shows its owner the analysis, and ends the session by a button", async () => {
   const { context, page } = owner;
-  await ask("projects/lab/jobs", { kind: "analyse_study", inputs: { study: { item: GIVEN.item } } });
-  const claim = { worker: "w", kinds: ["analyse_study"], max: 1 };
-  const { leases } = await ask<{ leases: { job: string; fence: number; attempt_token: string }[] }>("leases", claim, GIVEN.worker);
-  const { job, fence, attempt_token } = leases[0]!;
-  await ask(`jobs/${job}/attempts/${fence}/complete`, { write_id: "12345678", result: GIVEN.result }, attempt_token);
+  await analyse();
   const report = page.getByRole("link", { name: "Report with figures 3 to 5" });
   await report.waitFor({ timeout: 120_000 }); // until the page looks again
   await page.getByRole("region", { name: "Fitted metrics, best first" }).waitFor();

@@ -78,14 +78,18 @@ export interface Fit {
 export interface Analysis {
   job: string;
   finishedAt: string;
-  participants: number;
-  trials: number;
-  noise: number;
+  /** What participants had perceived when the study was analysed; all who may read the project may see it. */
+  table: Differences;
   triangles: { checked: number; violated: number };
   fits: Fit[];
   refusals: string[];
   /** Addresses of the files of the result, relative to the root of the server. */
   files: { report: string | null; document: string; fitted: string | null };
+}
+
+interface AnalysisDocument extends Omit<Differences, "order" | "noise">, Pick<Analysis, "triangles" | "fits" | "refusals"> {
+  order: { order: number[] } | null;
+  noise_ceiling: number;
 }
 
 interface Job {
@@ -154,10 +158,11 @@ export class Study {
     if (job.id === known?.job) return known;
     const base = `${this.project}/jobs/${job.id}/files`;
     const address = (name: string) => (job.result![name] ? `api/v1/${base}/${name}` : null);
-    const document = await this.api.json<Omit<Analysis, "noise"> & { noise_ceiling: number }>("GET", `${base}/document`);
+    const document = await this.api.json<AnalysisDocument>("GET", `${base}/document`);
+    const table = { ...document, order: document.order?.order ?? null, noise: document.noise_ceiling };
     return {
-      job: job.id, finishedAt: job.finished_at, participants: document.participants, trials: document.trials,
-      noise: document.noise_ceiling, triangles: document.triangles, fits: document.fits, refusals: document.refusals,
+      job: job.id, finishedAt: job.finished_at, table,
+      triangles: document.triangles, fits: document.fits, refusals: document.refusals,
       files: { report: address("report"), document: `api/v1/${base}/document`, fitted: address("fitted") },
     };
   }

@@ -93,8 +93,9 @@ def read_result_file(tx: Transaction, project: str, job_id: str, name: str) -> S
             return StoredFile.model_validate(entry.get(name))
         except ValidationError:
             files = ", ".join(other for other, value in entry.items() if isinstance(value, dict) and "blob" in value)
-            detail = f"The result of the job has no file {name!r}; it has {files or 'none'}."
-            raise NotFoundProblem(detail, code="no-file") from None
+            raise NotFoundProblem(
+                f"The result of the job has no file {name!r}; it has {files or 'none'}.", code="no-file"
+            ) from None
     raise NotFoundProblem(f"There is no job {job_id!r} in this project that you may see.", code="no-job")
 
 
