@@ -36,19 +36,19 @@ def find_differences(collected: CollectedAnswers) -> StudyDifferences:
             revision=collected.revision, participants=0, trials=0, shown=none, chosen=none, differences=unknown,
             order=None, noise=None,
         )  # fmt: skip
-    table = difference_table(judgements_of(count, collected.answers))
+    # As of one participant: otherwise, tables of each participant would need memory.
+    table = difference_table(judgements_of(count, [(0, shown, chosen) for _, shown, chosen in collected.answers]))
     try:
         order = tuple(order_along_first_component(table.differences).tolist())
     except MotionError:  # a motion was in no answered trial yet
         order = None
-    known = table.differences
     return StudyDifferences(
         revision=collected.revision,
         participants=len({answer[0] for answer in collected.answers}),
         trials=len(collected.answers),
         shown=_rows(table.shown),
         chosen=_rows(table.chosen),
-        differences=tuple(tuple(None if np.isnan(one) else float(one) for one in row) for row in known),
+        differences=tuple(tuple(None if np.isnan(one) else float(one) for one in row) for row in table.differences),
         order=order,
         noise=table.noise_ceiling,
     )
