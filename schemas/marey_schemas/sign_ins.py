@@ -20,6 +20,9 @@ VIEW_PREFIX = "mareyview_"
 VIEW_PATH = "/view"
 """Path, below the address of the server, of the page that shows clips."""
 
+STUDY_PATH = "/studies"
+"""Path, below the address of the server, of the page that shows a study to those who carry it out."""
+
 Subject = Annotated[str, StringConstraints(min_length=1, max_length=255, pattern=r"^[\x20-\x7e]+$")]
 """Id of a person at an identity provider: at most 255 ASCII characters (OpenID Connect Core, section 2)."""
 
@@ -85,7 +88,7 @@ class BrowserLink(Answer):
     """Code that signs one browser in, once. It belongs in the fragment of an address, which browsers do not send."""
 
     code: str
-    path: str = Field(VIEW_PATH, description="Path of the page that accepts the code, as in `/view#<code>`.")
+    path: str = Field(VIEW_PATH, description="Path of a page that accepts the code, as in `/view#<code>`.")
     expires_at: datetime = Field(description="Time until which the code must be used.")
 
 

@@ -153,6 +153,7 @@ def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
         "POST /projects/{project}/{kind}/{item}/participants": "maintainer",
         "DELETE /projects/{project}/{kind}/{item}/participants/{participant}": "maintainer",
         "GET /projects/{project}/{kind}/{item}/judgements": "maintainer",
+        "GET /projects/{project}/{kind}/{item}/differences": "maintainer",
         "DELETE /projects/{project}/scripts/{script}": "maintainer",
         "DELETE /projects/{project}/collections/{collection}": "maintainer",
         "POST /projects/{project}/collections/{collection}/restore": "maintainer",

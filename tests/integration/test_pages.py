@@ -16,6 +16,7 @@ import pytest
 from hatch_build import SOURCES
 from tests.support.database_fixtures import copied_sqlite
 from tests.support.rest_server import Server, running
+from tests.support.studying import analysis_of, files_of
 from tests.support.tiers import chromium
 from tests.support.web_cases import write_cases
 
@@ -70,6 +71,38 @@ def test_a_link_signs_one_browser_in_once_to_read_one_project(server: Server, ow
         assert thief.post("/projects/lab/collections", json={"path": "x"}).status_code == 403
 
 
+def test_a_browser_ends_its_session_and_no_other(server: Server, owner: httpx.Client) -> None:
+    codes = [owner.post("/projects/lab/browser-links").json()["code"] for _ in range(2)]
+    plain = cookie_of(exchange(server, codes[0]))
+    secure = cookie_of(exchange(server, codes[1], Origin=server.address.replace("http:", "https:")))
+    both = OWN_PAGE | {"Cookie": f"{plain['Cookie']}; {secure['Cookie']}"}
+    ending = f"{server.api}/browser-sessions/lab"
+
+    def reads(cookie: dict[str, str]) -> bool:
+        return httpx.get(f"{server.api}/projects/lab", headers=OWN_PAGE | cookie).is_success
+
+    assert httpx.delete(ending, headers=both | {"Sec-Fetch-Site": "cross-site"}).status_code == 403
+    assert httpx.delete(ending, headers=plain | {"Origin": "https://elsewhere.example"}).status_code == 403
+    for path in ("browser-sessions/other", "browser-sessions/lab"):  # of another project, and without a cookie
+        headers = OWN_PAGE | (plain if path.endswith("other") else {})
+        assert httpx.delete(f"{server.api}/{path}", headers=headers).status_code == 204
+    assert reads(plain)
+    assert reads(secure)
+
+    ended = httpx.delete(ending, headers=OWN_PAGE | plain)
+    assert ended.status_code == 204
+    (cleared,) = ended.headers.get_list("Set-Cookie")
+    assert cleared.startswith('marey-view-lab=""; expires=')
+    assert (reads(plain), reads(secure)) == (False, True)
+    assert [one["name"] for one in owner.get("/tokens").json()["items"]].count("browser") == 1
+    again = httpx.delete(ending, headers=both)
+    assert again.status_code == 204
+    assert not reads(secure)
+    hosted = next(one for one in again.headers.get_list("Set-Cookie") if one.startswith("__Host-"))
+    assert "Secure" in hosted, "browsers ignore cookies with this prefix that are not secure, also to delete them"
+    assert owner.get("/projects/lab").is_success
+
+
 def test_a_link_is_refused_to_pages_of_other_sites_and_ends_with_the_token_that_made_it(
     server: Server, owner: httpx.Client
 ) -> None:
@@ -111,7 +144,7 @@ def test_pages_are_revalidated_their_files_kept_and_their_addresses_relative(
     (folder / "assets" / "a.js").write_text("export {};" * 100)
     (folder / "secret.txt").write_text("not part of the pages")
     monkeypatch.setattr(pages, "FOLDER", folder)
-    for path, base in (("/view?clip=lab/x&unknown=1", "./"), ("/s/", "../")):
+    for path, base in (("/view?clip=lab/x&unknown=1", "./"), ("/studies?study=lab/x", "./"), ("/s/", "../")):
         page = httpx.get(server.address + path)
         assert f'<base href="{base}" />' in page.text
         assert page.headers["Cache-Control"] == "private, no-cache"
@@ -160,25 +193,35 @@ def test_exactly_the_trials_that_a_participant_answers_in_a_browser_are_recorded
     shown: tuple[Server, httpx.Client], tmp_path: Path
 ) -> None:
     server, owner = shown
-    for file in _takes(tmp_path):
-        _upload(owner, file)
-    for number in range(3):
+    takes = [_upload(owner, file) for file in _takes(tmp_path)]
+    for number in range(7):
         file = tmp_path / f"gait {number}.bvh"
-        file.write_bytes(write_bvh(generate_gait(speed_m_s=0.7 + 0.4 * number, turn_rate_rad_s=0.0, duration_s=2.0)))
+        file.write_bytes(write_bvh(generate_gait(speed_m_s=0.6 + 0.2 * number, turn_rate_rad_s=0.0, duration_s=2.0)))
         _upload(owner, file)
     token = owner.headers["Authorization"].removeprefix("Bearer ")
     with Marey(server.address, token) as marey:
         studies, clips = marey.project("lab").studies, list(marey.project("lab").clips.list())
+        gaits = [clip for clip in clips if clip.item.name not in takes]
         calm = studies.design(
-            "Walks", clips, consent_text="I take part.\nI may stop at any time.", trials=10, seconds=120
+            "Walks", gaits, consent_text="I take part.\nI may stop at any time.", trials=10, seconds=120
         )
         hurried = studies.design("Hurried", clips, consent_text="I take part.", trials=1, seconds=1)
         codes = [link.code for study, count in ((calm, 3), (hurried, 1)) for link in study.invite(count).links]
+        rita = server.make_user("rita")
+        assert owner.put("/projects/lab/members/rita", json={"role": "reader"}).is_success
         given = {
             "chromium": chromium(),
             "page": f"{server.address}/s/",
             "codes": dict(zip(("whole", "withdrawn", "slow", "hurried"), codes, strict=True)),
             "trials": 10,
+            "conductor": _study_page(server, owner, calm.id),
+            "reader": _study_page(server, server.client(rita), calm.id),
+            "api": server.api,
+            "token": token,
+            "study": f"projects/lab/studies/{calm.id}",
+            "item": calm.id,
+            "worker": server.make_user("wanda", administrator=True, scopes=("work",)),
+            "files": _written(files_of(analysis_of(7), {"item": calm.id, "revision": 1}), tmp_path),
             "answers": str(tmp_path / "answers.json"),
         }
         _run_vitest("browser", "browser/study.test.ts", MAREY_WEB_GIVEN=json.dumps(given))
@@ -195,6 +238,19 @@ def test_exactly_the_trials_that_a_participant_answers_in_a_browser_are_recorded
         assert (progress.finished, progress.withdrawn, progress.answered, progress.timeouts) == (1, 1, 10, 0)
         assert "p2" not in judged
         assert (hurried.progress().answered, hurried.progress().timeouts) == (0, 1)
+
+
+def _written(files: dict[str, bytes], folder: Path) -> dict[str, str]:
+    """Write files, and return their paths by name."""
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    return {name: str(folder / name) for name in files}
+
+
+def _study_page(server: Server, reader: httpx.Client, study: str) -> str:
+    """Return the address of the page of a study, with the code of a new link."""
+    code = reader.post("/projects/lab/browser-links").json()["code"]
+    return f"{server.address}/studies?study=lab/{study}#{code}"
 
 
 def _takes(folder: Path) -> list[Path]:
@@ -238,6 +294,7 @@ def _run_vitest(project: str, *files: str, **variables: str) -> None:
     command = ["node", "node_modules/vitest/vitest.mjs", "run", "--project", project, *files]
     done = subprocess.run(
         command, cwd=SOURCES, env=os.environ | variables | {"NO_COLOR": "1"}, check=False, capture_output=True,
-        text=True, timeout=240,
+        text=True, timeout=290,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
+    print(*(line for line in done.stdout.splitlines() if line.startswith("time: ")), sep="\n")  # pytest -s shows them

@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 from tests.support.rest_server import Server
-from tests.support.studying import Participant, choice_by, grouped_differences, make_links, make_study
+from tests.support.studying import (
+    Participant,
+    choice_by,
+    finish_analysis,
+    grouped_differences,
+    make_links,
+    make_study,
+)
 
 from marey_motion.perception.judging import Judgements, difference_table, triangle_violations
 from marey_motion.perception.ordering import order_motions
@@ -73,6 +80,59 @@ def test_the_same_seed_draws_the_same_trials_however_the_links_are_made(server: 
         assert first["trial"]["clips"] == second["trial"]["clips"]
 
 
+def test_differences_count_the_answers_so_far_and_forget_those_who_withdraw(
+    server: Server, owner: httpx.Client
+) -> None:
+    study = make_study(owner, 4, trials=2)
+    address = f"/projects/lab/studies/{study}/differences"
+    empty = owner.get(address, params={"revision": 1}).json()
+    assert (empty["trials"], empty["order"], empty["noise"], empty["shown"]) == (0, None, None, [[0] * 4] * 4)
+    assert empty["differences"][0] == [0.0, None, None, None]
+    first, second = (Participant.begin(server.client, code) for code in make_links(owner, study, 2))
+    by_size = choice_by(np.abs(np.subtract.outer([0, 1, 5, 9], [0, 1, 5, 9])) / 9, 1e-6, seed=1)
+    for someone in (first, second):
+        someone.answer_all(by_size)
+    found = owner.get(address, params={"revision": 1}).json()
+    assert (found["revision"], found["participants"], found["trials"]) == (1, 2, 4)
+    assert (found["shown"][0][1], found["chosen"][0][1], found["chosen"][1][2]) == (4, 4, 0)
+    assert found["differences"][0] == [0.0, 0.0, 1.0, 1.0]
+    assert sorted(found["order"]) == [0, 1, 2, 3]
+    assert abs(found["order"].index(0) - found["order"].index(1)) == 1, "the two that are alike are neighbours"
+    assert first.client.delete("/participation").status_code == 204
+    assert owner.get(address, params={"revision": 1}).json()["trials"] == 2
+    assert refusal(owner.get(address, params={"revision": 2}))[0] == 404
+    assert owner.get(address).status_code == 400, "the revision is not named"
+
+
+def test_readers_get_the_files_of_an_analysis_which_browsers_show_without_scripts(
+    server: Server, owner: httpx.Client, worker: httpx.Client
+) -> None:
+    job = finish_analysis(owner, worker, make_study(owner, 7, trials=2))
+    reader, stranger = (server.client(server.make_user(name)) for name in ("rita", "sam"))
+    assert owner.put("/projects/lab/members/rita", json={"role": "reader"}).is_success
+    files = f"/projects/lab/jobs/{job}/files"
+    report = reader.get(f"{files}/report")
+    assert (report.status_code, report.headers["Content-Type"]) == (200, "text/html; charset=utf-8")
+    assert "Order and groups" in report.text
+    policy = report.headers["Content-Security-Policy"]
+    assert policy.startswith("default-src 'none'")
+    assert policy.endswith("; sandbox")
+    again = reader.get(f"{files}/report", headers={"If-None-Match": report.headers["ETag"]})
+    assert (again.status_code, again.headers["Cache-Control"]) == (304, "private, no-cache")
+    document = reader.get(f"{files}/document")
+    assert (document.json()["schema"], document.headers["Content-Type"]) == (
+        "marey/study-analysis@1", "application/json",
+    )  # fmt: skip
+    assert reader.get(f"{files}/fitted").json()["origin"] == "fitted"
+    assert refusal(reader.get(f"{files}/participants"))[1:] == (
+        "no-file", "The result of the job has no file 'participants'; it has document, fitted, report.",
+    )  # fmt: skip
+    assert owner.post("/projects", json={"name": "other"}).is_success
+    assert refusal(owner.get(f"/projects/other/jobs/{job}/files/report"))[:2] == (404, "no-job")
+    assert refusal(stranger.get(f"{files}/report"))[0] == 404
+    assert refusal(server.client().get(f"{files}/report"))[0] in (401, 404)
+
+
 def copy_of(owner: httpx.Client, study: str) -> str:
     design = owner.get(f"/projects/lab/studies/{study}/parts/study").json()
     made: str = owner.post("/projects/lab/studies", json={"name": "again", "parts": {"study": design}}).json()["id"]
@@ -111,7 +171,7 @@ def test_only_people_of_the_study_see_participants_and_readers_see_numbers(serve
     assert reader.get(f"{base}/progress").json() == {
         "invited": 2, "started": 1, "finished": 1, "withdrawn": 0, "answered": 2, "timeouts": 0,
     }  # fmt: skip
-    for path in ("/participants", "/judgements?revision=1"):
+    for path in ("/participants", "/judgements?revision=1", "/differences?revision=1"):
         assert refusal(reader.get(base + path))[:2] == (403, "insufficient-role")
         assert maintainer.get(base + path).status_code == 200
     listed = maintainer.get(f"{base}/participants").json()["items"]

@@ -153,6 +153,7 @@ _OTHER_THINGS = {
     "{item}/participants": {"kind": "studies", "item": "{study}"},
     "{item}/progress": {"kind": "studies", "item": "{study}"},
     "{item}/judgements": {"kind": "studies", "item": "{study}"},
+    "{item}/differences": {"kind": "studies", "item": "{study}"},
     "/participation/clips": {"part": "motion"},
     "{project}/restore": {"project": "gone"},
 }
@@ -161,6 +162,7 @@ _QUERIES = {
     "{item}/export": "?format=original",
     "{item}/difference": "?from=1&to=1",
     "{item}/judgements": "?revision=1",
+    "{item}/differences": "?revision=1",
     "judgements/{item}": "?revision=1",
     "explanations/{kind}": "?query=has%20tag",
     "{dataset}/blame": f"?entry={CANARY}&kind=graph",
@@ -241,6 +243,7 @@ def build_house(people: People) -> House:
         "fence": str(running["fence"]), "digest": SECRET_DIGEST, "job_kind": "import", "figure": "offsets",
         "stream": stream.json()["id"], "token": "token_of_nobody", "sign_in": "sign_in_of_nobody",
         "identity": "identity_of_nobody", "upload": "upload_of_nobody", "asset": "file-of-nobody.js",
+        "file": "report",
     }  # fmt: skip
     return House(people, tokens, variables)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import secrets
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +13,11 @@ import httpx
 import numpy as np
 
 from marey_motion.arrays import Floats
+from marey_motion.perception.fitting import PairDifferences
+from marey_motion.perception.judging import simulate_judgements
+from marey_motion.perception.study_analysis import StudyAnalysis, analyse_study, analysis_to_tree, metric_to_tree
+from marey_reports.perception.study_page import render_study_report
+from marey_schemas.documents.metrics import classes_of
 
 Choice = Callable[[list[int]], tuple[int, int]]
 """Function that chooses two places, given the motions that are shown."""
@@ -100,3 +107,42 @@ def grouped_differences(sizes: tuple[int, int], seed: int) -> Floats:
     points = draw.normal(size=(len(group), 2)) + np.where(group[:, None] == 1, (6.0, 0.0), 0.0)
     distances = np.linalg.norm(points[:, None] - points[None], axis=2)
     return np.asarray(distances / distances.max())
+
+
+def analysis_of(motions: int) -> StudyAnalysis:
+    """Return the analysis of simulated answers about motions of two groups, whose positions explain the answers."""
+    group = np.arange(motions) // (motions // 2)
+    table = np.where(np.eye(motions, dtype=bool), 0.0, 0.5 + 0.4 * (group[:, None] != group))
+    ones, others = np.triu_indices(motions, 1)
+    draw, pairs = np.random.default_rng(2), np.stack((ones, others), axis=1).astype(np.int64)
+    frames = tuple(draw.gamma(2.0, 0.04, (30, 8)) + 0.2 * (group[i] != group[j]) for i, j in pairs)
+    measured = PairDifferences("positions", classes_of("positions"), pairs, frames)
+    return analyse_study(simulate_judgements(table, 6, seed=1, noise=0.1), [measured], name="walks", draws=0, seed=3)
+
+
+def files_of(analysis: StudyAnalysis, study: dict[str, Any]) -> dict[str, bytes]:
+    """Return the files that a job stores for an analysis of a revision of a study, by name."""
+    names = [f"motion {number}" for number in range(analysis.judgements.motion_count)]
+    return {
+        "document": json.dumps(analysis_to_tree(analysis, study)).encode(),
+        "fitted": json.dumps(metric_to_tree(analysis, analysis.fits[0], study)).encode(),
+        "report": render_study_report(analysis, names, title="Walks").encode(),
+    }
+
+
+def finish_analysis(owner: httpx.Client, worker: httpx.Client, study: str) -> str:
+    """Submit the analysis of a study of seven motions, end it as a worker does, and return the id of the job."""
+    body = {"kind": "analyse_study", "inputs": {"study": {"item": study}}}
+    assert owner.post("/projects/lab/jobs", json=body).status_code == 202
+    claim = {"worker": "w", "kinds": ["analyse_study"], "max": 1}
+    (lease,) = worker.post("/leases", json=claim).json()["leases"]
+    own = {"Authorization": f"Bearer {lease['attempt_token']}"}
+    result = {}
+    for name, content in files_of(analysis_of(7), {"item": study, "revision": 1}).items():
+        digest = f"sha256:{hashlib.sha256(content).hexdigest()}"
+        assert worker.put(f"/blobs/{digest}", content=content, headers=own).is_success
+        result[name] = {"blob": digest, "size_bytes": len(content)}
+    address = f"/jobs/{lease['job']}/attempts/{lease['fence']}/complete"
+    ended = worker.post(address, json={"write_id": "12345678", "result": result}, headers=own)
+    assert ended.is_success, ended.text
+    return str(lease["job"])

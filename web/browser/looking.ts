@@ -2,7 +2,9 @@
 import axe from "axe-core";
 import { mkdirSync } from "node:fs";
 import { join } from "node:path";
-import { type Browser, chromium, type Page } from "playwright-core";
+import { type Browser, type BrowserContext, chromium, type Page } from "playwright-core";
+import { expect } from "vitest";
+import type { SceneState } from "../src/player/testHandle";
 
 const FLAGS = [
   "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage",
@@ -27,14 +29,47 @@ export function colours(where: Page): Promise<number> {
   });
 }
 
-export async function picture(where: Page, name: string): Promise<void> {
+export async function picture(where: Page, name: string, fullPage = false): Promise<void> {
   if (PICTURES === null) return;
   mkdirSync(PICTURES, { recursive: true });
-  await where.screenshot({ path: join(PICTURES, `${name}.png`) });
+  await where.screenshot({ path: join(PICTURES, `${name}.png`), fullPage });
 }
 
 export async function faults(where: Page): Promise<string[]> {
   await where.evaluate(axe.source); // not as a script of the page, which the content security policy refuses
   const found = await where.evaluate(() => window.axe.run());
   return found.violations.map((one) => `${one.id}: ${one.nodes.map((node) => node.target.join(" ")).join(", ")}`);
+}
+
+/** Return the state of the scene as soon as it meets a condition. */
+export async function scene(where: Page, meets: (state: SceneState) => boolean): Promise<SceneState> {
+  let state: SceneState | undefined;
+  for (let tries = 0; tries < 1200; tries++) {
+    state = await where.evaluate(() => window.marey);
+    if (state !== undefined && meets(state)) return state;
+    await where.waitForTimeout(50);
+  }
+  throw new Error(`the scene does not get there: ${JSON.stringify(state)?.slice(0, 300)}; page: ${await where.innerText("body")}`);
+}
+
+/** Print the time at which a page had painted its first pose, after its beginning or after a mark; pytest shows it with -s. */
+export async function tellFirstPose(where: Page, what: string, since: string | null = null): Promise<void> {
+  const passed = await where.evaluate((mark) => {
+    const last = (name: string) => performance.getEntriesByName(name).at(-1)?.startTime;
+    return last("marey-posed")! - (mark === null ? 0 : last(mark)!);
+  }, since);
+  expect(passed).toBeGreaterThan(0);
+  console.log(`time: ${what}: first pose painted after ${passed.toFixed(0)} ms`);
+}
+
+/** End the session of a page by its button, and make sure that nothing of it is left. */
+export async function signOut(where: Page, context: BrowserContext): Promise<void> {
+  expect(await context.cookies()).toHaveLength(1);
+  await where.getByRole("button", { name: "Sign out" }).click();
+  await where.getByRole("heading", { name: "You are signed out" }).waitFor();
+  expect(await context.cookies()).toEqual([]);
+  expect(await faults(where)).toEqual([]);
+  await where.reload();
+  await where.getByText("Nothing to see here without a link").waitFor();
+  expect(await where.getByRole("button", { name: "Sign out" }).count()).toBe(0);
 }

@@ -1,8 +1,7 @@
 /** The pages in a real Chromium, against a real server that pytest has started and filled (tests/integration/test_pages.py). */
 import { type Browser, type BrowserContext, type Page } from "playwright-core";
 import { afterAll, beforeAll, expect, it } from "vitest";
-import type { SceneState } from "../src/player/testHandle";
-import { colours, faults, launch, picture } from "./looking";
+import { colours, faults, launch, picture, scene, signOut, tellFirstPose } from "./looking";
 
 interface Given {
   chromium: string;
@@ -15,6 +14,9 @@ interface Given {
 
 const GIVEN = JSON.parse(process.env["MAREY_WEB_GIVEN"]!) as Given;
 const TOLERANCE_M = 1e-4;
+/** Draw calls of one figure: ground, its lines twice, limbs and balls with their shadows, and marks of four feet. */
+const MOST_CALLS = 3 + 4 + 4;
+const MOST_TRIANGLES = 30_000;
 
 let browser: Browser;
 let context: BrowserContext;
@@ -32,22 +34,15 @@ beforeAll(async () => {
 
 afterAll(() => browser.close());
 
-/** Return the state of the scene as soon as it meets a condition. */
-async function scene(where: Page, meets: (state: SceneState) => boolean): Promise<SceneState> {
-  let state: SceneState | undefined;
-  for (let tries = 0; tries < 400; tries++) {
-    state = await where.evaluate(() => window.marey);
-    if (state !== undefined && meets(state)) return state;
-    await where.waitForTimeout(50);
-  }
-  throw new Error(`the scene does not get there: ${JSON.stringify(state)?.slice(0, 300)}; page: ${await where.innerText("body")}`);
-}
-
 it("draws both clips with WebGL, with every joint where the server computes it", async () => {
   let state = await scene(page, (one) => one.actors.length === 2);
   expect(state.stage).toBe("webgl");
   expect(state.actors.map((actor) => actor.name)).toEqual(GIVEN.clips);
+  await tellFirstPose(page, "view, cold");
   expect(state.calls).toBeGreaterThan(4);
+  expect(state.calls).toBeLessThanOrEqual(2 * MOST_CALLS);
+  expect(state.triangles).toBeGreaterThan(1000);
+  expect(state.triangles).toBeLessThanOrEqual(2 * MOST_TRIANGLES);
   for (const [frame, expected] of Object.entries(GIVEN.positions)) {
     await page.getByRole("slider", { name: "Frame" }).fill(frame);
     state = await scene(page, (one) => one.actors[0]!.frame === Number(frame));
@@ -129,3 +124,5 @@ it("says what to do without a session, and for a link that was used", async () =
   expect(await faults(other)).toEqual([]);
   await stranger.close();
 });
+
+it("ends the session by a button", () => signOut(page, context));

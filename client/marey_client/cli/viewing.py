@@ -1,10 +1,11 @@
-"""Command `view`: prints or opens the address of the page that shows a clip in a browser."""
+"""Command `view`, and addresses of pages: prints or opens the address of the page that shows a clip in a browser."""
 
 from __future__ import annotations
 
 import html
 import tempfile
 import webbrowser
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 from urllib.parse import quote, urlencode
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from marey_client.items import ItemHandle
     from marey_client.marey import Marey
 
+InBrowser = Annotated[
+    bool, typer.Option("--browser", help="Open the page in a browser of this machine; default: print its address.")
+]
 SOURCE = "source"
 """Value of `--beside` that means the clip from which the clip was made."""
 _REDIRECT = '<!doctype html><meta charset="utf-8"><title>Marey</title><meta http-equiv="refresh" content="0;url={url}">'
@@ -38,12 +42,11 @@ def view(
         str | None,
         typer.Option(help="Another clip of the project to show beside it, or `source`: the clip it was made from."),
     ] = None,
-    browser: Annotated[
-        bool,
-        typer.Option("--browser", help="Open the page in a browser of this machine; default: print its address."),
-    ] = False,
+    browser: InBrowser = False,
 ) -> None:
     """Show a clip in a browser. The address signs one browser in, once, within two minutes."""
+    from marey_schemas.sign_ins import VIEW_PATH
+
     other = [] if beside in (None, SOURCE) else [str(beside)]
     addresses = addresses_in_one_project([place, *other])
     project = addresses[0].project
@@ -52,9 +55,19 @@ def view(
         shown = [_named(clip.id, revision) for clip, revision in found]
         if beside == SOURCE:
             shown.append(_source_of(*found[0]))
-        link = marey.project(project).browser_link()
         clips = dict(zip(("clip", "beside"), (f"{project}/{one}" for one in shown), strict=False))
-        url = f"{marey.transport.url}{link.path}?{urlencode(clips, safe='/@')}#{quote(link.code)}"
+        url = page_address(marey, project, VIEW_PATH, clips)
+    return show_page(url, browser=browser)
+
+
+def page_address(marey: Marey, project: str, path: str, query: Mapping[str, str]) -> str:
+    """Return the address of a page about a project, with the code of a new link that signs one browser in."""
+    link = marey.project(project).browser_link()
+    return f"{marey.transport.url}{path}?{urlencode(query, safe='/@')}#{quote(link.code)}"
+
+
+def show_page(url: str, *, browser: bool) -> None:
+    """Open the address of a page in a browser of this machine, or print it. Raises `WrongUsage` without a browser."""
     if browser:
         return _open(url)
     return typer.echo(url)

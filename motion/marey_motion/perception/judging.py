@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,10 @@ from marey_schemas.documents.studies import SHOWN
 TRIALS = 63
 _CANDIDATE_DRAWS = 24
 _FIRST, _SECOND = np.triu_indices(SHOWN, 1)
+_PAIR_OF = {(int(one), int(other)): pair for pair, (one, other) in enumerate(zip(_FIRST, _SECOND, strict=True))}
+"""Index of the chosen pair by its two places on the screen."""
+Answer = tuple[int, Sequence[int], tuple[int, int]]
+"""Answered trial: number of the participant, motions shown by place, and the two chosen places in ascending order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +76,30 @@ class DifferenceTable:
         shown, p = self.shown[pairs], self.differences[pairs]
         seen = shown > 0
         return float(np.sqrt(np.mean(p[seen] * (1.0 - p[seen]) / shown[seen])))
+
+
+def judgements_of(motion_count: int, answers: Sequence[Answer]) -> Judgements:
+    """Return answered trials as arrays.
+
+    Parameters
+    ----------
+    motion_count : int    number of motions
+    answers : sequence of Answer    at least one
+
+    Returns
+    -------
+    Judgements    the trials in the same order
+
+    Raises
+    ------
+    MotionError    if there are no answers, or an answer names other places or motions than there are
+    """
+    wrong = next((number for number, answer in enumerate(answers) if answer[2] not in _PAIR_OF), None)
+    if wrong is not None:
+        raise MotionError(f"the places {answers[wrong][2]} are no pair", where=f"trial {wrong}")
+    who = np.array([answer[0] for answer in answers], np.int64)
+    shown = np.array([answer[1] for answer in answers], np.int64).reshape(len(answers), -1)
+    return Judgements(motion_count, who, shown, np.array([_PAIR_OF[answer[2]] for answer in answers], np.int64))
 
 
 def draw_trials(

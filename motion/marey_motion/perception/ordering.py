@@ -52,16 +52,39 @@ def order_motions(differences: Floats, seed: int = 0) -> MotionOrder:
     from sklearn.cluster import KMeans
 
     rows = _filled(differences)
-    centred = rows - rows.mean(axis=0)
-    direction = np.linalg.svd(centred, full_matrices=False)[2][0]
-    direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
-    projections = centred @ direction
+    projections = _project(rows)
     means = KMeans(2, n_init=RESTARTS, random_state=seed).fit(rows)
     groups, centres = means.labels_.astype(np.int64), means.cluster_centers_
     if projections[groups == 0].mean() > projections[groups == 1].mean():
         groups, centres = 1 - groups, centres[::-1]
     from_0, from_1 = (np.linalg.norm(rows - centre, axis=1) for centre in centres)
     return MotionOrder(np.argsort(projections, kind="stable"), projections, groups, from_0 / (from_0 + from_1))
+
+
+def order_along_first_component(differences: Floats) -> Ints:
+    """Order motions as `order_motions` does, without groups.
+
+    Parameters
+    ----------
+    differences : (n, n) float64    symmetric table; a missing difference is taken as the mean of those of both motions
+
+    Returns
+    -------
+    (n,) int64    motions by increasing projection on the first principal component
+
+    Raises
+    ------
+    MotionError    for fewer than three motions, or a motion without any difference to another
+    """
+    return np.argsort(_project(_filled(differences)), kind="stable")
+
+
+def _project(rows: Floats) -> Floats:
+    """Return the projections (n,) of points (n, n) on their first principal component."""
+    centred = rows - rows.mean(axis=0)
+    direction = np.linalg.svd(centred, full_matrices=False)[2][0]
+    direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
+    return np.asarray(centred @ direction)
 
 
 def _filled(differences: Floats) -> Floats:

@@ -65,6 +65,30 @@ class StudyProgress(Answer):
     timeouts: int
 
 
+class StudyDifferences(Answer):
+    """Differences that the participants of one revision of a study have perceived so far.
+
+    All tables are symmetric and in the order of the study's motions.
+    """
+
+    revision: int
+    participants: int = Field(description="Number of participants with an answered trial.")
+    trials: int = Field(description="Number of answered trials.")
+    shown: tuple[tuple[int, ...], ...] = Field(
+        description="How often each pair of motions was in an answered trial; 0: the pair is missing."
+    )
+    chosen: tuple[tuple[int, ...], ...] = Field(description="How often each pair was chosen.")
+    differences: tuple[tuple[float | None, ...], ...] = Field(
+        description="1 - chosen / shown, and 0 on the diagonal; null: the pair is missing."
+    )
+    order: tuple[int, ...] | None = Field(
+        description="Motions along the first principal component of the differences; null: some motion is in no trial."
+    )
+    noise: float | None = Field(
+        description="Standard error of the differences (root mean square), which follows from the number of trials."
+    )
+
+
 class JudgedTrial(Answer):
     """A trial that was answered or timed out."""
 

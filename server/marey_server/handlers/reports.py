@@ -55,15 +55,15 @@ class FigureQuery(ReportQuery):
 
 
 class StoredFileSender(BlobSender):
-    """Base of resources that answer with a file to which a document refers."""
+    """Base of resources that answer with a file to which a document or the result of a job refers."""
 
-    async def send_file(self, file: StoredFile, query: ReportQuery, media_type: str, sandbox: str) -> Rendered | None:
+    async def send_file(self, file: StoredFile, media_type: str, cache_control: str, sandbox: str) -> Rendered | None:
         """Answer with the file; a content security policy with `sandbox` restricts browsers that display the file."""
         return await self.send_blob(
             file.blob,
             disposition="inline",
             media_type=media_type,
-            cache_control=caching_of_revision(query.revision),
+            cache_control=cache_control,
             headers={"Content-Security-Policy": f"{SHOWN_ONLY}; {sandbox}"},
         )
 
@@ -86,7 +86,8 @@ class ItemReport(StoredFileSender):
     async def get(self, project: str, kind: str, item: str, query: ReportQuery) -> Rendered | None:
         """Return the report of an item (kinds `evaluations`, `models`) as one self-contained HTML page."""
         report = await self.look_up(read_report, project, kind_of(kind), item, query.revision)
-        return await self.send_file(report.html, query, "text/html; charset=utf-8", _scripts(report))
+        caching = caching_of_revision(query.revision)
+        return await self.send_file(report.html, "text/html; charset=utf-8", caching, _scripts(report))
 
 
 class Figure(StoredFileSender):
@@ -108,7 +109,7 @@ class Figure(StoredFileSender):
         """Return a figure of a report (kinds `evaluations`, `models`) as an image, a vector drawing, or its numbers."""
         report = await self.look_up(read_report, project, kind_of(kind), item, query.revision)
         file = file_of(find_figure(report, figure, query.trial), query)
-        return await self.send_file(file, query, FIGURE_TYPES[query.format], "sandbox")
+        return await self.send_file(file, FIGURE_TYPES[query.format], caching_of_revision(query.revision), "sandbox")
 
 
 def _scripts(report: ReportDocument) -> str:

@@ -3,6 +3,7 @@
 A cookie contains the token of a session, which has only the scope `read` in its project. Other sites can neither send
 the cookie (`SameSite=Strict`) nor read answers (`Cross-Origin-Resource-Policy`, and no CORS). Pages cannot read it
 (`HttpOnly`). It is accepted only for declared GET operations of its project, so a forged request could change nothing.
+The one exception ends the session, and is refused to other sites.
 """
 
 from __future__ import annotations
@@ -30,6 +31,20 @@ def cookie_name(project: str, *, https: bool) -> str:
     return f"{_OVER_HTTPS if https else ''}{_NAME}{project}"
 
 
+def is_secure(name: str) -> bool:
+    """Return whether browsers send a cookie of this name only over https."""
+    return name.startswith(_OVER_HTTPS)
+
+
+def sent_cookies(request: HTTPServerRequest, project: str) -> dict[str, str]:
+    """Return the tokens of sessions in a project that the browser has sent, by the name of their cookie."""
+    if "Cookie" not in request.headers:
+        return {}
+    sent: dict[str, Morsel[Any]] = dict(request.cookies)
+    names = (cookie_name(project, https=https) for https in (True, False))
+    return {name: sent[name].value for name in names if name in sent and sent[name].value}
+
+
 def require_own_page(request: HTTPServerRequest) -> None:
     """Raise `ForbiddenProblem` if a page of another site has sent the request.
 
@@ -50,8 +65,6 @@ def _is_foreign(request: HTTPServerRequest) -> bool:
 def session_token(request: HTTPServerRequest, operation: Operation, project: str | None) -> str | None:
     """Return the token of the browser's session, if the operation only reads the project of the session."""
     reads_project = operation.method == "GET" and operation.scope == "read" and operation.access.role is not None
-    if project is None or not reads_project or "Cookie" not in request.headers or _is_foreign(request):
+    if project is None or not reads_project or _is_foreign(request):
         return None
-    sent: dict[str, Morsel[Any]] = dict(request.cookies)
-    names = (cookie_name(project, https=https) for https in (True, False))
-    return next((sent[name].value for name in names if name in sent and sent[name].value), None)
+    return next(iter(sent_cookies(request, project).values()), None)

@@ -55,6 +55,7 @@ PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
     "participant": ("Id of the participant of a study.", _NAME),
     "trial": ("Number of the trial.", {"type": "integer", "minimum": 0, "maximum": 999_999_999}),
     "clip": ("Number of a motion of the study, from 0.", {"type": "integer", "minimum": 0, "maximum": 999_999_999}),
+    "file": ("Name of a file in the result of the job.", {"type": "string", "pattern": "^[a-z0-9_]{1,64}$"}),
     "fence": ("Fence of the attempt.", {"type": "integer", "minimum": 0, "maximum": 999_999_999}),
 }  # fmt: skip
 _OFFSET = {"type": "integer", "minimum": 0, "maximum": 10**12 - 1}

@@ -7,6 +7,7 @@ import json
 import re
 import shlex
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import httpx
 import numpy as np
@@ -40,7 +41,7 @@ def test_the_commands_of_the_page_lead_from_clips_to_a_metric(
     lab: ProjectHandle, run: CommandLine, server: ServerProcess, marey: Marey
 ) -> None:
     (run.folder / "consent.txt").write_text("I take part in this study.\n", encoding="utf-8")
-    create, invite, status, listing, *exports, analyse, store, withdraw = commands()
+    create, invite, status, listing, show, *exports, analyse, store, withdraw = commands()
     run(*create)
     made = run(*invite)
     codes = re.findall(r"/s/#(mareystudy_\w+)", made.stdout)
@@ -58,6 +59,16 @@ def test_the_commands_of_the_page_lead_from_clips_to_a_metric(
         Participant.begin(connect, code).answer_all(choice_by(true, 0.05, seed=number))
     assert re.search(r"finished +3\n", run(*status).stdout)
     assert "p3" in run(*listing).stdout
+
+    assert show[-1] == "--browser"
+    page = urlsplit(run(*show[:-1]).stdout.strip())
+    assert (page.path, page.query) == ("/studies", f"study=lab/{study.id}")
+    with httpx.Client(base_url=f"{server.url}/api/v1", headers={"Sec-Fetch-Site": "same-origin"}) as browser:
+        assert browser.post("/browser-sessions", json={"code": page.fragment}).status_code == 201
+        seen = browser.get(f"/projects/lab/studies/{study.id}/differences?revision=1").json()
+        assert (seen["participants"], seen["trials"], len(seen["order"])) == (3, 189, len(design.motions))
+        assert browser.delete("/browser-sessions/lab").status_code == 204
+        assert browser.get("/projects/lab").status_code in (401, 404)
 
     for export in exports:
         run(*export)

@@ -20,7 +20,7 @@ from marey_schemas.studies.conducting import JudgingParticipant, StudyLinksCreat
 from marey_schemas.studies.participation import ParticipationCreate, TrialAnswer, TrialStep
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem
-from marey_server.motions.drawing_trials import draw_plans
+from marey_server.motions.studies import draw_plans
 from marey_server.store import items
 from marey_server.store.credentials import sign_ins, tokens
 from marey_server.store.database.connections import Database

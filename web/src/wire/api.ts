@@ -65,22 +65,22 @@ async function problemOf(answer: Response): Promise<ApiError> {
   return new ApiError(answer.status, problem.code ?? "", detail, answer.headers.get("X-Request-Id"));
 }
 
-/** Address of a clip in a link: `project/item`, or `project/item@revision`. */
-export interface ClipAddress {
+/** Address of an item in a link: `project/item`, or `project/item@revision`. */
+export interface ItemAddress {
   project: string;
   item: string;
   revision: number | null;
 }
 
-/** Read the address of a clip. Throws a RangeError for other texts. */
-export function parseAddress(text: string): ClipAddress {
+/** Read the address of an item. Throws a RangeError for other texts. */
+export function parseAddress(text: string): ItemAddress {
   const match = /^([^/@]+)\/([^/@]+)(?:@([1-9]\d{0,8}))?$/.exec(text);
-  if (match === null) throw new RangeError(`“${text}” is no clip; write project/item or project/item@revision`);
+  if (match === null) throw new RangeError(`“${text}” is no address; write project/item or project/item@revision`);
   return { project: match[1]!, item: match[2]!, revision: match[3] === undefined ? null : Number(match[3]) };
 }
 
 /** Load a clip with its skeleton. */
-export async function loadClip(api: Api, address: ClipAddress): Promise<Clip> {
+export async function loadClip(api: Api, address: ItemAddress): Promise<Clip> {
   const project = `projects/${encodeURIComponent(address.project)}`;
   const item = `${project}/clips/${encodeURIComponent(address.item)}`;
   const [{ name, collection }, motion] = await Promise.all([

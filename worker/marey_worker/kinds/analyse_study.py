@@ -15,7 +15,7 @@ from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
 from marey_motion.perception.comparing import MOST_TABLE_CELLS, measure_clip
 from marey_motion.perception.fitting import PairDifferences
-from marey_motion.perception.judging import Judgements
+from marey_motion.perception.judging import Judgements, judgements_of
 from marey_motion.perception.measuring import MeasuredClip
 from marey_motion.perception.study_analysis import (
     StudyAnalysis,
@@ -70,21 +70,18 @@ def run(context: Context, params: AnalyseStudyParams) -> dict[str, Any]:
 
 def _judgements(study: StudyDocument, people: Sequence[JudgingParticipant]) -> Judgements:
     """Return the answered trials; participants without any are left out."""
-    ones, others = np.triu_indices(study.shown, 1)
-    number_of = {(int(i), int(j)): number for number, (i, j) in enumerate(zip(ones, others, strict=True))}
     answered = [[trial for trial in one.trials if trial.chosen is not None] for one in people]
-    rows = [
-        (who, trial.shown, number_of[trial.chosen])
+    answers = [
+        (who, trial.shown, trial.chosen)
         for who, trials in enumerate(filter(None, answered))
         for trial in trials
         if trial.chosen is not None
     ]
-    if not rows:
+    if not answers:
         raise JobRefused(
             "no-judgements", "nobody has answered a trial of this revision of the study; wait for participants"
         )
-    who, shown, chosen = zip(*rows, strict=True)
-    return Judgements(len(study.motions), np.array(who), np.array(shown), np.array(chosen))
+    return judgements_of(len(study.motions), answers)
 
 
 def _measured(context: Context, study: StudyDocument) -> tuple[list[PairDifferences], list[str]]:

@@ -10,9 +10,11 @@ import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
 from marey_client.cli.evaluations import clips_in
+from marey_client.cli.revisions import require_revision
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
+from marey_client.cli.viewing import InBrowser, page_address, show_page
 
 if TYPE_CHECKING:
     from marey_client.handles.studies import StudyHandle
@@ -71,6 +73,24 @@ def create(
     if as_json:
         return print_json(made.item)
     return print_pairs([("study", made.path), ("id", made.id), ("motions", str(len(clips)))])
+
+
+@study.command("show")
+def show(
+    context: typer.Context,
+    place: Annotated[str, typer.Argument(metavar="STUDY", help="The study: project/folder/name[@revision].")],
+    browser: InBrowser = False,
+) -> None:
+    """Show the design, the participants and the results in a browser. The address signs one browser in, once."""
+    from marey_schemas.kinds import Kind
+    from marey_schemas.sign_ins import STUDY_PATH
+
+    address = Address.parse(place)
+    with connect(context) as marey:
+        found, revision = require_revision(marey, address, [Kind.STUDY])
+        named = f"{address.project}/{found.id}" + ("" if revision is None else f"@{revision}")
+        url = page_address(marey, address.project, STUDY_PATH, {"study": named})
+    show_page(url, browser=browser)
 
 
 @study.command("invite")

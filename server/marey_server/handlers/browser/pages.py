@@ -122,6 +122,28 @@ class ViewPage(WebPage):
         return await self.document()
 
 
+class StudyQuery(AnyQuery):
+    """Parameters in the address of the page of a study."""
+
+    study: str | None = Field(None, description="The study: `project/item`, or `project/item@revision`.")
+
+
+class StudyPage(WebPage):
+    """Page of a study, for those who carry it out."""
+
+    path = "/studies"
+    tag = "Pages"
+    to_root = b"./"
+
+    @reads(
+        access=Access.ANYONE, scope=None, query=StudyQuery, answer=Bytes, answer_types=("text/html",),
+        also=((404, None),), for_browsers=True,
+    )  # fmt: skip
+    async def get(self, query: StudyQuery) -> Reply:  # noqa: ARG002 - the page itself reads it
+        """Return the page that shows the design, the participants and the results of a study."""
+        return await self.document()
+
+
 class ParticipantPage(WebPage):
     """Page of the participants of perceptual studies."""
 
@@ -158,4 +180,4 @@ class PageAsset(Resource):
         return Reply(found.compressed, media_type=found.media_type, headers=headers)
 
 
-RESOURCES: tuple[type[Resource], ...] = (ViewPage, ParticipantPage, PageAsset)
+RESOURCES: tuple[type[Resource], ...] = (ViewPage, StudyPage, ParticipantPage, PageAsset)

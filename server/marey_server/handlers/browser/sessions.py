@@ -6,7 +6,7 @@ from urllib.parse import urlsplit
 
 from marey_schemas.sign_ins import BrowserLink, BrowserSession, BrowserSessionCreate
 from marey_server.handlers.access import MAX_LOGIN_BYTES, PasswordResource
-from marey_server.http.browser_cookies import cookie_name, require_own_page
+from marey_server.http.browser_cookies import cookie_name, is_secure, require_own_page, sent_cookies
 from marey_server.http.caching import WITH_SECRET
 from marey_server.http.declarations import Access, RequestBody, reads, writes
 from marey_server.http.reply import Rendered, Reply
@@ -59,4 +59,21 @@ class BrowserSessions(PasswordResource):
         return urlsplit(address).scheme == "https"
 
 
-RESOURCES: tuple[type[Resource], ...] = (BrowserLinks, BrowserSessions)
+class OneBrowserSession(Resource):
+    """Session of a browser in one project."""
+
+    path = "/browser-sessions/{project}"
+    tag = "Access"
+
+    @writes(access=Access.ANYONE, scope=None, reserved=True)
+    async def delete(self, project: str) -> Reply:
+        """End the session of the browser that sends this request, named by its cookie; without one, nothing changes."""
+        require_own_page(self.request)
+        for name, secret in sent_cookies(self.request, project).items():
+            if await self.look_up(browser_links.is_session, secret):
+                await self.change(browser_links.end_session, secret)
+            self.clear_cookie(name, path="/", secure=is_secure(name), httponly=True, samesite="Strict")
+        return Reply()
+
+
+RESOURCES: tuple[type[Resource], ...] = (BrowserLinks, BrowserSessions, OneBrowserSession)

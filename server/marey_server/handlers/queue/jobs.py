@@ -23,6 +23,8 @@ from marey_schemas.queue.jobs import (
 )
 from marey_schemas.sizes import MIB
 from marey_server.errors import NotFoundProblem
+from marey_server.handlers.reports import StoredFileSender
+from marey_server.http.caching import REVALIDATED
 from marey_server.http.declarations import Access, Bytes, RequestBody, reads, writes
 from marey_server.http.queries import CommaSeparated, CommaSeparatedOf, CountedPageQuery, PageQuery
 from marey_server.http.reply import Rendered, Reply
@@ -38,6 +40,10 @@ LOOK_AGAIN_S = 15.0
 """Interval in seconds at which a waiting request polls the job, in case the notification of its end is lost."""
 
 MAX_SUBMISSION_BYTES = 32 * MIB
+RESULT_TYPES = {
+    "report": "text/html; charset=utf-8", "document": "application/json", "fitted": "application/json",
+}  # fmt: skip
+"""Media types of files of results, by their names in the result; other files have no known type."""
 _WAIT = re.compile(r"(?:^|[,;\s])wait=(\d{1,4})(?:$|[,;\s])")
 
 
@@ -237,6 +243,26 @@ class JobResults(Resource):
         return await self.answer(reading.list_results, job, query.cursor, query.limit)
 
 
+class JobFile(StoredFileSender):
+    """File of the result of a job."""
+
+    path = "/projects/{project}/jobs/{job}/files/{file}"
+    tag = "Jobs"
+
+    @reads(
+        access=Access.READER,
+        answer=Bytes,
+        answer_types=("application/json", "text/html", "application/octet-stream"),
+        etag=True,
+        also=((206, None), (416, None)),
+        headers=("Range", "If-Range"),
+    )
+    async def get(self, project: str, job: str, file: str) -> Rendered | None:
+        """Return a file of a job's result: its `report` as HTML, its `document` as JSON, or another member."""
+        found = await self.look_up(reading.read_result_file, project, job, file)
+        return await self.send_file(found, RESULT_TYPES.get(file, "application/octet-stream"), REVALIDATED, "sandbox")
+
+
 class JobEventsQuery(Request):
     """Query parameters for reading events: the position in the feed, and the number of events."""
 
@@ -325,6 +351,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     JobAttempts,
     JobOutputs,
     JobResults,
+    JobFile,
     JobEvents,
     JobLog,
     JobCancellation,

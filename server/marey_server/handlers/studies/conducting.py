@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from marey_schemas.base import Request
 from marey_schemas.studies.conducting import (
     MOST_JUDGES_AT_ONCE,
     JudgingParticipant,
     NewStudyLinks,
+    StudyDifferences,
     StudyLinksCreate,
     StudyParticipant,
     StudyProgress,
@@ -18,10 +20,16 @@ from marey_server.http.declarations import Access, reads, writes
 from marey_server.http.queries import MAX_INTEGER, PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
-from marey_server.motions.drawing_trials import draw_plans
+from marey_server.motions.studies import draw_plans, find_differences
 from marey_server.store.studies import conducting, judgements
 
 TAG = "Studies"
+
+
+class DifferencesQuery(Request):
+    """Query parameters of the differences of a study: its revision."""
+
+    revision: int = Field(ge=1, le=MAX_INTEGER, description="Revision of the study that the participants saw.")
 
 
 class JudgementsQuery(PageQuery):
@@ -111,6 +119,24 @@ class StudyJudgementsResource(Resource):
         )
 
 
+class StudyDifferencesResource(Resource):
+    """Differences that the participants of a study perceived."""
+
+    path = "/projects/{project}/{kind}/{item}/differences"
+    tag = TAG
+
+    @reads(access=Access.MAINTAINER, query=DifferencesQuery, answer=StudyDifferences, public=False)
+    async def get(self, project: str, kind: str, item: str, query: DifferencesQuery) -> Reply:
+        """Return the differences of a study's motions by the answers so far, without anything about participants.
+
+        The job kind `analyse_study` computes the same differences, groups of the motions, and metrics.
+        """
+        collected = await self.look_up(
+            judgements.collect_answers, project, kind_of(kind), item, revision=query.revision
+        )
+        return Reply(await self.compute(find_differences, collected))
+
+
 class AttemptJudgements(Resource):
     """Judgements of a study that is the input of a job."""
 
@@ -136,5 +162,6 @@ RESOURCES: tuple[type[Resource], ...] = (
     OneStudyParticipant,
     StudyProgressResource,
     StudyJudgementsResource,
+    StudyDifferencesResource,
     AttemptJudgements,
 )

@@ -14,9 +14,10 @@ from typing import NamedTuple
 from sqlalchemy import and_, delete, func, insert, select, update
 
 from marey_schemas.sign_ins import VIEW_PREFIX, BrowserLink, BrowserSession
+from marey_server.access.principal import Principal
 from marey_server.access.scopes import projects_of
 from marey_server.access.secret_tokens import hash_secret, issue_prefix, issue_user_token, split_view_code
-from marey_server.errors import NotFoundProblem, QuotaExceededProblem
+from marey_server.errors import NotFoundProblem, QuotaExceededProblem, UnauthenticatedProblem
 from marey_server.store import projects, users
 from marey_server.store.credentials import sign_ins, tokens
 from marey_server.store.credentials.sign_ins import SignInTry
@@ -95,6 +96,28 @@ def redeem_link(tx: Transaction, code: str, attempt: SignInTry) -> IssuedSession
     sign_ins.take_back(tx, attempt)
     (project,) = projects_of(row.scopes, "read")
     return IssuedSession(BrowserSession(project=project, expires_at=datetime_of(expires_us)), issued.text)
+
+
+def is_session(tx: Transaction, secret: str) -> bool:
+    """Return whether a text is the token of a valid session."""
+    return _session_of(tx, secret) is not None
+
+
+def end_session(tx: Transaction, secret: str) -> None:
+    """Revoke the token of a session; an unknown token changes nothing."""
+    found = _session_of(tx, secret)
+    if found is not None and found.token_id is not None:
+        tx.principal = found
+        tokens.revoke_token(tx, found.token_id)
+
+
+def _session_of(tx: Transaction, secret: str) -> Principal | None:
+    """Return the principal of a session, or None if the text is no token of a user, or not valid any more."""
+    try:
+        found = tokens.resolve_token(tx, secret)
+    except UnauthenticatedProblem:
+        return None
+    return found if found.kind == "user" else None
 
 
 def _hash(secret: str) -> str:

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from pydantic import ValidationError
 from sqlalchemy import ColumnElement, Row, Select, and_, case, func, select, update
 
 from marey_schemas.access import Role
+from marey_schemas.documents.reports import StoredFile
 from marey_schemas.items import Page
 from marey_schemas.queue.jobs import Attempt, Job, JobOutput, JobState, TaskResult
 from marey_server.access import roles
@@ -80,6 +82,21 @@ def list_jobs(
     parts = _parts(project_row.id, filters, order)
     rows, next_cursor = listing.read_page(tx, select_jobs(), order, identity, cursor, limit, parts)
     return Page(items=tuple(as_documents(tx, rows)), next_cursor=next_cursor, count=total)
+
+
+def read_result_file(tx: Transaction, project: str, job_id: str, name: str) -> StoredFile:
+    """Return the reference to a file of a job's result. Raises `NotFoundProblem`."""
+    row, project_row = find_job(tx, job_id)
+    entry = as_documents(tx, [row])[0].result or {}
+    if project_row.name == project:
+        try:
+            return StoredFile.model_validate(entry.get(name))
+        except ValidationError:
+            files = ", ".join(other for other, value in entry.items() if isinstance(value, dict) and "blob" in value)
+            raise NotFoundProblem(
+                f"The result of the job has no file {name!r}; it has {files or 'none'}.", code="no-file"
+            ) from None
+    raise NotFoundProblem(f"There is no job {job_id!r} in this project that you may see.", code="no-job")
 
 
 def list_attempts(tx: Transaction, job_id: str) -> Page:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Row, select
@@ -46,6 +47,33 @@ def list_for_attempt(
         raise NotFoundProblem("The job has no such study as its input.", code="no-item")
     _require_maintainer(tx, job_id)
     return _page(tx, item_id, revision, cursor, limit)
+
+
+@dataclass(frozen=True, slots=True)
+class CollectedAnswers:
+    """Answered trials of one revision of a study, without anything else about the participants."""
+
+    revision: int
+    motion_count: int
+    answers: list[tuple[int, list[int], tuple[int, int]]]
+    """For each trial: number of the participant from 0, motions shown by place, and the chosen places."""
+
+
+def collect_answers(tx: Transaction, project: str, kind: Kind, item_id: str, *, revision: int) -> CollectedAnswers:
+    """Return all answered trials of a revision of a study. Raises `NotFoundProblem` or `ForbiddenProblem`."""
+    _, row = require_study(tx, project, kind, item_id)
+    design = load_design(tx, row.id, revision)
+    answered = (
+        select(study_participant.c.number, study_trial.c.shown, study_trial.c.chosen)
+        .join(study_trial, study_trial.c.participant_id == study_participant.c.id)
+        .where(study_participant.c.item_id == row.id, study_participant.c.revision == revision)
+        .where(study_participant.c.answered > 0, study_trial.c.ended_us.is_not(None))
+        .order_by(study_participant.c.number, study_trial.c.number)
+    )
+    rows = [one for one in tx.execute(answered) if one.chosen is not None]
+    places = {number: place for place, number in enumerate(dict.fromkeys(one.number for one in rows))}
+    answers = [(places[one.number], list(one.shown), (one.chosen[0], one.chosen[1])) for one in rows]
+    return CollectedAnswers(revision, len(design.motions), answers)
 
 
 def _page(tx: Transaction, item_id: str, revision: int, cursor: str | None, limit: int) -> Page:
