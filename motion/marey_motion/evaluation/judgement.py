@@ -47,7 +47,7 @@ Region = Literal["straight", "gentle turns", "sharp turns", "speed changes"]
 REGIONS: tuple[Region, ...] = ("straight", "gentle turns", "sharp turns", "speed changes")
 
 
-class Check(NamedTuple):
+class LimitCheck(NamedTuple):
     """One measure of a trial beside its limit; `metric` is the name of the metric that is compared.
 
     `value` is None if the measure is not defined, which counts as infinite strain; its sign is that of the error.
@@ -66,19 +66,19 @@ class Check(NamedTuple):
 
 
 @dataclass(frozen=True)
-class JudgedTrial:
+class TrialVerdict:
     """A trial with all its checks, those of the path first."""
 
     outcome: TrialResult
-    checks: tuple[Check, ...]
+    checks: tuple[LimitCheck, ...]
 
     @property
-    def worst(self) -> Check:
+    def worst(self) -> LimitCheck:
         """The check with the largest strain; the first of several."""
         return max(self.checks, key=lambda each: each.strain)
 
     @property
-    def exceeded(self) -> tuple[Check, ...]:
+    def exceeded(self) -> tuple[LimitCheck, ...]:
         """The checks that exceed their limits, the largest strain first."""
         return tuple(sorted((each for each in self.checks if each.exceeded), key=lambda each: -each.strain))
 
@@ -111,13 +111,13 @@ class Judgement:
     Parameters
     ----------
     grade : str    one of `GRADES`
-    trials : tuple of JudgedTrial    in the order of the suite
+    trials : tuple of TrialVerdict    in the order of the suite
     looks_measured : bool    False for results of versions that did not measure looks; their trials are judged by place,
         speed and turn rate only
     """
 
     grade: str
-    trials: tuple[JudgedTrial, ...]
+    trials: tuple[TrialVerdict, ...]
     looks_measured: bool
 
     @property
@@ -131,7 +131,7 @@ class Judgement:
         return sum(each.on_path for each in self.trials)
 
     @property
-    def ranked(self) -> tuple[JudgedTrial, ...]:
+    def ranked(self) -> tuple[TrialVerdict, ...]:
         """The trials in the order of their largest strain, the worst first; equal ones in the order of their names."""
         return tuple(sorted(self.trials, key=lambda each: (-each.worst.strain, each.outcome.trial.name)))
 
@@ -153,7 +153,7 @@ def judge(result: EvaluationResult) -> Judgement:
     return Judgement(grade, trials, all("foot_skate" in each.metrics for each in result.trials))
 
 
-def judge_trial(outcome: TrialResult, limits: VerdictLimits) -> JudgedTrial:
+def judge_trial(outcome: TrialResult, limits: VerdictLimits) -> TrialVerdict:
     """Compare every measure of a trial with its limit.
 
     Parameters
@@ -163,18 +163,18 @@ def judge_trial(outcome: TrialResult, limits: VerdictLimits) -> JudgedTrial:
 
     Returns
     -------
-    JudgedTrial    the checks; measures of looks that are not defined are left out
+    TrialVerdict    the checks; measures of looks that are not defined are left out
     """
     path = (
         _check("place", outcome.metrics, "offset_mean", limits.lag_s * mean_speed_m_s(outcome.trial)),
         *_speed_checks(outcome, limits),
         *_turn_checks(outcome.metrics, limits),
     )
-    return JudgedTrial(outcome, (*path, *_looks_checks(outcome.metrics, limits)))
+    return TrialVerdict(outcome, (*path, *_looks_checks(outcome.metrics, limits)))
 
 
-def _speed_checks(outcome: TrialResult, limits: VerdictLimits) -> Iterator[Check]:
-    """Check the speed of each regime away from switches, and the answers to switches."""
+def _speed_checks(outcome: TrialResult, limits: VerdictLimits) -> Iterator[LimitCheck]:
+    """LimitCheck the speed of each regime away from switches, and the answers to switches."""
     trial, metrics = outcome.trial, outcome.metrics
     regimes = [(mean_speed_m_s(trial), metrics)]
     if "settled_se_v" in metrics and trial.family == "switching" and "switched" in outcome.regimes:
@@ -188,20 +188,20 @@ def _speed_checks(outcome: TrialResult, limits: VerdictLimits) -> Iterator[Check
     yield from _response_checks(metrics, limits)
 
 
-def _response_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[Check]:
-    """Check the median answer to switches, which is not defined if most of them have no answer."""
+def _response_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[LimitCheck]:
+    """LimitCheck the median answer to switches, which is not defined if most of them have no answer."""
     if metrics.get("response_median_s") is not None or ("response_median_s" in metrics and metrics["response_missed"]):
         yield _check("response", metrics, "response_median_s", limits.response_s)
 
 
-def _turn_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[Check]:
+def _turn_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[LimitCheck]:
     yield _check("turn", metrics, "se_omega_deg", limits.turn_deg_s)
     if "heading_rms_deg" in metrics:
         yield _check("heading", metrics, "heading_rms_deg", limits.heading_deg)
         yield _check("turn wobble", metrics, "dse_omega_deg", limits.turn_wobble_deg_s)
 
 
-def _looks_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[Check]:
+def _looks_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[LimitCheck]:
     if metrics.get("foot_skate") is not None:
         of_clips = metrics.get("foot_skate_clips") or 0.0
         yield _check("skating", metrics, "foot_skate", max(limits.skate_m_s, limits.skate_ratio * of_clips))
@@ -210,7 +210,7 @@ def _looks_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[Check]:
     if (contacts := metrics.get("contacts_per_m")) is not None:
         of_clips = metrics.get("contacts_per_m_clips") or 0.0
         least = max(limits.steps_per_m, of_clips / limits.step_ratio)
-        yield Check("gliding", "contacts_per_m", contacts, least, least / contacts if contacts else np.inf)
+        yield LimitCheck("gliding", "contacts_per_m", contacts, least, least / contacts if contacts else np.inf)
         if of_clips:
             yield _check("pattering", metrics, "contacts_per_m", max(least, of_clips * limits.step_ratio))
     if (change := metrics.get("pose_cost_clips")) is not None:
@@ -241,10 +241,10 @@ def exceeded_in_suite(result: EvaluationResult) -> frozenset[str]:
     return frozenset(each.metric for each in checks if each.exceeded and each.value is not None)
 
 
-def _check(measure: Measure, metrics: Metrics, metric: str, limit: float) -> Check:
+def _check(measure: Measure, metrics: Metrics, metric: str, limit: float) -> LimitCheck:
     value = metrics.get(metric)
     strain = np.inf if value is None else abs(value) / max(limit, TOLERANCE)
-    return Check(measure, metric, value, limit, strain)
+    return LimitCheck(measure, metric, value, limit, strain)
 
 
 def mean_speed_m_s(trial: Trial) -> float:

@@ -95,9 +95,8 @@ class LooksMeter:
         speeds = ground_speeds(toes, record.positions, record.headings, record.rate_hz)
         skate = _mean(speeds[standing_steps(contacts) & window[:, None]])
         skate_of_clips = _ratio(shown["skated_m_s"], shown["standing"])
-        steady = without_flicker(contacts, record.rate_hz, CONTACT_WINDOW_S)
+        begun = begun_contacts(without_flicker(contacts, record.rate_hz, CONTACT_WINDOW_S)) & window[:, None]
         path_m = float(np.linalg.norm(np.diff(record.positions, axis=0), axis=1)[window].sum())
-        travels = path_m >= LEAST_PATH_M
         floor = _ratio(shown["heights_m"], shown["standing_rows"])
         depths = None if floor is None else np.maximum(0.0, floor - toes[1:, :, 1].min(axis=1)[window])
         return {
@@ -105,7 +104,7 @@ class LooksMeter:
             "foot_skate_clips": skate_of_clips,
             "foot_skate_ratio": _skate_ratio(skate, skate_of_clips),
             "foot_depth_p95": float(np.percentile(depths, 95.0)) if depths is not None and len(depths) else None,
-            "contacts_per_m": np.count_nonzero(begun_contacts(steady) & window[:, None]) / path_m if travels else None,
+            "contacts_per_m": float(np.count_nonzero(begun)) / path_m if path_m >= LEAST_PATH_M else None,
             "contacts_per_m_clips": _ratio(shown["contacts"], shown["path_m"]),
         }
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from marey_motion.evaluation.judgement import Check, JudgedTrial, Measure, exceeded_in_suite, judge
+from marey_motion.evaluation.judgement import LimitCheck, Measure, TrialVerdict, exceeded_in_suite, judge
 from marey_motion.evaluation.relevance import SourceUsage, recorded_rows, sum_by_source
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.scenario import demand
@@ -81,8 +81,8 @@ def error_chapter(result: EvaluationResult, figures: Figures) -> Section:
         "The character follows every trajectory."
         if not lost
         else f"The character does not follow {lost:,} of {counted(len(result.trials), 'trajectory')}. In "
-        f"{len(judgement.trials) - judgement.on_path:,}, it loses place, speed or heading; the others are kept to, but do "
-        "not look right."
+        f"{len(judgement.trials) - judgement.on_path:,}, it loses place, speed or heading; in the others, it does not "
+        "look right."
     )
     rows = [_trial_row(each) for each in judgement.ranked[:WORST_TRIALS]]
     listing = table("The worst trials; values beyond their limits are marked", TRIAL_HEADS, rows, numbers=TRIAL_NUMBERS)
@@ -242,7 +242,7 @@ TRIAL_NUMBERS = range(1, len(TRIAL_COLUMNS) + 1)
 USE_HEADS = ("clip", "share of display", "length (s)", "own frames displayed", "times entered")
 
 
-def _trial_row(trial: JudgedTrial) -> list[Cell]:
+def _trial_row(trial: TrialVerdict) -> list[Cell]:
     outcome = trial.outcome
     row: list[Cell] = [element("span", demand(outcome.trial), title=outcome.trial.name)]
     for _, metric, measures, digits, factor in TRIAL_COLUMNS:
@@ -257,7 +257,7 @@ def _trial_row(trial: JudgedTrial) -> list[Cell]:
     return [*row, ", ".join(dict.fromkeys(each.measure for each in trial.exceeded))]
 
 
-def _strain(check: Check) -> float:
+def _strain(check: LimitCheck) -> float:
     return check.strain
 
 

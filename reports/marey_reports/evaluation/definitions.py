@@ -103,7 +103,7 @@ _READINGS = (
     (
         "static errors (equations 1 and 2)",
         "1/m · Σ v_r − v_ref over m + 1 terms, brackets missing",
-        "signed bias: the mean of recorded minus desired values over the steps of the circle. Too fast and too far to "
+        "signed bias: the mean of simulated minus desired values over the steps of the circle. Too fast and too far to "
         "the left are positive.",
     ),
     (
@@ -120,7 +120,7 @@ _READINGS = (
     (
         "sign of errors (figure 8)",
         "a peak at +1.5 m/s for a speed that is not reached",
-        "recorded minus desired everywhere; the option negate_errors of figures reverses the sign.",
+        "simulated minus desired everywhere; the option negate_errors of figures reverses the sign.",
     ),
     (
         "window of evaluation",

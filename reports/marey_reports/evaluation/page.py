@@ -30,7 +30,7 @@ from marey_reports.evaluation.comparison import (
 from marey_reports.evaluation.definitions import definitions
 from marey_reports.evaluation.figures import DrawnFigure, draw_figures
 from marey_reports.evaluation.provenance import provenance
-from marey_reports.evaluation.verdicts import region_verdicts, verdict
+from marey_reports.evaluation.sentences import region_verdicts, verdict
 
 __all__ = ["compared", "render_comparison", "render_report"]
 

@@ -39,7 +39,7 @@ from marey_reports.drawing.words import duration
 from marey_reports.evaluation.definitions import METRICS, definitions
 from marey_reports.evaluation.figures import FIGURES, USE_FIGURES, draw_figure
 from marey_reports.evaluation.page import compared, render_comparison, render_report
-from marey_reports.evaluation.verdicts import region_verdicts, verdict
+from marey_reports.evaluation.sentences import region_verdicts, verdict
 from marey_reports.evaluation.words import find_holes
 from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.options.verdict import VerdictLimits

@@ -17,7 +17,7 @@ from marey_motion.evaluation.suite import assemble, evaluate_baseline, run_suite
 from marey_motion.matching.record import TrialRecord
 from marey_reports.evaluation.figures import FIGURES, DrawnFigure, draw_figure, draw_figures
 from marey_reports.evaluation.page import render_report
-from marey_reports.evaluation.verdicts import region_verdicts, verdict
+from marey_reports.evaluation.sentences import region_verdicts, verdict
 from marey_schemas.documents.evaluations import HEADLINE_METRICS
 from marey_schemas.documents.reports import EvaluationReport
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree

@@ -24,7 +24,7 @@ class FigureOptions:
 
     Parameters
     ----------
-    negate_errors : draw reference minus recorded, as the paper's figure 8, instead of recorded minus reference
+    negate_errors : draw reference minus simulated, as the paper's figure 8, instead of simulated minus reference
     logarithmic : whether the sizes of dots and the lengths of bars have a logarithmic scale
     most_clips : number of clips that are drawn one by one; all other clips are summed up
     """

@@ -14,7 +14,7 @@ from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import result_from_tree, result_to_tree
 from marey_motion.matching.record import Status, TrialRecord
-from marey_reports.evaluation.verdicts import region_verdicts, verdict
+from marey_reports.evaluation.sentences import region_verdicts, verdict
 from marey_schemas.options.matching import ControllerOptions
 from marey_schemas.options.verdict import VerdictLimits
 

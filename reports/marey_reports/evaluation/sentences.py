@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from marey_motion.evaluation.judgement import REGIONS, Check, JudgedTrial, Judgement, Measure, judge
+from marey_motion.evaluation.judgement import REGIONS, Judgement, LimitCheck, Measure, TrialVerdict, judge
 from marey_motion.evaluation.relevance import sum_by_source
 from marey_motion.evaluation.result import Coverage, EvaluationResult
 from marey_motion.evaluation.scenario import demand
@@ -21,7 +21,7 @@ SIDEWAYS_M_S = 0.3
 """Speed to the side or backwards from which a window of a clip counts as a walk in this direction."""
 
 
-class _Problem(NamedTuple):
+class _Wording(NamedTuple):
     """Words for an exceeded limit: `words` after "it" or "its", and the decimals of value and limit; times `scale`."""
 
     words: str
@@ -30,21 +30,21 @@ class _Problem(NamedTuple):
     scale: float = 1.0
 
 
-_PROBLEMS: dict[Measure, _Problem] = {
-    "place": _Problem("it is {} away from its place", 1, " m"),
-    "speed": _Problem("its speed is wrong by {}", 1, " m/s"),
-    "response": _Problem("it answers a new speed after {}", 1, " s"),
-    "speed wobble": _Problem("its speed wavers by {}", 2, " m/s"),
-    "turn": _Problem("its turn rate is wrong by {}", 0, " deg/s"),
-    "heading": _Problem("it faces {} away from its direction", 0, " degrees"),
-    "turn wobble": _Problem("it sways by {}", 0, " deg/s"),
-    "skating": _Problem("its feet slide at {} while they should stand", 2, " m/s"),
-    "sinking": _Problem("its feet sink {} into the ground", 1, " cm", 100.0),
-    "gliding": _Problem("it glides, with only {}", 2, " steps per metre"),
-    "pattering": _Problem("it patters, with {}", 1, " steps per metre"),
-    "jerking": _Problem("its poses jerk, by {} over all joints from frame to frame", 2, " m"),
-    "jumping": _Problem("it jumps between frames {}", 1, " times a second"),
-    "treading": _Problem("it treads on the spot {}", 1, " times a second"),
+_PROBLEMS: dict[Measure, _Wording] = {
+    "place": _Wording("it is {} away from its place", 1, " m"),
+    "speed": _Wording("its speed is wrong by {}", 1, " m/s"),
+    "response": _Wording("it answers a new speed after {}", 1, " s"),
+    "speed wobble": _Wording("its speed wavers by {}", 2, " m/s"),
+    "turn": _Wording("its turn rate is wrong by {}", 0, " deg/s"),
+    "heading": _Wording("it faces {} away from its direction", 0, " degrees"),
+    "turn wobble": _Wording("it sways by {}", 0, " deg/s"),
+    "skating": _Wording("its feet slide at {} while they should stand", 2, " m/s"),
+    "sinking": _Wording("its feet sink {} into the ground", 1, " cm", 100.0),
+    "gliding": _Wording("it glides, with only {}", 2, " steps per metre"),
+    "pattering": _Wording("it patters, with {}", 1, " steps per metre"),
+    "jerking": _Wording("its poses jerk, by {} over all joints from frame to frame", 2, " m"),
+    "jumping": _Wording("it jumps between frames {}", 1, " times a second"),
+    "treading": _Wording("it treads on the spot {}", 1, " times a second"),
 }
 
 
@@ -110,11 +110,11 @@ def _not_asked_for(coverage: Coverage, window_s: float) -> list[RegionVerdict]:
     return found
 
 
-def _problems(trials: Sequence[JudgedTrial]) -> str:
+def _problems(trials: Sequence[TrialVerdict]) -> str:
     """Describe the limits that most of these trials exceed, each with the median of the values beyond the limit."""
-    beyond: dict[Measure, list[Check]] = {}
+    beyond: dict[Measure, list[LimitCheck]] = {}
     for trial in trials:
-        worst: dict[Measure, Check] = {}
+        worst: dict[Measure, LimitCheck] = {}
         for check in trial.exceeded:
             worst.setdefault(check.measure, check)
         for measure, check in worst.items():
@@ -123,7 +123,7 @@ def _problems(trials: Sequence[JudgedTrial]) -> str:
     return ", ".join(f"in {len(checks)} {_typical(measure, checks)}" for measure, checks in most)
 
 
-def _typical(measure: Measure, checks: Sequence[Check]) -> str:
+def _typical(measure: Measure, checks: Sequence[LimitCheck]) -> str:
     known = [abs(check.value) for check in checks if check.value is not None]
     if len(known) <= len(checks) // 2:
         return _undefined(measure)
@@ -140,7 +140,7 @@ def _undefined(measure: Measure) -> str:
     return "most changes of the speed stay unanswered" if measure == "response" else "it was not measured"
 
 
-def failing(trial: JudgedTrial) -> str:
+def failing(trial: TrialVerdict) -> str:
     """Describe the error of a trial that is largest relative to its limit."""
     check, outcome = trial.worst, trial.outcome
     if check.value is None:
