@@ -10,7 +10,8 @@ import numpy as np
 
 from marey_motion.clip import Clip
 from marey_motion.evaluation.result import EvaluationResult
-from marey_motion.evaluation.suite import assemble, run_suite, suite_trials
+from marey_motion.evaluation.scenario import suite_trials
+from marey_motion.evaluation.suite import assemble, run_suite
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database

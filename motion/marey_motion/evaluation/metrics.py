@@ -184,10 +184,11 @@ def _travel_turn_rates(steps: Floats, speeds: Floats, pieces: NDArray[np.int64],
 
 
 def _metrics(series: TrialSeries, record: TrialRecord, window: Flags) -> dict[str, float | None]:
+    speeds = _speed_metrics(series, window)
     return {
-        **_speed_metrics(series, window),
+        **speeds,
         **_offset_metrics(series, window),
-        **_settled_metrics(series, window),
+        **_settled_metrics(series, window, speeds),
         **_response_metrics(series, window),
         **_switch_metrics(record, window),
         **_cost_metrics(record, window),
@@ -240,17 +241,19 @@ def _offset_metrics(series: TrialSeries, window: Flags) -> dict[str, float | Non
     return metrics
 
 
-def _settled_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None]:
-    """Compute error and spread of the speed away from its switches, and the error of the heading as an angle."""
+def _settled_metrics(series: TrialSeries, window: Flags, speeds: Metrics) -> dict[str, float | None]:
+    """Compute error and spread of the speed away from its switches, and the error of the heading as an angle.
+
+    `speeds` are the metrics of the whole window, which are the same if the speed does not switch.
+    """
+    heading = _of(_rms, series.heading_errors_rad[window])
+    heading_deg = None if heading is None else float(np.degrees(heading))
+    if series.settled.all():
+        return {"settled_se_v": speeds["se_v"], "settled_dse_v": speeds["dse_v"], "heading_rms_deg": heading_deg}
     settled = window & series.settled
     errors = (series.speeds_m_s - series.wanted_speeds_m_s)[settled]
     spread = _pooled_spread(series.speeds_m_s[settled], series.regimes[settled])
-    heading = _of(_rms, series.heading_errors_rad[window])
-    return {
-        "settled_se_v": _of(np.mean, errors),
-        "settled_dse_v": spread,
-        "heading_rms_deg": None if heading is None else float(np.degrees(heading)),
-    }
+    return {"settled_se_v": _of(np.mean, errors), "settled_dse_v": spread, "heading_rms_deg": heading_deg}
 
 
 def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None]:

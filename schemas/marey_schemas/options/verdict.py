@@ -21,7 +21,7 @@ class VerdictLimits(Options):
     """Limits of a trial. A trial counts as followed if it exceeds none of them."""
 
     lag_s: _Limit = Field(
-        0.5, description="Greatest mean distance from the desired position, as the time to cover it at desired speed."
+        0.5, description="Greatest mean distance from the desired position, as the time in seconds to cover it."
     )
     speed_share: _Limit = Field(
         0.15,
