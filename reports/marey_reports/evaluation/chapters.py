@@ -237,7 +237,7 @@ TRIAL_COLUMNS: tuple[tuple[str, str, tuple[Measure, ...], int, float], ...] = (
 )
 """Heading, metric, the measures that limit it, decimals and factor of each column of a trial's numbers."""
 SIGNED = ("settled_se_v", "se_v", "se_omega_deg")
-TRIAL_HEADS = ("trial", *(column[0] for column in TRIAL_COLUMNS), "beyond limits")
+TRIAL_HEADS = ("trial", *(column[0] for column in TRIAL_COLUMNS))
 TRIAL_NUMBERS = range(1, len(TRIAL_COLUMNS) + 1)
 USE_HEADS = ("clip", "share of display", "length (s)", "own frames displayed", "times entered")
 
@@ -250,11 +250,11 @@ def _trial_row(trial: TrialVerdict) -> list[Cell]:
         value = outcome.metrics.get(metric) if check is None else check.value
         look = BEYOND if check is not None and check.exceeded else ""
         if check is not None and check.measure == "response" and check.value is None:
-            row.append(Number(None, "most unanswered", look))
+            row.append(Number(None, "unanswered", look))
             continue
         scaled = None if value is None else factor * value
         row.append(number(scaled, digits, signed=metric in SIGNED, look=look))
-    return [*row, ", ".join(dict.fromkeys(each.measure for each in trial.exceeded))]
+    return row
 
 
 def _strain(check: LimitCheck) -> float:

@@ -336,7 +336,6 @@ def test_numbers_beyond_their_limits_are_marked_where_they_stand(result: Evaluat
     page = render_report(bad, title="t", figures={})
     for written in ("0.87", "9.90", "2.50", "0.63"):
         assert re.search(rf'<td[^>]*class="[^"]*bad[^"]*"[^>]*>{written}</td>', page), written
-    assert "skating, treading" in is_sound(page).text
 
 
 def test_each_region_gets_a_sentence_and_motion_that_no_trial_asks_for_is_named(result: EvaluationResult) -> None:
