@@ -174,7 +174,7 @@ def judge_trial(outcome: TrialResult, limits: VerdictLimits) -> TrialVerdict:
 
 
 def _speed_checks(outcome: TrialResult, limits: VerdictLimits) -> Iterator[LimitCheck]:
-    """LimitCheck the speed of each regime away from switches, and the answers to switches."""
+    """Check the speed of each regime away from switches, and the answers to switches."""
     trial, metrics = outcome.trial, outcome.metrics
     regimes = [(mean_speed_m_s(trial), metrics)]
     if "settled_se_v" in metrics and trial.family == "switching" and "switched" in outcome.regimes:
@@ -189,7 +189,7 @@ def _speed_checks(outcome: TrialResult, limits: VerdictLimits) -> Iterator[Limit
 
 
 def _response_checks(metrics: Metrics, limits: VerdictLimits) -> Iterator[LimitCheck]:
-    """LimitCheck the median answer to switches, which is not defined if most of them have no answer."""
+    """Check the median answer to switches, which is not defined if most of them have no answer."""
     if metrics.get("response_median_s") is not None or ("response_median_s" in metrics and metrics["response_missed"]):
         yield _check("response", metrics, "response_median_s", limits.response_s)
 

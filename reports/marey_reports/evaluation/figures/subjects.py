@@ -121,7 +121,7 @@ def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequen
         candidates = [each for each in shared if each.trial.family == family and name in (None, each.trial.name)]
         if candidates:
             limits = subjects[0].result.options.limits
-            return max(candidates, key=lambda each: judge_trial(each, limits).worst.strain).trial
+            return min(candidates, key=lambda each: (-judge_trial(each, limits).worst.strain, each.trial.name)).trial
     wanted = f"trial {name!r}" if name is not None else "trial"
     owner = "the evaluation has" if len(subjects) == 1 else "the two evaluations share"
     raise MotionError(
