@@ -405,10 +405,26 @@ def foot_contacts(
     (120, 2)
     """
     slow = np.linalg.norm(velocities(toes, frame_rate_hz), axis=-1) < speed_limit_m_s
+    return without_flicker(slow, frame_rate_hz, window_s)
+
+
+def without_flicker(flags: NDArray[np.bool_], frame_rate_hz: float, window_s: float) -> NDArray[np.bool_]:
+    """Replace each flag by the majority of the flags around it.
+
+    Parameters
+    ----------
+    flags : (F, k) bool    flags of F frames
+    frame_rate_hz : float    frames per second
+    window_s : float    duration of the window, in seconds: the largest odd number of frames that fits is used
+
+    Returns
+    -------
+    (F, k) bool    the flags; the first and the last are continued beyond the ends
+    """
     reach = max(0, (int(window_s * frame_rate_hz + 1e-9) - 1) // 2)
-    padded = np.pad(slow, ((reach + 1, reach), (0, 0)), mode="edge")
+    padded = np.pad(flags, ((reach + 1, reach), (0, 0)), mode="edge")
     padded[0] = False
     total = np.cumsum(padded, axis=0, dtype=np.int64)
-    votes = total[2 * reach + 1 :] - total[: len(slow)]
-    standing: NDArray[np.bool_] = 2 * votes > 2 * reach + 1
-    return standing
+    votes = total[2 * reach + 1 :] - total[: len(flags)]
+    steady: NDArray[np.bool_] = 2 * votes > 2 * reach + 1
+    return steady

@@ -13,9 +13,16 @@ from marey_motion.evaluation.suite import assemble, run_suite
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import TrialRecord
 from marey_schemas.options.evaluation import EvaluationOptions
+from marey_schemas.options.matching import ControllerOptions
 
 OPTIONS = EvaluationOptions(
-    speeds_m_s=(1.0, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), approach_s=2.0, duration_s=6.0, families=("circle",)
+    speeds_m_s=(1.0, 2.0),
+    turn_rates_deg_s=(-50.0, 0.0, 50.0),
+    approach_s=2.0,
+    duration_s=6.0,
+    families=("circle",),
+    # A frame that is barred near the current one could be chosen in a copy of its clip.
+    controller=ControllerOptions(reselect_window_s=0.0),
 )
 UNWANTED = ("fast_000", "fast_001")
 

@@ -20,7 +20,7 @@ from marey_motion.rigs import map_joints
 from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
 
 FOLLOWS = ("time", "path", "open_loop")
-EXACT = ControllerOptions(root_inertialisation=False)
+EXACT = ControllerOptions(root_inertialisation=False, reselect_window_s=0.0)
 """Options without blending, so that the root moves exactly as in the rows."""
 
 HORIZONS = (20, 40, 60)

@@ -21,6 +21,9 @@ from marey_schemas.documents.evaluations import COSTS
 from marey_schemas.queue.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
 from marey_schemas.queue.jobs import JobCreate
 
+TRIAL_VERDICT = ("followed", "worst_rank", "beyond_limits")
+"""Verdict on a trial: whether it was followed, its place in the order of the worst (0: the worst), exceeded limits."""
+
 
 class EvaluationHandle(ReportedHandle):
     """Handle of an evaluation."""
@@ -33,7 +36,7 @@ class EvaluationHandle(ReportedHandle):
         return self.part("evaluation", revision=revision)
 
     def trials(self) -> list[dict[str, Any]]:
-        """Return one row per trial: name, requested motion, and metrics."""
+        """Return one row per trial: name, requested motion, verdict, and metrics."""
         return list(trial_rows(self.document()))
 
     def clips(self) -> list[dict[str, Any]]:
@@ -143,7 +146,10 @@ class EvaluationHandle(ReportedHandle):
 
 
 def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Return one flat row for each trial of an evaluation's document: its requested motion and its metrics."""
+    """Return one flat row for each trial of an evaluation's document: its requested motion, verdict and metrics.
+
+    Evaluations of old versions have no verdict on single trials.
+    """
     for one in document["trials"]:
         asked = one["trial"]
         turn_rate_deg_s = math.degrees(asked["turn_rate_rad_s"])
@@ -152,6 +158,7 @@ def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
             "family": asked["family"],
             "speed_m_s": asked["speed_m_s"],
             "turn_rate_deg_s": turn_rate_deg_s,
+            **{name: one[name] for name in TRIAL_VERDICT if name in one},
             **one["metrics"],
         }
 

@@ -32,6 +32,11 @@ LESS_IS_BETTER = (
     "pose_cost_mean",
     "pose_cost_p95",
     "response_s",
+    "response_median_s",
+    "heading_rms_deg",
+    "foot_skate",
+    "foot_depth_p95",
+    "treading_per_s",
 )
 """Metrics for which a lower value is better; for all other metrics, only the change is reported."""
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from marey_motion.arrays import Flags, Floats
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.result import Metrics, TrialResult
 from marey_motion.evaluation.scenario import TIME_TOLERANCE_S, Reference, Trial
 from marey_motion.matching.record import Status, TrialRecord
@@ -27,6 +28,8 @@ RESPONSE_SHARE = 0.1
 """A desired speed counts as reached if the error stays below this share of the desired speed for `RESPONSE_HOLD_S`."""
 RESPONSE_HOLD_S = 0.5
 """Seconds for which the error must stay below `RESPONSE_SHARE` for the speed to count as reached."""
+SETTLING_S = 1.0
+"""Time around a switch of the desired speed in which the character changes its speed: it looks one second ahead."""
 LEAST_TRAVEL_M_S = 0.05
 """Speed below which the direction of travel of a step is not defined."""
 
@@ -43,6 +46,8 @@ class TrialSeries:
     wanted_speeds_m_s, wanted_turn_rates_rad_s : speed and turn rate of the reference
     offsets_m : distance from the reference at the same tick
     cross_track_m, along_track_m : components of this offset in the reference's frame, positive to the left and ahead
+    heading_errors_rad : recorded minus desired heading at the same tick
+    settled : whether the step is at least `SETTLING_S` away from switches of the desired speed
     regimes : index of the step's regime in `REGIMES`
     pieces : index of the step's period of constant desired speed, -1 for the approach
     """
@@ -57,6 +62,8 @@ class TrialSeries:
     offsets_m: Floats
     cross_track_m: Floats
     along_track_m: Floats
+    heading_errors_rad: Floats
+    settled: Flags
     regimes: NDArray[np.int8]
     pieces: NDArray[np.int64]
 
@@ -101,12 +108,20 @@ def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> Tri
         offsets_m=np.hypot(apart[:, 0], apart[:, 1]),
         cross_track_m=apart[:, 0] * cosine - apart[:, 1] * sine,
         along_track_m=apart[:, 0] * sine + apart[:, 1] * cosine,
+        heading_errors_rad=record.headings[1:] - reference.headings[1:ticks],
+        settled=_settled(trial, np.arange(ticks - 1) / rate),
         regimes=np.where(pieces < 0, 0, 1 + pieces % 2).astype(np.int8),
         pieces=pieces,
     )
 
 
-def measure_trial(trial: Trial, reference: Reference, record: TrialRecord, options: EvaluationOptions) -> TrialResult:
+def measure_trial(
+    trial: Trial,
+    reference: Reference,
+    record: TrialRecord,
+    options: EvaluationOptions,
+    looks: LooksMeter | None = None,
+) -> TrialResult:
     """Compute every metric of one trial (docs/explanation/evaluation.md), and of each regime if there are several.
 
     Parameters
@@ -115,6 +130,7 @@ def measure_trial(trial: Trial, reference: Reference, record: TrialRecord, optio
     reference : Reference    trajectory of the trial
     record : TrialRecord    T ticks
     options : EvaluationOptions    options of the evaluation
+    looks : LooksMeter, optional    measures of looks over the database of the record; left out if None
 
     Returns
     -------
@@ -127,6 +143,8 @@ def measure_trial(trial: Trial, reference: Reference, record: TrialRecord, optio
     series = trial_series(trial, reference, record)
     window = np.full(len(series.times_s), True) if options.window == "all" else series.pieces >= 0
     metrics = _metrics(series, record, window)
+    if looks is not None:
+        metrics |= looks.measure(record, window)
     if options.literal_formulas:
         metrics |= _literal_metrics(series, window, options)
     regimes = {}
@@ -144,6 +162,15 @@ def _pieces(trial: Trial, times_s: Floats) -> NDArray[np.int64]:
     return np.where(on_circle < 0.0, -1, 0).astype(np.int64)
 
 
+def _settled(trial: Trial, times_s: Floats) -> Flags:
+    """Mark the times that are not near a switch of the desired speed; if switches are frequent, half of all times."""
+    if trial.family != "switching":
+        return np.full(len(times_s), True)
+    margin_s = min(SETTLING_S, 0.25 * trial.switch_every_s)
+    since_s = np.mod(times_s + TIME_TOLERANCE_S - trial.approach_s, trial.switch_every_s)
+    return (since_s >= margin_s) & (since_s < trial.switch_every_s - margin_s)
+
+
 def _travel_turn_rates(steps: Floats, speeds: Floats, pieces: NDArray[np.int64], rate: float) -> Floats:
     """Compute the turn rate of the direction of travel between each step and the one before it.
 
@@ -157,9 +184,11 @@ def _travel_turn_rates(steps: Floats, speeds: Floats, pieces: NDArray[np.int64],
 
 
 def _metrics(series: TrialSeries, record: TrialRecord, window: Flags) -> dict[str, float | None]:
+    speeds = _speed_metrics(series, window)
     return {
-        **_speed_metrics(series, window),
+        **speeds,
         **_offset_metrics(series, window),
+        **_settled_metrics(series, window, speeds),
         **_response_metrics(series, window),
         **_switch_metrics(record, window),
         **_cost_metrics(record, window),
@@ -212,8 +241,27 @@ def _offset_metrics(series: TrialSeries, window: Flags) -> dict[str, float | Non
     return metrics
 
 
+def _settled_metrics(series: TrialSeries, window: Flags, speeds: Metrics) -> dict[str, float | None]:
+    """Compute error and spread of the speed away from its switches, and the error of the heading as an angle.
+
+    `speeds` are the metrics of the whole window, which are the same if the speed does not switch.
+    """
+    heading = _of(_rms, series.heading_errors_rad[window])
+    heading_deg = None if heading is None else float(np.degrees(heading))
+    if series.settled.all():
+        return {"settled_se_v": speeds["se_v"], "settled_dse_v": speeds["dse_v"], "heading_rms_deg": heading_deg}
+    settled = window & series.settled
+    errors = (series.speeds_m_s - series.wanted_speeds_m_s)[settled]
+    spread = _pooled_spread(series.speeds_m_s[settled], series.regimes[settled])
+    return {"settled_se_v": _of(np.mean, errors), "settled_dse_v": spread, "heading_rms_deg": heading_deg}
+
+
 def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None]:
-    """Compute the mean response time to speed switches, None without responses; count switches without response."""
+    """Compute mean and median response time to speed switches, and count switches without response.
+
+    The mean is that of the switches with a response. In the median, switches without response count as longer than all
+    others; it is None if half of the switches or more have no response.
+    """
     times = [
         _response_s(series, first, stop)
         for first, stop in _stretches(series.pieces)
@@ -222,8 +270,15 @@ def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | N
     answered = [time for time in times if time is not None]
     return {
         "response_s": float(np.mean(answered)) if answered else None,
+        "response_median_s": _censored_median(answered, len(times)),
         "response_missed": float(len(times) - len(answered)),
     }
+
+
+def _censored_median(answered: Sequence[float], count: int) -> float | None:
+    """Compute the median of `count` times, of which only the `answered` ones are known and all others are longer."""
+    middle = sorted(answered)[(count - 1) // 2 : count // 2 + 1] if count else []
+    return float(np.mean(middle)) if len(middle) == 1 + (count + 1) % 2 else None
 
 
 def _stretches(pieces: NDArray[np.int64]) -> list[tuple[int, int]]:

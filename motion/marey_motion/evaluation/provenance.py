@@ -44,6 +44,7 @@ def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials
         options=_digest({"database": database.options, "controller": options.controller, "window": options.window}),
         scenarios=_digest(list(trials)),
         code_version=code_version(),
+        limits=_digest(options.limits),
     )
 
 
@@ -75,6 +76,10 @@ _CONDITIONS = {
     "normaliser": ("normalisers", "evaluate both with one pinned normaliser, or with one fitted on both"),
     "options": ("options", "evaluate both with the same database, controller and window"),
     "scenarios": ("scenarios", "evaluate both over the same trials"),
+    "limits": (
+        "limits of the verdict",
+        "evaluate both with the same limits, and again if one of them has none, since looks were not measured then",
+    ),
 }
 
 
@@ -115,4 +120,4 @@ def _canonical(value: Any) -> Any:
 
 
 def _short(digest: str) -> str:
-    return digest[: len("sha256:") + 12]
+    return digest[: len("sha256:") + 12] or "none"

@@ -228,11 +228,26 @@ def treading_share(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]
     -------
     float or None    0 to 1; None if no jump was chosen
     """
-    made = back = 0
-    for record in records:
-        jumps = find_jumps(clips, record)
-        left, entered = jumps.left[~jumps.forced], jumps.entered[~jumps.forced]
-        same = clips_of_rows(clips, left) == clips_of_rows(clips, entered)
-        made += len(left)
-        back += int(np.count_nonzero(same & (np.abs(entered - left) <= TREADING_S * record.rate_hz)))
+    made = sum(int(np.count_nonzero(record.status[1:] == Status.REPLACING)) for record in records)
+    back = sum(int(np.count_nonzero(treading_steps(clips, record))) for record in records)
     return back / made if made else None
+
+
+def treading_steps(clips: Sequence[DatabaseClip], record: TrialRecord) -> NDArray[np.bool_]:
+    """Mark the chosen jumps of a trial that lead to a frame of the same clip at most `TREADING_S` away.
+
+    Parameters
+    ----------
+    clips : sequence of DatabaseClip    the clips
+    record : TrialRecord    T ticks
+
+    Returns
+    -------
+    (T - 1,) bool    True if such a jump leads from a tick to the next
+    """
+    rows = record.rows.astype(np.int64)
+    back: NDArray[np.bool_] = record.status[1:] == Status.REPLACING
+    back &= np.abs(np.diff(rows)) <= TREADING_S * record.rate_hz
+    at = np.flatnonzero(back)
+    back[at] = clips_of_rows(clips, rows[at]) == clips_of_rows(clips, rows[at + 1])
+    return back

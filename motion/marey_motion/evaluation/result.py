@@ -84,7 +84,10 @@ class Coverage:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Digests ("sha256:…") of the data of an evaluation and of the conditions that comparable evaluations share."""
+    """Digests ("sha256:…") of the data of an evaluation and of the conditions that comparable evaluations share.
+
+    `limits` is "" in results of versions that did not measure looks.
+    """
 
     dataset: str
     clips: Mapping[str, str]
@@ -92,6 +95,7 @@ class Provenance:
     options: str
     scenarios: str
     code_version: str
+    limits: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.judgement import judge
 from marey_motion.evaluation.perceived import PerceivedTransitions
 from marey_motion.evaluation.result import ClipUsage, Coverage, EvaluationResult, Provenance, TrialResult
 from marey_motion.evaluation.scenario import Trial
@@ -40,13 +41,22 @@ def result_to_tree(result: EvaluationResult) -> Tree:
 
 
 def _result_body(result: EvaluationResult) -> Tree:
+    judgement = judge(result)
+    ranks = {each.outcome.trial.name: rank for rank, each in enumerate(judgement.ranked)}
     return {
         "options": _options_to_tree(result.options),
         "provenance": _plain(asdict(result.provenance)),
         "clips": [_plain(asdict(clip)) for clip in result.clips],
         "trials": [
-            {"trial": asdict(one.trial), "metrics": dict(one.metrics), "regimes": _plain(one.regimes)}
-            for one in result.trials
+            {
+                "trial": asdict(one.outcome.trial),
+                "metrics": dict(one.outcome.metrics),
+                "regimes": _plain(one.outcome.regimes),
+                "followed": one.followed,
+                "worst_rank": ranks[one.outcome.trial.name],
+                "beyond_limits": list(dict.fromkeys(check.measure for check in one.exceeded)),
+            }
+            for one in judgement.trials
         ],
         "suite": dict(result.suite),
         "usage": {
@@ -128,7 +138,8 @@ def options_from_tree(tree: Mapping[str, Any]) -> EvaluationOptions:
     ValidationError    if a value is out of range
     """
     flat = {**tree, **tree["grid"]}
-    return EvaluationOptions.model_validate({name: flat[name] for name in EvaluationOptions.model_fields})
+    known = EvaluationOptions.model_fields.keys() & flat.keys()  # results of old versions have no limits
+    return EvaluationOptions.model_validate({name: flat[name] for name in known})
 
 
 def _options_to_tree(options: EvaluationOptions) -> Tree:

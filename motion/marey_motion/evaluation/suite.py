@@ -14,6 +14,7 @@ from math import radians
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import measure_coverage
+from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.metrics import measure_trial, offset_asymmetry, pooled_metrics
 from marey_motion.evaluation.provenance import provenance_of
 from marey_motion.evaluation.relevance import count_switches, measure_usage, treading_share, unused_clips
@@ -182,9 +183,9 @@ def assemble(
     """
     if len(trials) != len(records):
         raise MotionError(f"each trial needs one record, but there are {len(records)} records for {len(trials)} trials")
-    rate = database.options.rate_hz
+    rate, looks = database.options.rate_hz, LooksMeter(database, options.controller)
     results = tuple(
-        measure_trial(trial, reference(trial, rate), record, options)
+        measure_trial(trial, reference(trial, rate), record, options, looks)
         for trial, record in zip(trials, records, strict=True)
     )
     usage = measure_usage(database.clips, records)

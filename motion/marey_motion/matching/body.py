@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,21 @@ from marey_motion.skeleton import Skeleton
 
 POSE_JOINTS = ("pelvis", "spine_2", "head", "left_wrist", "right_wrist", "left_ankle", "right_ankle")
 """Standard joints over which the pose cost of a transition is summed: hips, spine, head, hands, feet."""
+
+
+class JointChain(NamedTuple):
+    """Some joints of a skeleton with all their ancestors.
+
+    Parameters
+    ----------
+    joints : (K,) int64    indices of all these joints in the whole skeleton, increasing
+    skeleton : Skeleton    a skeleton of only these K joints
+    ends : (P,) int64    the joints from which the chain was made, in their order, as indices in `joints`
+    """
+
+    joints: NDArray[np.int64]
+    skeleton: Skeleton
+    ends: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,17 +103,36 @@ class MatchingBody:
         )
 
     @cached_property
-    def pose_chain(self) -> tuple[NDArray[np.int64], Skeleton]:
-        """Indices (K,) of the pose joints and all their ancestors, increasing, and a skeleton of only these joints."""
-        needed = {0}
-        for joint in self.pose_joints:
-            while joint > 0:
-                needed.add(joint)
-                joint = int(self.skeleton.parents[joint])
-        whole, chain = self.skeleton, np.array(sorted(needed), dtype=np.int64)
-        parents = np.concatenate(([-1], np.searchsorted(chain, whole.parents[chain[1:]])))
-        names = tuple(whole.joint_names[joint] for joint in chain)
-        return chain, Skeleton(names, parents.astype(np.int32), whole.offsets[chain], whole.rest_rotations[chain])
+    def pose_chain(self) -> JointChain:
+        """The pose joints and all their ancestors."""
+        return joint_chain(self.skeleton, self.pose_joints)
+
+    @cached_property
+    def leg_chain(self) -> JointChain:
+        """The toes and all their ancestors."""
+        return joint_chain(self.skeleton, self.toes)
+
+
+def joint_chain(skeleton: Skeleton, joints: Sequence[int]) -> JointChain:
+    """Find some joints of a skeleton with all their ancestors.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    joints : sequence of int    indices of the joints
+
+    Returns
+    -------
+    JointChain    K joints
+    """
+    needed = {0}
+    for joint in joints:
+        needed.update(skeleton.path_to_root(joint))
+    chain = np.array(sorted(needed), dtype=np.int64)
+    parents = np.concatenate(([-1], np.searchsorted(chain, skeleton.parents[chain[1:]])))
+    names = tuple(skeleton.joint_names[joint] for joint in chain)
+    part = Skeleton(names, parents.astype(np.int32), skeleton.offsets[chain], skeleton.rest_rotations[chain])
+    return JointChain(chain, part, np.searchsorted(chain, np.array(joints, dtype=np.int64)))
 
 
 def _carrier(skeleton: Skeleton, standard_joints: Mapping[str, int]) -> int:

@@ -9,6 +9,7 @@ from marey_motion import quaternions
 from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.kinematics import as_kernel_input, forward_kinematics
+from marey_motion.matching.body import JointChain
 from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.inertialisation import decay_matrix
 from marey_motion.matching.record import TrialRecord
@@ -64,15 +65,33 @@ def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: Con
     -------
     (T,) float64    metres, summed over the pose joints
     """
-    chain, skeleton = database.body.pose_chain
-    poses, places = _inertialised(database, rows, chain, options.half_life_s)
-    moved = np.flatnonzero(np.isin(chain, database.translated_joints))
-    shown = forward_kinematics(skeleton, poses, translations=places, translated_joints=tuple(moved.tolist()))
-    points = shown[:, np.searchsorted(chain, database.body.pose_joints)]
+    points = displayed_points(database, rows, database.body.pose_chain, options)
     after = database.root_motion.successors[rows[-1]]
     following = np.append(rows[1:], after if after >= 0 else rows[-1])
     distances: Floats = np.linalg.norm(points - database.pose_points[following], axis=-1).sum(axis=-1)
     return distances
+
+
+def displayed_points(
+    database: MatchingDatabase, rows: NDArray[np.int32], chain: JointChain, options: ControllerOptions
+) -> Floats:
+    """Compute where joints are displayed, with the remaining offsets of earlier switches.
+
+    Parameters
+    ----------
+    database : MatchingDatabase    the database that the trial used
+    rows : (T,) int32    displayed rows
+    chain : JointChain    the joints, with their ancestors
+    options : ControllerOptions    options of the trial
+
+    Returns
+    -------
+    (T, P, 3) float64    positions of the chain's ends in the frame of the root, metres
+    """
+    poses, places = _inertialised(database, rows, chain.joints, options.half_life_s)
+    moved = np.flatnonzero(np.isin(chain.joints, database.translated_joints))
+    shown = forward_kinematics(chain.skeleton, poses, translations=places, translated_joints=tuple(moved.tolist()))
+    return np.asarray(shown[:, chain.ends], dtype=np.float64)
 
 
 def switched_rows(database: MatchingDatabase, rows: NDArray[np.int32]) -> NDArray[np.int64]:

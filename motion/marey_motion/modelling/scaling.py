@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from marey_motion import kinematics
+from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Floats
 from marey_motion.skeleton import Skeleton
 
@@ -47,13 +47,15 @@ def jacobian_weights(skeleton: Skeleton, poses: Floats) -> Floats:
     Parameters
     ----------
     skeleton : Skeleton    J joints
-    poses : (F, D) float64    typical poses, such as those of the mean motion
+    poses : (F, D) float64    typical poses, such as those of the mean motion; rotations are normalised first, because
+        those of a mean are shorter than 1
 
     Returns
     -------
     (D,) float64    metres per unit of each channel
     """
-    joints = kinematics.forward_kinematics(skeleton, poses)
+    rotations = quaternions.normalise(poses[:, 3:].reshape(len(poses), -1, 4)).reshape(len(poses), -1)
+    joints = kinematics.forward_kinematics(skeleton, np.concatenate((poses[:, :3], rotations), axis=1))
     below = _descent(skeleton)
     squares = np.zeros(skeleton.joint_count)
     block = max(1, MOST_DIFFERENCES // skeleton.joint_count**2)

@@ -58,6 +58,7 @@ def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: Mo
                 f"{options.spatial_share:.0%} of the variance",
             )
         )
+    found += _of_time_components(primitive, report, options)
     errors = report.reconstruction
     if errors is not None and primitive.spatial.count < len(errors.components):
         training, left_out = (curve[primitive.spatial.count] for curve in (errors.training_cm, errors.left_out_cm))
@@ -81,6 +82,22 @@ def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: Mo
             )
         )
     return found
+
+
+def _of_time_components(primitive: MotionPrimitive, report: TrainingReport, options: ModelOptions) -> list[Warned]:
+    """Warn if the greatest number of time components was too low for the share of the variance that was asked for."""
+    kept = primitive.temporal.count
+    held = float(report.temporal_energy[kept - 1]) if 0 < kept <= len(report.temporal_energy) else 0.0
+    if kept < options.most_temporal_components or kept >= len(report.temporal_energy) or held >= options.temporal_share:
+        return []
+    return [
+        Warned(
+            "time-components-missing",
+            f"{kept} temporal components explain {held:.0%} of the variance of the timing, but "
+            f"{options.temporal_share:.0%} were asked for; raise most_temporal_components, or accept that samples vary "
+            "less in their timing than the examples",
+        )
+    ]
 
 
 def _likelihood(example: ExampleReport) -> float:

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from marey_motion.evaluation.judgement import is_followed, judge, strain
+from marey_motion.evaluation.judgement import LimitCheck, Measure, TrialVerdict, exceeded_in_suite, judge
 from marey_motion.evaluation.relevance import SourceUsage, recorded_rows, sum_by_source
-from marey_motion.evaluation.result import EvaluationResult, TrialResult
+from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.scenario import demand
 from marey_reports.drawing.markup import Content, Html, element, joined
 from marey_reports.drawing.page import Section, shown
@@ -48,7 +48,8 @@ def headline(result: EvaluationResult) -> Html:
     covered = int(np.count_nonzero(coverage.deficit_s <= 0.0))
     return facts(
         (
-            ("trajectories followed", f"{judgement.followed} of {judgement.trials}", judgement.grade),
+            ("trajectories followed", f"{judgement.followed} of {len(judgement.trials)}", judgement.grade),
+            ("feet in contact slide at", _written(result, "foot_skate"), _beside_clips(result)),
             ("distance from the path", _written(result, "offset_mean"), beside),
             ("speeds and turns covered", f"{covered} of {coverage.deficit_s.size}", f"{duration(held)} of clips"),
             ("clips used", f"{used} of {len(sources)}", _mirroring(result)),
@@ -74,15 +75,17 @@ def coverage_chapter(result: EvaluationResult, figures: Figures) -> Section:
 
 def error_chapter(result: EvaluationResult, figures: Figures) -> Section:
     """Write the chapter on the errors of the character, the worst trials first."""
-    worst = sorted(result.trials, key=lambda each: (-strain(each).worst, each.trial.name))[:WORST_TRIALS]
-    lost = sum(not is_followed(each) for each in result.trials)
+    judgement = judge(result)
+    lost = len(judgement.trials) - judgement.followed
     text = (
         "The character follows every trajectory."
         if not lost
-        else f"The character does not follow {lost:,} of {counted(len(result.trials), 'trajectory')}."
+        else f"The character does not follow {lost:,} of {counted(len(result.trials), 'trajectory')}. In "
+        f"{len(judgement.trials) - judgement.on_path:,}, it loses place, speed or heading; in the others, it does not "
+        "look right."
     )
-    rows = [_trial_row(each) for each in worst]
-    listing = table("The worst trials; values beyond their limits are marked", TRIAL_HEADS, rows, numbers=range(1, 8))
+    rows = [_trial_row(each) for each in judgement.ranked[:WORST_TRIALS]]
+    listing = table("The worst trials; values beyond their limits are marked", TRIAL_HEADS, rows, numbers=TRIAL_NUMBERS)
     pictures = (
         shown(figures, "offsets"),
         listing,
@@ -170,19 +173,21 @@ def baseline_chapter(result: EvaluationResult) -> Section:
     """
     base = result.baseline
     heads = ["measure", "this dataset", *(["generated baseline"] if base is not None else []), "unit"]
+    beyond = exceeded_in_suite(result)
     rows: list[Sequence[Cell]] = []
     for name, metric in METRICS.items():
         if name not in result.suite:
             continue
-        row: list[Cell] = [metric.label, number(result.suite[name], metric.digits)]
+        look = BEYOND if METRICS[name].limited_as in beyond or name in beyond else ""
+        row: list[Cell] = [metric.label, number(result.suite[name], metric.digits, look=look)]
         if base is not None:
             row.append(number(base.suite.get(name), metric.digits))
         rows.append([*row, metric.unit])
     about = (
-        f"{HOW_POOLED} The baseline is the same suite with generated clips, one for each speed and turn rate. It shows "
-        "the results of the same motion matching if no data is missing."
+        f"{HOW_POOLED} {MARKED} The baseline is the same suite with generated clips, one for each speed and turn rate. "
+        "It shows the results of the same motion matching if no data is missing."
         if base is not None
-        else f"{HOW_POOLED} No baseline was evaluated."
+        else f"{HOW_POOLED} {MARKED} No baseline was evaluated."
     )
     listing = table("Metrics of the suite", heads, rows, numbers=range(1, len(heads) - 1), sortable=False)
     return Section("numbers", "Metrics", (element("p", about), listing))
@@ -190,7 +195,7 @@ def baseline_chapter(result: EvaluationResult) -> Section:
 
 def appendix_chapter(result: EvaluationResult) -> Section:
     """Write the appendix, which lists every trial and every clip."""
-    trials = table("All trials", TRIAL_HEADS, map(_trial_row, result.trials), numbers=range(1, 7))
+    trials = table("All trials", TRIAL_HEADS, map(_trial_row, judge(result).trials), numbers=TRIAL_NUMBERS)
     clips = table(
         "All clips",
         USE_HEADS,
@@ -212,31 +217,53 @@ HOW_POOLED = (
     "The values are means over all trials, with these exceptions: the maximum for the largest distance, the root mean "
     "square for “ahead or behind” and “beside the path”, and the sum for counts."
 )
+MARKED = "Values beyond the limits of single trials are marked."
 BEYOND = "bad"
-TRIAL_HEADS = (
-    "trial",
-    "distance (m)",
-    "largest (m)",
-    "speed error (m/s)",
-    "turn rate error (deg/s)",
-    "transitions (1/s)",
-    "response (s)",
+TRIAL_COLUMNS: tuple[tuple[str, str, tuple[Measure, ...], int, float], ...] = (
+    ("distance (m)", "offset_mean", ("place",), 2, 1.0),
+    ("largest (m)", "offset_max", (), 2, 1.0),
+    ("speed error (m/s)", "settled_se_v", ("speed",), 2, 1.0),
+    ("speed spread (m/s)", "settled_dse_v", ("speed wobble",), 2, 1.0),
+    ("turn rate error (deg/s)", "se_omega_deg", ("turn",), 1, 1.0),
+    ("turn rate spread (deg/s)", "dse_omega_deg", ("turn wobble",), 0, 1.0),
+    ("heading error (deg)", "heading_rms_deg", ("heading",), 0, 1.0),
+    ("response (s)", "response_median_s", ("response",), 2, 1.0),
+    ("feet slide (m/s)", "foot_skate", ("skating",), 2, 1.0),
+    ("feet sink (cm)", "foot_depth_p95", ("sinking",), 1, 100.0),
+    ("steps per metre", "contacts_per_m", ("gliding", "pattering"), 2, 1.0),
+    ("transition cost (m)", "pose_cost_mean", ("jerking",), 2, 1.0),
+    ("transitions (1/s)", "transitions_per_s", ("jumping",), 2, 1.0),
+    ("treading (1/s)", "treading_per_s", ("treading",), 2, 1.0),
 )
+"""Heading, metric, the measures that limit it, decimals and factor of each column of a trial's numbers."""
+SIGNED = ("settled_se_v", "se_v", "se_omega_deg")
+TRIAL_HEADS = ("trial", *(column[0] for column in TRIAL_COLUMNS))
+TRIAL_NUMBERS = range(1, len(TRIAL_COLUMNS) + 1)
 USE_HEADS = ("clip", "share of display", "length (s)", "own frames displayed", "times entered")
 
 
-def _trial_row(outcome: TrialResult) -> list[Cell]:
-    metrics, marks = outcome.metrics, [BEYOND if part > 1.0 else "" for part in strain(outcome)]
-    name = element("span", demand(outcome.trial), title=outcome.trial.name)
-    return [
-        name,
-        number(metrics.get("offset_mean"), look=marks[0]),
-        number(metrics.get("offset_max")),
-        number(metrics.get("se_v"), signed=True, look=marks[1]),
-        number(metrics.get("se_omega_deg"), 1, signed=True, look=marks[2]),
-        number(metrics.get("transitions_per_s")),
-        number(metrics.get("response_s")) if outcome.trial.family == "switching" else Number(None, ""),
-    ]
+def _trial_row(trial: TrialVerdict) -> list[Cell]:
+    outcome = trial.outcome
+    row: list[Cell] = [element("span", demand(outcome.trial), title=outcome.trial.name)]
+    for _, metric, measures, digits, factor in TRIAL_COLUMNS:
+        check = max((each for each in trial.checks if each.measure in measures), key=_strain, default=None)
+        value = outcome.metrics.get(metric) if check is None else check.value
+        look = BEYOND if check is not None and check.exceeded else ""
+        if check is not None and check.measure == "response" and check.value is None:
+            row.append(Number(None, "unanswered", look))
+            continue
+        scaled = None if value is None else factor * value
+        row.append(number(scaled, digits, signed=metric in SIGNED, look=look))
+    return row
+
+
+def _strain(check: LimitCheck) -> float:
+    return check.strain
+
+
+def _beside_clips(result: EvaluationResult) -> str:
+    of_clips = result.suite.get("foot_skate_clips")
+    return "" if of_clips is None else f"{of_clips:.2f} m/s in the clips shown"
 
 
 def _use_row(source: SourceUsage, result: EvaluationResult) -> list[Cell]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from marey_motion.evaluation.compare import Comparison, MetricChange
-from marey_motion.evaluation.judgement import Judgement, is_followed, judge
+from marey_motion.evaluation.judgement import Judgement, judge, judge_trial
 from marey_motion.evaluation.relevance import sum_by_source
 from marey_motion.evaluation.result import EvaluationResult, TrialResult
 from marey_motion.evaluation.scenario import demand
@@ -20,6 +20,7 @@ from marey_reports.evaluation.figures import (
     USE_FIGURES,
     DrawnFigure,
 )
+from marey_schemas.options.verdict import VerdictLimits
 from marey_schemas.wording import counted
 
 Figures = Mapping[str, DrawnFigure]
@@ -31,9 +32,10 @@ LEAST_SHIFT_M = 0.005  # what is written as 0.00 is neither good nor bad
 def compared(before: EvaluationResult, after: EvaluationResult) -> str:
     """Describe in one sentence whether the second evaluation is better than the first."""
     first, second = judge(before), judge(after)
-    pairs = paired(before, after)
-    gained = sum(is_followed(new) and not is_followed(old) for old, new in pairs)
-    lost = sum(is_followed(old) and not is_followed(new) for old, new in pairs)
+    kept = [{each.outcome.trial.name: each.followed for each in one.trials} for one in (first, second)]
+    shared = kept[0].keys() & kept[1].keys()
+    gained = sum(kept[1][name] and not kept[0][name] for name in shared)
+    lost = sum(kept[0][name] and not kept[1][name] for name in shared)
     if second.followed == first.followed:
         start, parts = "Neither better nor worse", [f"the character follows {_share(second)} trajectories, as before"]
     else:
@@ -119,7 +121,7 @@ def trial_chapter(
     heads = ("trial", "distance before (m)", "after (m)", "change (m)", "followed before", "after")
     listing: Content = None
     if pairs:
-        rows = [_trial_row(old, new) for old, new in pairs]
+        rows = [_trial_row(old, new, before.options.limits, after.options.limits) for old, new in pairs]
         listing = table("The largest changes", heads, rows[:MOST_TRIALS], numbers=(1, 2, 3))
         if len(rows) > MOST_TRIALS:
             everything = table("All changed trials", heads, rows, numbers=(1, 2, 3))
@@ -156,7 +158,7 @@ def _names(title: str, uids: Sequence[str], names: Mapping[str, str]) -> Html:
     return folded(heading, listing) if len(uids) > MOST_NAMES else element("div", element("h3", heading), listing)
 
 
-def _trial_row(old: TrialResult, new: TrialResult) -> list[Cell]:
+def _trial_row(old: TrialResult, new: TrialResult, *limits: VerdictLimits) -> list[Cell]:
     offsets = [each.metrics.get("offset_mean") for each in (old, new)]
     shift = _shift(old, new)
     look = "" if abs(shift) < LEAST_SHIFT_M else "good" if shift < 0.0 else "bad"
@@ -164,7 +166,7 @@ def _trial_row(old: TrialResult, new: TrialResult) -> list[Cell]:
         element("span", demand(old.trial), title=old.trial.name),
         *(number(offset) for offset in offsets),
         number(shift if None not in offsets else None, signed=True, look=look),
-        *("yes" if is_followed(each) else "no" for each in (old, new)),
+        *("yes" if judge_trial(each, own).followed else "no" for each, own in zip((old, new), limits, strict=True)),
     ]
 
 
@@ -187,7 +189,7 @@ def _look(change: MetricChange | None) -> str:
 
 
 def _share(judgement: Judgement) -> str:
-    return f"{judgement.followed} of {judgement.trials}"
+    return f"{judgement.followed} of {len(judgement.trials)}"
 
 
 def _arrow(old: str, new: str) -> str:

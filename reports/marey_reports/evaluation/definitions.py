@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from marey_motion.evaluation.judgement import GRADES, LARGEST_SPEED_SHARE, LARGEST_TURN_DEG_S, LONGEST_LAG_S
+from marey_motion.evaluation.judgement import GRADES
 from marey_reports.drawing.markup import Html, element, joined
-from marey_reports.drawing.tables import table
+from marey_reports.drawing.tables import Number, table
+from marey_schemas.options.verdict import VerdictLimits
 
 
 class Metric(NamedTuple):
-    """Metric over all trials in a report: name, unit, decimals and meaning."""
+    """Metric over all trials in a report: name, unit, decimals and meaning.
+
+    `limited_as` is the name of a metric whose limit also holds for this one, because both measure the same.
+    """
 
     label: str
     unit: str
     digits: int
     meaning: str
+    limited_as: str = ""
 
 
 METRICS = {
@@ -32,6 +37,9 @@ METRICS = {
     ),
     "abs_se_v": Metric("speed error", "m/s", 2, "absolute error of the mean speed of a trial"),
     "abs_se_omega_deg": Metric("turn rate error", "deg/s", 1, "absolute error of the mean turn rate of a trial"),
+    "heading_rms_deg": Metric(
+        "heading error", "deg", 1, "root mean square of the angle between the desired and the simulated heading"
+    ),
     "dse_v": Metric("spread of the speed", "m/s", 2, "standard deviation of the speed about its own mean"),
     "dse_omega_deg": Metric(
         "spread of the turn rate",
@@ -39,24 +47,46 @@ METRICS = {
         1,
         "standard deviation of the turn rate about its own mean; the sway of each step contributes to it",
     ),
-    "response_s": Metric(
+    "response_median_s": Metric(
         "response to a new speed",
         "s",
         2,
-        "mean time from a switch until the speed is within 10 % of the new one, and stays there for half a second",
+        "median time from a switch until the speed is within 10 % of the new one, and stays there for half a second; "
+        "switches without response count as longer than all others",
+    ),
+    "response_s": Metric(
+        "response, if there is one", "s", 2, "mean of the same time over the switches with a response only"
     ),
     "response_missed": Metric(
         "speeds never reached", "", 0, "number of switches to which the character did not respond before the next one"
     ),
+    "foot_skate": Metric(
+        "feet slide",
+        "m/s",
+        2,
+        "mean speed of the toes on the ground while the foot is in contact in the displayed clip",
+    ),
+    "foot_skate_clips": Metric("feet slide in the clips", "m/s", 2, "the same in the clips shown, without transitions"),
+    "foot_depth_p95": Metric(
+        "feet sink", "m", 3, "depth of the lower toe below the mean height of toes in contact; 95 % of it is less"
+    ),
+    "contacts_per_m": Metric("steps per metre", "1/m", 2, "number of times that a foot comes into contact, per metre"),
+    "contacts_per_m_clips": Metric("steps per metre in the clips", "1/m", 2, "the same in the clips shown"),
     "pose_cost_mean": Metric(
         "transition cost", "m", 3, "distance over hips, spine, head, hands and feet from one displayed pose to the next"
     ),
     "pose_cost_p95": Metric("transition cost, 95 %", "m", 3, "95 % of the transition costs are below"),
+    "pose_cost_clips": Metric(
+        "change of pose in the clips", "m", 3, "the same distance between successive frames of the clips shown"
+    ),
     "transitions_per_s": Metric(
         "transitions", "1/s", 2, "number of jumps per second that a search chose although the clip could have continued"
     ),
+    "treading_per_s": Metric(
+        "treading", "1/s", 2, "number of transitions per second to a frame of the same clip at most 1/3 s away"
+    ),
     "treading_share": Metric(
-        "treading", "", 2, "share of the transitions that lead to a frame of the same clip at most 1/3 s away"
+        "share of treading", "", 2, "share of these transitions in all transitions", limited_as="treading_per_s"
     ),
     "clip_ends": Metric("clip ends met", "", 0, "number of jumps at the end of a clip and of restarts of a loop"),
     "offset_asymmetry": Metric(
@@ -73,7 +103,7 @@ _READINGS = (
     (
         "static errors (equations 1 and 2)",
         "1/m · Σ v_r − v_ref over m + 1 terms, brackets missing",
-        "signed bias: the mean of recorded minus desired values over the steps of the circle. Too fast and too far to "
+        "signed bias: the mean of simulated minus desired values over the steps of the circle. Too fast and too far to "
         "the left are positive.",
     ),
     (
@@ -90,7 +120,7 @@ _READINGS = (
     (
         "sign of errors (figure 8)",
         "a peak at +1.5 m/s for a speed that is not reached",
-        "recorded minus desired everywhere; the option negate_errors of figures reverses the sign.",
+        "simulated minus desired everywhere; the option negate_errors of figures reverses the sign.",
     ),
     (
         "window of evaluation",
@@ -119,24 +149,22 @@ _COVERAGE = (
 )
 
 
-def definitions() -> Html:
-    """Write the definitions of metrics, the rules of the verdict, and our interpretation of every ambiguous formula."""
+def definitions(limits: VerdictLimits) -> Html:
+    """Write the definitions of metrics, the limits of the verdict, and our interpretation of ambiguous formulas."""
     metrics = [
         (metric.label, metric.unit, metric.meaning, element("code", name, class_="name"))
         for name, metric in METRICS.items()
     ]
-    rules = (
-        f"its distance from the desired position is at most the distance that it travels in {LONGEST_LAG_S:g} s at the "
-        "desired speed",
-        f"its speed differs from the desired speed by at most {100 * LARGEST_SPEED_SHARE:g} %",
-        f"its turn rate differs from the desired turn rate by at most {LARGEST_TURN_DEG_S:g} degrees per second",
-    )
+    rules = [
+        (name, Number(value, f"{value:g}"), VerdictLimits.model_fields[name].description)
+        for name, value in limits.model_dump().items()
+    ]
     grades = ", ".join(f"from {100 * share:g} % {name}" for share, name in GRADES[:-1])
     return joined(
         (
             element("h3", "Followed trajectories"),
-            element("p", "The character follows a trajectory if, on average over the trial:"),
-            element("ul", [element("li", rule) for rule in rules]),
+            element("p", "The character follows a trajectory if it exceeds none of these limits:"),
+            table("Limits of a trial", ("limit", "value", "meaning"), rules, numbers=(1,), sortable=False),
             element(
                 "p",
                 f"The share of followed trajectories determines the grade: {grades}, below that {GRADES[-1][1]}.",

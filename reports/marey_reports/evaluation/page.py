@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
-import numpy as np
-
 from marey_motion.evaluation.compare import Comparison
-from marey_motion.evaluation.judgement import judge, strain
-from marey_motion.evaluation.relevance import sum_by_source
-from marey_motion.evaluation.result import EvaluationResult, TrialResult
-from marey_motion.evaluation.scenario import demand
+from marey_motion.evaluation.result import EvaluationResult
 from marey_reports.drawing.markup import element
 from marey_reports.drawing.page import Section, page
 from marey_reports.evaluation.chapters import (
@@ -36,9 +30,9 @@ from marey_reports.evaluation.comparison import (
 from marey_reports.evaluation.definitions import definitions
 from marey_reports.evaluation.figures import DrawnFigure, draw_figures
 from marey_reports.evaluation.provenance import provenance
-from marey_schemas.wording import counted
+from marey_reports.evaluation.sentences import region_verdicts, verdict
 
-__all__ = ["compared", "render_comparison", "render_report", "verdict"]
+__all__ = ["compared", "render_comparison", "render_report"]
 
 
 def render_report(result: EvaluationResult, *, title: str, figures: Mapping[str, DrawnFigure] | None = None) -> str:
@@ -58,10 +52,11 @@ def render_report(result: EvaluationResult, *, title: str, figures: Mapping[str,
         recording_chapter(result, drawn),
         baseline_chapter(result),
         appendix_chapter(result),
-        Section("definitions", "Definitions", definitions()),
+        Section("definitions", "Definitions", definitions(result.options.limits)),
         Section("provenance", "Provenance", (provenance([result], ["value"]), notes(result))),
     ]
-    lead = element("p", verdict(result), class_="verdict"), headline(result)
+    regions = element("ul", [element("li", region.sentence) for region in region_verdicts(result)], class_="regions")
+    lead = element("p", verdict(result), class_="verdict"), regions, headline(result)
     return page(title, lead, sections, f"Written by Marey {result.provenance.code_version}.")
 
 
@@ -88,41 +83,8 @@ def render_comparison(
         trial_chapter(before, after, comparison, drawn),
         clip_chapter(before, after, drawn),
         coverage_of_two_chapter(drawn),
-        Section("definitions", "Definitions", definitions()),
+        Section("definitions", "Definitions", definitions(after.options.limits)),
         Section("provenance", "Provenance", provenance([before, after], labels)),
     ]
     lead = element("p", compared(before, after), class_="verdict"), headline_of_two(before, after, labels)
     return page(title, lead, sections, f"Written by Marey {after.provenance.code_version}.")
-
-
-def verdict(result: EvaluationResult) -> str:
-    """Summarise quality, largest errors, coverage and unused data in one sentence."""
-    judgement = judge(result)
-    if judgement.worst is None:
-        return "Not judged: the evaluation has no trials."
-    parts = [f"the character follows {judgement.followed} of {counted(judgement.trials, 'trajectory')}"]
-    if judgement.followed < judgement.trials:
-        parts[0] += f", worst at a {demand(judgement.worst.trial)} ({_failing(judgement.worst)})"
-    missing = result.coverage.deficit_s
-    enough = int(np.count_nonzero(missing <= 0.0))
-    parts.append(f"{enough} of {counted(missing.size, 'cell')} of speed and turn rate hold enough data")
-    sources = sum_by_source(result.clips, result.usage)
-    unused = sum(1 for source in sources if not source.ticks)
-    if unused:
-        parts.append(f"{unused} of {counted(len(sources), 'clip')} {'is' if unused == 1 else 'are'} never used")
-    return f"{judgement.grade.capitalize()}: {'; '.join(parts)}."
-
-
-def _failing(outcome: TrialResult) -> str:
-    """Describe the error of a trial (offset, speed or turn rate) that is largest relative to its limit."""
-    kind = max(zip(strain(outcome), ("offset_mean", "se_v", "se_omega_deg"), strict=True))
-    value = outcome.metrics.get(kind[1])
-    if value is None or math.isinf(kind[0]):
-        return "not measured"
-    if kind[1] == "offset_mean":
-        return f"{value:.1f} m off on average"
-    if kind[1] == "se_v":
-        return f"{abs(value):.1f} m/s too {'fast' if value > 0.0 else 'slow'}"
-    turn = outcome.trial.turn_rate_rad_s
-    much = value * turn > 0.0 if turn else True
-    return f"{abs(value):.0f} deg/s too {'much' if much else 'little'}"

@@ -68,6 +68,15 @@ REMOVAL_FACETS: Mapping[str, str] = MappingProxyType(
 """Meaning of each facet (published number) that a job of the kind `suggest` gives to clips, by name of the facet."""
 
 
+class RegionVerdict(Request):
+    """Verdict on the trials of one region, such as sharp turns."""
+
+    region: str = Field(max_length=64, description="Name of the region.")
+    followed: int = Field(ge=0, description="Number of followed trials.")
+    trials: int = Field(ge=0, description="Number of trials; 0 if no trial asks for such motion.")
+    sentence: str = Field(max_length=2000, description="The verdict in one sentence.")
+
+
 class EvaluationDocument(Request):
     """Part `evaluation`: options, provenance, metrics of every trial, usage, coverage, baseline.
 
@@ -79,6 +88,9 @@ class EvaluationDocument(Request):
 
     schema_: Literal["marey/evaluation@1"] = Field("marey/evaluation@1", alias="schema")
     verdict: str = Field(max_length=2000, description="Assessment of the clips in one or two sentences.")
+    regions: tuple[RegionVerdict, ...] = Field(
+        (), max_length=16, description="Verdict on each region of the trials; empty in evaluations of old versions."
+    )
     headline: dict[str, float | int | None] = Field(
         max_length=64, description="Numbers by name, shown in lists of items."
     )

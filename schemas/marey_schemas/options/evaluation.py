@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from marey_schemas.base import Options
 from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
+from marey_schemas.options.verdict import VerdictLimits
 
 Family = Literal["circle", "switching"]
 Speed = Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)]
@@ -92,6 +93,7 @@ class EvaluationOptions(Grid):
         DatabaseOptions(), description="Options of the database that is built from the clips."
     )
     controller: ControllerOptions = Field(ControllerOptions(), description="Options of the motion matching controller.")
+    limits: VerdictLimits = Field(VerdictLimits(), description="Limits within which a trial counts as followed.")
 
     @model_validator(mode="after")
     def _check_families(self) -> Self:

@@ -129,11 +129,12 @@ class ControllerOptions(Options):
         description="Least reduction of the cost for which the character switches to another clip or frame.",
     )
     reselect_window_s: float = Field(
-        0.0,
+        1 / 3,
         ge=0,
         le=10,
         allow_inf_nan=False,
-        description="Seconds around the current frame that a search does not select.",
+        description="Seconds around the current frame that a search does not select, so that the character does not "
+        "tread on the spot; 0 allows all frames.",
     )
     half_life_s: float = Field(
         0.1,

@@ -35,7 +35,7 @@ EVALUATE = KindDeclaration(
     implementation="marey_worker.kinds.evaluate:run",
     gathering="marey_worker.kinds.evaluate:gather",
     task_count=job_params.count_evaluation_tasks,
-    version=3,
+    version=4,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to evaluate, all of one skeleton."),
         "rig": RIG,
@@ -56,7 +56,7 @@ COMPARE = KindDeclaration(
     description="Compares two evaluations trial by trial, with confidence intervals of the changes.",
     params=job_params.CompareParams,
     implementation="marey_worker.kinds.compare:run",
-    version=1,
+    version=2,
     inputs={
         "before": InputSpec(kind=Kind.EVALUATION, description="The evaluation before the change."),
         "after": InputSpec(
@@ -126,7 +126,7 @@ SUGGEST = KindDeclaration(
     "coverage.",
     params=job_params.SuggestParams,
     implementation="marey_worker.kinds.suggest:run",
-    version=2,
+    version=3,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES, "metric": METRIC},
     outputs={"document": "file"},
     facets=REMOVAL_FACETS,
@@ -137,7 +137,7 @@ OPTIMISE = KindDeclaration(
     description="Removes clips from an evaluated set and adds others, step by step, as long as the set improves.",
     params=job_params.OptimiseParams,
     implementation="marey_worker.kinds.optimise:run",
-    version=1,
+    version=2,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES},
     outputs={"document": "file"},
 )
@@ -149,7 +149,7 @@ SWEEP = KindDeclaration(
     implementation="marey_worker.kinds.sweep:run",
     gathering="marey_worker.kinds.sweep:gather",
     task_count=job_params.count_sweep_tasks,
-    version=1,
+    version=2,
     inputs={"evaluation": _EVALUATED},
     outputs={"document": "file"},
 )

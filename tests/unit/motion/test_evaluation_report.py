@@ -24,7 +24,7 @@ from tests.support.report_pages import HOSTILE, Page, is_sound
 from tests.support.tiers import is_soak
 
 from marey_motion.evaluation.compare import compare_results
-from marey_motion.evaluation.judgement import is_followed, judge, mean_speed_m_s
+from marey_motion.evaluation.judgement import GRADES, judge, judge_trial, mean_speed_m_s
 from marey_motion.evaluation.result import EvaluationResult, TrialResult
 from marey_motion.evaluation.scenario import Trial, demand
 from marey_motion.evaluation.suite import evaluate
@@ -36,12 +36,13 @@ from marey_motion.rigs import map_joints
 from marey_reports.drawing.drawn import DrawnFigure
 from marey_reports.drawing.markup import element, text
 from marey_reports.drawing.words import duration
-from marey_reports.evaluation import definitions
-from marey_reports.evaluation.definitions import METRICS
+from marey_reports.evaluation.definitions import METRICS, definitions
 from marey_reports.evaluation.figures import FIGURES, USE_FIGURES, draw_figure
-from marey_reports.evaluation.page import compared, render_comparison, render_report, verdict
+from marey_reports.evaluation.page import compared, render_comparison, render_report
+from marey_reports.evaluation.sentences import region_verdicts, verdict
 from marey_reports.evaluation.words import find_holes
 from marey_schemas.options.evaluation import EvaluationOptions
+from marey_schemas.options.verdict import VerdictLimits
 from marey_schemas.wording import counted
 
 pytestmark = DRAWN_EVALUATIONS
@@ -281,7 +282,7 @@ def judged(result: EvaluationResult, followed: int, trials: int) -> EvaluationRe
     ],
 )
 def test_a_trial_is_followed_within_its_three_limits(metrics: dict[str, Any], followed: bool) -> None:
-    assert is_followed(outcome(**metrics)) is followed
+    assert judge_trial(outcome(**metrics), VerdictLimits()).followed is followed
 
 
 def test_a_switching_trial_is_measured_by_its_mean_speed() -> None:
@@ -291,12 +292,12 @@ def test_a_switching_trial_is_measured_by_its_mean_speed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("followed", "grade"), [(10, "very good"), (9, "very good"), (8, "good"), (7, "good"), (6, "usable in part"),
-                            (4, "usable in part"), (3, "poor"), (0, "poor")]
+    ("followed", "grade"), [(20, "very good"), (15, "very good"), (14, "good"), (11, "good"), (10, "usable in part"),
+                            (6, "usable in part"), (5, "poor"), (0, "poor")]
 )  # fmt: skip
 def test_the_share_of_followed_trials_gives_the_grade(followed: int, grade: str, result: EvaluationResult) -> None:
-    judgement = judge(judged(result, followed, 10))
-    assert (judgement.grade, judgement.followed, judgement.trials) == (grade, followed, 10)
+    judgement = judge(judged(result, followed, 20))
+    assert (judgement.grade, judgement.followed, len(judgement.trials)) == (grade, followed, 20)
 
 
 def test_the_verdict_is_one_sentence_with_the_worst_trial_and_its_reason(result: EvaluationResult) -> None:
@@ -315,15 +316,37 @@ def test_the_verdict_is_one_sentence_with_the_worst_trial_and_its_reason(result:
     assert verdict(replace(result, trials=())) == "Not judged: the evaluation has no trials."
 
 
-def test_the_definitions_name_the_limits_and_shares_of_the_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "differs from the desired speed by at most 15 %" in definitions.definitions()
-    monkeypatch.setattr(definitions, "LARGEST_SPEED_SHARE", 0.2)
-    monkeypatch.setattr(definitions, "LARGEST_TURN_DEG_S", 12.0)
-    monkeypatch.setattr(definitions, "LONGEST_LAG_S", 0.7)
-    monkeypatch.setattr(definitions, "GRADES", ((0.8, "fine"), (0.0, "bad")))
-    told = definitions.definitions()
-    for part in ("by at most 20 %", "by at most 12 degrees", "in 0.7 s", "from 80 % fine, below that bad"):
-        assert part in told
+def test_the_definitions_show_the_limits_of_the_evaluation_and_the_shares_of_the_grades() -> None:
+    told = definitions(VerdictLimits(speed_share=0.21, skate_m_s=0.33))
+    for name, value in VerdictLimits(speed_share=0.21, skate_m_s=0.33).model_dump().items():
+        assert name in told
+        assert f"{value:g}" in told
+    for share, name in GRADES[:-1]:
+        assert f"from {100 * share:g} % {name}" in told
+
+
+def test_numbers_beyond_their_limits_are_marked_where_they_stand(result: EvaluationResult) -> None:
+    metrics = {**result.trials[0].metrics, "foot_skate": 0.87, "foot_skate_clips": 0.08, "pose_cost_clips": 0.05,
+               "treading_per_s": 2.5, "transitions_per_s": 9.9}  # fmt: skip
+    bad = replace(
+        result,
+        trials=(replace(result.trials[0], metrics=metrics), *result.trials[1:]),
+        suite={**result.suite, **metrics, "treading_share": 0.63},
+    )
+    page = render_report(bad, title="t", figures={})
+    for written in ("0.87", "9.90", "2.50", "0.63"):
+        assert re.search(rf'<td[^>]*class="[^"]*bad[^"]*"[^>]*>{written}</td>', page), written
+
+
+def test_each_region_gets_a_sentence_and_motion_that_no_trial_asks_for_is_named(result: EvaluationResult) -> None:
+    regions = region_verdicts(result)
+    assert [each.region for each in regions] == [
+        "straight", "gentle turns", "sharp turns", "speed changes", "backwards"
+    ]  # fmt: skip
+    assert sum(each.trials for each in regions) == len(result.trials)
+    assert "no trial asks for it" in regions[-1].sentence
+    page = is_sound(render_report(result, title="t", figures={}))
+    assert all(each.sentence in page.text for each in regions)
 
 
 # Comparisons

@@ -190,6 +190,14 @@ def test_a_joint_weighs_what_a_step_of_it_moves_the_body() -> None:
     np.testing.assert_array_equal(weights[:3], 1.0)
 
 
+def test_weights_of_a_mean_pose_are_those_of_its_normalised_rotations() -> None:
+    skeleton = chain(5)
+    poses = unit_poses(np.random.default_rng(4).normal(size=(9, 3 + 4 * 5)))
+    shorter = poses.copy()
+    shorter[:, 3:] *= 0.93
+    np.testing.assert_allclose(jacobian_weights(skeleton, shorter), jacobian_weights(skeleton, poses), rtol=1e-12)
+
+
 def test_weights_do_not_depend_on_how_many_frames_are_held_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     skeleton = chain(5)
     poses = unit_poses(np.random.default_rng(2).normal(size=(17, 3 + 4 * 5)))

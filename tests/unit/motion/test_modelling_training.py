@@ -283,6 +283,21 @@ def test_feet_that_slide_in_samples_and_stand_in_examples_are_told() -> None:
     assert "feet-slide" not in codes(sliding, sliding)
 
 
+def test_time_components_that_hold_less_than_was_asked_for_are_told() -> None:
+    options = QUICK.replace(most_temporal_components=1)
+    trained = train_primitive(walks(16), options)
+    kept = trained.primitive.temporal.count
+
+    def codes(held: float) -> list[str]:
+        energy = np.array([held, 1.0])
+        report = dataclasses.replace(trained.report, temporal_energy=energy)
+        return [warning.code for warning in warnings_of(trained.primitive, report, options)]
+
+    assert kept == 1
+    assert "time-components-missing" in codes(0.89)
+    assert "time-components-missing" not in codes(0.995)
+
+
 def test_few_examples_are_a_warning() -> None:
     codes = [warning.code for warning in train_primitive(walks(5)).warnings]
     assert "too-few-examples" in codes

@@ -16,7 +16,8 @@ from marey_motion.evaluation.scenario import Trial, suite_trials
 from marey_motion.evaluation.suite import assemble, evaluate_baseline, run_suite
 from marey_motion.matching.record import TrialRecord
 from marey_reports.evaluation.figures import FIGURES, DrawnFigure, draw_figure, draw_figures
-from marey_reports.evaluation.page import render_report, verdict
+from marey_reports.evaluation.page import render_report
+from marey_reports.evaluation.sentences import region_verdicts, verdict
 from marey_schemas.documents.evaluations import HEADLINE_METRICS
 from marey_schemas.documents.reports import EvaluationReport
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
@@ -80,6 +81,7 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
         "normaliser": database.normaliser.as_tree(),
         "clip_set": wanted_clips(context, params).as_tree(),
         "verdict": verdict(result),
+        "regions": [region.model_dump() for region in region_verdicts(result)],
         "headline": headline_of(result),
     }
     parts = {"evaluation": evaluation, "records": records_to_tree(trials, records)}

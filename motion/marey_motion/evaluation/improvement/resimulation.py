@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.evaluation.improvement.selection import clips_by_source, require_sources, rows_of_sources, source_of
+from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.metrics import measure_trial
 from marey_motion.evaluation.result import TrialResult
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials
@@ -75,6 +76,7 @@ class Resimulation:
         self._threads, self._cancelled = threads, cancelled
         self._source_of_clip = np.array([source_of(clip) for clip in database.clips], dtype=object)
         self.index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
+        self._looks = LooksMeter(database, options.controller)
         self._known: list[list[tuple[Sources, Outcome]]] = [[] for _ in self.trials]
         if records is not None:
             self._keep(NONE, range(len(self.trials)), records, self.index)
@@ -209,7 +211,8 @@ class Resimulation:
             rows = needed_rows(self.database, index, trial, record, self.options)
             clips = np.unique(self.database.clip_of_row[rows])
             outcome = Outcome(
-                measure_trial(trial, asked, record, self.options), frozenset(self._source_of_clip[clips].tolist())
+                measure_trial(trial, asked, record, self.options, self._looks),
+                frozenset(self._source_of_clip[clips].tolist()),
             )
             self._known[number].append((gone, outcome))
             outcomes.append(outcome)

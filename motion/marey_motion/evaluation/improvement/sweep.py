@@ -9,6 +9,7 @@ import numpy as np
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.objective import headline_means, objective_value
+from marey_motion.evaluation.looks import LooksMeter
 from marey_motion.evaluation.metrics import measure_trial, pooled_metrics
 from marey_motion.evaluation.result import Metrics
 from marey_motion.evaluation.scenario import Trial, reference, suite_trials
@@ -114,6 +115,7 @@ def sweep_weights(
     wanted = suite_trials(options) if trials is None else tuple(trials)
     aim = objective or ObjectiveOptions()
     report = progress or (lambda _done, _total, _note: None)
+    looks = LooksMeter(database, options.controller)
     rows = []
     for number, weights in enumerate(settings):
         weighted = reweighted(database, weights)
@@ -124,7 +126,7 @@ def sweep_weights(
         records = run_suite(weighted, options, trials=wanted, threads=threads, progress=told, cancelled=cancelled)
         rate = database.options.rate_hz
         results = [
-            measure_trial(trial, reference(trial, rate), record, options)
+            measure_trial(trial, reference(trial, rate), record, options, looks)
             for trial, record in zip(wanted, records, strict=True)
         ]
         # The price of data is the same for all settings, and left out.

@@ -37,7 +37,7 @@ def draw_errors(subjects: Sequence[Subject], trial: str | None, options: FigureO
     chosen = choose_trial(subjects, trial, ("switching", "circle"))
     views = [view_trial(subject, chosen) for subject in subjects]
     errors = [_errors(view, options.negate_errors) for view in views]
-    meaning = "desired minus recorded" if options.negate_errors else "recorded minus desired"
+    meaning = "desired minus simulated" if options.negate_errors else "simulated minus desired"
     quantities = (
         (f"speed error (m/s), {meaning}", "m/s"),
         (f"turn rate error (deg/s, left positive), {meaning}", "deg/s"),

@@ -46,7 +46,7 @@ def _draw(subjects: Sequence[Subject], name: str | None, family: Family) -> Sket
             figure, place, title=subject.label, x="x (m, left positive)", y="z (m)" if number == 0 else ""
         )
         if path is not None:
-            panel.plot(*path.T, color=COLOURS[number], lw=1.1, alpha=0.85, zorder=2, label="recorded")
+            panel.plot(*path.T, color=COLOURS[number], lw=1.1, alpha=0.85, zorder=2, label="simulated")
         panel.plot(*guide.positions.T, color=REFERENCE, lw=1.8, zorder=3, label="desired")
         panel.plot(0.0, 0.0, "o", color=INK, ms=5, zorder=4)
         _number_sections(panel, guide.positions, sections, limits)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import MotionError
-from marey_motion.evaluation.judgement import strain
+from marey_motion.evaluation.judgement import judge_trial
 from marey_motion.evaluation.metrics import TrialSeries, trial_series
 from marey_motion.evaluation.relevance import count_switches, measure_usage
 from marey_motion.evaluation.result import ClipUsage, EvaluationResult
@@ -24,7 +24,7 @@ class FigureOptions:
 
     Parameters
     ----------
-    negate_errors : draw reference minus recorded, as the paper's figure 8, instead of recorded minus reference
+    negate_errors : draw reference minus simulated, as the paper's figure 8, instead of simulated minus reference
     logarithmic : whether the sizes of dots and the lengths of bars have a logarithmic scale
     most_clips : number of clips that are drawn one by one; all other clips are summed up
     """
@@ -120,7 +120,8 @@ def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequen
     for family in families:
         candidates = [each for each in shared if each.trial.family == family and name in (None, each.trial.name)]
         if candidates:
-            return max(candidates, key=lambda each: strain(each).worst).trial
+            limits = subjects[0].result.options.limits
+            return min(candidates, key=lambda each: (-judge_trial(each, limits).worst.strain, each.trial.name)).trial
     wanted = f"trial {name!r}" if name is not None else "trial"
     owner = "the evaluation has" if len(subjects) == 1 else "the two evaluations share"
     raise MotionError(

@@ -29,7 +29,7 @@ def draw_transition_costs(subjects: Sequence[Subject], trial: str | None, _optio
     top = max([LEAST_TOP_M, *(float(np.nanmax(cost, initial=0.0)) for cost in costs)])
     for number, (view, cost) in enumerate(zip(views, costs, strict=True)):
         look: dict[str, Any] = {"color": COLOURS[number], "lw": 0.9, "alpha": 0.85}
-        above.plot(view.series.times_s, view.series.speeds_m_s, label=view.subject.label or "recorded", **look)
+        above.plot(view.series.times_s, view.series.speeds_m_s, label=view.subject.label or "simulated", **look)
         below.plot(view.series.times_s, cost, **look)
         switches = view.series.times_s[view.switched]
         level = np.full(len(switches), -(0.045 + 0.05 * number) * top)

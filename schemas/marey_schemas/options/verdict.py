@@ -1,0 +1,88 @@
+"""Limits of the verdict on an evaluation: how far a followed trial may be from what was asked for, and how it may look.
+
+Limits of looks are derived from two sources: the clips that the trial shows, and the baseline of generated clips, whose
+feet do not slide. The figures of the baseline in the descriptions are those of the 162 default trials.
+docs/explanation/what-a-verdict-means.md explains each limit.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from marey_schemas.base import Options
+from marey_schemas.options.contacts import TOE_SPEED_M_S
+
+_Limit = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
+
+
+class VerdictLimits(Options):
+    """Limits of a trial. A trial counts as followed if it exceeds none of them."""
+
+    lag_s: _Limit = Field(
+        0.5, description="Greatest mean distance from the desired position, as the time in seconds to cover it."
+    )
+    speed_share: _Limit = Field(
+        0.15,
+        description="Greatest error of the mean speed, as a share of the desired speed; for each speed of a switching "
+        "trial, away from the switches.",
+    )
+    turn_deg_s: _Limit = Field(10.0, description="Greatest error of the mean turn rate, in degrees per second.")
+    heading_deg: _Limit = Field(
+        15.0, description="Greatest root mean square error of the heading, in degrees; the baseline reaches 12."
+    )
+    speed_wobble_share: _Limit = Field(
+        0.2,
+        description="Greatest standard deviation of the speed, as a share of the desired speed; in a switching trial "
+        "away from the switches, as a share of the faster speed, because the character catches up after a switch. The "
+        "baseline reaches 0.19.",
+    )
+    turn_wobble_deg_s: _Limit = Field(
+        25.0,
+        description="Greatest standard deviation of the turn rate, in degrees per second; the sway of the steps of the "
+        "baseline reaches 21.",
+    )
+    response_s: _Limit = Field(
+        2.0,
+        description="Greatest median time to answer a switch of the speed, in seconds; switches without an answer "
+        "count as longer than all others.",
+    )
+    skate_m_s: _Limit = Field(
+        TOE_SPEED_M_S,
+        description="Greatest mean speed of feet in contact, in metres per second, unless `skate_ratio` allows more; "
+        "by default the speed up to which a foot counts as standing.",
+    )
+    skate_ratio: _Limit = Field(2.0, description="Greatest ratio of this speed to that of the clips shown.")
+    sinking_m: _Limit = Field(
+        0.03,
+        description="Depth below the floor of the clips shown that the feet keep within for 95 % of the time, in "
+        "metres; the baseline sinks by 0.006.",
+    )
+    step_ratio: _Limit = Field(
+        1.5,
+        description="Greatest ratio between the contacts per metre of the trial and of the clips shown, in either "
+        "direction; the ratio of the baseline is between 0.97 and 1.05.",
+    )
+    steps_per_m: _Limit = Field(
+        0.3, description="Fewest contacts per metre; a sprinter has 0.4, so fewer show that the character glides."
+    )
+    pose_cost_ratio: _Limit = Field(
+        2.0,
+        description="Greatest ratio of the mean pose cost to the mean change of pose in the clips shown; the baseline "
+        "reaches 1.5.",
+    )
+    pose_cost_p95_ratio: _Limit = Field(
+        4.0,
+        description="Greatest ratio of the 95th percentile of the pose cost to the mean change of pose in the clips "
+        "shown.",
+    )
+    transitions_per_s: _Limit = Field(
+        6.0,
+        description="Greatest number of transitions per second; 95 % of the trials of the baseline have fewer than 5.",
+    )
+    treading_per_s: _Limit = Field(
+        0.5,
+        description="Greatest number of transitions per second to a frame of the same clip at most 1/3 s away; the "
+        "baseline has none.",
+    )
