@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -163,12 +164,14 @@ def random_metric(rng: np.random.Generator, name: str) -> PerceptualMetric:
     return replace(metric, components=tuple(parts), angle=str(angle))  # type: ignore[arg-type]
 
 
-UGLY = {
+UGLY: dict[str, Callable[[np.random.Generator], list[np.ndarray]]] = {
     "constant": lambda rng: [np.repeat(random_run(rng, 1, 0.1), int(n), 0) for n in rng.integers(1, 70, 4)],
     "duplicates": lambda rng: [random_run(np.random.default_rng(7), 50, 0.02) for _ in range(5)],
     "short": lambda rng: [random_run(rng, int(n), 0.05) for n in rng.integers(1, 8, 40)],
     "one clip": lambda rng: [random_run(rng, 200, 0.02)],
-    "huge": lambda rng: [random_run(rng, 60, 0.05) * np.repeat(np.float32([1e6, 1]), [90, 44]) for _ in range(3)],
+    "huge": lambda rng: [
+        random_run(rng, 60, 0.05) * np.repeat(np.array([1e6, 1], np.float32), [90, 44]) for _ in range(3)
+    ],
 }
 
 
