@@ -248,8 +248,10 @@ def _find_similar(clip: Clip) -> None:
     from marey_motion.motion import Motion
     from marey_motion.perception.metric import published_metric
     from marey_motion.rigs import map_joints
+    from marey_motion.similarity.example import Example, sample_offsets
     from marey_motion.similarity.features import PoseFeatures, clip_features
-    from marey_motion.similarity.searching import Example, SearchedShard, sample_offsets, search_windows
+    from marey_motion.similarity.searching import search_windows
+    from marey_motion.similarity.shard_search import SearchedShard
     from marey_motion.similarity.shards import Shard, presence, write_shard
 
     body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))

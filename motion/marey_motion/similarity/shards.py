@@ -6,9 +6,11 @@ balls. The centres and radii of all balls follow, and then the rows. A search re
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -98,9 +100,10 @@ class Shard:
         ------
         MotionError    if the file is no shard with these runs
         """
-        mapped = np.memmap(path, np.uint8, "r")
+        with path.open("rb", buffering=0) as file:
+            mapped = mmap(file.fileno(), 0, access=ACCESS_READ) if os.fstat(file.fileno()).st_size else b""
         runs = Runs.of(lengths)
-        mark, rows, balls = _HEAD.unpack(mapped[: _HEAD.size].tobytes()) if len(mapped) >= _HEAD.size else (b"", 0, 0)
+        mark, rows, balls = _HEAD.unpack(mapped[: _HEAD.size]) if len(mapped) >= _HEAD.size else (b"", 0, 0)
         size = _HEAD.size + 4 * (balls * (WIDTH + _RADII) + rows * WIDTH)
         if (mark, rows, balls, size) != (_MARK, runs.starts[-1], runs.balls[-1], len(mapped)):
             raise MotionError(f"the file of {len(mapped)} bytes is no shard of a motion index", code="shard-damaged")

@@ -1,10 +1,4 @@
-"""Kernels of searches by example: distances of windows, and lower bounds of them.
-
-A ball holds a few consecutive rows: a centre for each vector and rotation, and a radius. By the triangle inequality,
-the distance of a joint from a pose to any row in the ball is at least the distance to the centre less the radius. For
-rotations, this holds for the chord of quaternions, which is never longer than half of the angle. The shapings increase,
-so the bounds of joints give a bound of the metric.
-"""
+"""Kernels of searches by example: distances of windows, balls of poses, and groups of samples."""
 
 from __future__ import annotations
 
@@ -14,8 +8,16 @@ import numpy as np
 
 from marey_motion.kernels import compiled, contracted, inlined
 from marey_motion.perception.map_kernels import ANGLE, EUCLID, MANHATTAN, ONE_MINUS_DOT, SIGMOID
+from marey_motion.similarity.bounding_kernels import bounds_within, narrow_steps
 
-_CHUNK = 256
+_TILE = 128
+"""Windows whose rows are compared at a time."""
+
+
+@compiled
+def loosened(most, samples):  # type: ignore[no-untyped-def]
+    """Compute the sum of distances up to which bounds in single precision may belong to a mean of at most `most`."""
+    return (most + 1e-5) * samples / (1.0 - 1e-4)
 
 
 @inlined
@@ -77,29 +79,125 @@ def pose_distance(a, b, tables, rotations_at):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def step_distances(query, offsets, rows, steps, starts, firsts, size, tables, rotations_at, most, out):  # type: ignore[no-untyped-def]
-    """Fill out (n, size) with the distances of the windows that start in some steps, where they are less than out.
+def group_samples(query, tables, rotations_at, most, groups, distances):  # type: ignore[no-untyped-def]
+    """Fill groups (T,) with numbers of groups of similar samples, and return their count, at most `most`.
 
-    The run r has the rows [starts[r], starts[r + 1]) and the steps [firsts[r], firsts[r + 1]). steps (n,) ascend.
-    A distance is the mean over the query's samples, in any order. Windows whose distance is certainly above `most`, and
-    windows that leave their run, get no distance.
+    Each group is started by the sample that is farthest from the samples that have started a group so far. distances
+    (T,) are those of the samples from the sample that has started their group.
     """
-    samples = query.shape[0]
-    length = np.max(offsets)
-    limit = most * samples * (1.0 + 1e-12)
-    run = 0
+    distances[:] = np.inf
+    first = 0
+    for group in range(most):
+        for t in range(query.shape[0]):
+            distance = pose_distance(query[first], query[t], tables, rotations_at)
+            if distance < distances[t]:
+                distances[t], groups[t] = distance, group
+        first = int(np.argmax(distances))
+        if distances[first] == 0.0:
+            return group + 1
+    return most
+
+
+@compiled
+def _places_of(steps, runs, length, layout, places, rows):  # type: ignore[no-untyped-def]
+    """Fill places (n, 2) with the ball in which each step lies and its number in it, and rows (n, 2) with the rows at
+    which windows of `length` start in it, a half-open range.
+    """
+    starts, firsts, ball_firsts = runs
+    size, per_ball = layout[0], layout[1]
+    run: int = 0
     for place in range(steps.shape[0]):
         while steps[place] >= firsts[run + 1]:
             run += 1
-        first = starts[run] + (steps[place] - firsts[run]) * size
-        for start in range(first, min(first + size, starts[run + 1] - length)):
-            total = 0.0
-            for t in range(samples):
-                total += pose_distance(query[t], rows[start + offsets[t]], tables, rotations_at)
-                if total > limit:
-                    break
-            if total <= limit:
-                out[place, start - first] = min(out[place, start - first], total / samples)
+        step = steps[place] - firsts[run]
+        places[place] = ball_firsts[run] + step // per_ball, step % per_ball
+        rows[place, 0] = starts[run] + step * size
+        rows[place, 1] = max(rows[place, 0], min(rows[place, 0] + size, starts[run + 1] - length))
+
+
+@compiled
+def _windows_in(left, rows, windows):  # type: ignore[no-untyped-def]
+    """List the windows (n, 2) that start in some steps: their step and first row. Return their number."""
+    count = 0
+    for place in left:
+        for row in range(rows[place, 0], rows[place, 1]):
+            windows[count] = place, row
+            count += 1
+    return count
+
+
+@contracted
+def _still_near(query, rows, bounds, done, places, windows, layout, tables, limit):  # type: ignore[no-untyped-def]
+    """List the windows whose distance is not certainly above a limit.
+
+    For one sample after the other, the bound of its ball in a window's sum is replaced by that of the very row. The
+    sums contain the bounds of single samples for the first `done` of them.
+    """
+    samples, offsets, groups, _, turns = query
+    by_group, by_sample, step_sums = bounds
+    size, per_ball, vectors, columns = layout
+    tile = np.zeros((rows.shape[1], _TILE), np.float32)
+    radii = np.zeros((vectors + (rows.shape[1] - 3 * vectors) // 4, _TILE), np.float32)
+    reaches = np.zeros(radii.shape[0], np.float32)
+    x, raw, total = np.empty(_TILE, np.float32), np.empty(_TILE, np.float32), np.empty(_TILE, np.float32)
+    left = np.arange(windows.shape[0])
+    sums = step_sums[windows[:, 0]]
+    for k in range(samples.shape[0]):
+        turn = (done + k) % samples.shape[0]
+        t = turns[turn]
+        known = by_sample[t] if turn < done else by_group[groups[t]]
+        kept = 0
+        for begin in range(0, left.shape[0], _TILE):
+            n = min(_TILE, left.shape[0] - begin)
+            for i in range(n):
+                row = windows[left[begin + i], 1] + offsets[t]
+                for c in columns:
+                    tile[c, i] = rows[row, c]
+            bounds_within(samples[t], reaches, tile, radii, 0, n, tables, vectors, x[:n], raw[:n], total[:n])
+            for i in range(n):
+                window = left[begin + i]
+                place = windows[window, 0]
+                sums[window] += total[i] - known[places[place, 0] + (places[place, 1] + offsets[t] // size) // per_ball]
+                if sums[window] <= limit:
+                    left[kept] = window
+                    kept += 1
+        left = left[:kept]
+    return left
+
+
+@compiled
+def step_distances(query, shard, bounds, steps, runs, layout, tables, rotations_at, most, out):  # type: ignore[no-untyped-def]
+    """Fill out (n, size) with the distances of the windows that start in some steps, where they are less than out.
+
+    query holds samples (T, width), offsets (T,), groups (T,), the order in which the distances of samples are added,
+    and the order in which their bounds are used. shard holds rows, and centres and radii of balls. bounds holds bounds
+    of groups (G, balls), room for those of samples (T, balls), and the sums (n,) of the steps. runs are the first
+    rows, steps and balls of runs. steps (n,) ascend. layout holds the rows of a step, the steps of a ball, the number
+    of vectors, and the columns that the tables use. Windows whose distance is certainly above `most`, and windows that
+    leave their run, get no distance.
+    """
+    samples, offsets, _, order, _ = query
+    size, count = layout[0], samples.shape[0]
+    places, rows = np.empty((steps.shape[0], 2), np.int64), np.empty((steps.shape[0], 2), np.int64)
+    _places_of(steps, runs, np.max(offsets), layout, places, rows)
+    left, limit, done = np.arange(steps.shape[0]), loosened(most, count), 0
+    if most < np.inf and count > 1:
+        left, done = narrow_steps(query, shard, bounds, places, layout, tables, limit)
+    windows = np.empty((left.shape[0] * size, 2), np.int64)
+    windows = windows[: _windows_in(left, rows, windows)]
+    near = np.arange(windows.shape[0])
+    if most < np.inf:
+        near = _still_near(query, shard[0], bounds, done, places, windows, layout, tables, limit)
+    limit = most * count * (1.0 + 1e-12)
+    for window in near:
+        place, row = windows[window]
+        total = 0.0
+        for t in order:
+            total += pose_distance(samples[t], shard[0][row + offsets[t]], tables, rotations_at)
+            if total > limit:
+                break
+        if total <= limit:
+            out[place, row - rows[place, 0]] = min(out[place, row - rows[place, 0]], total / count)
 
 
 @compiled
@@ -143,107 +241,3 @@ def balls(rows, starts, size, vectors, rotations, centres, radii):  # type: igno
                 # Rounded up, so that the ball holds its rows in single precision, too.
                 radii[p, ball] = math.sqrt(greatest) * (1.0 + 1e-5) + 1e-6
             ball += 1
-
-
-@contracted
-def _add_rotation_bounds(q, centres, radii, factor, measure, x):  # type: ignore[no-untyped-def]
-    """Add lower bounds of the distances of a rotation from those in balls (4, n)."""
-    zero = np.float32(0.0)
-    w, u, v, z = q[0], q[1], q[2], q[3]
-    cw, cu, cv, cz = centres[0], centres[1], centres[2], centres[3]
-    if measure == ANGLE:
-        factor = factor * np.float32(2.0)
-    for j in range(radii.shape[0]):
-        minus = (w - cw[j]) ** 2 + (u - cu[j]) ** 2 + (v - cv[j]) ** 2 + (z - cz[j]) ** 2
-        plus = (w + cw[j]) ** 2 + (u + cu[j]) ** 2 + (v + cv[j]) ** 2 + (z + cz[j]) ** 2
-        d = max(np.float32(math.sqrt(min(minus, plus))) - radii[j], zero)
-        x[j] += factor * (np.float32(0.5) * d * d if measure == ONE_MINUS_DOT else d)
-
-
-@contracted
-def _add_vector_bounds(q, centres, radii, factor, x):  # type: ignore[no-untyped-def]
-    """Add lower bounds of the distances of a vector from those in balls (3, n)."""
-    u, v, z = q[0], q[1], q[2]
-    cu, cv, cz = centres[0], centres[1], centres[2]
-    for j in range(radii.shape[0]):
-        d = (u - cu[j]) ** 2 + (v - cv[j]) ** 2 + (z - cz[j]) ** 2
-        x[j] += factor * max(np.float32(math.sqrt(d)) - radii[j], np.float32(0.0))
-
-
-@contracted
-def _add_shaped(x, weight, shaping, exponent, raw):  # type: ignore[no-untyped-def]
-    """Add weight · F(x)."""
-    if shaping == SIGMOID:
-        for j in range(x.shape[0]):
-            raw[j] += weight * (x[j] / (x[j] + np.float32(1.0)))
-    elif shaping == MANHATTAN:
-        for j in range(x.shape[0]):
-            raw[j] += weight * x[j]
-    elif shaping == EUCLID:
-        for j in range(x.shape[0]):
-            raw[j] += weight * x[j] * x[j]
-    else:
-        for j in range(x.shape[0]):
-            raw[j] += weight * np.float32(x[j] ** exponent)
-
-
-@contracted
-def pose_bounds(query, centres, radii, mine, tables, vectors, out):  # type: ignore[no-untyped-def]
-    """Fill out (samples, balls) with lower bounds of the distances from each sample to the rows in the balls.
-
-    Only balls b with mine[b] are filled: those to which the tables apply. All arithmetic is in single precision.
-    """
-    for begin in range(0, centres.shape[1], _CHUNK):
-        some = slice(begin, min(begin + _CHUNK, centres.shape[1]))
-        if np.any(mine[some]):
-            for s in range(query.shape[0]):
-                total = _bounds_of_sample(query[s], centres[:, some], radii[:, some], tables, vectors)
-                for j in range(total.shape[0]):
-                    if mine[begin + j]:
-                        out[s, begin + j] = total[j]
-
-
-@contracted
-def _bounds_of_sample(q, centres, radii, tables, vectors):  # type: ignore[no-untyped-def]
-    """Compute lower bounds (n,) of the distances from a sample to the rows in balls."""
-    rotated, places, factors, weights, starts, constants, shapings, exponents, measure, always = tables
-    total = np.zeros(centres.shape[1], np.float32)
-    x, raw = np.empty_like(total), np.empty_like(total)
-    for c in range(constants.shape[0]):
-        raw[:] = np.float32(0.0)
-        for t in range(starts[c], starts[c + 1]):
-            x[:] = np.float32(0.0)
-            for side in range(2):
-                p, factor = places[t, side], np.float32(factors[t, side])
-                if p >= 0 and rotated[t]:
-                    at = 3 * vectors + 4 * p
-                    ball = centres[at : at + 4], radii[vectors + p]
-                    _add_rotation_bounds(q[at : at + 4], ball[0], ball[1], factor, measure, x)
-                elif p >= 0:
-                    _add_vector_bounds(q[3 * p : 3 * p + 3], centres[3 * p : 3 * p + 3], radii[p], factor, x)
-            _add_shaped(x, np.float32(weights[t]), shapings[c], exponents[c], raw)
-        for j in range(raw.shape[0]):
-            total[j] += raw[j] + np.float32(constants[c] if always or raw[j] > 0.0 else 0.0)
-    return total
-
-
-@contracted
-def step_bounds(poses, steps, firsts, ball_firsts, per_ball, out):  # type: ignore[no-untyped-def]
-    """Fill out (S,) with lower bounds of the distances of all windows that start in a step.
-
-    poses (samples, balls) holds bounds of single poses, and the samples are `steps` after the start. The run r has the
-    steps [firsts[r], firsts[r + 1]), and balls of `per_ball` steps from ball_firsts[r]. Steps in which no window starts
-    that is within the run get infinity.
-    """
-    samples = poses.shape[0]
-    for run in range(firsts.shape[0] - 1):
-        count = firsts[run + 1] - firsts[run]
-        for place in range(count):
-            if place + steps[samples - 1] >= count:
-                out[firsts[run] + place] = np.inf
-                continue
-            total = 0.0
-            for t in range(samples):
-                total += poses[t, ball_firsts[run] + (place + steps[t]) // per_ball]
-            # Less the rounding of single precision.
-            out[firsts[run] + place] = total / samples * (1.0 - 1e-4) - 1e-5

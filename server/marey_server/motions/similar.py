@@ -29,7 +29,9 @@ from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:  # numeric modules are loaded by children alone
     from marey_motion.perception.metric import PerceptualMetric
-    from marey_motion.similarity.searching import Example, Hit, SearchedShard
+    from marey_motion.similarity.example import Example
+    from marey_motion.similarity.searching import Hit
+    from marey_motion.similarity.shard_search import SearchedShard
 
 Tree = dict[str, Any]
 
@@ -288,8 +290,8 @@ def _example(order: SimilarOrder) -> tuple[Example, float]:
     from marey_motion.matching.body import MatchingBody
     from marey_motion.motion import Motion
     from marey_motion.rigs import map_joints, require_trust
+    from marey_motion.similarity.example import Example, sample_offsets
     from marey_motion.similarity.features import INDEX_RATE_HZ, features_at
-    from marey_motion.similarity.searching import Example, sample_offsets
 
     skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(unpack_tree(order.hierarchy)))
     if order.mapping is None:
@@ -310,7 +312,7 @@ def _searched(
     """Return a shard with what of it is searched: no dropped clips, and none that changed since the index was made."""
     import numpy as np
 
-    from marey_motion.similarity.searching import SearchedShard
+    from marey_motion.similarity.shard_search import SearchedShard
     from marey_motion.similarity.shards import Shard
 
     changed = [order.heads.get(one, number) != number for one, number in zip(clips.items, clips.revisions, strict=True)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +23,21 @@ from marey_motion.perception.measuring import measure_motion
 from marey_motion.perception.metric import PerceptualMetric, metric_of, published_metric
 from marey_motion.retargeting import plan_retarget, retarget
 from marey_motion.rigs import guess_axes, map_joints
-from marey_motion.similarity.features import INDEX_RATE_HZ, JOINTS, WIDTH, PoseFeatures, clip_features, mirrored
-from marey_motion.similarity.searching import Example, Hit, SearchedShard, sample_offsets, search_clips, search_windows
+from marey_motion.similarity.example import Example, sample_offsets
+from marey_motion.similarity.features import (
+    INDEX_RATE_HZ,
+    JOINTS,
+    ROTATIONS_AT,
+    WIDTH,
+    PoseFeatures,
+    clip_features,
+    mirrored,
+)
+from marey_motion.similarity.searching import Hit, search_clips, search_windows
+from marey_motion.similarity.shard_search import SearchedShard
 from marey_motion.similarity.shards import Shard, presence, write_shard
+from marey_motion.similarity.similarity_kernels import pose_distance as pose_distance_kernel
+from marey_motion.similarity.weighing import metric_tables
 from marey_schemas.documents.metrics import built_in_metric
 
 ALL = (1 << len(JOINTS)) - 1
@@ -128,6 +142,93 @@ def test_clips_with_a_window_within_a_distance_are_found(tmp_path: Path) -> None
         assert search_clips(parts, example, metric, distance + 1e-5, 100, threads=2) == expected
     assert search_clips(parts, example, metric, 0.0, 100, below=True) == []
     assert len(search_clips(parts, example, metric, 1e6, 5)) == 5
+
+
+def exhaustively(
+    parts: list[SearchedShard], example: Example, metric: PerceptualMetric, count: int
+) -> list[tuple[int, int, int, float]]:
+    """Find the hits by the kernel of distances alone, without bounds, steps or limits."""
+    tables, order, length = metric_tables(metric, example.poses.present), example.order, int(example.offsets[-1])
+    assert tables is not None
+    found = []
+    for number, part in enumerate(parts):
+        shard = part.load()
+        for run in range(len(part.ranks)):
+            rows = shard.rows[shard.runs.starts[run] : shard.runs.starts[run + 1]]
+            for row in range(len(rows) - length):
+                total = 0.0
+                for t in order:
+                    one, other = example.poses.rows[t], rows[row + example.offsets[t]]
+                    total += pose_distance_kernel(one, other, tables, ROTATIONS_AT)
+                found.append((total / len(order), int(part.ranks[run]), row, number, run))
+    hits: list[tuple[int, int, int, float]] = []
+    for distance, _, row, number, run in sorted(found):
+        overlaps = any(hit[:2] == (number, run) and abs(hit[2] - row) < example.separation_rows for hit in hits)
+        if len(hits) < count and not overlaps:
+            hits.append((number, run, row, distance))
+    return hits
+
+
+def random_metric(rng: np.random.Generator, name: str) -> PerceptualMetric:
+    """Return a built-in metric with other weights, some of them 0, constants, and measure of angles."""
+    metric = metric_of(built_in_metric(name))
+    parts = []
+    for part in metric.components:
+        weights = {joint: float(rng.gamma(0.5)) * bool(rng.integers(4)) for joint in part.weights}
+        weights[str(rng.choice(list(weights)))] = 1.0
+        parts.append(replace(part, weights=weights, constant=float(rng.choice([0.0, 0.3]))))
+    angle = rng.choice(["half_angle", "angle", "one_minus_dot"])
+    return replace(metric, components=tuple(parts), angle=str(angle))  # type: ignore[arg-type]
+
+
+UGLY: dict[str, Callable[[np.random.Generator], list[np.ndarray]]] = {
+    "constant": lambda rng: [np.repeat(random_run(rng, 1, 0.1), int(n), 0) for n in rng.integers(1, 70, 4)],
+    "duplicates": lambda rng: [random_run(np.random.default_rng(7), 50, 0.02) for _ in range(5)],
+    "short": lambda rng: [random_run(rng, int(n), 0.05) for n in rng.integers(1, 8, 40)],
+    "one clip": lambda rng: [random_run(rng, 200, 0.02)],
+    "huge": lambda rng: [
+        random_run(rng, 60, 0.05) * np.repeat(np.array([1e6, 1], np.float32), [90, 44]) for _ in range(3)
+    ],
+}
+
+
+@pytest.mark.parametrize("material", UGLY)
+@pytest.mark.parametrize("seconds", [0.0, 0.5, 3.3])
+def test_hits_and_distances_are_exactly_those_of_an_exhaustive_search(
+    tmp_path: Path, material: str, seconds: float
+) -> None:
+    rng = np.random.default_rng([len(material), int(10 * seconds)])
+    runs, offsets = UGLY[material](rng), sample_offsets(seconds)
+    half = len(runs) // 2
+    parts = [searched(tmp_path, some, name=str(n)) for n, some in enumerate((runs[:half], runs[half:])) if some]
+    firsts = np.cumsum([0, *(len(part.ranks) for part in parts)])
+    ranks = rng.permutation(len(runs))
+    parts = [replace(part, ranks=ranks[firsts[n] : firsts[n + 1]]) for n, part in enumerate(parts)]
+    names = ("published/sigmoid", "uniform/euclid", "published/angles-manhattan", "uniform/velocities-sigmoid")
+    for name in rng.choice(names, 2, replace=False):
+        metric = random_metric(rng, str(name))
+        source = np.concatenate([runs[-1], random_run(rng, 130, 0.05)])
+        example = Example(PoseFeatures(source[offsets], np.ones(15, np.bool_)), offsets)
+        expected = exhaustively(parts, example, metric, 10)
+        for count in (1, 10):
+            found = search_windows(parts, example, metric, count, threads=2)
+            assert [hit[:4] for hit in found] == expected[:count]
+
+
+def test_dropped_overlaps_raise_the_limit_until_the_hits_are_those_of_an_exhaustive_search(tmp_path: Path) -> None:
+    """The windows with the lowest bounds all overlap each other, so the first limits are wrong or missing."""
+    rng = np.random.default_rng(3)
+    pose = random_run(rng, 1, 0.1)
+    near = np.repeat(pose, 700, 0) + rng.normal(0.0, 1e-4, (700, WIDTH)).astype(np.float32)
+    runs = [near, *(random_run(rng, 40, 0.02) for _ in range(12))]
+    offsets = sample_offsets(30.0)[:9]
+    example = Example(PoseFeatures(np.repeat(pose, len(offsets), 0), np.ones(15, np.bool_)), offsets)
+    short = Example(PoseFeatures(pose, np.ones(15, np.bool_)), sample_offsets(0.0))
+    for one, count in ((example, 3), (short, 60)):
+        parts = [searched(tmp_path, runs, name=str(count))]
+        found = search_windows(parts, one, published_metric(), count)
+        assert [hit[:4] for hit in found] == exhaustively(parts, one, published_metric(), count)
+        assert len(found) > 1
 
 
 def test_the_distance_is_the_perceptual_metric_of_the_clips(tmp_path: Path) -> None:
