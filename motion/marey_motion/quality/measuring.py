@@ -130,10 +130,8 @@ def measure_quality(
         sampled = np.round(np.arange(motion.frame_count) * max(clip.frame_rate_hz / rate, 1.0)).astype(np.intp)
         contacts = contacts[np.minimum(sampled, clip.frame_count - 1)]
     feet = of_feet.Feet.of(ankles, toes, rate, options, contacts)
-    depth = np.maximum(-points[..., 1].min(axis=1), 0.0)
     jerks = jerk(joints[:, list(body.judged)], rate)
-    rotations = np.asarray(kinematics.as_global_rotations(skeleton, motion.rotations), dtype=np.float64)
-    excess = limit_excess_deg(body.hinges, joints, rotations, options)
+    depth, excess = _beyond_limits(clip, body, options)
     root = simulation_root(joints, body.body, rate)
     windows = sliding_windows(root.positions, root.headings, rate)
     speeds, turns = windows.speed_m_s, np.degrees(windows.turn_rate_rad_s)
@@ -159,6 +157,18 @@ def measure_quality(
         _seconds(speeds, SPEED_EDGES_M_S) / rate,
         _seconds(turns, TURN_EDGES_DEG_S) / rate,
     )
+
+
+def _beyond_limits(clip: Clip, body: QualityBody, options: QualityOptions) -> tuple[Floats, Floats | None]:
+    """Compute depth below the floor (F,) and excess of joint limits (F,) in every frame of the clip.
+
+    They are compared with fixed limits, so they need no common rate, and no frame may be left out.
+    """
+    motion, skeleton = Motion.of(clip), clip.skeleton
+    points = _points(clip, motion)
+    rotations = np.asarray(kinematics.as_global_rotations(skeleton, motion.rotations), dtype=np.float64)
+    excess = limit_excess_deg(body.hinges, points[:, : skeleton.joint_count], rotations, options)
+    return np.maximum(-points[..., 1].min(axis=1), 0.0), excess
 
 
 def jerk(points: Floats, rate_hz: float) -> Floats:

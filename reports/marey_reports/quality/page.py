@@ -108,13 +108,14 @@ def _headline(document: QualityDocument) -> Html:
 
 
 def _totals(document: QualityDocument) -> Html:
-    heads = ["measure", "unit", "clips", "95 % interval", "n"]
+    heads = ["measure", "unit", "mean", "95 % interval", "clips"]
     if document.reference is not None:
         heads += ["reference", "95 % interval", "difference", "95 % interval"]
     rows = [list(_total_row(document, name)) for name in MEASURES]
     note = (
-        "Means over clips, weighted by their duration. Intervals are from draws of whole takes; n is the number of "
-        "clips in which a measure is defined. Bold differences are worse than the reference, beyond chance."
+        'Means over clips, weighted by their duration. Intervals are from draws of whole takes. The column "clips" '
+        "has the number of clips in which a measure is defined. Bold differences are worse than the reference, beyond "
+        "chance."
     )
     numbers = [column for column in range(2, len(heads)) if heads[column] != "95 % interval"]
     return joined((element("p", note), table("Totals", heads, rows, numbers=numbers, sortable=False)))

@@ -68,7 +68,8 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
         ),
         "skate_ratio": Measure(
             "skate ratio", "", "less", 3,
-            "Share of the frames with a toe near the floor in which this toe is faster than the limit, 0 to 1.",
+            "Share of the steps from frame to frame, with a toe near the floor in both, in which this toe is faster "
+            "than the limit, 0 to 1.",
             f"{_KIMODO}, FootSkateRatio, after Karunratanakul et al. (2023), Guided motion diffusion",
             "A foot that glides just below the limit has the ratio 0.",
         ),
@@ -94,7 +95,7 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
         ),
         "penetration_max_m": Measure(
             "greatest penetration", "m", "less", 4,
-            "Greatest depth of a joint or end of a bone below height 0 in any frame.",
+            "Greatest depth of a joint or end of a bone below height 0 in any frame of the clip.",
             "Greatest value of `penetration_m`",
             "One frame decides, such as the pose before a recording begins.",
         ),
@@ -106,9 +107,9 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
         ),
         "jerk_peak_m_s3": Measure(
             "greatest jerk", "m/s³", "less", 0,
-            "Greatest jerk of a joint in any frame.",
+            "Greatest jerk of a joint in any measured frame.",
             "Greatest value of the jerk in `jitter_m_s3`",
-            "One frame decides. It finds pops, but also hard landings.",
+            "One frame decides. It finds hard landings, too, and misses pops in frames that resampling leaves out.",
         ),
         "limit_excess_deg": Measure(
             "excess of joint limits", "°", "less", 2,
@@ -118,7 +119,7 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
         ),
         "limit_excess_max_deg": Measure(
             "greatest excess of joint limits", "°", "less", 1,
-            "Greatest angle by which a knee or an elbow exceeds its range in any frame.",
+            "Greatest angle by which a knee or an elbow exceeds its range in any frame of the clip.",
             "Greatest value of `limit_excess_deg`",
             "One frame decides.",
         ),

@@ -299,6 +299,8 @@ def _likeness(tree: Any, source: str) -> Likeness:
     if distance < 0:
         raise QueryError("a distance is at least 0", _column(limit))
     named = _text(metric[0]) if metric else None
+    if named == "":
+        raise QueryError("name a metric, or leave it out for the default one", _column(metric[0]))
     return Likeness(parsed, named, distance, operator == "<", source, int(tree.meta.start_pos) + 1)
 
 

@@ -114,7 +114,7 @@ def clips_of(project: str, condition: Likeness, found: AlikeClips) -> frozenset[
     """
     if found.behind:
         raise ConflictProblem(
-            f"{counted(found.behind, 'clip')} changed since the index of motions was updated, so "
+            f"{counted(found.behind, 'clip')} changed or were created since the index of motions was updated, so "
             f"{condition.source} cannot be decided for them; update the index with `marey index {project}`.",
             code="index-outdated",
         )

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sqlalchemy import or_, select
+from sqlalchemy import func, or_, select
 
 from marey_schemas.documents.motion_indexes import INDEX_VERSION, MotionIndexDocument
 from marey_schemas.documents.reports import StoredFile
@@ -95,6 +95,21 @@ def _changed_since(tx: Transaction, project_id: str, since_us: int) -> dict[str,
             code="index-outdated",
         )
     return {row.id: row.head if row.deleted_us is None else 0 for row in rows}
+
+
+def require_all_clips(tx: Transaction, project: str, found: FoundIndex) -> None:
+    """Raise `ConflictProblem` if an index of some folders lacks clips of the project that have not changed since."""
+    project_row = projects.require(tx, project)
+    existing = (item.c.project_id == project_row.id, item.c.kind == Kind.CLIP.value, item.c.deleted_us.is_(None))
+    clips = tx.execute(select(func.count()).select_from(item).where(*existing)).scalar_one()
+    deleted = sum(head == 0 for head in found.heads.values())
+    indexed = found.document.clips + found.document.left_out - deleted
+    if clips > indexed:
+        raise ConflictProblem(
+            f"The newest index of motions has {max(indexed, 0):,} of the {clips:,} clips of the project, so conditions "
+            f"on motion cannot be decided for the others; `marey index {project}` indexes all of them.",
+            code="index-outdated",
+        )
 
 
 def name_clips(tx: Transaction, project: str, ids: Collection[str]) -> dict[str, FoundClip]:

@@ -107,7 +107,7 @@ def test_similar_moments_are_found_and_the_index_follows_the_project(
     (tmp_path / "right.bvh").write_bytes(write_bvh(mirror_clip(clip, partners)))
     left, right = (upload(lab, tmp_path / f"{name}.bvh", "turns") for name in ("left", "right"))
     assert lab.similar(left, (60, 90)).behind == 2
-    with pytest.raises(Conflict, match=r"2 clips changed since .*marey index lab"):
+    with pytest.raises(Conflict, match=r"2 clips changed or were created since .*marey index lab"):
         list(lab.clips.list(query=condition))
     told = indexed(lab)
     assert (told["clips"], told["new_clips"], told["written_shards"]) == (11, 2, 1)
@@ -132,6 +132,11 @@ def test_similar_moments_are_found_and_the_index_follows_the_project(
     assert indexed(lab)["new_clips"] == 10
     after = lab.similar(left, (60, 90), results=100, mirrored=True)
     assert (before.moments, before.behind) == (after.moments, 0), "an update gives the result of a rebuild"
+
+    # An index of some folders cannot decide conditions for the other clips.
+    run("index", "lab/turns")
+    with pytest.raises(Conflict, match=r"has 1 of the 10 clips of the project.*`marey index lab`"):
+        list(lab.clips.list(query='like("turns/left:60-90") < 1'))
 
 
 def test_wrong_examples_are_refused_with_the_reason(lab: ProjectHandle, run: CommandLine) -> None:

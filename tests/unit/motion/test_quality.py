@@ -255,3 +255,13 @@ def test_recorded_walks_skate_less_than_the_same_walks_gliding(mocap: Path, name
         assert other > 1.15 * one, measure
     assert (glided["contact_consistency"] or 0.0) < (recorded["contact_consistency"] or 0.0)
     assert recorded["limit_excess_max_deg"] == 0.0
+
+
+def test_depth_and_bends_are_measured_in_every_frame_of_the_clip() -> None:
+    still = standing(121, 120.0)
+    poses = still.poses.copy()
+    poses[50, 1] -= 0.5  # resampling to 30 Hz leaves this frame out
+    values = measure_quality(replace(still, poses=poses), body_of(still.skeleton), OPTIONS).values
+    assert values["penetration_max_m"] == pytest.approx(0.5, abs=1e-5)
+    assert values["penetration_m"] == pytest.approx(0.5 / 121, abs=1e-5)
+    assert values["jerk_peak_m_s3"] == 0.0

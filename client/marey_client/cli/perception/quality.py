@@ -113,7 +113,7 @@ def _print(document: QualityDocument, changes: Mapping[str, tuple[float, float]]
 def _print_totals(document: QualityDocument, changes: Mapping[str, tuple[float, float]] | None) -> None:
     from marey_schemas.documents.quality import MEASURES
 
-    columns = ["measure", "unit", "clips", "95 % interval"]
+    columns = ["measure", "unit", "mean", "95 % interval"]
     if document.reference is not None:
         columns += ["reference", "difference", "95 % interval of the difference"]
     if changes is not None:
@@ -129,7 +129,7 @@ def _print_totals(document: QualityDocument, changes: Mapping[str, tuple[float, 
         if changes is not None:
             row += [_number(changes[name][0] if name in changes else None, digits)]
         rows.append(row)
-    print_table(columns, rows, right=("clips", "reference", "difference", "earlier"))
+    print_table(columns, rows, right=("mean", "reference", "difference", "earlier"))
 
 
 def _print_clips(document: QualityDocument) -> None:

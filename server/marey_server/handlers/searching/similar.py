@@ -40,6 +40,7 @@ class IndexSearcher(Resource):
             order = partial(likeness.likeness_order, one, index, shards)
             clips = await self.compute_apart(likeness.SEARCH_CLIPS, order, AlikeClips.unpack)
             alike[one.condition.source] = likeness.clips_of(project, one.condition, clips)
+        await self.look_up(motion_indexes.require_all_clips, project, index)
         return replace(filters, alike=alike)
 
     async def files_of(self, index: FoundIndex) -> tuple[ShardFiles, ...]:
