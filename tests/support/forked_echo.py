@@ -6,6 +6,7 @@ import errno
 import os
 import sys
 import threading
+import time
 from multiprocessing.connection import Connection
 
 from marey_schemas.processes.child_process import READY, connect_to_parent
@@ -52,5 +53,7 @@ if __name__ == "__main__":
         os.fork = lambda: next(forks, fork)()
     if sys.argv[2:] == ["threaded"]:
         threading.Thread(target=threading.Event().wait, daemon=True).start()
+    if sys.argv[2:] == ["ending"]:
+        threading.Thread(target=time.sleep, args=[0.3], daemon=True).start()
     control.send_bytes(READY)
     fork_children(control, answer)

@@ -18,6 +18,7 @@ import socket
 import struct
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -45,6 +46,11 @@ STARTED = 1 << 16
 """Value in place of the exit status of a child that has been started; exit statuses are smaller."""
 LOST = 1 << 17
 """Value in place of the exit status of a child whose fork server has ended."""
+THREADS_END_S = 2.0
+"""Longest wait in seconds for the end of other threads of a fork server, which work while modules are loaded.
+
+`Thread.join` returns a moment before the system has removed the thread.
+"""
 NO_CHILD = -1
 """Value in place of the process id of a child that could not be started."""
 _NUMBER, _NUMBER_AND_STATUS = struct.Struct("<q"), struct.Struct("<qq")
@@ -227,10 +233,13 @@ class ForkedChild(ConnectedChild):
 def fork_children(pipe: Connection, serve: Callable[[Connection], None]) -> None:
     """Fork a child for each socket that the parent sends, until the parent closes the pipe; `serve` runs in the child.
 
-    Raises `RuntimeError` if this process has more than one thread.
+    Raises `RuntimeError` if this process keeps more than one thread.
     """
-    if (threads := len(os.listdir("/proc/self/task"))) > 1:
-        raise RuntimeError(f"a fork server must have one thread, but this process has {threads}")
+    deadline = time.monotonic() + THREADS_END_S
+    while (threads := len(os.listdir("/proc/self/task"))) > 1:
+        if time.monotonic() > deadline:
+            raise RuntimeError(f"a fork server must have one thread, but this process has {threads}")
+        time.sleep(0.002)
     woken, wake = socket.socketpair()
     woken.setblocking(False)
     wake.setblocking(False)

@@ -194,6 +194,13 @@ def test_a_process_with_a_second_thread_forks_nothing() -> None:
     server.close()
 
 
+def test_threads_that_worked_while_modules_were_loaded_may_end_a_moment_later() -> None:
+    server = ForkServer("tests.support.forked_echo", ["ending"])
+    server.wait_until_ready()
+    assert ids_from(server.fork())
+    server.close()
+
+
 def test_a_fork_server_that_ends_while_it_loads_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ChildBroken) as broken:
         ForkServer("tests.support.forked_echo", ["broken"]).wait_until_ready()
