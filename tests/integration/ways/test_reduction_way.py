@@ -39,7 +39,7 @@ def lab(new_lab: Callable[[], ProjectHandle], run: CommandLine) -> ProjectHandle
     (run.folder / "takes").mkdir()
     for number, row in enumerate(csv.DictReader(rows)):
         duration_s = DURATIONS_S.get(row["clip"], 1.5)
-        motion = write_bvh(generate_gait(1.0 + 0.03 * number, 0.4 if row["action"] == "turn" else 0.0, duration_s))
+        motion = write_bvh(generate_gait(1.0 + 0.1 * number, 0.4 if row["action"] == "turn" else 0.0, duration_s))
         (run.folder / "takes" / f"{row['clip']}.bvh").write_bytes(motion)
     return new_lab()
 
