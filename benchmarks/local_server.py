@@ -103,7 +103,7 @@ def one_worker(server: LocalServer, *, slots: int = 1) -> Iterator[None]:
     with tempfile.TemporaryDirectory(prefix="marey-bench-") as cache:
         process = subprocess.Popen(
             [sys.executable, "-m", "marey_client.cli", "worker", "--cache", cache, "--slots", str(slots)],
-            env=clean_environment() | {"MAREY_URL": server.url, "MAREY_TOKEN": server.token},
+            env=clean_environment() | {"MAREY_SERVER": server.url, "MAREY_TOKEN": server.token},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 import httpx
 
 from marey_client.errors import BadAddress, BadCredentialFile, BadToken
-from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
+from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT, SERVER_VARIABLES
 
 DEFAULT_URL = f"http://{DEFAULT_HOST}:{DEFAULT_PORT}"
 DEFAULT_DATA = "marey-data"
@@ -86,7 +86,8 @@ def resolve(
     """Return the server and token given by flags, environment or stored logins."""
     environment = os.environ if environment is None else environment
     stored = read_logins(logins_path(environment))
-    chosen = (url or environment.get("MAREY_URL") or stored.default or DEFAULT_URL).rstrip("/")
+    by_variable = next(filter(None, map(environment.get, SERVER_VARIABLES)), None)
+    chosen = (url or by_variable or stored.default or DEFAULT_URL).rstrip("/")
     require_address(chosen)
     if token_file is not None:
         return _from_file(chosen, token_file)

@@ -5,3 +5,9 @@ API = "/api/v1"
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8460
+
+SERVER_VARIABLES = ("MAREY_SERVER", "MAREY_URL")
+"""Environment variables with the address of the server, which clients and workers read; the first that is set counts.
+
+The second one is the earlier name.
+"""

@@ -12,6 +12,7 @@ from docs.generate import ROOT
 from tests.support.s3_servers import seaweedfs
 from tests.support.told_commands import unknown_options
 
+from marey_schemas.address import SERVER_VARIABLES
 from marey_server.process.settings import Settings
 from marey_server.store.object_storage.client import Bucket
 
@@ -21,7 +22,7 @@ COMPOSE = ROOT / "docker-compose.yml"
 PAGE = ROOT / "docs" / "how-to" / "deploy.md"
 UPGRADE_PAGE = ROOT / "docs" / "how-to" / "upgrade.md"
 FILES = [COMPOSE, PAGE, UPGRADE_PAGE, *sorted(file for file in (ROOT / "deploy").rglob("*") if file.is_file())]
-OF_CLIENTS = {"MAREY_URL"}
+OF_CLIENTS = set(SERVER_VARIABLES)
 """Variables that clients and workers read."""
 
 

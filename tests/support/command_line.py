@@ -49,7 +49,7 @@ class CommandLine:
 
     def _environment(self, more: dict[str, str]) -> dict[str, str]:
         others = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
-        known = {"MAREY_URL": self.server.url, "MAREY_DATA": str(self.server.data), "COLUMNS": WIDTH}
+        known = {"MAREY_SERVER": self.server.url, "MAREY_DATA": str(self.server.data), "COLUMNS": WIDTH}
         return {**others, **known, "HOME": str(self.folder), "XDG_CONFIG_HOME": str(self.folder), **more}
 
 

@@ -86,7 +86,7 @@ def work(
 def main() -> None:
     """Run the command line of `python -m marey_worker`; `marey serve` starts workers with it."""
     parser = argparse.ArgumentParser(prog="python -m marey_worker", description="Run jobs of a Marey server.")
-    parser.add_argument("--server", help="address of the server; default: from MAREY_URL or the stored login")
+    parser.add_argument("--server", help="address of the server; default: from MAREY_SERVER or the stored login")
     parser.add_argument("--slots", type=int, default=1, help="number of jobs that run at the same time; default: 1")
     parser.add_argument("--kind", action="append", default=[], help="run only jobs of this kind; may be repeated")
     parser.add_argument(

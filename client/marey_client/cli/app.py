@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from marey_client.cli import (
     accounts,
@@ -36,9 +37,51 @@ from marey_client.cli.perception import metrics, quality
 from marey_client.cli.queue import jobs, pipelines, schedules, scripts
 from marey_client.cli.studies import conducting, results
 from marey_client.cli.terminal.invocation import Invocation
+from marey_schemas.address import SERVER_VARIABLES
+
+OTHER_NAMES = {
+    "cancel": "job cancel",
+    "clip": "ls",
+    "clips": "ls",
+    "delete": "rm",
+    "export": "download",
+    "get": "download",
+    "health": "ready",
+    "import": "upload",
+    "info": "show",
+    "init": "project create",
+    "jobs": "job ls",
+    "list": "ls",
+    "move": "mv",
+    "play": "view",
+    "query": "ls --query",
+    "remove": "rm",
+    "rename": "mv",
+    "skeletons": "ls --kind skeleton",
+    "start": "serve",
+    "status": "ready",
+    "undelete": "restore",
+    "undo": "revert",
+    "users": "user ls",
+    "version": "--version",
+    "whoami": "user show",
+}
+"""What to type instead of names of commands of other programs."""
+
+
+class CommandGroup(TyperGroup):
+    """Group of commands that names the right command for some names of other programs."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        """Return name, command and further arguments; end with a usage error if there is no such command."""
+        if args[0] not in self.commands and args[0] in OTHER_NAMES:
+            ctx.fail(f"No such command {args[0]!r}. Type: marey {OTHER_NAMES[args[0]]}")
+        return super().resolve_command(ctx, args)
+
 
 app = typer.Typer(
     name="marey",
+    cls=CommandGroup,
     help="Motion data and model management.",
     no_args_is_help=True,
     rich_markup_mode=None,
@@ -64,7 +107,9 @@ def marey(
     context: typer.Context,
     server: Annotated[
         str | None,
-        typer.Option(envvar="MAREY_URL", help="Address of the server; default: the server of your last login."),
+        typer.Option(
+            envvar=list(SERVER_VARIABLES), help="Address of the server; default: the server of your last login."
+        ),
     ] = None,
     token_file: Annotated[Path | None, typer.Option(help="File that holds a token and nothing else.")] = None,
     verbose: Annotated[

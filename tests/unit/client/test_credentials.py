@@ -25,6 +25,13 @@ def write_secret(path: Path, text: str, mode: int = 0o600) -> Path:
     return path
 
 
+def test_the_address_comes_from_a_flag_or_a_variable_by_its_new_or_earlier_name(environment: dict[str, str]) -> None:
+    assert credentials.resolve(None, None, {**environment, "MAREY_URL": SERVER}).url == SERVER
+    both = {**environment, "MAREY_SERVER": SERVER, "MAREY_URL": "http://127.0.0.1:9"}
+    assert credentials.resolve(None, None, both).url == SERVER
+    assert credentials.resolve("http://127.0.0.1:8", None, both).url == "http://127.0.0.1:8"
+
+
 def test_a_token_file_comes_before_the_variable_and_that_before_the_stored_login(
     environment: dict[str, str], tmp_path: Path
 ) -> None:
