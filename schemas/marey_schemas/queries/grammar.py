@@ -150,25 +150,24 @@ def parse(text: str) -> Query:
 
 
 def conditions_of(query: Query) -> Iterator[Condition]:
-    """Yield all conditions of a query."""
-    if isinstance(query, Condition):
-        yield query
-    elif isinstance(query, Negation):
-        yield from conditions_of(query.query)
-    elif isinstance(query, Junction):
-        for part in query.queries:
-            yield from conditions_of(part)
+    """Yield all conditions on fields in a query."""
+    return (one for one in _leaves(query) if isinstance(one, Condition))
 
 
 def likenesses_of(query: Query) -> Iterator[Likeness]:
     """Yield all conditions `like(...)` of a query."""
-    if isinstance(query, Likeness):
-        yield query
-    elif isinstance(query, Negation):
-        yield from likenesses_of(query.query)
+    return (one for one in _leaves(query) if isinstance(one, Likeness))
+
+
+def _leaves(query: Query) -> Iterator[Query]:
+    """Yield the parts of a query that contain no other query, from left to right."""
+    if isinstance(query, Negation):
+        yield from _leaves(query.query)
     elif isinstance(query, Junction):
         for part in query.queries:
-            yield from likenesses_of(part)
+            yield from _leaves(part)
+    else:
+        yield query
 
 
 def with_clips(query: Query, found: Mapping[str, frozenset[str]]) -> Query:
