@@ -20,13 +20,24 @@ def main() -> None:
 
 
 def _run() -> None:
-    from marey_client.cli.app import app
+    from marey_client.cli.app import with_one_command
     from marey_client.cli.terminal.failures import reported
 
     _take_any_text()
     arguments = with_global_options_first(sys.argv[1:])
     with reported(verbose=any(switch in arguments for switch in GLOBAL_SWITCHES)):
-        app(args=arguments, prog_name="marey")
+        with_one_command(_command_name(arguments))(args=arguments, prog_name="marey")
+
+
+def _command_name(arguments: list[str]) -> str | None:
+    """Return the first argument that is neither a global option nor its value, or None."""
+    left = iter(arguments)
+    for argument in left:
+        if argument in GLOBAL_OPTIONS:
+            next(left, None)
+        elif argument not in GLOBAL_SWITCHES and not argument.startswith(tuple(f"{name}=" for name in GLOBAL_OPTIONS)):
+            return argument
+    return None
 
 
 def _take_any_text() -> None:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.browser_login import sign_in_in_browser
 from marey_client.cli.projects import ByteLimit, DefaultLimits, ItemLimit, changed_limits, print_quotas
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, UserName, connect, refuse_ignored
@@ -81,6 +80,8 @@ def login(
         if with_token:
             secret = typer.get_text_stream("stdin").read().strip()
         elif browser:
+            from marey_client.cli.browser_login import sign_in_in_browser
+
             secret = sign_in_in_browser(marey, days * DAY_S, paste=paste)
         elif invitation:
             secret = _sign_up(marey, name, days)

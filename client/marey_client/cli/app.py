@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
+from typer.main import get_command_name
+from typer.models import CommandInfo
 
 from marey_client.cli import (
     accounts,
@@ -169,3 +172,20 @@ for register in (
     audit,
 ):
     register.add_to(app)
+
+
+def with_one_command(name: str | None) -> typer.Typer:
+    """Return `app` with only the command or group of this name, or with all commands if there is no such command.
+
+    Typer builds the parameters of all commands before it runs one; building only one takes a tenth of the time.
+    """
+    chosen = copy.copy(app)
+    chosen.registered_commands = [command for command in app.registered_commands if _name(command) == name]
+    chosen.registered_groups = [group for group in app.registered_groups if group.name == name]
+    known = chosen.registered_commands or chosen.registered_groups or name in OTHER_NAMES
+    return chosen if known else app
+
+
+def _name(command: CommandInfo) -> str:
+    assert command.callback is not None
+    return command.name or get_command_name(command.callback.__name__)

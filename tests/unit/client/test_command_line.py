@@ -23,7 +23,7 @@ from tests.support.scripted_server import ScriptedServer, problem
 
 from marey_client.cli import projects, tokens, with_global_options_first
 from marey_client.cli.addresses import Address, require_item, the_thing
-from marey_client.cli.app import OTHER_NAMES, app
+from marey_client.cli.app import OTHER_NAMES, app, with_one_command
 from marey_client.cli.clip_jobs import _print_aligned, _print_warnings, print_labelled
 from marey_client.cli.datasets import combining, versions
 from marey_client.cli.datasets.combining import resolutions_of
@@ -106,6 +106,16 @@ def test_help_loads_nothing_heavy() -> None:
         "why",
     ):
         assert command in done.stdout
+
+
+def test_each_command_is_built_without_the_others() -> None:
+    every_command: Any = typer.main.get_command(app)
+    for name, command in every_command.commands.items():
+        alone: Any = typer.main.get_command(with_one_command(name))
+        assert list(alone.commands) == [name]
+        assert alone.commands[name].help == command.help
+    assert with_one_command("no-such-command") is app
+    assert with_one_command(None) is app
 
 
 def test_every_command_explains_itself() -> None:
@@ -717,19 +727,21 @@ def test_at_a_narrow_terminal_ids_stay_in_one_piece_and_moments_are_told_to_the_
     assert "03:05:58Z" in printed
 
 
-@pytest.mark.parametrize(("typed", "meant"), OTHER_NAMES.items())
-def test_names_of_other_programs_are_answered_with_a_command_that_exists(typed: str, meant: str) -> None:
-    answered = run_here([typed, "lab"])
-    assert answered.returncode == 2
-    assert f"No such command '{typed}'. Type: marey {meant}" in answered.stderr
-    group: Any = typer.main.get_command(app)
-    for word in meant.split():
-        if word.startswith("--"):
-            assert any(word in option.opts for option in group.params)
-        elif word in getattr(group, "commands", {}):
-            group = group.commands[word]
-        else:
-            assert word in set(Kind), word
+def test_names_of_other_programs_are_answered_with_a_command_that_exists() -> None:
+    every_command: Any = typer.main.get_command(app)
+    for typed, meant in OTHER_NAMES.items():
+        assert typed not in every_command.commands
+        answered = run_here([typed, "lab"])
+        assert answered.returncode == 2
+        assert f"No such command '{typed}'. Type: marey {meant}" in answered.stderr
+        group = every_command
+        for word in meant.split():
+            if word.startswith("--"):
+                assert any(word in option.opts for option in group.params)
+            elif word in getattr(group, "commands", {}):
+                group = group.commands[word]
+            else:
+                assert word in set(Kind), word
 
 
 def test_ready_tells_by_its_status_whether_the_server_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:
