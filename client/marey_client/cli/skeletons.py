@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from typing import Annotated
 
 import typer
@@ -42,11 +44,14 @@ def map_joints(
         mapping = found.mapping()
         if assignments or confirm:
             known = {joint.name for joint in found.hierarchy().joints}
-            joints = {**mapping.joints, **_assigned(assignments or [], known)}
+            joints = {**mapping.joints, **_assigned(assignments or [], known, mapping.joints)}
             chosen = {standard: joint for standard, joint in joints.items() if joint}
-            mapping = mapping.model_copy(update={"joints": chosen, "method": "manual", "confidence": 1.0})
-            item = found.put_mapping(mapping)
-            print_message(f"{place}: revision {item.revision}")
+            changed = mapping.model_copy(update={"joints": chosen, "method": "manual", "confidence": 1.0})
+            if changed == mapping or (chosen == mapping.joints and not confirm):
+                print_message(f"{place}: nothing changes")
+            else:
+                mapping = changed
+                print_message(f"{place}: revision {found.put_mapping(mapping).revision}")
     if as_json:
         return print_json(mapping)
     rig = mapping.rig or "no known rig"
@@ -91,18 +96,29 @@ def joint_axes(
     return print_table(("joint", "twist", "swing"), rows)
 
 
-def _assigned(assignments: list[str], known: set[str]) -> dict[str, str]:
+def _assigned(assignments: list[str], known: set[str], mapped: Mapping[str, str]) -> dict[str, str]:
+    """Return the joint of each standard joint in the texts; names in `mapped` can be cleared whatever they are."""
+    from marey_schemas.standard_joints import STANDARD_JOINTS
+
     given: dict[str, str] = {}
     for assignment in assignments:
         standard, equals, joint = assignment.partition("=")
         if not equals or not standard:
             raise WrongUsage(f"{assignment!r} does not map a joint; write standard_joint=JointName")
+        if standard not in STANDARD_JOINTS and (joint or standard not in mapped):
+            raise WrongUsage(f"{standard!r} is not a standard joint{_nearest(standard, STANDARD_JOINTS)}")
         if joint and joint not in known:
-            raise WrongUsage(
-                f"{joint!r} is not a joint of this skeleton; its joints are {', '.join(sorted(known)[:8])}, ..."
-            )
+            raise WrongUsage(f"{joint!r} is not a joint of this skeleton{_nearest(joint, sorted(known))}")
         given[standard] = joint
     return given
+
+
+def _nearest(name: str, names: Sequence[str]) -> str:
+    """Return the end of a sentence about a wrong name, with the most similar names, or with some of them."""
+    similar = get_close_matches(name, names, n=3)
+    if similar:
+        return f"; did you mean {' or '.join(similar)}?"
+    return f"; it must be one of {', '.join(names[:8])}" + (", ..." if len(names) > 8 else "")
 
 
 def _vector(text: str | None) -> tuple[float, float, float] | None:

@@ -1,31 +1,10 @@
-"""The standard joints: one name for the same anatomical joint of every rig.
-
-A joint is named for the articulation at its origin: `left_hip` is where the left thigh turns, and `left_shoulder` is
-where the left upper arm turns (rigs often call this joint "arm", and the clavicle "shoulder").
-"""
+"""Standard joints: which of them a body needs, how they follow each other, and which are mirror images."""
 
 from __future__ import annotations
 
-SIDES = ("left", "right")
-FINGERS = ("index", "middle", "ring", "pinky")
+from marey_schemas.standard_joints import CENTRE_JOINTS, FINGERS, SIDES, STANDARD_JOINTS
 
-CENTRE_JOINTS = ("root", "pelvis", "spine", "spine_1", "spine_2", "neck", "head")
-SIDE_JOINTS = (
-    "clavicle",
-    "shoulder",
-    "elbow",
-    "wrist",
-    "finger",
-    "hip",
-    "knee",
-    "ankle",
-    "toe",
-    "heel",
-    "hold_point",
-    *(f"thumb_{part}" for part in ("base", "mid", "tip", "end")),
-    *(f"{finger}_finger_{part}" for finger in FINGERS for part in ("root", "base", "mid", "tip", "end")),
-)
-STANDARD_JOINTS = (*CENTRE_JOINTS, *(f"{side}_{joint}" for side in SIDES for joint in SIDE_JOINTS))
+__all__ = ["CENTRE_JOINTS", "CHAINS", "ESSENTIAL_JOINTS", "FINGERS", "SIDES", "STANDARD_JOINTS", "mirrored"]
 
 # Without these a body cannot be read or retargeted as a human's.
 ESSENTIAL_JOINTS = (

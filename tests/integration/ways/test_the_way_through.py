@@ -441,6 +441,11 @@ def test_a_body_that_was_hardly_recognised_is_refused_until_somebody_confirms_it
     sources = [CollectionInput(collection="raw")]
     ended = marey.jobs.wait(project.retarget(sources, studio.id, into="doubtful").id, timeout_s=60)
     assert [refusal["code"] for refusal in ended.result["refused"]] == ["mapping-uncertain"]
-    run("skeleton", "map", f"{project.name}/{source.id}", "--confirm")
+    place = f"{project.name}/{source.id}"
+    assert "revision 3" in run("skeleton", "map", place, "--confirm").stderr
+    known = source.mapping().joints["left_ankle"]
+    assert "nothing changes" in run("skeleton", "map", place, f"left_ankle={known}").stderr
+    assert "did you mean left_ankle" in run("skeleton", "map", place, f"leftankle={known}", status=2).stderr
+    assert project.skeletons.get(source.id).item.revision == 3
     ended = marey.jobs.wait(project.retarget(sources, studio.id, into="confirmed").id, timeout_s=60)
     assert ended.result["clips"] == 1

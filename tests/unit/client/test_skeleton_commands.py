@@ -1,0 +1,30 @@
+"""Command `skeleton map`: assignments of joints, as people type them."""
+
+import pytest
+
+from marey_client.cli.skeletons import _assigned
+from marey_client.cli.terminal.failures import WrongUsage
+
+KNOWN = {"Foot_L", "Foot_R", "Hips"}
+MAPPED = {"left_ankle": "Foot_L", "leftankle": "Foot_L"}
+
+
+@pytest.mark.parametrize(
+    ("assignment", "told"),
+    [
+        ("leftfoot=Foot_L", "'leftfoot' is not a standard joint; did you mean left_"),
+        ("leftankle=Foot_L", "'leftankle' is not a standard joint; did you mean left_ankle"),
+        ("tail=Hips", "'tail' is not a standard joint; it must be one of root, pelvis, "),
+        ("tail=", "'tail' is not a standard joint"),
+        ("left_ankle=Foot-L", "'Foot-L' is not a joint of this skeleton; did you mean Foot_"),
+        ("left_ankle", "write standard_joint=JointName"),
+    ],
+)
+def test_a_typing_error_is_answered_with_the_nearest_name(assignment: str, told: str) -> None:
+    with pytest.raises(WrongUsage) as refused:
+        _assigned([assignment], KNOWN, MAPPED)
+    assert told in str(refused.value)
+
+
+def test_a_name_that_is_not_standard_can_be_cleared() -> None:
+    assert _assigned(["leftankle="], KNOWN, MAPPED) == {"leftankle": ""}
