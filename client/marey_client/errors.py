@@ -144,11 +144,14 @@ class RequestFailed(MareyError):
 
     status: ClassVar[int] = 0
 
-    def __init__(self, problem: Problem, *, retry_after_s: float | None = None, anonymous: bool = False) -> None:
+    def __init__(
+        self, problem: Problem, *, retry_after_s: float | None = None, anonymous: bool = False, server: str = ""
+    ) -> None:
         super().__init__(problem.detail)
         self.problem = problem
         self.retry_after_s = retry_after_s
         self.anonymous = anonymous
+        self.server = server
 
     def __str__(self) -> str:
         if len(self.errors) == 1 and self.errors[0].detail == self.detail:
@@ -285,11 +288,13 @@ _BY_STATUS: dict[int, type[RequestFailed]] = {
 _BY_CODE: dict[str, type[RequestFailed]] = {"lease-lost": LeaseLost}
 
 
-def error_of(problem: Problem, *, retry_after_s: float | None = None, anonymous: bool = False) -> RequestFailed:
+def error_of(
+    problem: Problem, *, retry_after_s: float | None = None, anonymous: bool = False, server: str = ""
+) -> RequestFailed:
     """Return the exception for a problem document; its class is found by code, then by status.
 
-    `anonymous` states whether the request had no token.
+    `anonymous` states whether the request had no token, and `server` is the address of the server.
     """
     known = _BY_CODE.get(problem.code) or _BY_STATUS.get(problem.status)
     kind = known or (ServerFailed if problem.status >= 500 else RequestFailed)
-    return kind(problem, retry_after_s=retry_after_s, anonymous=anonymous)
+    return kind(problem, retry_after_s=retry_after_s, anonymous=anonymous, server=server)

@@ -326,9 +326,12 @@ def raise_for_problem(response: httpx.Response) -> None:
     """Raise an error if the status of an answer is 400 or higher."""
     if response.status_code < 400:
         return
+    server = str(response.request.url.copy_with(raw_path=b"/"))
     circumstances: dict[str, Any] = {
-        "retry_after_s": retry_after_s(response), "anonymous": "Authorization" not in response.request.headers,
-    }  # fmt: skip
+        "retry_after_s": retry_after_s(response),
+        "anonymous": "Authorization" not in response.request.headers,
+        "server": server.rstrip("/"),
+    }
     if response.headers.get("Content-Type", "").startswith(PROBLEM) and response.content:
         with suppress(ValidationError):  # others than Marey answer with problems, too
             raise error_of(Problem.model_validate_json(response.content), **circumstances)
@@ -336,7 +339,7 @@ def raise_for_problem(response: httpx.Response) -> None:
         type="about:blank",
         title=response.reason_phrase,
         status=response.status_code,
-        detail=f"{response.request.url.copy_with(raw_path=b'/')} answered {response.status_code} "
+        detail=f"{server} answered {response.status_code} "
         f"{response.reason_phrase}, and not as a Marey server does; is it the right address?",
         instance=response.headers.get("X-Request-Id", "unknown"),
         code=f"http-{response.status_code}",

@@ -8,7 +8,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -35,7 +35,7 @@ from marey_client.cli.queue.pipelines import _print_shortfalls
 from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
 from marey_client.cli.terminal.following import clips_at, follow, print_ended
 from marey_client.cli.terminal.invocation import connect
-from marey_client.cli.terminal.output import print_table
+from marey_client.cli.terminal.output import ago, print_table
 from marey_client.credentials import Credential, Logins, read_logins, store_login, write_private
 from marey_client.errors import BadCredentialFile, Forbidden, Invalid, NotFound, Unauthenticated
 from marey_client.handles.pipelines import PipelineRun
@@ -365,7 +365,7 @@ def test_what_is_wrong_with_a_field_is_told_once(script: ScriptedServer) -> None
     script.answers = [problem(422, "invalid", detail="/a: no", errors=errors)]
     with pytest.raises(Invalid) as raised:
         script.marey().project("lab").read()
-    assert sentence(raised.value) == "/a: no; /b: neither (invalid, request req-1)"
+    assert sentence(raised.value) == "/a: no; /b: neither (invalid, request req-1 at http://server.test)"
 
 
 def test_a_token_that_is_refused_is_told_with_the_place_it_came_from(
@@ -755,3 +755,10 @@ def test_ready_tells_by_its_status_whether_the_server_is_ready(monkeypatch: pyte
     assert "the reason" in refused.stderr
     assert [request.url.path for request in server.requests] == ["/readyz", "/readyz"]
     assert all("Authorization" not in request.headers for request in server.requests)
+
+
+def test_times_of_jobs_are_told_in_their_largest_unit() -> None:
+    now = datetime(2026, 11, 29, 12, 0, 0, tzinfo=UTC)
+    lengths = (-5, 0, 59, 60, 3_599, 3_600, 86_399, 86_400 * 40)
+    told = [ago(now - timedelta(seconds=seconds), now) for seconds in lengths]
+    assert told == ["0 s ago", "0 s ago", "59 s ago", "1 min ago", "59 min ago", "1 h ago", "23 h ago", "40 d ago"]

@@ -124,6 +124,8 @@ def ls(
     items = _sorted(items, order[0], reverse=sort.startswith("-"))
     if as_json:
         return print_json({"collections": folders, "items": [one.item for one in items]})
+    if not folders and not items:
+        return print_message(_nothing_at(address, chosen=bool(kind or tag or find or query or stale)))
     rows: list[tuple[object, ...]] = [
         (f"{name}/", *("collection" if column == "kind" else "" for column in shown)) for name in folders
     ]
@@ -135,6 +137,13 @@ def ls(
         rows,
         right=[column for column in shown if column in FIGURES or column.startswith(FACET_PREFIX)],
     )
+
+
+def _nothing_at(address: Address, *, chosen: bool) -> str:
+    """Return what to say instead of an empty list; `chosen` states that options left something out."""
+    if chosen:
+        return f"{address} contains nothing that meets the options"
+    return f"{address} is empty; `marey upload FOLDER --project {address.project}` stores motion files"
 
 
 def _explain(

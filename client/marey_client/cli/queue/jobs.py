@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -11,7 +12,7 @@ from marey_client.cli.addresses import Address, require_item
 from marey_client.cli.terminal.failures import Refused, WrongUsage
 from marey_client.cli.terminal.following import SEEDED_JOB, Into, Wait, follow, input_at, print_commit, print_ended
 from marey_client.cli.terminal.invocation import AsJson, JobId, ProjectName, connect
-from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
+from marey_client.cli.terminal.output import ago, print_json, print_message, print_pairs, print_table
 from marey_client.cli.terminal.schema_options import Chosen, add_command
 from marey_client.cli.terminal.typed_values import Schema, assignment, range_text, read_parameter, resolved, type_text
 from marey_schemas.wording import counted
@@ -171,7 +172,10 @@ def list_jobs(
         jobs = list(islice(marey.project(project).jobs(filters=filters), limit))
     if as_json:
         return print_json(jobs)
-    rows = [(one.id, one.kind, one.state, _done(one), one.author, one.created_at) for one in jobs]
+    if not jobs:
+        return print_message(f"{project} has no such jobs" if any(filters.values()) else f"{project} has no jobs yet")
+    now = datetime.now(UTC)
+    rows = [(one.id, one.kind, one.state, _done(one), one.author, ago(one.created_at, now)) for one in jobs]
     return print_table(("id", "kind", "state", "done", "author", "submitted"), rows)
 
 

@@ -74,13 +74,14 @@ def interrupted_by_sigterm() -> Iterator[None]:
 
 
 def sentence(error: BaseException) -> str:
-    """Return an error in one line, with its code, request id and notes if it has them."""
+    """Return an error in one line, with its code, request id, server and notes if it has them."""
     from marey_client.errors import NotFound, RequestFailed
 
     text = " ".join(_text_of(error).split()) or type(error).__name__
     if not isinstance(error, RequestFailed):
         return text
-    whole = f"{text} ({error.code}, request {error.request_id})"
+    where = f" at {error.server}" if error.server else ""
+    whole = f"{text} ({error.code}, request {error.request_id}{where})"
     if error.anonymous and (isinstance(error, NotFound) or error.code == "unauthenticated"):
         return f"{whole}; {ANONYMOUS_HINT}"
     return "; ".join([whole, *getattr(error, "__notes__", ())])

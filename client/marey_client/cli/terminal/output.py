@@ -14,6 +14,8 @@ import typer
 from marey_schemas.wording import printable
 
 if TYPE_CHECKING:
+    from datetime import datetime
+
     from pydantic import BaseModel
 
 
@@ -54,6 +56,15 @@ def _shown(cell: object) -> str:
     if isinstance(cell, datetime):
         return cell.strftime("%Y-%m-%d %H:%M:%SZ")
     return printable("" if cell is None else str(cell))
+
+
+def ago(moment: datetime, now: datetime) -> str:
+    """Return how long ago a moment was, in its largest unit; a moment after `now`, by another clock, is "0 s ago"."""
+    seconds = max(0, int((now - moment).total_seconds()))
+    for unit, length_s in (("d", 86_400), ("h", 3_600), ("min", 60)):
+        if seconds >= length_s:
+            return f"{seconds // length_s} {unit} ago"
+    return f"{seconds} s ago"
 
 
 def print_rows(rows: Iterable[tuple[str, str, str]]) -> None:
