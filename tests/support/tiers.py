@@ -69,6 +69,11 @@ def backend_of(item: pytest.Item) -> str | None:
     return next((value for value in values if isinstance(value, str) and value in BACKENDS), None)
 
 
+def _without_backend(item: pytest.Item) -> str:
+    """Return the name of a test, which is the same for each database."""
+    return item.nodeid.replace(backend_of(item) or "", "")
+
+
 def _on_postgres(item: pytest.Item) -> bool:
     return backend_of(item) == "postgres"
 
@@ -141,12 +146,15 @@ def _on_other_database(item: pytest.Item) -> bool:
     """Return whether the tier `test` runs this test only on the other database.
 
     This concerns fault cases, REST tests and workflows; tests of the store itself run on both databases. A hash of the
-    name of the test, or of the workflow's module, chooses the database, so about half of these tests run on each.
+    name of the test, or of the workflow's module, chooses the database, so about half of these tests run on each. Tests
+    that exist for only one database always run.
     """
     backend = backend_of(item)
     if backend is None or item.get_closest_marker("every_database") or not (_fault(item) or _rest(item)):
         return False
-    name = _folder(item) if _whole_way(item) else item.nodeid.replace(backend, "")
+    if item.config.stash[ON_DATABASES][_without_backend(item)] < len(BACKENDS):
+        return False
+    name = _folder(item) if _whole_way(item) else _without_backend(item)
     return BACKENDS[zlib.crc32(name.encode()) % len(BACKENDS)] != backend
 
 
@@ -174,6 +182,8 @@ TIERS = {
 
 LEFT_OUT = pytest.StashKey[Counter[str]]()
 """Key of the number of tests that the tier left out, by reason."""
+ON_DATABASES = pytest.StashKey[Counter[str]]()
+"""Key of the number of databases on which a test can run, by its name without the database."""
 
 
 def examples(count: int) -> int:
@@ -248,6 +258,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         reasons = {"need kubectl": _needs_kubectl, **reasons}
     if unset := [name for name in (CLUSTER_VARIABLE, CLUSTER_IMAGE_VARIABLE) if name not in os.environ]:
         reasons = {f"need a Kubernetes cluster ({' and '.join(unset)} not set)": _needs_cluster, **reasons}
+    config.stash[ON_DATABASES] = Counter(_without_backend(item) for item in items if backend_of(item))
     kept, gone = [], []
     for item in items:
         reason = next((reason for reason, applies in reasons.items() if applies(item)), None)
