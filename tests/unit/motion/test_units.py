@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.floor_work import FLOOR_WORK, floor_work
 from tests.support.motion_files import body_asf, bvh
 
 from marey_motion import quaternions
@@ -313,3 +314,42 @@ def test_a_body_that_lies_does_not_contradict_the_axis_of_its_rest_pose(walk: Cl
     poses[:, 3:7] = quaternions.multiply(turned, poses[:, 3:7])
     file = write_bvh(Clip(walk.skeleton, 30.0, poses), unit="cm")
     assert "up-axis-doubtful" not in codes(read_motion(file, "lies.bvh", options=ImportOptions(up_axis="y")))
+
+
+# -- people on the ground --
+
+
+@pytest.mark.parametrize("unit", ["cm", "cmu"])
+@pytest.mark.parametrize("up_axis", ["y", "z"])
+@pytest.mark.parametrize("name", FLOOR_WORK)
+def test_a_known_rig_on_the_ground_is_a_person_upright_in_its_rest_pose(name: str, up_axis: str, unit: str) -> None:
+    """Neither hands on the ground nor flat ground decide: both mislead in cartwheels, rolls or crawling."""
+    for heading_deg in (0.0, 45.0, 90.0, 200.0):
+        clip = in_axes(floor_work(name, heading_deg=heading_deg), FILE_AXES[up_axis])
+        motion = imported(clip, unit)
+        assert (motion.source.up_axis, motion.source.unit_scale_m) == (up_axis, pytest.approx(UNITS_M[unit]))
+        assert "left-handed" not in codes(motion)
+
+
+def test_a_rest_pose_that_contradicts_motion_and_ground_is_asked_about() -> None:
+    """The body is on the ground of a file with z up, but its rest pose has y up."""
+    for name, heading_deg in (("crawl", 0.0), ("crawl", 90.0), ("cartwheels", 0.0), ("cartwheels", 90.0)):
+        doubtful = with_upright_rest(floor_work(name, heading_deg=heading_deg))
+        with pytest.raises(AmbiguousUnits, match=r"rest pose points along y.*--up-axis"):
+            imported(doubtful)
+        assert imported(doubtful, up_axis="z").source.up_axis == "z"
+    for upright in (floor_work("kneel"), generate_gait(1.3, 0.2, 2.0, 30.0)):
+        assert imported(with_upright_rest(upright)).source.up_axis == "z"
+
+
+def test_a_mirrored_kneeling_body_is_told_by_its_rest_pose() -> None:
+    assert "left-handed" in codes(imported(in_axes(floor_work("kneel"), MIRROR)))
+
+
+def with_upright_rest(clip: Clip) -> Clip:
+    """Return the same motion in a file with z up, by the root's rotation alone: the rest pose keeps y up."""
+    quarter = quaternions.from_axis_angle(np.array([1.0, 0.0, 0.0]), np.pi / 2)
+    poses = clip.poses.astype(np.float64)
+    poses[:, :3] = poses[:, :3] @ FILE_AXES["z"].T
+    poses[:, 3:7] = quaternions.multiply(quarter, poses[:, 3:7])
+    return Clip(clip.skeleton, clip.frame_rate_hz, poses.astype(np.float32))
