@@ -124,3 +124,12 @@ def _posed(skeleton: Skeleton, pose: Mapping[str, AnyFloats], ways: AnyFloats) -
         rotations[:, skeleton.index_of(name)] = turn
     poses = np.concatenate([ways, rotations.reshape(len(ways), -1)], axis=1)
     return Clip(skeleton, FRAME_RATE_HZ, poses.astype(np.float32))
+
+
+def with_upright_rest(clip: Clip) -> Clip:
+    """Return the same motion in a file with z up, by the root's rotation alone: the rest pose keeps y up."""
+    quarter = quaternions.from_axis_angle(np.array([1.0, 0.0, 0.0]), np.pi / 2)
+    poses = clip.poses.astype(np.float64)
+    poses[:, :3] = quaternions.rotate_vectors(quarter, poses[:, :3])
+    poses[:, 3:7] = quaternions.multiply(quarter, poses[:, 3:7])
+    return replace(clip, poses=poses.astype(np.float32))

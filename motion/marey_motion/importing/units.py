@@ -74,9 +74,12 @@ class Conversion:
     handedness: Handedness
     evidence: tuple[str, ...]
     warnings: tuple[CheckWarning, ...]
+    axis_is_clear: bool
 
 
-def infer_conversion(source: SourceMotion, anatomy: Anatomy, file: str, options: ImportOptions) -> Conversion:
+def infer_conversion(
+    source: SourceMotion, anatomy: Anatomy, file: str, options: ImportOptions, sibling_axis: UpAxis | None = None
+) -> Conversion:
     """Determine the unit and the upward axis from the options, or else from the format, or else from the body.
 
     Parameters
@@ -85,6 +88,7 @@ def infer_conversion(source: SourceMotion, anatomy: Anatomy, file: str, options:
     anatomy : Anatomy    anatomy of the source's skeleton
     file : str    name of the file, for messages
     options : ImportOptions    facts given by the user
+    sibling_axis : str, optional    upward axis of other files with this skeleton
 
     Returns
     -------
@@ -96,10 +100,12 @@ def infer_conversion(source: SourceMotion, anatomy: Anatomy, file: str, options:
     ContradictedOption    when the body clearly contradicts a given unit or axis
     """
     body = measure_body(source, anatomy, file)
-    up_axis = choose_up_axis(source, body, options)
+    up_axis = choose_up_axis(source, body, options, sibling_axis)
     unit_scale_m = _choose_unit(source, body, options, up_axis)
     _look_for_mirroring(source, body, options, up_axis)
-    return Conversion(unit_scale_m, up_axis, options.handedness, tuple(body.evidence), tuple(body.warnings))
+    return Conversion(
+        unit_scale_m, up_axis, options.handedness, tuple(body.evidence), tuple(body.warnings), body.axis_is_clear
+    )
 
 
 # Unit

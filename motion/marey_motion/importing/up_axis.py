@@ -40,7 +40,9 @@ _ONLY_GROUND_VOTE = 1.0
 _CLEAR_LEAD = 0.6
 
 
-def choose_up_axis(source: SourceMotion, body: BodyMeasures, options: ImportOptions) -> UpAxis:
+def choose_up_axis(
+    source: SourceMotion, body: BodyMeasures, options: ImportOptions, sibling_axis: UpAxis | None
+) -> UpAxis:
     """Determine the upward axis from the options, or else from the format, or else from the body.
 
     Parameters
@@ -48,6 +50,7 @@ def choose_up_axis(source: SourceMotion, body: BodyMeasures, options: ImportOpti
     source : SourceMotion    the file in its own unit and axes
     body : BodyMeasures    measures of the file; receives the evidence and warnings
     options : ImportOptions    facts given by the user
+    sibling_axis : str, optional    upward axis of other files with this skeleton, for a file that does not show its own
 
     Returns
     -------
@@ -71,12 +74,18 @@ def choose_up_axis(source: SourceMotion, body: BodyMeasures, options: ImportOpti
             CheckWarning("up-axis-assumed", "no feet were found that show which axis points up; y is assumed")
         )
         return "y"
+    return _infer_up_axis(body, sibling_axis)
+
+
+def _infer_up_axis(body: BodyMeasures, sibling_axis: UpAxis | None) -> UpAxis:
+    """Infer the upward axis from motion, rest pose and ground; `sibling_axis` counts if the motion is not clear."""
     standing, resting = _body_axis(body.positions, body.landmarks), _body_axis(body.rest[:, None], body.landmarks)
     flat = _flat_axis(body)
     is_person = body.landmarks.by_names and resting[1] >= _CLEAR_COSINE
     on_fours = flat is not None and flat[0] != standing[0] and _stands_on_all_fours(body, flat[0])
     if flat is not None and on_fours and not is_person:
         body.evidence.append(f"up axis {flat[0]}: hands and feet are below the hips; {flat[1]}")
+        body.axis_is_clear = True
         return flat[0]
     # Along y, a person may lie in a file with z up; a rest pose with z up may stand in a file with y up.
     is_undoubted = not is_person or resting[0] == "y" or _stands_on_origin(body, "y")
@@ -84,10 +93,18 @@ def choose_up_axis(source: SourceMotion, body: BodyMeasures, options: ImportOpti
         body.evidence.append(
             f"up axis y: head above feet, mean cosine {standing[1]:.2f} over {body.positions.shape[1]} frames"
         )
+        body.axis_is_clear = True
         return "y"
+    if sibling_axis is not None:
+        told = _told(standing, resting)
+        body.evidence.append(f"up axis {sibling_axis}: other files with this skeleton have it; {told}")
+        return sibling_axis
     if is_person:
-        return _axis_of_person(body, standing, resting, flat, on_fours=on_fours)
-    return _settle_up_axis(body, *standing, flat)
+        axis = _axis_of_person(body, standing, resting, flat, on_fours=on_fours)
+    else:
+        axis = _settle_up_axis(body, *standing, flat)
+    body.axis_is_clear = axis == standing[0] and standing[1] >= _CLEAR_COSINE
+    return axis
 
 
 def _axis_of_person(
