@@ -195,9 +195,10 @@ def _ambiguous_unit(body: BodyMeasures, hip_height: float) -> AmbiguousUnits:
         for name in by_fit[:3]
     ]
     low, high = LEG_LENGTH_M
+    fitting = [name for name, size in UNITS_M.items() if _within(LEG_LENGTH_M, body.leg * size)]
+    fit = f"fit {' or '.join(fitting)}, but the names of the joints are not known" if fitting else "fit no known unit"
     return AmbiguousUnits(
-        f"the unit of length is not clear: legs of {body.leg:.4g} units fit no known unit "
-        f"(adults have {low} to {high} m); "
+        f"the unit of length is not clear: legs of {body.leg:.4g} units {fit} (adults have {low} to {high} m); "
         f"name it with --unit (unit_scale_m); candidates: {', '.join(listed)}",
         file=body.file,
     )

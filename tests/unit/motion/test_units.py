@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from marey_motion.formats.npz import write_npz
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_motion.importing.units import unit_in_metres
 from marey_motion.kinematics import global_positions, global_rotations
+from marey_motion.rigs import map_joints
 from marey_motion.skeleton import EndSite, Skeleton
 from marey_schemas.formats import UNITS_M
 
@@ -345,3 +347,52 @@ def test_a_rest_pose_that_contradicts_motion_and_ground_is_asked_about() -> None
 
 def test_a_mirrored_kneeling_body_is_told_by_its_rest_pose() -> None:
     assert "left-handed" in codes(imported(in_axes(floor_work("kneel"), MIRROR)))
+
+
+# -- names of early optical systems --
+
+EARLY_NAMES = {
+    "Hips": "hip",
+    "Spine": "lowback",
+    "Spine1": "midback",
+    "Spine2": "chest",
+    "Neck": "neck",
+    "Head": "head",
+    **{
+        f"{side}{name}": f"{start}{early}"
+        for side, word in (("Left", "left"), ("Right", "right"))
+        for name, early, start in (
+            ("Shoulder", "collar", word),
+            ("Arm", "uparm", word),
+            ("ForeArm", "lowarm", word),
+            ("Hand", "hand", word),
+            ("UpLeg", "thigh", word[0]),
+            ("Leg", "lowleg", word),
+            ("Foot", "foot", word),
+            ("ToeBase", "toe", word[0]),
+        )
+    },
+}
+
+
+def renamed(clip: Clip, names: dict[str, str]) -> Clip:
+    skeleton = clip.skeleton
+    called = tuple(names.get(name, name.lower()) for name in skeleton.joint_names)
+    return replace(
+        clip,
+        skeleton=Skeleton(called, skeleton.parents, skeleton.offsets, skeleton.rest_rotations, skeleton.end_sites),
+    )
+
+
+def test_early_names_with_small_sides_make_an_inch_known(walk: Clip) -> None:
+    motion = imported(renamed(walk, EARLY_NAMES), "inch")
+    assert motion.source.unit_scale_m == UNITS_M["inch"]
+    joints = map_joints(motion.skeleton).joints
+    assert (joints["left_shoulder"], joints["right_knee"], joints["left_hip"]) == ("leftuparm", "rightlowleg", "lthigh")
+    assert joints["pelvis"] == "hip"
+
+
+def test_a_unit_that_fits_only_with_unknown_names_is_named(walk: Clip) -> None:
+    unnamed = renamed(walk, {name: f"bone{index}" for index, name in enumerate(walk.skeleton.joint_names)})
+    with pytest.raises(AmbiguousUnits, match="fit inch, but the names of the joints are not known"):
+        imported(unnamed, "inch")
