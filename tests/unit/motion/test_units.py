@@ -12,7 +12,7 @@ from tests.support.motion_files import body_asf, bvh
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
-from marey_motion.errors import AmbiguousUnits, ContradictedOption, MotionError
+from marey_motion.errors import AmbiguousUnits, ContradictedOption, FormatError, MotionError
 from marey_motion.formats import ImportedMotion, ImportOptions, read_motion, write_bvh
 from marey_motion.formats.npz import write_npz
 from marey_motion.gait import game_skeleton, generate_gait
@@ -396,3 +396,23 @@ def test_a_unit_that_fits_only_with_unknown_names_is_named(walk: Clip) -> None:
     unnamed = renamed(walk, {name: f"bone{index}" for index, name in enumerate(walk.skeleton.joint_names)})
     with pytest.raises(AmbiguousUnits, match="fit inch, but the names of the joints are not known"):
         imported(unnamed, "inch")
+
+
+# -- small facts about a file --
+
+
+def test_a_rate_of_one_frame_a_second_is_doubted(walk: Clip) -> None:
+    motion = imported(replace(walk, frame_rate_hz=1.0))
+    assert "frame-rate-doubtful" in codes(motion)
+
+
+def test_a_missing_line_motion_is_named() -> None:
+    with pytest.raises(FormatError, match="the line MOTION is missing before this line") as refused:
+        read_motion(bvh().replace(b"MOTION\n", b""), "arm.bvh")
+    assert (refused.value.code, refused.value.line) == ("motion-missing", 16)
+
+
+@pytest.mark.parametrize("path", ["../x", "raw/./x", ".."])
+def test_a_folder_is_not_called_like_a_step_in_a_path(path: str) -> None:
+    with pytest.raises(ValueError, match=r"has no \. or \.\. in it"):
+        ImportOptions(collection=path)
