@@ -201,7 +201,10 @@ def _on_skeleton(imported: ImportedMotion, clip: Clip, skeleton: Skeleton, file:
     order = np.array([own.index_of(name) for name in skeleton.joint_names])
     parents = [own.joint_names[parent] if parent >= 0 else None for parent in own.parents[order]]
     wanted = [skeleton.joint_names[parent] if parent >= 0 else None for parent in skeleton.parents]
-    apart = np.abs(own.offsets[order] - skeleton.offsets)[1:].max(initial=0.0)
+    bones = np.abs(own.offsets[order] - skeleton.offsets)
+    # Every clip states the place of its root, and of joints that move relative to their parents.
+    bones[[0, *(skeleton.index_of(own.joint_names[joint]) for joint in clip.translated_joints)]] = 0.0
+    apart = bones.max(initial=0.0)
     if parents != wanted or apart > SAME_OFFSET_M:
         raise FormatError(
             f"the bones of the file differ from those of the chosen skeleton (offsets by up to {apart:.4f} "
