@@ -145,7 +145,7 @@ def skeleton_item(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
     anatomy = anatomy_of(skeleton)
     parts = {"hierarchy": anatomy.hierarchy}
     name = skeleton_output(file.planned.name)
-    item_name = anatomy.mapping.rig or "skeleton"
+    item_name = "animal" if anatomy.mapping.is_animal else anatomy.mapping.rig or "skeleton"
     return ImportedItem(name, Kind.SKELETON, item_name, SKELETON_COLLECTION, parts, reuse="by_content")
 
 

@@ -128,7 +128,8 @@ def _axis_of_person(
         votes[flat[0]] += _FLAT_VOTE + _ALL_FOURS_VOTE * on_fours
     level = [axis for axis in get_args(UpAxis) if _stands_on_origin(body, axis) and _keeps_to_ground(body, axis)]
     grounded = [axis for axis in votes if _stands_on_origin(body, axis)]
-    for axis in {*grounded, *level}:
+    ground = list(dict.fromkeys([*grounded, *level]))
+    for axis in ground:
         votes[axis] += _GROUND_VOTE
     if resting[0] not in grounded:
         for axis in level:
@@ -137,7 +138,6 @@ def _axis_of_person(
     if standing[1] >= _CLEAR_COSINE and upright_on_ground:
         votes[standing[0]] += _UPRIGHT_VOTE
     best, *others = sorted(votes, key=lambda axis: -votes[axis])
-    ground = list(dict.fromkeys([*grounded, *level]))
     borne = f"; the ground through the origin bears the body along {' and '.join(ground)}" if ground else ""
     told = _told(standing, resting) + borne + ("" if flat is None else f"; {flat[1]}")
     if others and votes[best] - votes[others[0]] < _CLEAR_LEAD:

@@ -25,6 +25,7 @@ ANIMAL_CONFIDENCE = 0.2
 LEAST_CONFIDENCE = 0.5
 # A clavicle shorter than this share of the upper arm is a joint without a bone.
 _SHORTEST_CLAVICLE = 1e-3
+_ANIMAL_NOTE = "hind and front legs were taken for legs and arms, check before use"
 _ANIMAL_WORDS = ("tail", "paw", "hoof", "hock", "fetlock", "snout", "muzzle")
 
 
@@ -54,6 +55,11 @@ class JointMapping:
     confidence: float
     method: Method
     notes: tuple[str, ...] = ()
+
+    @property
+    def is_animal(self) -> bool:
+        """Whether the skeleton seems to have four legs."""
+        return any(note.endswith(_ANIMAL_NOTE) for note in self.notes)
 
     def indices(self, skeleton: Skeleton, standard_names: Iterable[str]) -> tuple[int, ...]:
         """Look up the joints of standard names.
@@ -127,7 +133,7 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
     signs = _animal_signs(skeleton, joints)
     if signs:
         confidence = min(confidence, ANIMAL_CONFIDENCE)
-        notes.append(f"{signs}; hind and front legs were taken for legs and arms, check before use")
+        notes.append(f"{signs}; {_ANIMAL_NOTE}")
     named = {standard: skeleton.joint_names[joints[standard]] for standard in STANDARD_JOINTS if standard in joints}
     return JointMapping(rig, named, round(confidence, 3), method, tuple(notes))
 
