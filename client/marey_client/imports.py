@@ -35,6 +35,10 @@ from marey_schemas.queue.jobs import Job, JobOutput
 if TYPE_CHECKING:
     from marey_schemas.datasets.exports import ExportedClip
 
+OTHER_MOTION = (
+    ".fbx", ".trc", ".htr", ".mvnx", ".vmd", ".vrma", ".dae", ".glb", ".gltf", ".usd", ".usda", ".usdc",
+)  # fmt: skip
+"""Endings of files that contain motion, but that Marey does not read."""
 FILES_PER_IMPORT = 50
 BYTES_PER_IMPORT = 64 << 20
 UPLOADS_AT_ONCE = 8
@@ -60,12 +64,18 @@ class FoundFiles:
 
     files: tuple[LocalFile, ...]
     left_out: tuple[Path, ...]
+    """Files that no reader reads, and hidden motion files."""
     exported: Mapping[str, ExportedClip] = field(default_factory=dict)
     """Clips whose files an export of a dataset wrote, by the names of the files."""
     unit: LengthUnit | None = None
     """Unit of length of the files; known if all files come from one export, otherwise None."""
     changed_tables: tuple[Path, ...] = ()
     """Tables of take records that differ from the sidecars in their folders; imports use only the sidecars."""
+
+    @property
+    def motions_left_out(self) -> tuple[Path, ...]:
+        """Files among those left out that contain motion, by their endings."""
+        return tuple(path for path in self.left_out if path.name.lower().endswith((*IMPORTED_ENDINGS, *OTHER_MOTION)))
 
 
 def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
@@ -97,8 +107,10 @@ def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
                 _add(files, below if folder is None else folder.name_of(below), path)
             else:
                 left_out.append(path)
+        left_out += _hidden_motions(place)
     if not files:
-        raise NothingToUpload(f"no motion files ({', '.join(IMPORTED_ENDINGS)}) in {_listed(searched)}")
+        reasons = "".join(f"; {line}" for line in left_out_texts(left_out))
+        raise NothingToUpload(f"no motion files ({', '.join(IMPORTED_ENDINGS)}) in {_listed(searched)}{reasons}")
     return FoundFiles(
         tuple(files.values()),
         tuple(left_out),
@@ -115,6 +127,16 @@ def _files_below(folder: Path) -> list[Path]:
         folders[:] = (name for name in folders if not name.startswith("."))
         found += (Path(parent, name) for name in names if not name.startswith("."))
     return sorted(path for path in found if path.is_file())
+
+
+def _hidden_motions(folder: Path) -> list[Path]:
+    """Return the hidden motion files in a folder and below, outside hidden folders, without notes of macOS."""
+    found: list[Path] = []
+    for parent, folders, names in os.walk(folder, onerror=_raise):
+        folders[:] = (name for name in folders if not name.startswith("."))
+        hidden = (name for name in names if name.startswith(".") and not name.startswith("._"))
+        found += (Path(parent, name) for name in hidden if name.lower().endswith((*IMPORTED_ENDINGS, *OTHER_MOTION)))
+    return sorted(found)
 
 
 def _raise(error: OSError) -> None:
@@ -273,10 +295,25 @@ def refusal_text(entry: ImportEntry) -> str:
     return f"{entry.name}{line}{joint}: {detail} ({entry.error.code})"
 
 
-def left_out_text(paths: Sequence[Path]) -> str:
-    """Return a message about the files that were left out because they are not motion files."""
-    others = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
-    return f"left out, because not motion files: {paths[0].name}{others}"
+def left_out_texts(paths: Sequence[Path]) -> list[str]:
+    """Return one message for each kind of file that was left out: the number of files, the reason, and all names."""
+    kinds: defaultdict[str, list[Path]] = defaultdict(list)
+    for path in paths:
+        kinds[_reason(path)].append(path)
+    return [
+        f"left out: {len(some)} {reason} ({', '.join(path.name for path in some)})"
+        for reason, some in sorted(kinds.items())
+    ]
+
+
+def _reason(path: Path) -> str:
+    ending = path.suffix.lower()
+    kind = ending[1:].upper() or "without ending"
+    if path.name.startswith("."):
+        return f"hidden {kind}: name them to import them"
+    if ending in OTHER_MOTION:
+        return f"{kind}: not readable here, export as BVH"
+    return f"{kind}: not motion"
 
 
 def _ignore_notice(_stage: str, _done: int, _total: int) -> None:

@@ -8,10 +8,11 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+from tests.support.floor_work import floor_work, with_upright_rest
 from tests.support.motion_files import AMC, ASF
 from tests.support.rest_server import Server, running
 
-from marey_motion.formats import read_motion, write_predecessor, write_predecessor_skeleton
+from marey_motion.formats import read_motion, write_bvh, write_predecessor, write_predecessor_skeleton
 from marey_motion.gait import generate_gait
 from marey_motion.kinematics import forward_kinematics
 from marey_server.store.database.connections import Database
@@ -123,6 +124,20 @@ def test_good_files_go_in_and_each_bad_one_is_refused_with_its_place(owner: http
     info = owner.get(f"/projects/lab/clips/{made['id']}/parts/info").json()
     assert info["subject"] == "S1"
     assert info["source"]["file_name"] == "walk.bvh"
+
+
+def test_files_of_one_request_with_the_same_skeleton_show_the_axis(owner: httpx.Client) -> None:
+    crawl = ("files", ("crawl.bvh", write_bvh(with_upright_rest(floor_work("crawl")))))
+    walk = ("files", ("walk.bvh", write_bvh(with_upright_rest(generate_gait(1.2, 0.2, 2.0, 30.0)))))
+    (alone,) = owner.post("/projects/lab/imports", files=[crawl]).raise_for_status().json()["entries"]
+    assert alone["error"]["code"] == "up-axis-ambiguous"
+    both = owner.post("/projects/lab/imports", files=[crawl, walk]).raise_for_status().json()["entries"]
+    assert [(entry["name"], entry["status"]) for entry in both] == [("crawl.bvh", "created"), ("walk.bvh", "created")]
+    axes = {
+        owner.get(f"/projects/lab/clips/{entry['item']}/parts/info").json()["source"]["details"]["up_axis"]
+        for entry in both
+    }
+    assert axes == {"z"}
 
 
 def test_file_names_with_control_characters_are_refused_and_harm_no_other(owner: httpx.Client) -> None:

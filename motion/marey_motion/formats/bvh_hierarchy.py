@@ -147,6 +147,8 @@ class _HierarchyReader:
             self._read_offset(rest.split())
         elif keyword == b"CHANNELS":
             self._read_channels(rest.split())
+        elif keyword.startswith(b"FRAME") and self.header.names and not self.open:
+            raise self.lines.error("the line MOTION is missing before this line; add it", code="motion-missing")
         else:
             raise self.lines.error(
                 f"expected ROOT, JOINT, End Site, OFFSET, CHANNELS or a brace, not {excerpt(piece)!r}",

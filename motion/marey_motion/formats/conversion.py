@@ -44,7 +44,9 @@ _CONVERTED: LruCache[tuple[Anatomy, tuple[tuple[int, bytes], ...], bytes, float]
 """Cache of converted skeletons, by their inputs: the skeleton, end sites, axes and unit of the file."""
 
 
-def convert(source: SourceMotion, file: str, options: ImportOptions) -> ImportedMotion:
+def convert(
+    source: SourceMotion, file: str, options: ImportOptions, sibling_axis: UpAxis | None = None
+) -> ImportedMotion:
     """Convert a motion from the unit and axes of its file to a clip, and record the import.
 
     Parameters
@@ -52,6 +54,7 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
     source : SourceMotion    the file in its own unit and axes
     file : str    name of the file, for messages
     options : ImportOptions    facts given by the user
+    sibling_axis : str, optional    upward axis of other files with this skeleton, for a file that does not show its own
 
     Returns
     -------
@@ -66,7 +69,7 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
     _check_range(source, file)
     try:
         anatomy = anatomy_of(source)
-        found = infer_conversion(source, anatomy, file, options)
+        found = infer_conversion(source, anatomy, file, options, sibling_axis)
         axes = np.array(_TO_Y_UP[found.up_axis], np.float64)
         if found.handedness == "left":
             axes[0] = -axes[0]
@@ -101,7 +104,7 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
         floor_shift_m=floor_shift_m,
         evidence=found.evidence,
     )
-    return ImportedMotion(clip, skeleton, info, tuple(warnings))
+    return ImportedMotion(clip, skeleton, info, tuple(warnings), found.axis_is_clear)
 
 
 def _check_range(source: SourceMotion, file: str) -> None:

@@ -27,7 +27,7 @@ class BodyMeasures:
 
     `positions` (J, F, 3) are joint positions in sampled frames, `rest` (J, 3) joint positions in the rest pose. `leg`
     is the length of a leg, None if there are not two feet. What is inferred from the measures adds its `evidence` and
-    `warnings`.
+    `warnings`; `axis_is_clear` becomes true if the body stands along the upward axis that was inferred.
     """
 
     file: str
@@ -37,6 +37,7 @@ class BodyMeasures:
     leg: float | None
     evidence: list[str] = field(default_factory=list)
     warnings: list[CheckWarning] = field(default_factory=list)
+    axis_is_clear: bool = False
 
 
 def measure_body(source: SourceMotion, anatomy: Anatomy, file: str) -> BodyMeasures:

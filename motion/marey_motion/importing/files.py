@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_from_document, clip_to_tree, skeleton_from_document
-from marey_motion.errors import FormatError, MotionError
+from marey_motion.errors import AmbiguousUnits, FormatError, MotionError
 from marey_motion.formats import read_source
 from marey_motion.formats.conversion import convert
 from marey_motion.importing.anatomy import anatomy_of
@@ -27,6 +27,7 @@ from marey_motion.importing.items import (
     skeleton_item,
 )
 from marey_motion.importing.plan import PlannedFile
+from marey_motion.importing.siblings import AxisFinding
 from marey_motion.importing.source import ImportedMotion, SourceDocument
 from marey_motion.skeleton import SAME_OFFSET_M, Skeleton
 from marey_schemas.documents.clips import MotionDocument
@@ -112,7 +113,14 @@ def _imported(file: FileToImport) -> ImportedFile:
         from marey_motion.importing.models import import_document
 
         return import_document(file, source)
-    imported = convert(source, file.planned.name, file.options)
+    is_inferred = file.options.up_axis is None and source.up_axis is None
+    try:
+        imported = convert(source, file.planned.name, file.options, file.sibling_axis)
+    except AmbiguousUnits as error:
+        is_axis = is_inferred and error.code == "up-axis-ambiguous"
+        axis = AxisFinding(source.rig_digest, None, False) if is_axis else None
+        return ImportedFile(file.planned.name, refusal=refusal_of(error), axis=axis)
+    axis = AxisFinding(source.rig_digest, imported.source.up_axis, imported.axis_is_clear) if is_inferred else None
     checks = tuple(_check_document(warning.as_dict()) for warning in imported.warnings)
     items: list[ImportedItem] = []
     reference = {"output": skeleton_output(file.planned.name)}
@@ -125,7 +133,8 @@ def _imported(file: FileToImport) -> ImportedFile:
         motion = clip_to_tree(clip, reference)
         parts = {"motion": motion, "info": _info(imported, file, checks)}
         items.append(main_item(file, Kind.CLIP, file.planned.item_name, parts))
-    return ImportedFile(file.planned.name, tuple(items), checks, None if clip is None else clip.frame_count)
+    frames = None if clip is None else clip.frame_count
+    return ImportedFile(file.planned.name, tuple(items), checks, frames, axis=axis)
 
 
 def mapping_part(found: ImportedFile) -> Tree:
@@ -192,7 +201,10 @@ def _on_skeleton(imported: ImportedMotion, clip: Clip, skeleton: Skeleton, file:
     order = np.array([own.index_of(name) for name in skeleton.joint_names])
     parents = [own.joint_names[parent] if parent >= 0 else None for parent in own.parents[order]]
     wanted = [skeleton.joint_names[parent] if parent >= 0 else None for parent in skeleton.parents]
-    apart = np.abs(own.offsets[order] - skeleton.offsets)[1:].max(initial=0.0)
+    bones = np.abs(own.offsets[order] - skeleton.offsets)
+    # Every clip states the place of its root, and of joints that move relative to their parents.
+    bones[[0, *(skeleton.index_of(own.joint_names[joint]) for joint in clip.translated_joints)]] = 0.0
+    apart = bones.max(initial=0.0)
     if parents != wanted or apart > SAME_OFFSET_M:
         raise FormatError(
             f"the bones of the file differ from those of the chosen skeleton (offsets by up to {apart:.4f} "

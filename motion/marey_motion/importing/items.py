@@ -10,11 +10,12 @@ from marey_motion.documents import skeleton_from_document
 from marey_motion.formats.predecessor.graph import PredecessorGraph
 from marey_motion.importing.anatomy import anatomy_of
 from marey_motion.importing.plan import PlannedFile
+from marey_motion.importing.siblings import AxisFinding
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import Refusal, skeleton_output
 from marey_schemas.kinds import Kind
-from marey_schemas.options.imports import ImportOptions
+from marey_schemas.options.imports import ImportOptions, UpAxis
 
 SKELETON_COLLECTION = "skeletons"
 
@@ -46,6 +47,7 @@ class FileToImport:
     companion, companion_digest : bytes and digest of the companion file that the plan names
     options : import options given by the user
     skeleton : stored skeleton that the clips must use
+    sibling_axis : upward axis of other files with this skeleton; None in the first look at a file
     """
 
     planned: PlannedFile
@@ -55,6 +57,7 @@ class FileToImport:
     companion: bytes | memoryview | None = None
     companion_digest: str | None = None
     skeleton: GivenSkeleton | None = None
+    sibling_axis: UpAxis | None = None
 
     @property
     def collection(self) -> str:
@@ -101,6 +104,7 @@ class ImportedFile:
     checks : findings about the motion, as documents
     frames : number of frames of the clip
     graph : content of a file that holds a graph instead of items
+    axis : what the file shows about its upward axis; None if the axis was given or fixed by the format
     """
 
     name: str
@@ -109,6 +113,7 @@ class ImportedFile:
     frames: int | None = None
     graph: ImportedGraph | None = None
     refusal: Refusal | None = None
+    axis: AxisFinding | None = None
 
 
 def given_skeleton(given: GivenSkeleton) -> Skeleton:
@@ -140,7 +145,7 @@ def skeleton_item(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
     anatomy = anatomy_of(skeleton)
     parts = {"hierarchy": anatomy.hierarchy}
     name = skeleton_output(file.planned.name)
-    item_name = anatomy.mapping.rig or "skeleton"
+    item_name = "animal" if anatomy.mapping.is_animal else anatomy.mapping.rig or "skeleton"
     return ImportedItem(name, Kind.SKELETON, item_name, SKELETON_COLLECTION, parts, reuse="by_content")
 
 

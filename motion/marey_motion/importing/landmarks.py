@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.rigs import JointMapping, map_joints
+from marey_motion.rigs.mapping import LEAST_CONFIDENCE
 from marey_motion.skeleton import Skeleton
 
 # Skeletons whose anatomy and measures caches keep.
@@ -19,8 +20,8 @@ class Landmarks:
     """Joint indices of the landmarks of a body; None for a landmark that was not found.
 
     `hips` is the lowest joint from which both feet descend. The pairs are (left, right); `feet` are the ankles and
-    `hands` the wrists. `by_names` is true if the joints were recognised by their names; otherwise, the skeleton may be
-    that of an animal.
+    `hands` the wrists. `by_names` is true if the joints were clearly recognised by their names; otherwise, the skeleton
+    may be that of an animal.
     """
 
     hips: int | None = None
@@ -64,7 +65,7 @@ def find_landmarks(skeleton: Skeleton, mapping: JointMapping | None = None) -> L
         feet=feet,
         toes=pair("toe"),
         hands=pair("wrist"),
-        by_names=mapping.method == "names",
+        by_names=mapping.method == "names" and mapping.confidence >= LEAST_CONFIDENCE,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -58,6 +59,19 @@ class SourceMotion:
     declared: tuple[str, ...] = ()
     channels: tuple[tuple[str, ...], ...] = ()
     warnings: list[CheckWarning] = field(default_factory=list)
+
+    @cached_property
+    def rig_digest(self) -> str:
+        """Digest of names, hierarchy and bones; equal for all takes of one rig.
+
+        The root's offset and offsets that positions of the motion replace differ from take to take, and do not count.
+        """
+        bones = self.offsets.copy()
+        bones[[0, *self.translated_joints]] = 0.0
+        size = float(np.abs(bones).sum()) or 1.0
+        numbers = np.concatenate((bones / size, self.rest_rotations), axis=1).round(4) + 0.0
+        content = repr((self.joint_names, self.parents.tolist(), numbers.tolist()))
+        return hashlib.sha256(content.encode("utf-8", "surrogatepass")).hexdigest()
 
     @cached_property
     def skeleton(self) -> Skeleton:
@@ -129,6 +143,7 @@ class ImportedMotion:
     skeleton : Skeleton    its joints
     source : SourceInfo    record of the import
     warnings : tuple of CheckWarning    findings of the checks
+    axis_is_clear : bool    true if the upward axis was inferred from a body that stands along it
 
     Examples
     --------
@@ -142,3 +157,4 @@ class ImportedMotion:
     skeleton: Skeleton
     source: SourceInfo
     warnings: tuple[CheckWarning, ...] = ()
+    axis_is_clear: bool = False

@@ -37,6 +37,8 @@ LEG_LENGTH_M = (0.72, 1.2)
 ANY_LEG_LENGTH_M = (0.1, 1.5)
 
 _MIRRORED_COSINE = -0.2
+# Height of the hips of a body that stands, by the length of a leg.
+_STANDING_SHARE = 0.7
 
 
 def unit_in_metres(unit: str | float) -> float:
@@ -72,9 +74,12 @@ class Conversion:
     handedness: Handedness
     evidence: tuple[str, ...]
     warnings: tuple[CheckWarning, ...]
+    axis_is_clear: bool
 
 
-def infer_conversion(source: SourceMotion, anatomy: Anatomy, file: str, options: ImportOptions) -> Conversion:
+def infer_conversion(
+    source: SourceMotion, anatomy: Anatomy, file: str, options: ImportOptions, sibling_axis: UpAxis | None = None
+) -> Conversion:
     """Determine the unit and the upward axis from the options, or else from the format, or else from the body.
 
     Parameters
@@ -83,6 +88,7 @@ def infer_conversion(source: SourceMotion, anatomy: Anatomy, file: str, options:
     anatomy : Anatomy    anatomy of the source's skeleton
     file : str    name of the file, for messages
     options : ImportOptions    facts given by the user
+    sibling_axis : str, optional    upward axis of other files with this skeleton
 
     Returns
     -------
@@ -94,10 +100,12 @@ def infer_conversion(source: SourceMotion, anatomy: Anatomy, file: str, options:
     ContradictedOption    when the body clearly contradicts a given unit or axis
     """
     body = measure_body(source, anatomy, file)
-    up_axis = choose_up_axis(source, body, options)
+    up_axis = choose_up_axis(source, body, options, sibling_axis)
     unit_scale_m = _choose_unit(source, body, options, up_axis)
     _look_for_mirroring(source, body, options, up_axis)
-    return Conversion(unit_scale_m, up_axis, options.handedness, tuple(body.evidence), tuple(body.warnings))
+    return Conversion(
+        unit_scale_m, up_axis, options.handedness, tuple(body.evidence), tuple(body.warnings), body.axis_is_clear
+    )
 
 
 # Unit
@@ -156,7 +164,8 @@ def _doubtful_unit(unit_m: float, legs_m: float, origin: str) -> CheckWarning:
 def _unit_of_leg(body: BodyMeasures, hip_height: float, up_axis: UpAxis, stated: float | None) -> float:
     assert body.leg is not None
     (low, high), known, reason = LEG_LENGTH_M, tuple(UNITS_M), "legs"
-    if walks_on_hands(body, up_axis):
+    # The names of a known rig count before what the body does: people crawl and turn cartwheels, too.
+    if not body.landmarks.by_names and walks_on_hands(body, up_axis):
         (low, high), known, reason = ANY_LEG_LENGTH_M, CONVENTIONAL_UNITS, "hands stay on the ground, and legs"
     elif not body.landmarks.by_names:
         known, reason = CONVENTIONAL_UNITS, "the build is a body's, and legs"
@@ -186,9 +195,10 @@ def _ambiguous_unit(body: BodyMeasures, hip_height: float) -> AmbiguousUnits:
         for name in by_fit[:3]
     ]
     low, high = LEG_LENGTH_M
+    fitting = [name for name, size in UNITS_M.items() if _within(LEG_LENGTH_M, body.leg * size)]
+    fit = f"fit {' or '.join(fitting)}, but the names of the joints are not known" if fitting else "fit no known unit"
     return AmbiguousUnits(
-        f"the unit of length is not clear: legs of {body.leg:.4g} units fit no known unit "
-        f"(adults have {low} to {high} m); "
+        f"the unit of length is not clear: legs of {body.leg:.4g} units {fit} (adults have {low} to {high} m); "
         f"name it with --unit (unit_scale_m); candidates: {', '.join(listed)}",
         file=body.file,
     )
@@ -208,17 +218,22 @@ def _as_hips(hip_height: float, scale: float) -> str:
 def _look_for_mirroring(source: SourceMotion, body: BodyMeasures, options: ImportOptions, up_axis: UpAxis) -> None:
     """Warn if left and right seem exchanged.
 
-    The body is assumed to face where its feet point. Left and right seem exchanged if the left leg is on the right.
+    A body that stands faces where its feet point. Left and right seem exchanged if the left leg is then on the right.
+    Frames in which the body kneels, lies or crawls show nothing, because the feet point down or back in them; if the
+    body never stands, its rest pose is looked at.
     """
     landmarks = body.landmarks
     if landmarks.feet is None or landmarks.toes is None or options.handedness == "left":
         return
+    poses = _standing(body, body.positions, up_axis)
+    if not poses.size:
+        poses = _standing(body, body.rest[:, None], up_axis)
     up = np.zeros(3)
     up["xyz".index(up_axis[-1])] = -1.0 if up_axis[0] == "-" else 1.0
-    left, right = (mean_point(body.positions, _leg_joints(source.parents, landmarks, foot)) for foot in landmarks.feet)
+    left, right = (mean_point(poses, _leg_joints(source.parents, landmarks, foot)) for foot in landmarks.feet)
     leftwards = left - right
     # The lower foot stands; the other may point anywhere.
-    feet, toes = (body.positions.take(pair, axis=0) for pair in (landmarks.feet, landmarks.toes))
+    feet, toes = (poses.take(pair, axis=0) for pair in (landmarks.feet, landmarks.toes))
     standing = heights_along(feet, up_axis).argmin(axis=0)
     x, y, z = (toes - feet)[standing, np.arange(len(standing))].T
     expected = np.empty_like(leftwards)
@@ -234,6 +249,16 @@ def _look_for_mirroring(source: SourceMotion, body: BodyMeasures, options: Impor
                 values={"cosine": cosine},
             )
         )
+
+
+def _standing(body: BodyMeasures, positions: NDArray[np.float64], up_axis: UpAxis) -> NDArray[np.float64]:
+    """Select the frames of positions (J, F, 3) in which the body stands: the hips are nearly a leg above the feet."""
+    landmarks = body.landmarks
+    assert landmarks.feet is not None
+    assert body.leg is not None
+    above = heights_along(positions, up_axis)
+    heights = above[landmarks.hips] - above.take(landmarks.feet, axis=0).min(axis=0)
+    return positions[:, heights > _STANDING_SHARE * body.leg]
 
 
 def _leg_joints(parents: NDArray[np.int32], landmarks: Landmarks, foot: int) -> list[int]:

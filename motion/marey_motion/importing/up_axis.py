@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from typing import get_args
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,9 +29,20 @@ _FOLDED_COSINE = -0.9
 _FOLDED = "rest pose that is none of a body, with legs and trunk pointing the same way"
 _FLAT_GROUND = 0.1
 _CLEARLY_FLATTER = 3.0
+# Sum of the cosines of motion and rest pose, along the same axis, that is as clear as one upright body.
+_AGREEING_COSINES = 1.4
+# What speaks for an axis if the rig is known by its names; a cosine of the motion counts as itself. The rest pose of a
+# known rig counts most, because the body may lie, crawl or roll. Flat ground counts less: a roll is flat sideways, too.
+_REST_VOTE, _FLAT_VOTE, _UPRIGHT_VOTE, _ALL_FOURS_VOTE, _GROUND_VOTE = 1.5, 0.6, 0.8, 0.9, 0.4
+# The body is on the ground along this axis, but not along the axis of its rest pose.
+_ONLY_GROUND_VOTE = 1.0
+# Lead of the best axis over the second best below which the user is asked.
+_CLEAR_LEAD = 0.6
 
 
-def choose_up_axis(source: SourceMotion, body: BodyMeasures, options: ImportOptions) -> UpAxis:
+def choose_up_axis(
+    source: SourceMotion, body: BodyMeasures, options: ImportOptions, sibling_axis: UpAxis | None
+) -> UpAxis:
     """Determine the upward axis from the options, or else from the format, or else from the body.
 
     Parameters
@@ -36,6 +50,7 @@ def choose_up_axis(source: SourceMotion, body: BodyMeasures, options: ImportOpti
     source : SourceMotion    the file in its own unit and axes
     body : BodyMeasures    measures of the file; receives the evidence and warnings
     options : ImportOptions    facts given by the user
+    sibling_axis : str, optional    upward axis of other files with this skeleton, for a file that does not show its own
 
     Returns
     -------
@@ -59,16 +74,76 @@ def choose_up_axis(source: SourceMotion, body: BodyMeasures, options: ImportOpti
             CheckWarning("up-axis-assumed", "no feet were found that show which axis points up; y is assumed")
         )
         return "y"
-    standing, flat = _body_axis(body.positions, body.landmarks), _flat_axis(body)
-    if flat is not None and flat[0] != standing[0] and _stands_on_all_fours(body, flat[0]):
+    return _infer_up_axis(body, sibling_axis)
+
+
+def _infer_up_axis(body: BodyMeasures, sibling_axis: UpAxis | None) -> UpAxis:
+    """Infer the upward axis from motion, rest pose and ground; `sibling_axis` counts if the motion is not clear."""
+    standing, resting = _body_axis(body.positions, body.landmarks), _body_axis(body.rest[:, None], body.landmarks)
+    flat = _flat_axis(body)
+    is_person = body.landmarks.by_names and resting[1] >= _CLEAR_COSINE
+    on_fours = flat is not None and flat[0] != standing[0] and _stands_on_all_fours(body, flat[0])
+    if flat is not None and on_fours and not is_person:
         body.evidence.append(f"up axis {flat[0]}: hands and feet are below the hips; {flat[1]}")
+        body.axis_is_clear = True
         return flat[0]
-    if standing[0] == "y" and standing[1] >= _CLEAR_COSINE:
+    # Along y, a person may lie in a file with z up; a rest pose with z up may stand in a file with y up.
+    is_undoubted = not is_person or resting[0] == "y" or _stands_on_origin(body, "y")
+    if standing[0] == "y" and standing[1] >= _CLEAR_COSINE and is_undoubted and not on_fours:
         body.evidence.append(
             f"up axis y: head above feet, mean cosine {standing[1]:.2f} over {body.positions.shape[1]} frames"
         )
+        body.axis_is_clear = True
         return "y"
-    return _settle_up_axis(body, *standing, flat)
+    if sibling_axis is not None:
+        told = _told(standing, resting)
+        body.evidence.append(f"up axis {sibling_axis}: other files with this skeleton have it; {told}")
+        return sibling_axis
+    if is_person:
+        axis = _axis_of_person(body, standing, resting, flat, on_fours=on_fours)
+    else:
+        axis = _settle_up_axis(body, *standing, flat)
+    body.axis_is_clear = axis == standing[0] and standing[1] >= _CLEAR_COSINE
+    return axis
+
+
+def _axis_of_person(
+    body: BodyMeasures,
+    standing: tuple[UpAxis, float],
+    resting: tuple[UpAxis, float],
+    flat: tuple[UpAxis, str] | None,
+    *,
+    on_fours: bool,
+) -> UpAxis:
+    """Choose the upward axis of a known rig by weighing rest pose, motion and ground together.
+
+    `standing` and `resting` are the axes nearest to the direction from feet to head in the motion and in the rest pose,
+    with cosines. `flat` is the result of `_flat_axis`; `on_fours` is true if hands and feet are below the hips along
+    its axis.
+    """
+    votes: dict[UpAxis, float] = defaultdict(float)
+    votes[resting[0]] += _REST_VOTE
+    votes[standing[0]] += standing[1]
+    if flat is not None:
+        votes[flat[0]] += _FLAT_VOTE + _ALL_FOURS_VOTE * on_fours
+    level = [axis for axis in get_args(UpAxis) if _stands_on_origin(body, axis) and _keeps_to_ground(body, axis)]
+    grounded = [axis for axis in votes if _stands_on_origin(body, axis)]
+    ground = list(dict.fromkeys([*grounded, *level]))
+    for axis in ground:
+        votes[axis] += _GROUND_VOTE
+    if resting[0] not in grounded:
+        for axis in level:
+            votes[axis] += _ONLY_GROUND_VOTE
+    upright_on_ground = grounded == [standing[0]] or (flat is not None and flat[0] == standing[0])
+    if standing[1] >= _CLEAR_COSINE and upright_on_ground:
+        votes[standing[0]] += _UPRIGHT_VOTE
+    best, *others = sorted(votes, key=lambda axis: -votes[axis])
+    borne = f"; the ground through the origin bears the body along {' and '.join(ground)}" if ground else ""
+    told = _told(standing, resting) + borne + ("" if flat is None else f"; {flat[1]}")
+    if others and votes[best] - votes[others[0]] < _CLEAR_LEAD:
+        raise _unclear_axis(body, told, standing, resting)
+    body.evidence.append(f"up axis {best}: the joints have the names of a known rig; {told}")
+    return best
 
 
 def _compare_with_body(given: UpAxis, body: BodyMeasures, *, trusted: bool) -> None:
@@ -104,27 +179,37 @@ def _settle_up_axis(body: BodyMeasures, axis: UpAxis, cosine: float, flat: tuple
     axis and the direction. `flat` is the result of `_flat_axis`.
     """
     rest_axis, rest_cosine = _body_axis(body.rest[:, None], body.landmarks)
-    standing, resting = f"mean direction from feet to head is {axis} with cosine {cosine:.2f}", _FOLDED
-    if rest_cosine > 0.0:
-        resting = f"rest pose points along {rest_axis} with cosine {rest_cosine:.2f}"
-    if cosine == 0.0:
-        standing = f"the motion keeps to a {_FOLDED}"
-    if cosine >= _CLEAR_COSINE and rest_axis == axis and rest_cosine >= _CLEAR_COSINE:
-        body.evidence.append(f"up axis {axis}: {standing}; {resting}")
+    told = _told((axis, cosine), (rest_axis, rest_cosine))
+    agreed = rest_axis == axis and cosine + rest_cosine >= _AGREEING_COSINES
+    if agreed and (flat is None or flat[0] == axis or min(cosine, rest_cosine) >= _CLEAR_COSINE):
+        body.evidence.append(f"up axis {axis}: {told}")
         return axis
     if flat is not None:
-        body.evidence.append(f"up axis {flat[0]}: {flat[1]}; {standing}")
+        body.evidence.append(f"up axis {flat[0]}: {flat[1]}; {told}")
         return flat[0]
     if cosine >= _CLEAR_COSINE:
         grounded = [candidate for candidate in (axis, rest_axis) if _stands_on_origin(body, candidate)]
         if len(set(grounded)) == 1:
-            body.evidence.append(
-                f"up axis {grounded[0]}: the ground through the origin bears the body; {standing}; {resting}"
-            )
+            body.evidence.append(f"up axis {grounded[0]}: the ground through the origin bears the body; {told}")
             return grounded[0]
-    raise AmbiguousUnits(
-        f"the file does not show clearly which axis points up ({standing}; {resting}); name the axis with "
-        f"--up-axis (up_axis), one of {_likely_axes((axis, cosine), (rest_axis, rest_cosine))}",
+    raise _unclear_axis(body, told, (axis, cosine), (rest_axis, rest_cosine))
+
+
+def _told(standing: tuple[UpAxis, float], resting: tuple[UpAxis, float]) -> str:
+    """Say in words what the motion and the rest pose show."""
+    motion = f"mean direction from feet to head is {standing[0]} with cosine {standing[1]:.2f}"
+    if standing[1] == 0.0:
+        motion = f"the motion keeps to a {_FOLDED}"
+    rest = f"rest pose points along {resting[0]} with cosine {resting[1]:.2f}"
+    return f"{motion}; {_FOLDED if resting[1] == 0.0 else rest}"
+
+
+def _unclear_axis(
+    body: BodyMeasures, told: str, standing: tuple[UpAxis, float], resting: tuple[UpAxis, float]
+) -> AmbiguousUnits:
+    return AmbiguousUnits(
+        f"the file does not show clearly which axis points up ({told}); name the axis with --up-axis (up_axis), one "
+        f"of {_likely_axes(standing, resting)}",
         code="up-axis-ambiguous",
         file=body.file,
     )
@@ -189,6 +274,13 @@ def _stands_on_origin(body: BodyMeasures, axis: UpAxis) -> bool:
     assert body.leg is not None
     lowest = heights_along(body.positions, axis).min(axis=0)
     return bool(abs(low_quantile(lowest)) <= _FLAT_GROUND * body.leg)
+
+
+def _keeps_to_ground(body: BodyMeasures, axis: UpAxis) -> bool:
+    """Return whether the lowest point of the body hardly moves along an axis."""
+    assert body.leg is not None
+    lowest = heights_along(body.positions, axis).min(axis=0)
+    return bool(lowest.std() <= _FLAT_GROUND * body.leg)
 
 
 def _axis_name(axis: int, sign: float) -> UpAxis:

@@ -22,7 +22,10 @@ TRUSTED_SHARE = 0.75
 # What a mapping of something that seems to have four legs is worth.
 ANIMAL_CONFIDENCE = 0.2
 # Below this a person must have looked before anything is made of a mapping.
-LEAST_CONFIDENCE = 0.3
+LEAST_CONFIDENCE = 0.5
+# A clavicle shorter than this share of the upper arm is a joint without a bone.
+_SHORTEST_CLAVICLE = 1e-3
+_ANIMAL_NOTE = "hind and front legs were taken for legs and arms, check before use"
 _ANIMAL_WORDS = ("tail", "paw", "hoof", "hock", "fetlock", "snout", "muzzle")
 
 
@@ -35,7 +38,7 @@ class JointMapping:
     rig : str, optional    the known rig whose names were recognised
     joints : mapping of str to str    standard name to joint name; one joint can have several standard names, such as
         hips that are both root and pelvis
-    confidence : float    0 to 1; if below 0.5, a person should check the mapping before use
+    confidence : float    0 to 1; below `LEAST_CONFIDENCE`, a person must check the mapping before use
     method : str    "names", "geometry" or "manual"
     notes : tuple of str    assumptions and missing joints, in sentences for people
 
@@ -52,6 +55,11 @@ class JointMapping:
     confidence: float
     method: Method
     notes: tuple[str, ...] = ()
+
+    @property
+    def is_animal(self) -> bool:
+        """Whether the skeleton seems to have four legs."""
+        return any(note.endswith(_ANIMAL_NOTE) for note in self.notes)
 
     def indices(self, skeleton: Skeleton, standard_names: Iterable[str]) -> tuple[int, ...]:
         """Look up the joints of standard names.
@@ -117,6 +125,7 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
         note = "no known names and no two pairs of limbs: this does not look like a body"
         return JointMapping(None, {"root": skeleton.joint_names[0]}, 0.0, "geometry", (note,))
     joints["root"] = 0
+    _drop_clavicles_without_length(skeleton, joints)
     joints |= _spine(skeleton, joints)
     missing = [joint for joint in ESSENTIAL_JOINTS if joint not in joints]
     if missing:
@@ -124,7 +133,7 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
     signs = _animal_signs(skeleton, joints)
     if signs:
         confidence = min(confidence, ANIMAL_CONFIDENCE)
-        notes.append(f"{signs}; hind and front legs were taken for legs and arms, check before use")
+        notes.append(f"{signs}; {_ANIMAL_NOTE}")
     named = {standard: skeleton.joint_names[joints[standard]] for standard in STANDARD_JOINTS if standard in joints}
     return JointMapping(rig, named, round(confidence, 3), method, tuple(notes))
 
@@ -212,6 +221,18 @@ def _spine(skeleton: Skeleton, joints: Mapping[str, int]) -> dict[str, int]:
     if len(upwards) > 2:
         spine["spine_1"] = upwards[(len(upwards) - 1) // 2]
     return spine
+
+
+def _drop_clavicles_without_length(skeleton: Skeleton, joints: dict[str, int]) -> None:
+    """Remove clavicles at the position of the shoulder: no shoulder line can be read from them."""
+    positions = skeleton.rest_global_positions
+    for side in SIDES:
+        clavicle, shoulder, elbow = (joints.get(f"{side}_{part}") for part in ("clavicle", "shoulder", "elbow"))
+        if clavicle is None or shoulder is None or elbow is None:
+            continue
+        arm = float(np.linalg.norm(positions[elbow] - positions[shoulder]))
+        if float(np.linalg.norm(positions[shoulder] - positions[clavicle])) < _SHORTEST_CLAVICLE * arm:
+            del joints[f"{side}_clavicle"]
 
 
 def _animal_signs(skeleton: Skeleton, joints: Mapping[str, int]) -> str:

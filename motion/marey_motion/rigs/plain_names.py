@@ -25,6 +25,8 @@ _NUMBER_BEFORE = re.compile(r"^\d+[^A-Za-z0-9]")
 def readings(names: Sequence[str]) -> tuple[Names, ...]:
     """List the original names, then versions of them with one more shared mark removed each time.
 
+    The last version separates sides that are written without a capital letter: "lthigh" becomes "l_thigh".
+
     Parameters
     ----------
     names : sequence of str    names of all joints
@@ -43,7 +45,18 @@ def readings(names: Sequence[str]) -> tuple[Names, ...]:
         plainer = strip(found[-1])
         if plainer != found[-1] and all(plainer):
             found.append(plainer)
-    return tuple(found)
+    sided = _with_sides(found[-1])
+    return tuple(found) if sided == found[-1] else (*found, sided)
+
+
+def _with_sides(names: Names) -> Names:
+    """Separate a small l or r at the start of lower-case names, if the skeleton has the same name of the other side."""
+    known = set(names)
+
+    def is_sided(name: str) -> bool:
+        return name.islower() and name[0] in "lr" and name[1:2].isalpha() and "lr"[name[0] == "l"] + name[1:] in known
+
+    return tuple(f"{name[0]}_{name[1:]}" if is_sided(name) else name for name in names)
 
 
 def _marked(names: Names) -> Names:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from marey_schemas.base import Options
 from marey_schemas.formats import UNITS_M, LengthUnit
@@ -60,6 +60,14 @@ class ImportOptions(Options):
     subject: str | None = Field(None, max_length=255, description="The performer.")
     licence: str | None = Field(None, max_length=255, description="Licence of the data.")
     capture_system: str | None = Field(None, max_length=255, description="The device or system that recorded the data.")
+
+    @field_validator("collection")
+    @classmethod
+    def _names_folders(cls, path: str) -> str:
+        """Refuse parts of a path that stand for other folders in a file system, but would be names here."""
+        if {".", ".."} & set(path.split("/")):
+            raise ValueError("a path of folders begins at the project and has no . or .. in it; name the folders")
+        return path
 
     @property
     def metres_per_unit(self) -> float | None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
 from marey_schemas.imports import ImportAnswer, ImportEntry, ImportRequest
-from marey_schemas.options.imports import ImportOptions
+from marey_schemas.options.imports import ImportOptions, UpAxis
 from marey_schemas.queue.jobs import Job, JobCreate
 from marey_schemas.sizes import KIB, MIB
 from marey_server.errors import ApiProblem, BadRequestProblem, InvalidProblem, NotFoundProblem, TooLargeProblem
@@ -25,7 +25,7 @@ from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
 from marey_server.http.validation import decode_body, validate_body
 from marey_server.motions import importing
-from marey_server.motions.importing import PreparedImport, SourceFile
+from marey_server.motions.importing import PreparedImport, PutAside, SourceFile
 from marey_server.store import blobs, projects
 from marey_server.store.blob_backings import SPOOLED_BYTES, Spool
 from marey_server.store.jobs import submission
@@ -34,6 +34,9 @@ from marey_server.store.transaction import Transaction
 if TYPE_CHECKING:
     from marey_motion.importing.items import GivenSkeleton
     from marey_motion.importing.plan import PlannedFile
+
+Work = tuple[int, Callable[[], Awaitable[PreparedImport]]]
+"""Place of a file in the import, and the function that reads the file."""
 
 MAX_FILES = 1000
 MAX_UPLOAD_BYTES = 2048 * MIB
@@ -161,36 +164,61 @@ class ProjectImports(Resource):
         return Reply(job, status=202, location=f"/jobs/{job.id}", headers={"Retry-After": "1"})
 
     async def _import_now(self, project: str, options: ImportOptions) -> list[ImportEntry]:
-        """Read files in child processes while earlier files are stored; return one entry for each file, in order."""
+        """Import all files; return one entry for each file, in order."""
         skeleton = None
         if options.skeleton is not None:
             skeleton = await self.look_up(importing.read_skeleton, project, options.skeleton)
         plans = await self.compute(importing.plan, [file.name for file in self.files])
         by_name = {file.name: file for file in reversed(self.files)}
-        entries: list[ImportEntry] = []
-        reading = deque(plans)
-        ahead: deque[asyncio.Task[PreparedImport]] = deque()
-        storing: asyncio.Task[list[ImportEntry]] | None = None
+        prepare = partial(self._prepare, by_name, options, skeleton)
+        aside = PutAside()
+        entries = await self._import_all(
+            project, ((place, partial(prepare, planned, None)) for place, planned in enumerate(plans)), aside
+        )
+        entries |= await self._import_all(
+            project,
+            (
+                (place, partial(_ready, file) if axis is None else partial(prepare, plans[place], axis))
+                for place, file, axis in aside.files()
+            ),
+            None,
+        )
+        for entry in entries.values():
+            self.services.metrics.imports.labels(entry.status).inc()
+        return [entries[place] for place in range(len(plans))]
+
+    async def _import_all(self, project: str, works: Iterable[Work], aside: PutAside | None) -> dict[int, ImportEntry]:
+        """Read files in child processes while earlier files are stored; return the entries by place.
+
+        Files that `aside` takes are not stored.
+        """
+        entries: dict[int, ImportEntry] = {}
+        reading = deque(works)
+        ahead: deque[tuple[int, asyncio.Task[PreparedImport]]] = deque()
+        storing: asyncio.Task[dict[int, ImportEntry]] | None = None
         try:
             while reading or ahead:
-                ready: list[PreparedImport] = []
+                ready: dict[int, PreparedImport] = {}
                 while (reading or ahead) and len(ready) < FILES_PER_WRITE:
                     while reading and len(ahead) <= FILES_AHEAD:
-                        work = self._prepare(reading.popleft(), by_name, options, skeleton)
-                        ahead.append(asyncio.ensure_future(work))
-                    ready.append(await ahead.popleft())
+                        place, work = reading.popleft()
+                        ahead.append((place, asyncio.ensure_future(work())))
+                    place, task = ahead[0]
+                    file = await task
+                    ahead.popleft()
+                    if aside is None or not aside.take(place, file):
+                        ready[place] = file
                 if storing is not None:
-                    entries += await storing
+                    entries |= await storing
                 storing = asyncio.ensure_future(self._store(project, ready))
             if storing is not None:
-                entries += await storing
+                entries |= await storing
         finally:
-            await _give_up(one for one in (*ahead, storing) if one is not None)
-        for entry in entries:
-            self.services.metrics.imports.labels(entry.status).inc()
+            await _give_up(one for one in (*(task for _, task in ahead), storing) if one is not None)
         return entries
 
-    async def _store(self, project: str, files: list[PreparedImport]) -> list[ImportEntry]:
+    async def _store(self, project: str, ready: dict[int, PreparedImport]) -> dict[int, ImportEntry]:
+        files = list(ready.values())
         new = await self.look_up(importing.new_skeletons, project, files)
         for digest, first in importing.firsts_of_skeletons(files, new).items():
             make = partial(importing.mapping_order, first)
@@ -199,14 +227,15 @@ class ProjectImports(Resource):
                 files = importing.add_mapping(files, digest, mapping)
             except ApiProblem as error:
                 files = importing.refuse_with_skeleton(files, digest, error)
-        return await self.change(importing.publish, project, files)
+        return dict(zip(ready, await self.change(importing.publish, project, files), strict=True))
 
     async def _prepare(
         self,
-        planned: PlannedFile,
         by_name: dict[str, SourceFile],
         options: ImportOptions,
         skeleton: GivenSkeleton | None,
+        planned: PlannedFile,
+        sibling_axis: UpAxis | None,
     ) -> PreparedImport:
         if (entry := importing.planned_entry(planned)) is not None:
             return entry
@@ -215,7 +244,7 @@ class ProjectImports(Resource):
         try:
             return await self.compute_in_child(
                 importing.READ_FILE,
-                partial(importing.file_order, planned, sources, options, skeleton),
+                partial(importing.file_order, planned, sources, options, skeleton, sibling_axis),
                 partial(importing.prepared_import, planned.name, sources),
             )
         except ApiProblem as error:
@@ -235,6 +264,11 @@ class ProjectImports(Resource):
         for file in getattr(self, "files", ()):
             if isinstance(file.content, Spool):
                 file.content.close()
+
+
+async def _ready(file: PreparedImport) -> PreparedImport:
+    """Return a file that was read before."""
+    return file
 
 
 async def _give_up(tasks: Iterable[asyncio.Task[Any]]) -> None:

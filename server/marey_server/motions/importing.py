@@ -11,7 +11,7 @@ from marey_schemas.access import Role
 from marey_schemas.documents.clips import Check
 from marey_schemas.imports import ImportEntry, Refusal, refused_entry
 from marey_schemas.kinds import Kind
-from marey_schemas.options.imports import ImportOptions
+from marey_schemas.options.imports import ImportOptions, UpAxis
 from marey_server.access.folder_rights import FolderRoleProblem
 from marey_server.errors import ApiProblem, InvalidProblem
 from marey_server.motions.loading import LOADING
@@ -28,6 +28,7 @@ from marey_server.store.transaction import Transaction
 if TYPE_CHECKING:  # numeric modules take a second to load, so they are loaded only for imports
     from marey_motion.importing.items import GivenSkeleton, ImportedGraph
     from marey_motion.importing.plan import PlannedFile
+    from marey_motion.importing.siblings import AxisFinding
 
 REFUSED_ALTOGETHER = (401, 403, 404, 499, 503, 507)
 """HTTP status codes of errors that concern the whole request and not a single file."""
@@ -56,7 +57,8 @@ class SourceFile:
 class PreparedImport:
     """File of an import after it was read, ready to be stored.
 
-    If there is nothing to store, `entry` is the answer's entry for the file.
+    If there is nothing to store, `entry` is the answer's entry for the file. `axis` is what the file shows about its
+    upward axis.
     """
 
     name: str
@@ -66,6 +68,7 @@ class PreparedImport:
     frames: int | None = None
     graph: ImportedGraph | None = None
     entry: ImportEntry | None = None
+    axis: AxisFinding | None = None
 
 
 def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
@@ -98,9 +101,16 @@ def planned_entry(planned: PlannedFile) -> PreparedImport | None:
 
 
 def file_order(
-    planned: PlannedFile, sources: Sequence[SourceFile], options: ImportOptions, skeleton: GivenSkeleton | None
+    planned: PlannedFile,
+    sources: Sequence[SourceFile],
+    options: ImportOptions,
+    skeleton: GivenSkeleton | None,
+    sibling_axis: UpAxis | None,
 ) -> bytes:
-    """Return the packed message that asks a child process to read a file, with its companion file if it has one."""
+    """Return the packed message that asks a child process to read a file, with its companion file if it has one.
+
+    `sibling_axis` is the upward axis that other files with the same skeleton show.
+    """
     with LOADING:
         from marey_server.motions.reading import FileOrder, packed_skeleton
 
@@ -113,6 +123,7 @@ def file_order(
         companion=None if companion is None else companion.read(),
         companion_digest=None if companion is None else companion.digest,
         skeleton=packed_skeleton(skeleton),
+        sibling_axis=sibling_axis,
     ).pack()
 
 
@@ -123,7 +134,7 @@ def prepared_import(name: str, sources: Sequence[SourceFile], answer: bytes) -> 
 
     found = ReadFile.unpack(answer)
     if found.refusal is not None:
-        return PreparedImport(name, entry=refused_entry(name, found.refusal))
+        return PreparedImport(name, entry=refused_entry(name, found.refusal), axis=found.axis)
     drafts = tuple(
         Draft(
             item.name, item.kind, item.item_name, item.documents(), item.collection, item.tags, reuse=item.reuse
@@ -131,7 +142,37 @@ def prepared_import(name: str, sources: Sequence[SourceFile], answer: bytes) -> 
         for item in found.items
     )  # fmt: skip
     graph = None if found.graph is None else found.graph.graph()
-    return PreparedImport(name, tuple(sources), drafts, found.checks, found.frames, graph=graph)
+    return PreparedImport(name, tuple(sources), drafts, found.checks, found.frames, graph=graph, axis=found.axis)
+
+
+class PutAside:
+    """Files of an import that do not clearly show which axis points up: they wait until all files have been read.
+
+    Then other files with the same skeleton may have shown the axis.
+    """
+
+    def __init__(self) -> None:
+        self._files: dict[int, PreparedImport] = {}
+        self._findings: list[AxisFinding] = []
+
+    def take(self, place: int, file: PreparedImport) -> bool:
+        """Note what a file shows; return whether the file, at this place in the import, has to wait."""
+        if file.axis is None:
+            return False
+        self._findings.append(file.axis)
+        if file.axis.is_clear:
+            return False
+        self._files[place] = file
+        return True
+
+    def files(self) -> Iterator[tuple[int, PreparedImport, UpAxis | None]]:
+        """Yield place and content of each file, and the axis with which it must be read again; None for none."""
+        with LOADING:
+            from marey_motion.importing.siblings import axes_of_skeletons, axis_of_siblings
+
+        axes = axes_of_skeletons(self._findings)
+        for place, file in self._files.items():
+            yield place, file, axis_of_siblings(file.axis, axes)
 
 
 def refused_import(name: str, error: ApiProblem) -> PreparedImport:

@@ -10,6 +10,7 @@ from marey_motion.formats.predecessor.graph import GraphNode, PredecessorGraph
 from marey_motion.importing.files import import_file, mapping_part
 from marey_motion.importing.items import FileToImport, GivenSkeleton, ImportedFile, ImportedGraph, ImportedItem
 from marey_motion.importing.plan import PlannedFile
+from marey_motion.importing.siblings import AxisFinding
 from marey_motion.warm_up import compile_kernels
 from marey_schemas.documents.clips import Check
 from marey_schemas.encoding.canonical import canonical_json
@@ -17,7 +18,7 @@ from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.imports import Refusal
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
-from marey_schemas.options.imports import ImportOptions
+from marey_schemas.options.imports import ImportOptions, UpAxis
 from marey_server.motions.child import Message
 from marey_server.prepared_documents import PreparedDocument, decoded_tree, document_of_bytes, prepare_document
 
@@ -35,6 +36,7 @@ class FileOrder(Message):
     companion_digest: str | None = None
     skeleton: tuple[str, int, bytes] | None = None
     """Item, revision and hierarchy of the skeleton that the clips must use."""
+    sibling_axis: UpAxis | None = None
 
     def file(self) -> FileToImport:
         """Return the file with everything that is needed to import it."""
@@ -43,8 +45,9 @@ class FileOrder(Message):
             item, revision, hierarchy = self.skeleton
             given = GivenSkeleton(item, revision, decode_tree(hierarchy, MSGPACK))
         return FileToImport(
-            self.planned, self.content, self.digest, self.options, self.companion, self.companion_digest, given
-        )
+            self.planned, self.content, self.digest, self.options, self.companion, self.companion_digest, given,
+            self.sibling_axis,
+        )  # fmt: skip
 
 
 def packed_skeleton(given: GivenSkeleton | None) -> tuple[str, int, bytes] | None:
@@ -134,6 +137,7 @@ class ReadFile(Message):
     frames: int | None = None
     graph: ReadGraph | None = None
     refusal: Refusal | None = None
+    axis: AxisFinding | None = None
 
 
 class MappingOrder(Message):
@@ -166,6 +170,7 @@ def read_file(order: bytes) -> bytes:
         frames=found.frames,
         graph=None if found.graph is None else ReadGraph.of(found.graph),
         refusal=found.refusal,
+        axis=found.axis,
     ).pack()
 
 

@@ -13,7 +13,7 @@ import pytest
 from tests.support.scripted_server import ScriptedServer
 
 from marey_client import errors
-from marey_client.imports import FILES_PER_IMPORT, Imports, LocalFile, batches, find_files, refusal_text
+from marey_client.imports import FILES_PER_IMPORT, Imports, LocalFile, batches, find_files, left_out_texts, refusal_text
 from marey_schemas.options.imports import ImportOptions
 
 
@@ -31,7 +31,24 @@ def test_folders_are_searched_and_other_files_are_named_as_left_out(tmp_path: Pa
         (tmp_path / name).write_text("x")
     found = find_files([tmp_path])
     assert [file.name for file in found.files] == ["a/01.asf", "a/01_01.AMC", "b/walk.bvh"]
-    assert [path.name for path in found.left_out] == ["notes.txt"]
+    assert [path.name for path in found.left_out] == ["notes.txt", ".y.bvh"]
+
+
+def test_what_is_left_out_is_named_by_kind_and_in_full(tmp_path: Path) -> None:
+    for name in ("walk.bvh", "a.FBX", "b.fbx", "take.trc", "notes.txt", "README", ".old.bvh", "._walk.bvh"):
+        (tmp_path / name).write_text("x")
+    found = find_files([tmp_path])
+    assert left_out_texts(found.left_out) == [
+        "left out: 2 FBX: not readable here, export as BVH (a.FBX, b.fbx)",
+        "left out: 1 TRC: not readable here, export as BVH (take.trc)",
+        "left out: 1 TXT: not motion (notes.txt)",
+        "left out: 1 hidden BVH: name them to import them (.old.bvh)",
+        "left out: 1 without ending: not motion (README)",
+    ]
+    assert [path.name for path in found.motions_left_out] == ["a.FBX", "b.fbx", "take.trc", ".old.bvh"]
+    (tmp_path / "walk.bvh").unlink()
+    with pytest.raises(errors.NothingToUpload, match="2 FBX: not readable here, export as BVH"):
+        find_files([tmp_path])
 
 
 def test_a_file_named_itself_is_taken_whatever_it_is(tmp_path: Path) -> None:

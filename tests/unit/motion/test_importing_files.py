@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -223,3 +224,30 @@ def test_a_model_beside_a_skeleton_is_imported_without_a_tree() -> None:
     found = import_all({"skeleton.json": skeleton, "walk.json": json.dumps(models.layout_3()).encode()})
     assert found["walk.json"].refusal is None
     assert "tree" not in found["walk.json"].items[-1].parts
+
+
+def test_a_chosen_skeleton_may_differ_in_what_the_motion_replaces() -> None:
+    """The root's offset differs from take to take; a bone of another length is another skeleton."""
+    clip = generate_gait(1.2, 0.0, 1.0, 30.0)
+
+    def chosen(joint: int) -> GivenSkeleton:
+        offsets = clip.skeleton.offsets.copy()
+        offsets[joint] += 0.25
+        other = replace(clip.skeleton, offsets=offsets)
+        return GivenSkeleton("s1", 1, skeleton_to_document(other).model_dump(by_alias=True))
+
+    (planned,) = plan_imports(["walk.bvh"])
+    found = import_file(FileToImport(planned, write_bvh(clip), DIGEST, skeleton=chosen(0)))
+    assert found.refusal is None
+    assert found.items[0].parts["motion"]["skeleton"] == {"item": "s1", "revision": 1}
+    refused = import_file(FileToImport(planned, write_bvh(clip), DIGEST, skeleton=chosen(3))).refusal
+    assert refused is not None
+    assert refused.code == "skeleton-mismatch"
+
+
+def test_a_skeleton_with_a_tail_is_called_an_animal() -> None:
+    clip = generate_gait(1.2, 0.0, 1.0, 30.0)
+    assert read("walk.bvh", write_bvh(clip)).items[0].item_name == "hik"
+    tailed = write_bvh(clip).replace(b"LeftShoulder", b"Tail01")
+    options = ImportOptions(unit="cm", up_axis="y")
+    assert read("dog.bvh", tailed, options=options).items[0].item_name == "animal"

@@ -12,6 +12,7 @@ import pytest
 
 from marey_motion import quaternions
 from marey_motion.errors import MappingError
+from marey_motion.gait import studio_skeleton
 from marey_motion.rigs import ESSENTIAL_JOINTS, STANDARD_JOINTS, map_joints, mirrored, require_trust, symmetric_joints
 from marey_motion.rigs.known import KNOWN_RIGS, KnownRig
 from marey_motion.rigs.plain_names import readings
@@ -641,3 +642,21 @@ def test_a_rig_of_many_limbs_on_a_chain_of_a_thousand_joints_is_read_soon(body: 
 
     assert process_time() - started < 5.0
     assert mapping.method == "geometry"
+
+
+def test_a_clavicle_without_length_is_no_clavicle() -> None:
+    skeleton = studio_skeleton()
+    offsets = skeleton.offsets.copy()
+    offsets[skeleton.index_of("LeftArm")] = 0.0
+    bare = Skeleton(skeleton.joint_names, skeleton.parents, offsets, skeleton.rest_rotations, skeleton.end_sites)
+    joints = map_joints(bare).joints
+    assert joints["left_shoulder"] == "LeftArm"
+    assert "left_clavicle" not in joints
+    assert joints["right_clavicle"] == "RightShoulder"
+
+
+def test_what_documents_call_doubtful_is_refused() -> None:
+    mapping = map_joints(studio_skeleton())
+    assert require_trust(replace(mapping, confidence=0.5)).confidence == 0.5
+    with pytest.raises(MappingError, match=r"confidence of 0\.49 only.*--confirm"):
+        require_trust(replace(mapping, confidence=0.49))

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.floor_work import FLOOR_WORK, floor_work, with_upright_rest
 from tests.support.motion_files import body_asf, bvh
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
-from marey_motion.errors import AmbiguousUnits, ContradictedOption, MotionError
+from marey_motion.errors import AmbiguousUnits, ContradictedOption, FormatError, MotionError
 from marey_motion.formats import ImportedMotion, ImportOptions, read_motion, write_bvh
 from marey_motion.formats.npz import write_npz
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_motion.importing.units import unit_in_metres
 from marey_motion.kinematics import global_positions, global_rotations
+from marey_motion.rigs import map_joints
 from marey_motion.skeleton import EndSite, Skeleton
 from marey_schemas.formats import UNITS_M
 
@@ -313,3 +316,103 @@ def test_a_body_that_lies_does_not_contradict_the_axis_of_its_rest_pose(walk: Cl
     poses[:, 3:7] = quaternions.multiply(turned, poses[:, 3:7])
     file = write_bvh(Clip(walk.skeleton, 30.0, poses), unit="cm")
     assert "up-axis-doubtful" not in codes(read_motion(file, "lies.bvh", options=ImportOptions(up_axis="y")))
+
+
+# -- people on the ground --
+
+
+@pytest.mark.parametrize("unit", ["cm", "cmu"])
+@pytest.mark.parametrize("up_axis", ["y", "z"])
+@pytest.mark.parametrize("name", FLOOR_WORK)
+def test_a_known_rig_on_the_ground_is_a_person_upright_in_its_rest_pose(name: str, up_axis: str, unit: str) -> None:
+    """Neither hands on the ground nor flat ground decide: both mislead in cartwheels, rolls or crawling."""
+    for heading_deg in (0.0, 45.0, 90.0, 200.0):
+        clip = in_axes(floor_work(name, heading_deg=heading_deg), FILE_AXES[up_axis])
+        motion = imported(clip, unit)
+        assert motion.source.up_axis == up_axis
+        assert motion.source.unit_scale_m == pytest.approx(UNITS_M[unit])
+        assert "left-handed" not in codes(motion)
+
+
+def test_a_rest_pose_that_contradicts_motion_and_ground_is_asked_about() -> None:
+    """The body is on the ground of a file with z up, but its rest pose has y up."""
+    for name, heading_deg in (("crawl", 0.0), ("crawl", 90.0), ("cartwheels", 0.0), ("cartwheels", 90.0)):
+        doubtful = with_upright_rest(floor_work(name, heading_deg=heading_deg))
+        with pytest.raises(AmbiguousUnits, match=r"rest pose points along y.*--up-axis"):
+            imported(doubtful)
+        assert imported(doubtful, up_axis="z").source.up_axis == "z"
+    for upright in (floor_work("kneel"), generate_gait(1.3, 0.2, 2.0, 30.0)):
+        assert imported(with_upright_rest(upright)).source.up_axis == "z"
+
+
+def test_a_mirrored_kneeling_body_is_told_by_its_rest_pose() -> None:
+    assert "left-handed" in codes(imported(in_axes(floor_work("kneel"), MIRROR)))
+
+
+# -- names of early optical systems --
+
+EARLY_NAMES = {
+    "Hips": "hip",
+    "Spine": "lowback",
+    "Spine1": "midback",
+    "Spine2": "chest",
+    "Neck": "neck",
+    "Head": "head",
+    **{
+        f"{side}{name}": f"{start}{early}"
+        for side, word in (("Left", "left"), ("Right", "right"))
+        for name, early, start in (
+            ("Shoulder", "collar", word),
+            ("Arm", "uparm", word),
+            ("ForeArm", "lowarm", word),
+            ("Hand", "hand", word),
+            ("UpLeg", "thigh", word[0]),
+            ("Leg", "lowleg", word),
+            ("Foot", "foot", word),
+            ("ToeBase", "toe", word[0]),
+        )
+    },
+}
+
+
+def renamed(clip: Clip, names: dict[str, str]) -> Clip:
+    skeleton = clip.skeleton
+    called = tuple(names.get(name, name.lower()) for name in skeleton.joint_names)
+    return replace(
+        clip,
+        skeleton=Skeleton(called, skeleton.parents, skeleton.offsets, skeleton.rest_rotations, skeleton.end_sites),
+    )
+
+
+def test_early_names_with_small_sides_make_an_inch_known(walk: Clip) -> None:
+    motion = imported(renamed(walk, EARLY_NAMES), "inch")
+    assert motion.source.unit_scale_m == UNITS_M["inch"]
+    joints = map_joints(motion.skeleton).joints
+    assert (joints["left_shoulder"], joints["right_knee"], joints["left_hip"]) == ("leftuparm", "rightlowleg", "lthigh")
+    assert joints["pelvis"] == "hip"
+
+
+def test_a_unit_that_fits_only_with_unknown_names_is_named(walk: Clip) -> None:
+    unnamed = renamed(walk, {name: f"bone{index}" for index, name in enumerate(walk.skeleton.joint_names)})
+    with pytest.raises(AmbiguousUnits, match="fit inch, but the names of the joints are not known"):
+        imported(unnamed, "inch")
+
+
+# -- small facts about a file --
+
+
+def test_a_rate_of_one_frame_a_second_is_doubted(walk: Clip) -> None:
+    motion = imported(replace(walk, frame_rate_hz=1.0))
+    assert "frame-rate-doubtful" in codes(motion)
+
+
+def test_a_missing_line_motion_is_named() -> None:
+    with pytest.raises(FormatError, match="the line MOTION is missing before this line") as refused:
+        read_motion(bvh().replace(b"MOTION\n", b""), "arm.bvh")
+    assert (refused.value.code, refused.value.line) == ("motion-missing", 16)
+
+
+@pytest.mark.parametrize("path", ["../x", "raw/./x", ".."])
+def test_a_folder_is_not_called_like_a_step_in_a_path(path: str) -> None:
+    with pytest.raises(ValueError, match=r"has no \. or \.\. in it"):
+        ImportOptions(collection=path)

@@ -1,9 +1,10 @@
 """Publication of results of imports and jobs as items: together, once, and with references between them."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, Literal
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -396,3 +397,44 @@ def test_what_a_batch_refers_to_within_itself_is_not_read_again(lab: Lab, monkey
     publish(lab, *batch_of(3))
     again = publish(lab, rig_draft("other name"), clip_draft("found", "other name"))
     assert [one.created for one in again] == [False, True]
+
+
+def test_takes_of_one_rig_use_one_skeleton_whatever_means_nothing_differs(lab: Lab) -> None:
+    """The root's offset, rounding, and an offset that the motion replaces differ from take to take."""
+
+    def take(number: int, change: Callable[[dict[str, Any]], None], moved: tuple[str, ...] = ()) -> list[Published]:
+        hierarchy, motion = skeleton_tree(), motion_tree({"output": f"rig{number}"}, seed=number)
+        change(hierarchy)
+        if moved:
+            motion |= {"translated_joints": moved, "translations": np.zeros((5, len(moved), 3), np.float32)}
+        return publish(
+            lab,
+            Draft(f"rig{number}", Kind.SKELETON, "rig", {"hierarchy": hierarchy}, "skeletons", reuse="by_content"),
+            Draft(f"take{number}", Kind.CLIP, f"take{number}", {"motion": motion}, "takes"),
+        )
+
+    def offset(joint: int, change: float) -> Callable[[dict[str, Any]], None]:
+        def changed(hierarchy: dict[str, Any]) -> None:
+            x, y, z = hierarchy["joints"][joint]["offset"]
+            hierarchy["joints"][joint]["offset"] = [x, y + change, z]
+
+        return changed
+
+    first = take(0, offset(0, 0.0))[0].item
+    assert take(1, offset(0, 0.97))[0].item == first
+    assert take(2, offset(1, 1e-6))[0].item == first
+    assert take(3, offset(2, 0.2), moved=("j2",))[0].item == first
+    other = take(4, offset(2, 0.2))[0].item
+    assert other != first
+    assert take(5, offset(2, 0.2))[0].item == other
+    together = publish(
+        lab,
+        *(
+            Draft(
+                f"new{n}", Kind.SKELETON, "new", {"hierarchy": skeleton_tree(bone_m=0.9 + n * 1e-6)}, reuse="by_content"
+            )
+            for n in range(2)
+        ),
+    )
+    assert together[0].item == together[1].item
+    assert len(listed(lab, Kind.SKELETON)) == 3

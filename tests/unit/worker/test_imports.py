@@ -3,9 +3,12 @@
 import hashlib
 from math import radians
 from pathlib import Path
+from typing import Any
 
+from tests.support.floor_work import floor_work, with_upright_rest
 from tests.support.project_in_memory import ProjectInMemory
 
+from marey_motion.clip import Clip
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
 from marey_schemas.kinds import Kind
@@ -35,6 +38,37 @@ def test_a_file_that_is_too_large_is_refused_and_the_others_are_imported(tmp_pat
         files.append({"name": name, "blob": digest})
     huge, walk = imports.run(project, ImportParams.model_validate({"files": files}))["entries"]
     assert (huge["name"], huge["error"]["code"], walk["status"]) == ("huge.bvh", "file-too-large", "created")
+
+
+def test_files_with_the_same_skeleton_show_the_axis_of_a_body_on_the_ground(tmp_path: Path) -> None:
+    """A crawl alone is refused, because its rest pose has y up on a ground with z up; a later walk shows z."""
+    crawl, fall = with_upright_rest(floor_work("crawl")), with_upright_rest(floor_work("fall"))
+    walk = with_upright_rest(generate_gait(1.2, 0.2, 2.0, 30.0))
+
+    def entries(given: dict[str, Clip]) -> list[dict[str, Any]]:
+        project = ProjectInMemory(tmp_path)
+        files = []
+        for name, clip in given.items():
+            data = write_bvh(clip)
+            digest = f"sha256:{hashlib.sha256(data).hexdigest()}"
+            project.blobs[digest] = data
+            files.append({"name": name, "blob": digest})
+        result: list[dict[str, Any]] = imports.run(project, ImportParams.model_validate({"files": files}))["entries"]
+        axes = {
+            one.item_name: one.parts["info"]["source"]["details"]["up_axis"]
+            for one in project.staged
+            if one.kind is Kind.CLIP
+        }
+        return [{**entry, "axis": axes.get(entry["name"].removesuffix(".bvh"))} for entry in result]
+
+    (alone,) = entries({"crawl.bvh": crawl})
+    assert (alone["status"], alone["error"]["code"]) == ("failed", "up-axis-ambiguous")
+    together = entries({"crawl.bvh": crawl, "fall.bvh": fall, "walk.bvh": walk})
+    assert [(one["name"], one["axis"]) for one in together] == [
+        ("crawl.bvh", "z"),
+        ("fall.bvh", "z"),
+        ("walk.bvh", "z"),
+    ]
 
 
 def test_the_result_counts_the_clips_and_frames_that_were_imported(tmp_path: Path) -> None:

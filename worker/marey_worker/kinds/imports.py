@@ -9,11 +9,12 @@ from marey_motion.importing.files import import_file, mapping_part, planned_entr
 from marey_motion.importing.graphs import FEW, NamedModel, graph_item
 from marey_motion.importing.items import FileToImport, GivenSkeleton, ImportedFile, ImportedGraph, ImportedItem
 from marey_motion.importing.plan import PlannedFile, plan_imports
+from marey_motion.importing.siblings import AxisFinding, axes_of_skeletons, axis_of_siblings
 from marey_schemas.documents.clips import Check
 from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.imports import ImportEntry, Refusal, refused_entry
 from marey_schemas.kinds import Kind
-from marey_schemas.options.imports import ImportOptions
+from marey_schemas.options.imports import ImportOptions, UpAxis
 from marey_schemas.queue.job_params import ImportParams
 from marey_schemas.queue.worker_protocol import StagedOutput
 from marey_worker.context import Context, FileTooLarge, JobRefused, NoSuchThing
@@ -43,13 +44,24 @@ class _Importing:
     def run(self) -> dict[str, Any]:
         """Import all files in order, and return the result of the job."""
         plan = plan_imports([file.name for file in self._params.files])
-        entries = []
+        findings: list[AxisFinding | None] = []
+        made: list[ImportEntry | None] = []
         for done, planned in enumerate(plan):
             self._context.progress(done, len(plan), f"importing {planned.name}")
-            entry = planned_entry(planned) or self._import(planned)
-            if entry.error is not None:
-                self._context.log(f"{planned.name}: {entry.error.detail} ({entry.error.code})")
-            entries.append(entry)
+            entry, finding = planned_entry(planned), None
+            if entry is None:
+                entry, finding = self._import(planned)
+            made.append(entry)
+            findings.append(finding)
+        axes = axes_of_skeletons(findings)
+        entries = []
+        for planned, entry, finding in zip(plan, made, findings, strict=True):
+            # What was put aside is read again, because later files may have shown its upward axis.
+            final = entry or self._import(planned, axis_of_siblings(finding, axes), is_last=True)[0]
+            assert final is not None
+            if final.error is not None:
+                self._context.log(f"{planned.name}: {final.error.detail} ({final.error.code})")
+            entries.append(final)
         self._results.flush()
         imported = [entry for entry in entries if entry.status == "created"]
         return {
@@ -58,24 +70,33 @@ class _Importing:
             "frames": sum(entry.frames or 0 for entry in imported),
         }
 
-    def _import(self, planned: PlannedFile) -> ImportEntry:
+    def _import(
+        self, planned: PlannedFile, sibling_axis: UpAxis | None = None, *, is_last: bool = False
+    ) -> tuple[ImportEntry | None, AxisFinding | None]:
+        """Import a file; return its entry, and what it shows about its upward axis.
+
+        Unless this is the last look at the file, a file that does not clearly show the axis is put aside: it has no
+        entry yet.
+        """
         try:
-            found = self._read(planned)
+            found = self._read(planned, sibling_axis)
+            if found.axis is not None and not found.axis.is_clear and not is_last:
+                return None, found.axis
             items = found.items if found.graph is None else (self._graph_item(found.graph),)
         except NoSuchThing as error:
-            return refused_entry(planned.name, Refusal(code="blob-missing", detail=str(error)))
+            return refused_entry(planned.name, Refusal(code="blob-missing", detail=str(error))), None
         except FileTooLarge as error:
-            return refused_entry(planned.name, Refusal(code=error.code, detail=str(error)))
+            return refused_entry(planned.name, Refusal(code=error.code, detail=str(error))), None
         except MotionError as error:
-            return refused_entry(planned.name, refusal_of(error))
+            return refused_entry(planned.name, refusal_of(error)), None
         if found.refusal is not None:
-            return refused_entry(planned.name, found.refusal)
+            return refused_entry(planned.name, found.refusal), found.axis
         for item in items:
             self._stage(item, found)
         checks = tuple(map(Check.model_validate, found.checks))
-        return ImportEntry(name=planned.name, status="created", frames=found.frames, warnings=checks)
+        return ImportEntry(name=planned.name, status="created", frames=found.frames, warnings=checks), found.axis
 
-    def _read(self, planned: PlannedFile) -> ImportedFile:
+    def _read(self, planned: PlannedFile, sibling_axis: UpAxis | None) -> ImportedFile:
         digest = self._digests[planned.name]
         beside = None if planned.companion is None else self._digests[planned.companion]
         return import_file(
@@ -87,6 +108,7 @@ class _Importing:
                 companion=None if beside is None else self._context.blob(beside),
                 companion_digest=beside,
                 skeleton=self._skeleton,
+                sibling_axis=sibling_axis,
             )
         )
 

@@ -48,7 +48,7 @@ def upload(
     Clips from a folder that `marey dataset export` wrote get the paths, take records and tags that they had in the
     export.
     """
-    from marey_client.imports import find_files, left_out_text
+    from marey_client.imports import find_files, left_out_texts
     from marey_schemas.options.imports import ImportOptions
 
     if left_handed:
@@ -56,8 +56,8 @@ def upload(
             raise WrongUsage("--left-handed and --handedness right contradict each other; give only one of them")
         options["handedness"] = "left"
     found = find_files(places)
-    if found.left_out:
-        print_message(left_out_text(found.left_out))
+    for text in left_out_texts(found.left_out):
+        print_message(text)
     if found.unit is not None and not options.keys() & {"unit", "unit_scale_m"}:
         options["unit"] = found.unit
     with connect(context) as marey:
@@ -77,7 +77,7 @@ def upload(
     else:
         _print_entries(entries)
         _print_restored(restored, found.changed_tables, f"{project}/{options.get('collection', '')}".rstrip("/"))
-    if any(entry.status == "failed" for entry in entries):
+    if found.motions_left_out or any(entry.status == "failed" for entry in entries):
         raise Refused
 
 

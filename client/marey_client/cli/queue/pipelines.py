@@ -163,7 +163,7 @@ def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[st
                 "parameters, or give local files, and name the project that receives the files with --project"
             )
         return addresses[0].project, {"takes": [clips_at(marey, address) for address in addresses]}
-    from marey_client.imports import find_files, left_out_text
+    from marey_client.imports import find_files, left_out_texts
     from marey_schemas.options.imports import ImportOptions
 
     found = find_files(map(Path, takes))
@@ -172,8 +172,8 @@ def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[st
             "the takes are in a folder that `marey dataset export` wrote; first import the folder with `marey "
             "upload`, which also imports take records and consents, then give the imported clips as takes"
         )
-    if found.left_out:
-        print_message(left_out_text(found.left_out))
+    for text in left_out_texts(found.left_out):
+        print_message(text)
     return project, {"takes": found.files, "options": ImportOptions.model_validate(options)}
 
 

@@ -18,12 +18,14 @@ from marey_schemas.sizes import batched
 from marey_server import faults
 from marey_server.access.folder_rights import FolderRights
 from marey_server.errors import ConflictProblem, InvalidProblem
-from marey_server.prepared_documents import PreparedDocument, digest_of_body, prepared, with_body
+from marey_server.prepared_documents import PreparedDocument, digest_of_body, with_body
 from marey_server.store import collections, documents
 from marey_server.store.ids import new_id
 from marey_server.store.items import references
-from marey_server.store.items.drafts import Draft, Published, StoredDocument
+from marey_server.store.items.drafts import Draft, Published
+from marey_server.store.items.loaded_drafts import LoadedDraft, load_drafts
 from marey_server.store.items.revisions import NewRevision, read_part_digests, write_head, write_revisions
+from marey_server.store.items.same_rigs import on_known_rigs
 from marey_server.store.items.summaries import summarise
 from marey_server.store.projects import ProjectRow
 from marey_server.store.purge_lock import hold_off_purges
@@ -69,7 +71,7 @@ def publish(
     hold_off_purges(tx, project_row.id)
     require_places((draft for draft in drafts if draft.reuse != "by_content"), rights)
     publication = _Publication(tx, project_row, author_id, rights, job_id, refer_to_deleted)
-    for together in _in_turns(_load_parts(tx, drafts)):
+    for together in _in_turns(on_known_rigs(tx, project_row, load_drafts(tx, drafts))):
         publication.add(together)
     holdings.hold(tx, project_row.id, publication.added)
     faults.point("publish.before_commit")
@@ -85,48 +87,7 @@ def require_places(drafts: Iterable[Draft], rights: FolderRights | None) -> None
         rights.require(folder, Role.CONTRIBUTOR)
 
 
-@dataclass(frozen=True)
-class _Loaded:
-    """Draft with the documents of its parts, in the order that its kind declares.
-
-    `refers` lists the drafts that these documents refer to.
-    """
-
-    draft: Draft
-    bodies: Mapping[str, Tree]
-    contents: Mapping[str, PreparedDocument | StoredDocument]
-    refers: Sequence[str]
-
-
-def _load_parts(tx: Transaction, drafts: Sequence[Draft]) -> list[_Loaded]:
-    contents = [_contents(draft) for draft in drafts]
-    stored = {one.digest for parts in contents for one in parts.values() if isinstance(one, StoredDocument)}
-    loaded = documents.load_bodies(tx, stored)
-    answer = []
-    for draft, parts in zip(drafts, contents, strict=True):
-        bodies = {
-            part: loaded[one.digest] if isinstance(one, StoredDocument) else one.body for part, one in parts.items()
-        }
-        refers = [name for tree in bodies.values() for name in references.outputs_in(tree)]
-        answer.append(_Loaded(draft, bodies, parts, refers))
-    return answer
-
-
-def _contents(draft: Draft) -> dict[str, PreparedDocument | StoredDocument]:
-    specs = PARTS[draft.kind]
-    if unknown := [part for part in draft.parts if part not in specs]:
-        raise InvalidProblem(
-            f"An item of the kind {draft.kind} has no part {unknown[0]!r}; its parts are {', '.join(specs)}.",
-            code="no-part",
-        )
-    given = {part: draft.parts[part] for part in specs if part in draft.parts}
-    return {
-        part: content if isinstance(content, StoredDocument) else prepared(content, schema=specs[part].schema)
-        for part, content in given.items()
-    }
-
-
-def _in_turns(loaded: Sequence[_Loaded]) -> Iterator[list[_Loaded]]:
+def _in_turns(loaded: Sequence[LoadedDraft]) -> Iterator[list[LoadedDraft]]:
     """Split drafts into groups that can be published together, each after all drafts that it refers to.
 
     The drafts of a group have the same kind, the same `reuse` and different places. Drafts with the same place keep
@@ -135,7 +96,7 @@ def _in_turns(loaded: Sequence[_Loaded]) -> Iterator[list[_Loaded]]:
     by_name = {one.draft.name_in_batch: one for one in loaded}
     turns: dict[str, int] = {}
     next_turns: dict[Hashable, int] = {}
-    groups: defaultdict[tuple[int, Kind, str], list[_Loaded]] = defaultdict(list)
+    groups: defaultdict[tuple[int, Kind, str], list[LoadedDraft]] = defaultdict(list)
     for name in references.in_order({name: one.refers for name, one in by_name.items()}):
         one = by_name[name]
         draft = one.draft
@@ -200,7 +161,7 @@ class _Publication:
     def __post_init__(self) -> None:
         self._references = references.ReferenceCheck(self.tx, self.project, to_deleted=self.refer_to_deleted)
 
-    def add(self, group: Sequence[_Loaded]) -> None:
+    def add(self, group: Sequence[LoadedDraft]) -> None:
         """Publish drafts that have the same kind, the same `reuse`, and different places."""
         kind, reuse = group[0].draft.kind, group[0].draft.reuse
         waiting = self._store(group)
@@ -225,7 +186,7 @@ class _Publication:
             f"Other requests are changing the item {name!r} at the same time; try again.", code="contended"
         )
 
-    def _store(self, group: Sequence[_Loaded]) -> list[_Ready]:
+    def _store(self, group: Sequence[LoadedDraft]) -> list[_Ready]:
         """Store the documents of drafts, and return the drafts with the digests of their documents.
 
         References to drafts that were published before are replaced by references to their revisions.
