@@ -156,7 +156,7 @@ ALIGN = KindDeclaration(
     description="Aligns examples of one action with each other, in space and in time.",
     params=job_params.AlignParams,
     implementation="marey_worker.kinds.align:run",
-    version=1,
+    version=2,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The examples, all of one skeleton."),
         "annotations": InputSpec(

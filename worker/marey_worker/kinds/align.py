@@ -24,7 +24,7 @@ from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
 from marey_schemas.options.alignment import MEDOID, NEAREST_MEAN_LENGTH, AlignOptions
-from marey_schemas.queue.job_params import MOST_EXAMPLES, AlignParams
+from marey_schemas.queue.job_params import AlignParams
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.chosen_metric import read_metric
@@ -176,12 +176,6 @@ class _Job:
                 "too-few-clips",
                 f"only {len(examples)} of {len(clips)} clips can be aligned, but alignment needs at least "
                 f"two{self._refusals.first}",
-            )
-        if count > MOST_EXAMPLES and self._params.reference == MEDOID:
-            raise JobRefused(
-                "too-many-clips",
-                f"the reference `medoid` compares each clip with every other, which is possible for at most "
-                f"{MOST_EXAMPLES} clips, not {count}; choose a clip or {NEAREST_MEAN_LENGTH} as reference",
             )
 
     # -- annotations --
