@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Placement
+from marey_motion.alignment.aligned import UNKNOWN_RECORDING, AlignedClip, AlignedSet, Placement, Recording
 from marey_motion.alignment.canonical import placed, to_canonical
 from marey_motion.alignment.cost import CostPoints, cost_points, costs_between
 from marey_motion.alignment.dtw import align
@@ -63,12 +63,14 @@ class SourceExample:
     clip : Clip    the motion
     cuts : tuple of Cut    labelled frames of the clip, in the order of time (`segments.cuts_of`); all examples must
         have cuts with the same labels
+    recording : Recording    take and performer; without a name of the take, the example is a take of its own
     """
 
     uid: str
     name: str
     clip: Clip
     cuts: tuple[Cut, ...] = ()
+    recording: Recording = UNKNOWN_RECORDING
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,6 +329,7 @@ class _Aligning:
             placement=one.placement,
             cost=found.mean_cost,
             source_frames=one.motion.frame_count,
+            recording=one.example.recording,
         )
 
     def _found(self, reference: _Prepared, one: _Prepared) -> SectionedAlignment:

@@ -178,7 +178,7 @@ MODEL = KindDeclaration(
     description="Learns a generative model of one action from aligned clips.",
     params=job_params.ModelParams,
     implementation="marey_worker.kinds.model:run",
-    version=2,
+    version=3,
     inputs={
         "aligned": InputSpec(
             kind=Kind.PROCESSED, many=True, description="Clips of one action that were aligned with each other."
