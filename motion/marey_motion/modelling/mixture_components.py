@@ -16,7 +16,7 @@ MOST_ITERATIONS = 500
 """Maximum number of iterations from each start of expectation maximisation."""
 TOLERANCE = 1e-3
 """Change of the mean log-likelihood between iterations below which the fit has converged; without unit."""
-LEAST_DEVIATION = 1e-9
+SMALLEST_DEVIATION = 1e-9
 _NAMES = {"full": "full", "tied": "tied", "diagonal": "diag"}
 
 
@@ -124,7 +124,7 @@ def _shrunk(away: Floats) -> Floats:
     """Compute the covariance (d, d) of deviations from a mean (n, d), shrunk towards its diagonal."""
     from sklearn.covariance import ledoit_wolf
 
-    deviations = np.maximum(np.sqrt((away**2).mean(axis=0)), LEAST_DEVIATION)
+    deviations = np.maximum(np.sqrt((away**2).mean(axis=0)), SMALLEST_DEVIATION)
     shrunk, _ = ledoit_wolf(away / deviations, assume_centered=True)
     return np.asarray(shrunk * np.outer(deviations, deviations), dtype=np.float64)
 

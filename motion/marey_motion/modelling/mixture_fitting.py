@@ -268,7 +268,7 @@ class _Fitting:
         )
 
     def _simplest(self, tried: list[_Tried], best: _Tried) -> _Tried:
-        """Find the mixture with the fewest parameters that left-out examples do not tell from the best one."""
+        """Find the mixture with the fewest parameters that left-out examples cannot separate from the best one."""
 
         def size(one: _Tried) -> tuple[int, float]:
             candidate = one.candidate

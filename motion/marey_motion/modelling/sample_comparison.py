@@ -12,7 +12,7 @@ from marey_motion.modelling.sample_quality import toe_positions
 
 MOMENTS = 8
 """Number of canonical frames at which motions are compared."""
-MOST_COMPARED = 100
+MOTIONS_COMPARED = 100
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ def compare_samples(
     SampleComparison    the comparison
     """
     frames = np.unique(np.linspace(0, primitive.frame_count - 1, MOMENTS).round().astype(np.int64))
-    chosen = np.unique(np.linspace(0, len(poses) - 1, MOST_COMPARED).round().astype(np.int64))
-    some = sampled[:MOST_COMPARED]
+    chosen = np.unique(np.linspace(0, len(poses) - 1, MOTIONS_COMPARED).round().astype(np.int64))
+    some = sampled[:MOTIONS_COMPARED]
     drawn = primitive.poses(some)[:, frames]
     joints = tuple(range(primitive.skeleton.joint_count))
     examples = toe_positions(primitive.skeleton, poses[:, frames], joints)

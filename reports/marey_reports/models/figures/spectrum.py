@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from marey_motion.arrays import Floats
+from marey_motion.modelling.reconstruction import ReconstructionErrors
 from marey_motion.modelling.verdict import distributions_text
 from marey_reports.drawing.drawn import Sketch, Tables
 from marey_reports.drawing.paper import (
@@ -108,15 +109,6 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
     write(panel, (kept, top), f" kept: {kept}", color=QUIET, va="top")
     tick_whole_numbers(panel.xaxis)
     add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
-    at = min(kept, len(errors.components) - 1)
-    caption = (
-        "Error of examples that are reconstructed from the first components, by their number. With the "
-        f"{counted(kept, 'kept component')}, the mean error is {errors.training_cm[at]:.1f} cm for training examples"
-    )
-    if len(errors.left_out_each_cm) > 1:
-        caption += f", and {errors.left_out_cm[at]:.1f} cm for examples whose take was left out"
-    if by_subject is not None:
-        caption += f" ({by_subject[at]:.1f} cm if their performer was left out)"
     tables: Tables = {
         "errors": {
             "components": errors.components,
@@ -125,7 +117,20 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
             **({} if by_subject is None else {"left_out_subject_cm": by_subject}),
         }
     }
-    return Sketch(figure, tables, f"{caption}.")
+    return Sketch(figure, tables, _reconstruction_caption(errors, kept))
+
+
+def _reconstruction_caption(errors: ReconstructionErrors, kept: int) -> str:
+    at = min(kept, len(errors.components) - 1)
+    caption = (
+        "Error of examples that are reconstructed from the first components, by their number. With the "
+        f"{counted(kept, 'kept component')}, the mean error is {errors.training_cm[at]:.1f} cm for training examples"
+    )
+    if len(errors.left_out_each_cm) > 1:
+        caption += f", and {errors.left_out_cm[at]:.1f} cm for examples whose take was left out"
+    if errors.left_out_subject_cm is not None:
+        caption += f" ({errors.left_out_subject_cm[at]:.1f} cm if their performer was left out)"
+    return f"{caption}."
 
 
 def draw_criterion(subject: ModelSubject) -> Sketch | None:
@@ -159,8 +164,8 @@ def draw_criterion(subject: ModelSubject) -> Sketch | None:
     tables: Tables = {"candidates": {name: [getattr(each, name) for each in candidates] for name in columns}}
     caption = (
         "Mixtures that were tried, by their number of normal distributions and the kind of their covariances; the "
-        f"model uses {distributions_text(chosen)} ({covariance} covariance). Of mixtures that left-out takes cannot "
-        "tell apart, the simplest is used, and none in which a distribution has fewer than 5 examples. BIC weighs the "
+        f"model uses {distributions_text(chosen)} ({covariance} covariance). Of mixtures that left-out takes do not "
+        "separate, the simplest is used, and none in which a distribution has fewer than 5 examples. BIC weighs the "
         "fit against the number of parameters."
     )
     return Sketch(figure, tables, caption)
