@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,6 +37,22 @@ class Placement:
     joint: int = 0
 
 
+class Recording(NamedTuple):
+    """Take and performer that an example comes from; what a model has seen of one example, it has seen of all of them.
+
+    Parameters
+    ----------
+    take : str    stable name of the take; empty if the example is a take of its own
+    subject : str    performer; empty if unknown
+    """
+
+    take: str = ""
+    subject: str = ""
+
+
+UNKNOWN_RECORDING = Recording()
+
+
 @dataclass(frozen=True, eq=False)
 class AlignedClip:
     """One aligned example of N canonical frames.
@@ -51,6 +68,7 @@ class AlignedClip:
     placement : Placement    position and heading of the source's first frame
     cost : float    mean cost per cell of the alignment path that gave `time_function`, square metres
     source_frames : int    number of frames of the source at the set's rate
+    recording : Recording    take and performer
     """
 
     uid: str
@@ -60,6 +78,7 @@ class AlignedClip:
     placement: Placement
     cost: float
     source_frames: int
+    recording: Recording = UNKNOWN_RECORDING
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Placement
+from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Placement, Recording
 from marey_motion.alignment.aligning import MIRRORED, restore
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
@@ -76,6 +76,8 @@ def example_to_tree(
         "schema": ALIGNMENT_SCHEMA,
         "name": example.name,
         "clip": _reference_of(example.uid),
+        "take": example.recording.take or None,
+        "subject": example.recording.subject or None,
         "reference": _reference_of(aligned.reference),
         "set": digest,
         "frame_rate_hz": aligned.frame_rate_hz,
@@ -180,7 +182,14 @@ def _example(stored: StoredExample) -> AlignedClip:
         ),
         cost=float(info.get("cost", 0.0)),
         source_frames=int(info["source_frames"]),
+        recording=_recording(info),
     )
+
+
+def _recording(info: Mapping[str, Any]) -> Recording:
+    """Return take and performer; in older documents, the take is the clip itself."""
+    clip = info.get("clip") or {}
+    return Recording(str(info.get("take") or clip.get("item") or ""), str(info.get("subject") or ""))
 
 
 def _require_same_set(first: StoredExample, one: StoredExample) -> None:

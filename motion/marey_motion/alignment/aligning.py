@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Placement
+from marey_motion.alignment.aligned import UNKNOWN_RECORDING, AlignedClip, AlignedSet, Placement, Recording
 from marey_motion.alignment.canonical import placed, to_canonical
 from marey_motion.alignment.cost import CostPoints, cost_points, costs_between
 from marey_motion.alignment.dtw import align
-from marey_motion.alignment.reference import medoid, nearest_mean_length, pairwise_totals
+from marey_motion.alignment.reference import compared_motions, medoid, nearest_mean_length, pairwise_totals
 from marey_motion.alignment.segments import (
     Cut,
     SectionedAlignment,
@@ -63,12 +63,14 @@ class SourceExample:
     clip : Clip    the motion
     cuts : tuple of Cut    labelled frames of the clip, in the order of time (`segments.cuts_of`); all examples must
         have cuts with the same labels
+    recording : Recording    take and performer; without a name of the take, the example is a take of its own
     """
 
     uid: str
     name: str
     clip: Clip
     cuts: tuple[Cut, ...] = ()
+    recording: Recording = UNKNOWN_RECORDING
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,15 +304,17 @@ class _Aligning:
             return nearest_mean_length([one.motion.frame_count for one in prepared])
         if wanted != MEDOID:
             return [one.uid for one in prepared].index(wanted)
+        places = compared_motions(len(prepared))
+        compared = [prepared[place] for place in places]
         totals = pairwise_totals(
-            [one.points for one in prepared],
-            [one.sections.bounds for one in prepared],
+            [one.points for one in compared],
+            [one.sections.bounds for one in compared],
             self._costs,
             max_run=self._options.slope_limit,
             threads=self._threads,
-            progress=lambda done, total: self._tell(done, total, f"comparing {len(prepared)} clips"),
+            progress=lambda done, total: self._tell(done, total, f"comparing {len(compared)} clips"),
         )
-        return medoid(totals)
+        return places[medoid(totals)]
 
     # -- the alignment --
 
@@ -325,6 +329,7 @@ class _Aligning:
             placement=one.placement,
             cost=found.mean_cost,
             source_frames=one.motion.frame_count,
+            recording=one.example.recording,
         )
 
     def _found(self, reference: _Prepared, one: _Prepared) -> SectionedAlignment:

@@ -19,6 +19,15 @@ Advance = Callable[[int, int], None]
 SAME = 1e-9
 """Relative difference below which two sums of costs count as equal."""
 
+MOST_COMPARED = 200
+"""Greatest number of motions that are compared with each other to find the medoid.
+
+The number of pairs grows with its square: 200 motions are 19,900 pairs. With a probability of 99 %, a random sample of
+this size contains one of the best 2.3 % of all motions (0.977^200 = 1 %).
+"""
+
+_SAMPLE_SEED = 0
+
 
 def nearest_mean_length(frame_counts: Sequence[int]) -> int:
     """Choose the motion whose number of frames is nearest to the mean number.
@@ -51,6 +60,25 @@ def medoid(totals: Floats) -> int:
     sums = np.where(np.isinf(totals), 0.0, totals).sum(axis=1)
     sums[impossible > impossible.min()] = np.inf
     return int(np.flatnonzero(sums <= sums.min() * (1.0 + SAME))[0])
+
+
+def compared_motions(count: int) -> list[int]:
+    """Choose the motions that are compared with each other to find the medoid: all, or a random sample of them.
+
+    The choice depends on the number of motions alone, so the same motions in the same order give the same medoid.
+
+    Parameters
+    ----------
+    count : int    number of motions
+
+    Returns
+    -------
+    list of int    increasing indices, at most `MOST_COMPARED`
+    """
+    if count <= MOST_COMPARED:
+        return list(range(count))
+    drawn = np.random.Generator(np.random.Philox(_SAMPLE_SEED)).permutation(count)[:MOST_COMPARED]
+    return sorted(drawn.tolist())
 
 
 def pairwise_totals(

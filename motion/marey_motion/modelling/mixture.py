@@ -58,6 +58,19 @@ class LatentMixture:
         log_roots = np.log(np.diagonal(self.cholesky, axis1=1, axis2=2)).sum(axis=1)
         return np.asarray(np.log(self.weights) - log_roots - 0.5 * self.dimensions * np.log(2.0 * np.pi))
 
+    def widened(self, factor: float) -> LatentMixture:
+        """Make a mixture with the same means and larger covariances.
+
+        Parameters
+        ----------
+        factor : float    factor of all covariances, positive
+
+        Returns
+        -------
+        LatentMixture    the widened mixture
+        """
+        return LatentMixture(self.weights, self.means, self.covariances * factor)
+
     def component_log_densities(self, latents: Floats) -> Floats:
         """Compute each component's weighted log density ln(pi_k N_k(s)) of latent vectors.
 

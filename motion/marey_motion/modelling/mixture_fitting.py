@@ -1,41 +1,46 @@
-"""Fitting of mixtures of normal distributions to latent vectors, and choice of the number of components."""
+"""Choice of the mixture of normal distributions over latent vectors: number of distributions and kind of covariance."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Literal
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from marey_motion.arrays import Floats
+from marey_motion.arrays import Floats, Ints
 from marey_motion.errors import ModelError
+from marey_motion.modelling.example_groups import ExampleGroups
 from marey_motion.modelling.mixture import LatentMixture
-from marey_schemas.options.modelling import MixtureOptions
+from marey_motion.modelling.mixture_components import fit_components, parameter_count
+from marey_schemas.options.modelling import CovarianceKind, Criterion, MixtureOptions
 
 Refusal = Literal["", "small-component", "held-out"]
 
 LEAST_EXAMPLES_PER_COMPONENT = 5
-LEAST_FOLDS = 2
-SEEDS = 2**32
-MOST_ITERATIONS = 500
-"""Maximum number of iterations from each start of expectation maximisation."""
-TOLERANCE = 1e-3
-"""Change of the mean log-likelihood between iterations below which the fit has converged; without unit."""
+PATIENCE = 2
+"""Numbers of components in a row that may be worse than the best before no larger number is tried."""
+LOW_SHARE = 0.05
+"""Share of a mixture's own samples that are less likely than its threshold for improbable examples."""
+THRESHOLD_SAMPLES = 2000
+WIDENINGS = tuple(float(2.0 ** (step / 8)) for step in range(17))
+"""Factors of the covariances, 1 to 4, the least of which that calibrates the likelihoods is taken."""
 
 
 @dataclass(frozen=True)
 class MixtureCandidate:
-    """A mixture of a given number of components, with its criteria.
+    """A mixture of a given number of components and kind of covariance, with its criteria.
 
     Parameters
     ----------
     components : int    number of components
+    covariance : str    kind of covariance
     bic, aic : float    Bayesian and Akaike information criterion
     log_likelihood : float    natural logarithm of the likelihood of all examples
+    held_out_log_likelihood : float or None    mean log-likelihood of examples under mixtures that were fitted without
+        their takes; None without cross-validation
     smallest_weight : float    the least weight of a component
     converged : bool    whether the fit converged
     refusal : str    reason why the mixture is excluded, regardless of its criteria; empty if it is not excluded.
@@ -44,32 +49,55 @@ class MixtureCandidate:
     """
 
     components: int
+    covariance: CovarianceKind
     bic: float
     aic: float
     log_likelihood: float
+    held_out_log_likelihood: float | None
     smallest_weight: float
     converged: bool
     refusal: Refusal = ""
 
 
+class HeldOut(NamedTuple):
+    """Likelihoods of n examples under mixtures that were fitted without their takes, or without their performers.
+
+    Parameters
+    ----------
+    log_likelihoods : (n,) float64    natural logarithms of densities
+    thresholds : (n,) float64    log density that 5 % of the samples of the same mixture do not reach
+    """
+
+    log_likelihoods: Floats
+    thresholds: Floats
+
+    @property
+    def low_share(self) -> float:
+        """Share of the examples that are below the threshold; near 5 % if the likelihoods are calibrated."""
+        return float((self.log_likelihoods < self.thresholds).mean())
+
+
 @dataclass(frozen=True, eq=False)
 class FittedMixture:
-    """A mixture, the method by which it was fitted, and the candidates compared.
+    """A mixture, the kind of its covariance, and the candidates compared.
 
     Parameters
     ----------
     mixture : LatentMixture    the mixture
-    method : str    "em": expectation maximisation; "shrunk": one component of shrunk covariance, for few examples;
-        "point": a single point, for examples that do not vary
-    candidates : tuple of MixtureCandidate    by number of components; empty unless the method is "em"
-    held_out : (n,) float64, optional    ln p of each example under a mixture that has the same number of components,
-        but was fitted without the fold (part of the data) that contains the example
+    covariance : str    kind of covariance; "point" for examples that do not vary
+    widening : float    factor of the covariances for likelihoods, at least 1: with it, about 5 % of left-out examples
+        are less likely than 95 % of the widened mixture. It applies to `held_out`, not to the candidates
+    candidates : tuple of MixtureCandidate    by kind of covariance and number of components; empty for a point
+    held_out, held_out_subjects : HeldOut, optional    likelihoods of examples whose take, or whose performer, was left
+        out; None if there are too few of them
     """
 
     mixture: LatentMixture
-    method: Literal["em", "shrunk", "point"]
+    covariance: CovarianceKind | Literal["point"]
+    widening: float
     candidates: tuple[MixtureCandidate, ...]
-    held_out: Floats | None
+    held_out: HeldOut | None
+    held_out_subjects: HeldOut | None
 
 
 @contextmanager
@@ -88,18 +116,20 @@ def one_thread() -> Iterator[None]:
         yield
 
 
-def fit_mixture(latents: Floats, options: MixtureOptions | None = None, *, seed: int = 0) -> FittedMixture:
+def fit_mixture(
+    latents: Floats, options: MixtureOptions | None = None, *, groups: ExampleGroups | None = None, seed: int = 0
+) -> FittedMixture:
     """Fit a mixture to latent vectors.
 
-    With no more than d + 1 examples, a full covariance would be singular. The mixture then has one component only, and
-    its covariance is shrunk towards a sphere (Ledoit and Wolf 2004). Otherwise, mixtures with different numbers of
-    components are compared by `options.criterion`. A mixture is excluded if one of its components has fewer than d + 1
-    examples, or fewer than 5, or if held-out examples are not more likely than under a single component.
+    Mixtures with three kinds of covariance and up to 10 components are compared by `options.criterion`. Of mixtures
+    whose held-out likelihoods differ by less than their standard error, the one with the fewest parameters is taken. A
+    mixture is excluded if one of its components has fewer than 5 examples.
 
     Parameters
     ----------
     latents : (n, d) float64    latent vectors
     options : MixtureOptions, optional    options
+    groups : ExampleGroups, optional    takes and performers; by default, each example is a take of its own
     seed : int    the same seed gives the same mixture
 
     Returns
@@ -111,20 +141,56 @@ def fit_mixture(latents: Floats, options: MixtureOptions | None = None, *, seed:
     if not np.isfinite(latents).all():
         raise ModelError("latent vectors must be finite numbers", where="latents")
     if dimensions == 0:
-        return FittedMixture(_single(latents.mean(axis=0), np.zeros((0, 0))), "point", (), None)
+        point = LatentMixture(np.ones(1), latents.mean(axis=0)[None], np.zeros((1, 0, 0)))
+        return FittedMixture(point, "point", 1.0, (), None, None)
     # In units of the mean deviation, everything below is independent of the scale of the data.
     unit = float(np.sqrt(latents.var(axis=0).mean()))
     if not unit > 0.0:
         raise ModelError("all latent vectors are equal, so no mixture can be fitted to them", where="latents")
     with one_thread():
-        mixture, candidates, held_out = _Fitting(latents / unit, wanted, seed).choose()
+        found = _Fitting(latents / unit, wanted, groups or ExampleGroups.alone(examples), seed).choose()
     shift = dimensions * float(np.log(unit))
-    return FittedMixture(
+    mixture = found.mixture
+    return replace(
+        found,
         mixture=LatentMixture(mixture.weights, mixture.means * unit, mixture.covariances * unit**2),
-        method="em" if candidates else "shrunk",
-        candidates=tuple(_rescaled(candidate, shift * examples) for candidate in candidates),
-        held_out=None if held_out is None else held_out - shift,
+        candidates=tuple(_rescaled(candidate, shift, examples) for candidate in found.candidates),
+        held_out=_shifted(found.held_out, shift),
+        held_out_subjects=_shifted(found.held_out_subjects, shift),
     )
+
+
+class _Tried(NamedTuple):
+    """A fitted candidate."""
+
+    candidate: MixtureCandidate
+    mixture: LatentMixture
+    held_out: Floats | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Unseen:
+    """Latent vectors (n, d), the number of the fold (n,) of each, and the mixtures fitted without each fold."""
+
+    latents: Floats
+    folds: Ints
+    mixtures: tuple[LatentMixture, ...]
+    seed: int
+
+    def judged(self, widening: float = 1.0) -> HeldOut:
+        """Compute the likelihood of each example, and the threshold, under the widened mixture without its fold."""
+        found = HeldOut(np.empty(len(self.folds)), np.empty(len(self.folds)))
+        for fold, fitted in enumerate(self.mixtures):
+            mixture = fitted.widened(widening)
+            found.log_likelihoods[self.folds == fold] = mixture.log_density(self.latents[self.folds == fold])
+            found.thresholds[self.folds == fold] = low_density(mixture, self.seed)
+        return found
+
+    def calibration(self) -> float:
+        """Find the least widening with which at most 5 % of the examples (rounded up) are below the threshold."""
+        allowed = np.ceil(LOW_SHARE * len(self.folds)) / len(self.folds)
+        fits = (factor for factor in WIDENINGS if self.judged(factor).low_share <= allowed)
+        return next(fits, WIDENINGS[-1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,134 +199,157 @@ class _Fitting:
 
     latents: Floats
     options: MixtureOptions
+    groups: ExampleGroups
     seed: int
 
-    def choose(self) -> tuple[LatentMixture, list[MixtureCandidate], Floats | None]:
-        """Choose the mixture; return it, all candidates, and the examples' held-out log-likelihoods (n,) or None."""
-        examples, dimensions = self.latents.shape
-        if examples <= dimensions + 1:
-            return _fitted(self.latents, 1, self.options, self.seed)[0], [], self._held_out(1)
-        counts = range(1, max(1, min(self.options.most_mixture_components, examples // (2 * dimensions))) + 1)
-        if self.options.mixture_components is not None:
-            counts = range(self.options.mixture_components, self.options.mixture_components + 1)
-        fits = {count: _fitted(self.latents, count, self.options, self.seed) for count in counts}
-        candidates = {count: self._judged(count, *fit) for count, fit in fits.items()}
-        chosen, held_out = self._best(candidates)
-        return fits[chosen][0], list(candidates.values()), held_out
+    def choose(self) -> FittedMixture:
+        """Choose the mixture, and compute the likelihoods of left-out examples for it."""
+        folds = self.groups.take_folds(self.options.folds, self.seed)
+        criterion: Criterion = (
+            "bic" if folds is None and self.options.criterion == "held_out" else self.options.criterion
+        )
+        kinds = get_args(CovarianceKind) if self.options.covariance is None else (self.options.covariance,)
+        tried = [one for kind in kinds for one in self._of_kind(kind, criterion, folds)]
+        judged = tried if criterion == "held_out" else _with_refusals(tried)
+        usable = [one for one in judged if not one.candidate.refusal or self.options.mixture_components is not None]
+        best = max(usable, key=lambda one: _score(one.candidate, criterion))
+        if criterion == "held_out":
+            best = self._simplest(usable, best)
+        count, kind = best.candidate.components, best.candidate.covariance
+        unseen = self._unseen(count, kind, folds)
+        widening = self.options.widening or (1.0 if unseen is None else unseen.calibration())
+        by_subject = self._unseen(count, kind, self.groups.subject_folds() if self.options.folds else None)
+        return FittedMixture(
+            mixture=best.mixture,
+            covariance=kind,
+            widening=widening,
+            candidates=tuple(one.candidate for one in judged),
+            held_out=None if unseen is None else unseen.judged(widening),
+            held_out_subjects=None if by_subject is None else by_subject.judged(widening),
+        )
 
-    def _judged(self, count: int, mixture: LatentMixture, converged: bool) -> MixtureCandidate:
+    def _of_kind(self, kind: CovarianceKind, criterion: Criterion, folds: Ints | None) -> Iterator[_Tried]:
+        """Yield mixtures with one kind of covariance and 1, 2, ... components, until more components do not help."""
+        fixed = self.options.mixture_components
+        most = max(1, min(self.options.most_mixture_components, len(self.latents) // LEAST_EXAMPLES_PER_COMPONENT))
+        best, worse = -np.inf, 0
+        for count in range(1, most + 1) if fixed is None else (fixed,):
+            if count == 1 and kind == "tied" and self.options.covariance is None:
+                continue  # the same as full
+            mixture, converged = self._fit(self.latents, count, kind, self.options.starts)
+            unseen = self._unseen(count, kind, folds)
+            held_out = None if unseen is None else unseen.judged().log_likelihoods
+            candidate = self._judged(count, kind, mixture, converged, held_out)
+            yield _Tried(candidate, mixture, held_out)
+            score = _score(candidate, criterion)
+            worse = 0 if score > best else worse + 1
+            best = max(best, score)
+            if worse == PATIENCE:
+                return
+
+    def _judged(
+        self, count: int, kind: CovarianceKind, mixture: LatentMixture, converged: bool, held_out: Floats | None
+    ) -> MixtureCandidate:
         examples, dimensions = self.latents.shape
         likelihood = float(mixture.log_density(self.latents).sum())
-        numbers = count * (1 + dimensions + dimensions * (dimensions + 1) // 2) - 1
+        numbers = parameter_count(count, dimensions, kind)
         smallest = float(mixture.weights.min())
-        least = max(dimensions + 1, LEAST_EXAMPLES_PER_COMPONENT) / examples
+        small = count > 1 and smallest * examples < LEAST_EXAMPLES_PER_COMPONENT
         return MixtureCandidate(
             components=count,
+            covariance=kind,
             bic=numbers * float(np.log(examples)) - 2.0 * likelihood,
             aic=2.0 * numbers - 2.0 * likelihood,
             log_likelihood=likelihood,
+            held_out_log_likelihood=None if held_out is None else float(held_out.mean()),
             smallest_weight=smallest,
             converged=converged,
-            refusal="small-component" if count > 1 and smallest < least else "",
+            refusal="small-component" if small else "",
         )
 
-    def _best(self, candidates: dict[int, MixtureCandidate]) -> tuple[int, Floats | None]:
-        """Choose the number of components with the best criterion among the candidates that are not refused.
+    def _simplest(self, tried: list[_Tried], best: _Tried) -> _Tried:
+        """Find the mixture with the fewest parameters that left-out examples cannot separate from the best one."""
 
-        `candidates` maps a number of components to its candidate. A candidate that is refused here is replaced by a
-        copy that contains the reason. Returns the chosen number, and the held-out log-likelihoods (n,) of the examples
-        for this number, or None.
+        def size(one: _Tried) -> tuple[int, float]:
+            candidate = one.candidate
+            numbers = parameter_count(candidate.components, self.latents.shape[1], candidate.covariance)
+            return numbers, -_score(candidate, "held_out")
+
+        return min((one for one in tried if self._is_as_good(one, best)), key=size)
+
+    def _is_as_good(self, one: _Tried, best: _Tried) -> bool:
+        """Return whether left-out examples are less likely than with the best by at most one standard error.
+
+        The errors of examples of one take are not independent, so the standard error is that of the takes' sums.
         """
-        single = self._held_out(1)
-        falling = sorted(candidates.values(), key=lambda one: getattr(one, self.options.criterion))
-        for candidate in falling:
-            count = candidate.components
-            if count == 1 or self.options.mixture_components is not None:
-                return count, single if count == 1 else self._held_out(count)
-            if candidate.refusal:
-                continue
-            held_out = self._held_out(count)
-            if single is None or held_out is None or held_out.mean() > single.mean():
-                return count, held_out
-            candidates[count] = replace(candidate, refusal="held-out")
-        raise ModelError("no mixture can be chosen, because a mixture with 1 component was not tried")
+        assert one.held_out is not None
+        assert best.held_out is not None
+        gained = best.held_out - one.held_out
+        sums = np.bincount(self.groups.takes, weights=gained - gained.mean())
+        return bool(gained.mean() <= np.sqrt((sums**2).sum()) / len(gained))
 
-    def _held_out(self, count: int) -> Floats | None:
-        """Compute ln p (n,) of each example under a mixture of `count` components fitted without the example's fold.
-
-        Returns None if the examples cannot be divided into folds.
-        """
-        examples = len(self.latents)
-        if self.options.folds < LEAST_FOLDS or examples <= self.options.folds:
+    def _unseen(self, count: int, kind: CovarianceKind, folds: Ints | None) -> _Unseen | None:
+        """Fit a mixture without each fold; None without folds, or if a fold leaves fewer examples than components."""
+        if folds is None or len(folds) - np.bincount(folds).max() < count:
             return None
-        folds = np.random.Generator(np.random.Philox(self.seed)).permutation(examples) % self.options.folds
-        densities = np.empty(examples)
-        for fold in range(self.options.folds):
-            held = folds == fold
-            mixture, _ = _fitted(self.latents[~held], count, self.options, self.seed)
-            densities[held] = mixture.log_density(self.latents[held])
-        return densities
+        mixtures = [self._fit(self.latents[folds != fold], count, kind, 1)[0] for fold in range(int(folds.max()) + 1)]
+        return _Unseen(self.latents, folds, tuple(mixtures), self.seed)
 
-
-def _fitted(latents: Floats, count: int, options: MixtureOptions, seed: int) -> tuple[LatentMixture, bool]:
-    """Fit a mixture with `count` components to latent vectors (n, d); return it, and whether the fit converged."""
-    examples, dimensions = latents.shape
-    if count == 1:
-        return _normal(latents, options.regularisation, shrink=examples <= dimensions + 1), True
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.mixture import GaussianMixture
-
-    model = GaussianMixture(
-        count,
-        covariance_type="full",
-        reg_covar=options.regularisation,
-        n_init=options.starts,
-        max_iter=MOST_ITERATIONS,
-        tol=TOLERANCE,
-        random_state=seed % SEEDS,
-    )
-    if count > examples:
-        raise ModelError(
-            f"a mixture of {count} components needs at least {count} examples; there are {examples}",
-            code="too-many-components",
+    def _fit(self, latents: Floats, count: int, kind: CovarianceKind, starts: int) -> tuple[LatentMixture, bool]:
+        return fit_components(
+            latents, count, kind, regularisation=self.options.regularisation, starts=starts, seed=self.seed
         )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # told by the second result
-        model.fit(latents)
-    return _ordered(model.weights_, model.means_, model.covariances_), bool(model.converged_)
 
 
-def _normal(latents: Floats, regularisation: float, *, shrink: bool) -> LatentMixture:
-    """Fit one component to latent vectors (n, d) by maximum likelihood.
+def low_density(mixture: LatentMixture, seed: int) -> float:
+    """Compute the log density that 5 % of the samples of a mixture do not reach.
 
-    With `shrink`, the covariance is shrunk towards a sphere. `regularisation` is added to the diagonal.
+    Parameters
+    ----------
+    mixture : LatentMixture    the mixture
+    seed : int    seed of the samples
+
+    Returns
+    -------
+    float    natural logarithm
     """
-    if shrink:
-        from sklearn.covariance import ledoit_wolf
-
-        covariance, _ = ledoit_wolf(latents)
-    else:
-        away = latents - latents.mean(axis=0)
-        covariance = away.T @ away / len(latents)
-    return _single(latents.mean(axis=0), covariance + regularisation * np.eye(latents.shape[1]))
+    return float(np.quantile(mixture.log_density(mixture.sample(THRESHOLD_SAMPLES, seed)), LOW_SHARE))
 
 
-def _single(mean: Floats, covariance: Floats) -> LatentMixture:
-    return LatentMixture(np.ones(1), mean[None], covariance[None])
+def _score(candidate: MixtureCandidate, criterion: Criterion) -> float:
+    """Return the criterion of a candidate; higher is better."""
+    if criterion == "held_out":
+        return float("-inf") if candidate.held_out_log_likelihood is None else candidate.held_out_log_likelihood
+    return -(candidate.bic if criterion == "bic" else candidate.aic)
 
 
-def _ordered(weights: Floats, means: Floats, covariances: Floats) -> LatentMixture:
-    """Sort components, the heaviest first; components of equal weight are sorted by their means."""
-    order = np.lexsort((*means.T[::-1], -weights))
-    symmetric = 0.5 * (covariances + np.swapaxes(covariances, 1, 2))
-    return LatentMixture(weights[order] / weights.sum(), means[order], symmetric[order])
+def _with_refusals(tried: list[_Tried]) -> list[_Tried]:
+    """Refuse mixtures of several components that make left-out examples no more likely than a single one."""
+    singles = [_score(one.candidate, "held_out") for one in tried if one.candidate.components == 1]
+    least = max(singles, default=-np.inf)
+    return [
+        one._replace(candidate=replace(one.candidate, refusal="held-out"))
+        if one.held_out is not None
+        and one.candidate.components > 1
+        and not one.candidate.refusal
+        and _score(one.candidate, "held_out") <= least
+        else one
+        for one in tried
+    ]
 
 
-def _rescaled(candidate: MixtureCandidate, shift: float) -> MixtureCandidate:
-    """Convert a mixture to the units of the data; `shift` is the change of all log-likelihoods by the scaling."""
+def _shifted(held_out: HeldOut | None, shift: float) -> HeldOut | None:
+    """Convert likelihoods to the units of the data; `shift` is the change of each log density by the scaling."""
+    return None if held_out is None else HeldOut(held_out.log_likelihoods - shift, held_out.thresholds - shift)
+
+
+def _rescaled(candidate: MixtureCandidate, shift: float, examples: int) -> MixtureCandidate:
+    """Convert a candidate to the units of the data; `shift` is the change of each log density by the scaling."""
+    held_out = candidate.held_out_log_likelihood
     return replace(
         candidate,
-        bic=candidate.bic + 2.0 * shift,
-        aic=candidate.aic + 2.0 * shift,
-        log_likelihood=candidate.log_likelihood - shift,
+        bic=candidate.bic + 2.0 * shift * examples,
+        aic=candidate.aic + 2.0 * shift * examples,
+        log_likelihood=candidate.log_likelihood - shift * examples,
+        held_out_log_likelihood=None if held_out is None else held_out - shift,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -115,12 +116,14 @@ class MotionPrimitive:
     temporal : one channel over the N - 1 steps between canonical frames: the natural logarithm of the number of frames
         of real time, at `frame_rate_hz`, that pass in each step
     temporal_weight : positive factor of the temporal scores in latent vectors
-    mixture : distribution of latent vectors
+    mixture : distribution of latent vectors from which samples are drawn
     keyframes : canonical frame by label
     duration_range_s : shortest and longest duration of a motion, or None for no limits; limits matter because normal
         distributions of logarithms have long tails
     log_slope_range : limits of the temporal function, or None if the examples are not known; without limits, splines
         could overshoot at their ends, so that a motion would nearly stop there
+    widening : factor of the mixture's covariances for likelihoods, at least 1. Motions of takes that the model has not
+        seen vary more than its examples, so the mixture itself would call too many of them unlikely
     """
 
     name: str
@@ -133,6 +136,7 @@ class MotionPrimitive:
     keyframes: Mapping[str, int] = field(default_factory=dict)
     duration_range_s: tuple[float, float] | None = None
     log_slope_range: tuple[float, float] | None = None
+    widening: float = 1.0
 
     def __post_init__(self) -> None:
         if self.spatial.mean.shape[1] != 3 + 4 * self.skeleton.joint_count:
@@ -152,6 +156,8 @@ class MotionPrimitive:
             )
         if not (np.isfinite(self.temporal_weight) and self.temporal_weight > 0):
             raise MotionError("the temporal weight must be a positive number", where="temporal_weight")
+        if not (np.isfinite(self.widening) and self.widening >= 1):
+            raise MotionError("the widening must be at least 1", where="widening")
         least, most = self.log_slope_bounds
         if not -MOST_LOG_SLOPE <= least <= most <= MOST_LOG_SLOPE:
             message = f"{least:g} to {most:g} is not a range within {-MOST_LOG_SLOPE:g} to {MOST_LOG_SLOPE:g}"
@@ -171,6 +177,11 @@ class MotionPrimitive:
     def log_slope_bounds(self) -> tuple[float, float]:
         """Limits of the temporal function: `log_slope_range`, by default -`MOST_LOG_SLOPE` to `MOST_LOG_SLOPE`."""
         return self.log_slope_range or (-MOST_LOG_SLOPE, MOST_LOG_SLOPE)
+
+    @cached_property
+    def prior(self) -> LatentMixture:
+        """The mixture with widened covariances, which gives the likelihood of a motion."""
+        return self.mixture if self.widening == 1.0 else self.mixture.widened(self.widening)
 
     # -- from latent vectors -------------------------------------------------------------------------------------------
 
@@ -312,7 +323,7 @@ class MotionPrimitive:
         return np.concatenate((scores, self.temporal_weight * temporal), axis=1)
 
     def log_density(self, latents: Floats) -> Floats:
-        """Compute ln p(s) of latent vectors under the mixture.
+        """Compute ln p(s) of latent vectors under the widened mixture.
 
         Parameters
         ----------
@@ -322,7 +333,7 @@ class MotionPrimitive:
         -------
         (m,) float64    natural logarithms
         """
-        return self.mixture.log_density(latents)
+        return self.prior.log_density(latents)
 
 
 def _as_motion(poses: Floats) -> Motion:

@@ -53,6 +53,7 @@ def primitive_to_tree(primitive: MotionPrimitive, skeleton: Mapping[str, Any]) -
         "keyframes": {label: int(frame) for label, frame in primitive.keyframes.items()},
         "duration_range_s": _range_leaf(primitive.duration_range_s),
         "log_slope_range": _range_leaf(primitive.log_slope_range),
+        "widening": primitive.widening,
     }
 
 
@@ -112,6 +113,7 @@ def primitive_from_tree(tree: Mapping[str, Any], skeleton: Skeleton) -> MotionPr
         keyframes=dict(tree.get("keyframes") or {}),
         duration_range_s=_range_of(tree, "duration_range_s"),
         log_slope_range=_range_of(tree, "log_slope_range"),
+        widening=float(tree.get("widening", 1.0)),
     )
 
 
@@ -153,17 +155,25 @@ def _report_to_tree(report: TrainingReport) -> Tree:
     return {
         "spatial_energy": _leaf(report.spatial_energy),
         "temporal_energy": _leaf(report.temporal_energy),
-        "mixture_method": report.mixture_method,
+        "takes": report.takes,
+        "subjects": report.subjects,
+        "mixture_covariance": report.mixture_covariance,
         "candidates": [asdict(one) for one in report.candidates],
         "log_likelihood": report.log_likelihood,
         "held_out_log_likelihood": report.held_out_log_likelihood,
+        "held_out_low_share": report.held_out_low_share,
+        "held_out_subject_log_likelihood": report.held_out_subject_log_likelihood,
+        "held_out_subject_low_share": report.held_out_subject_low_share,
         "examples": [asdict(one) for one in report.examples],
-        "reconstruction": None if errors is None else {name: np.asarray(value) for name, value in vars(errors).items()},
+        "reconstruction": None
+        if errors is None
+        else {name: np.asarray(value) for name, value in vars(errors).items() if value is not None},
         "time_error_frames": report.time_error_frames,
         "training_durations": asdict(report.training_durations),
         "sample_durations": None if report.sample_durations is None else asdict(report.sample_durations),
         "training_feet": None if report.training_feet is None else asdict(report.training_feet),
         "sample_feet": None if report.sample_feet is None else asdict(report.sample_feet),
+        "comparison": None if report.comparison is None else asdict(report.comparison),
     }
 
 

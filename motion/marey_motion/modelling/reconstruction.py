@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.arrays import CM_PER_M, Floats
+from marey_motion.arrays import CM_PER_M, Floats, Ints
+from marey_motion.modelling.example_groups import ExampleGroups
 from marey_motion.modelling.fpca import PrincipalExamples
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.skeleton import Skeleton
@@ -28,15 +29,18 @@ class ReconstructionErrors:
     ----------
     components : (c,) numbers of components: 0, 1, 2, ...
     training_cm : (c,) mean error of the examples from which the components were computed
-    left_out_cm : (c,) mean error of examples that are reconstructed from the components and the mean of all other
-        examples
+    left_out_cm : (c,) mean error of examples that are reconstructed from the components and the mean of the examples of
+        all other takes
     left_out_each_cm : (m, c) the error of each of these examples
+    left_out_subject_cm : (c,) the same mean error if all examples of the performer are left out; None if fewer than
+        three performers are known
     """
 
     components: NDArray[np.int64]
     training_cm: Floats
     left_out_cm: Floats
     left_out_each_cm: Floats
+    left_out_subject_cm: Floats | None = None
 
 
 def reconstruction_errors(
@@ -45,6 +49,7 @@ def reconstruction_errors(
     poses: Floats,
     most_components: int,
     *,
+    groups: ExampleGroups | None = None,
     threads: int = 1,
     progress: Progress | None = None,
 ) -> ReconstructionErrors:
@@ -56,6 +61,7 @@ def reconstruction_errors(
     principal : PrincipalExamples    components of the examples
     poses : (m, N, D) float64    poses with consistent signs
     most_components : int    largest number of components
+    groups : ExampleGroups, optional    takes and performers; by default, each example is a take of its own
     threads : int    threads to use
     progress : callable, optional    called as progress(done, total, name of the step)
 
@@ -65,9 +71,10 @@ def reconstruction_errors(
 
     Notes
     -----
-    Leaving example i out of a principal component analysis subtracts c sᵢsᵢᵀ from the diagonal covariance of the scores
-    s, with c = m / (m - 1), and moves the mean to -sᵢ / (m - 1). Each left-out example therefore needs only an
-    eigendecomposition of the size of the score space; the coefficients are not analysed again.
+    Leaving g of m examples out of a principal component analysis, with the sum t of their scores s, subtracts Σ ssᵀ and
+    ttᵀ / (m - g) from the diagonal matrix of the sums of squared scores, and moves the mean to -t / (m - g). Each
+    left-out take therefore needs only an eigendecomposition of the size of the score space; the coefficients are not
+    analysed again.
     """
     basis = principal.functions.basis
     frames = comparison_frames(basis)
@@ -79,19 +86,34 @@ def reconstruction_errors(
     compare = _Comparison(skeleton, mean, directions)
     count = min(most_components, used) + 1
 
-    def errors_of(example: int) -> tuple[Floats, Floats]:
-        chosen = np.ascontiguousarray(poses[example, frames])
-        own = np.tril(np.ones((count, used)), -1) * scores[example]
-        return compare.distances(own, chosen), compare.distances(_left_out(scores, example, count), chosen)
+    groups = groups or ExampleGroups.alone(len(poses))
+    parts = [groups.takes] if groups.subjects is None else [groups.takes, groups.subjects]
+    todo = [(part, number) for part in parts for number in range(int(part.max()) + 1)]
+    training, left_out, of_others = (np.empty((len(poses), count)) for _ in range(3))
 
-    found = []
+    def measure(part: Ints, number: int) -> None:
+        members = np.flatnonzero(part == number)
+        without = _left_out(scores, members, count)
+        for place, example in enumerate(members.tolist()):
+            chosen = np.ascontiguousarray(poses[example, frames])
+            if part is groups.takes:
+                own = np.tril(np.ones((count, used)), -1) * scores[example]
+                training[example] = compare.distances(own, chosen)
+                left_out[example] = compare.distances(without[place], chosen)
+            else:
+                of_others[example] = compare.distances(without[place], chosen)
+
     with ThreadPoolExecutor(max(1, threads)) as pool:
-        for done, errors in enumerate(pool.map(errors_of, range(len(poses)))):
-            found.append(errors)
+        for done, _ in enumerate(pool.map(lambda one: measure(*one), todo)):
             if progress is not None:
-                progress(done + 1, len(poses), "leaving examples out")
-    training, left_out = (np.array(one) * CM_PER_M for one in zip(*found, strict=True))
-    return ReconstructionErrors(np.arange(count), training.mean(axis=0), left_out.mean(axis=0), left_out)
+                progress(done + 1, len(todo), "leaving examples out")
+    return ReconstructionErrors(
+        components=np.arange(count),
+        training_cm=CM_PER_M * training.mean(axis=0),
+        left_out_cm=CM_PER_M * left_out.mean(axis=0),
+        left_out_each_cm=CM_PER_M * left_out,
+        left_out_subject_cm=None if groups.subjects is None else CM_PER_M * of_others.mean(axis=0),
+    )
 
 
 def comparison_frames(basis: SplineBasis) -> NDArray[np.int64]:
@@ -109,17 +131,19 @@ def comparison_frames(basis: SplineBasis) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, basis.frame_count - 1, count).round().astype(np.int64))
 
 
-def _left_out(scores: Floats, example: int, count: int) -> Floats:
-    """Compute the scores (count, r) of reconstructions of an example by 0, 1, ... components of the other examples."""
-    examples = len(scores)
-    own = scores[example]
-    if examples < 2:
-        return np.zeros((count, scores.shape[1]))
-    share = examples / (examples - 1)
-    _, vectors = np.linalg.eigh(np.diag(np.einsum("mr,mr->r", scores, scores)) - share * np.outer(own, own))
+def _left_out(scores: Floats, members: Ints, count: int) -> Floats:
+    """Compute the scores (g, count, r) of g left-out examples, rebuilt by 0, 1, ... components of all others."""
+    own = scores[members]
+    others = len(scores) - len(members)
+    if not others:
+        return np.zeros((len(members), count, scores.shape[1]))
+    moved = own.sum(axis=0) / others
+    spread = np.diag(np.einsum("mr,mr->r", scores, scores)) - own.T @ own - others * np.outer(moved, moved)
+    _, vectors = np.linalg.eigh(spread)
     leading = vectors[:, ::-1][:, : count - 1]
-    along = leading * (leading.T @ own * share)
-    return np.asarray(np.concatenate((np.zeros((1, len(own))), np.cumsum(along.T, axis=0))) - own / (examples - 1))
+    along = ((own + moved) @ leading)[:, :, None] * leading.T
+    start = np.zeros((len(members), 1, scores.shape[1]))
+    return np.asarray(np.concatenate((start, np.cumsum(along, axis=1)), axis=1) - moved)
 
 
 @dataclass(frozen=True, eq=False)

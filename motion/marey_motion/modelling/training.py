@@ -11,6 +11,7 @@ from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.alignment.signs import consistent_poses
 from marey_motion.arrays import Floats
 from marey_motion.errors import ModelError
+from marey_motion.modelling.example_groups import ExampleGroups
 from marey_motion.modelling.fpca import Keep, PrincipalExamples, find_components
 from marey_motion.modelling.mixture_fitting import FittedMixture, fit_mixture, one_thread
 from marey_motion.modelling.primitive import MOST_LOG_SLOPE, MotionPrimitive
@@ -100,10 +101,11 @@ def train_primitive(
         )
         latents = np.concatenate((_kept_scores(fitted.spatial), weight * _kept_scores(fitted.temporal)), axis=1)
         progress(0, None, "fitting the mixture")
-        mixture = fit_mixture(latents, options, seed=seed)
+        groups = ExampleGroups.of(aligned)
+        mixture = fit_mixture(latents, options, groups=groups, seed=seed)
         primitive = _assemble(name, aligned, fitted, weight, mixture)
-        report = report_on(primitive, aligned, fitted.poses, fitted.spatial, fitted.temporal, latents, mixture, options,
-                           seed=seed, threads=threads, progress=progress)  # fmt: skip
+        report = report_on(primitive, aligned, fitted.poses, fitted.spatial, fitted.temporal, latents, mixture, groups,
+                           options, seed=seed, threads=threads, progress=progress)  # fmt: skip
     return TrainedPrimitive(primitive, report, warnings_of(primitive, report, options), options, fitted.weights)
 
 
@@ -232,6 +234,7 @@ def _assemble(
         keyframes=dict(aligned.keyframes),
         duration_range_s=_sampled_range(aligned),
         log_slope_range=_log_slope_range(aligned, fitted.temporal),
+        widening=mixture.widening,
     )
 
 

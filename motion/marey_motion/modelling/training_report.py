@@ -10,10 +10,12 @@ import numpy as np
 from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.arrays import Floats
 from marey_motion.importing.landmarks import find_landmarks
+from marey_motion.modelling.example_groups import ExampleGroups
 from marey_motion.modelling.fpca import PrincipalExamples
 from marey_motion.modelling.mixture_fitting import FittedMixture, MixtureCandidate
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.reconstruction import ReconstructionErrors, reconstruction_errors
+from marey_motion.modelling.sample_comparison import SampleComparison, compare_samples
 from marey_motion.modelling.sample_quality import FootQuality, foot_quality, standing_steps, toe_positions
 from marey_schemas.options.modelling import ModelOptions
 
@@ -34,9 +36,9 @@ class ExampleReport:
     Parameters
     ----------
     log_likelihood : natural logarithm of the density of the example
-    held_out_log_likelihood : log-likelihood of the example under a mixture fitted without the example's fold (a part of
-        the examples); None if it was not computed
-    left_out_error_cm : mean distance of the joints from their reconstruction by components of the other examples; the
+    held_out_log_likelihood : log-likelihood of the example under a mixture fitted without the fold (a part of the
+        takes) that contains the example's take; None if it was not computed
+    left_out_error_cm : mean distance of the joints from their reconstruction by components of the other takes; the
         number of components is that of the model
     outlier : whether the likelihood of the example is much lower than that of the other examples
     """
@@ -72,20 +74,30 @@ class TrainingReport:
     Parameters
     ----------
     spatial_energy, temporal_energy : cumulative share of the variance, over all components of the examples
-    mixture_method : see `FittedMixture`
+    takes, subjects : number of takes and of performers; 0 performers if they are unknown or fewer than three
+    mixture_covariance : kind of covariance, see `FittedMixture`
     candidates : mixtures compared, with their criteria
     log_likelihood : mean log-likelihood of the examples
     held_out_log_likelihood : mean of the examples' `held_out_log_likelihood`; None if it was not computed
+    held_out_low_share : share of the examples that are less likely, under a mixture fitted without their takes, than
+        95 % of its samples
+    held_out_subject_log_likelihood, held_out_subject_low_share : the same under mixtures fitted without the performer;
+        None if fewer than three performers are known
     examples : reports of the examples, in the order of the aligned set
     time_error_frames : root mean square difference between the examples' time functions and those rebuilt by the model
     """
 
     spatial_energy: Floats
     temporal_energy: Floats
-    mixture_method: str
+    takes: int
+    subjects: int
+    mixture_covariance: str
     candidates: tuple[MixtureCandidate, ...]
     log_likelihood: float
     held_out_log_likelihood: float | None
+    held_out_low_share: float | None
+    held_out_subject_log_likelihood: float | None
+    held_out_subject_low_share: float | None
     examples: tuple[ExampleReport, ...]
     reconstruction: ReconstructionErrors | None
     time_error_frames: float
@@ -93,6 +105,7 @@ class TrainingReport:
     sample_durations: Durations | None
     training_feet: FootQuality | None
     sample_feet: FootQuality | None
+    comparison: SampleComparison | None
 
 
 def report_on(
@@ -103,6 +116,7 @@ def report_on(
     temporal: PrincipalExamples,
     latents: Floats,
     fitted: FittedMixture,
+    groups: ExampleGroups,
     options: ModelOptions,
     *,
     seed: int,
@@ -119,6 +133,7 @@ def report_on(
     spatial, temporal : PrincipalExamples    all components of the examples, also those that the model does not keep
     latents : (m, L) float64    latent vectors of the examples
     fitted : FittedMixture    mixture and candidates
+    groups : ExampleGroups    takes and performers of the examples
     options : ModelOptions    options of the training
     seed : int    seed of the samples that are drawn from the model
     threads : int    number of threads for the leave-one-out reconstructions
@@ -129,11 +144,13 @@ def report_on(
     TrainingReport    the measures
     """
     densities = primitive.log_density(latents)
-    held_out = fitted.held_out
+    held_out, of_others = fitted.held_out, fitted.held_out_subjects
     errors = None
     if options.leave_one_out:
         most = primitive.spatial.count + MORE_COMPONENTS_SHOWN
-        errors = reconstruction_errors(primitive.skeleton, spatial, poses, most, threads=threads, progress=progress)
+        errors = reconstruction_errors(
+            primitive.skeleton, spatial, poses, most, groups=groups, threads=threads, progress=progress
+        )
     progress(0, None, "drawing samples")
     durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
     span = (float(durations.min()), float(durations.max()))
@@ -143,17 +160,25 @@ def report_on(
     return TrainingReport(
         spatial_energy=spatial.energy,
         temporal_energy=temporal.energy,
-        mixture_method=fitted.method,
+        takes=groups.take_count,
+        subjects=groups.subject_count,
+        mixture_covariance=fitted.covariance,
         candidates=fitted.candidates,
         log_likelihood=float(densities.mean()),
-        held_out_log_likelihood=None if held_out is None else float(held_out.mean()),
-        examples=_examples(primitive, aligned, densities, held_out, errors, durations),
+        held_out_log_likelihood=None if held_out is None else float(held_out.log_likelihoods.mean()),
+        held_out_low_share=None if held_out is None else held_out.low_share,
+        held_out_subject_log_likelihood=None if of_others is None else float(of_others.log_likelihoods.mean()),
+        held_out_subject_low_share=None if of_others is None else of_others.low_share,
+        examples=_examples(
+            primitive, aligned, densities, None if held_out is None else held_out.log_likelihoods, errors, durations
+        ),
         reconstruction=errors,
         time_error_frames=float(np.sqrt((time_error**2).mean())),
         training_durations=_durations(durations, span),
         sample_durations=None if sampled is None else _durations(primitive.durations_s(sampled), span),
         training_feet=feet,
         sample_feet=sample_feet,
+        comparison=None if sampled is None else compare_samples(primitive, poses, durations, groups.takes, sampled),
     )
 
 

@@ -16,6 +16,7 @@ SLIDING_RATIO = 2.0
 SLIDING_M_S = 0.1
 MANY_OUTSIDE = 0.1
 OVERFITTED_RATIO = 2.0
+MANY_UNLIKELY = 0.15
 LEAST_ERROR_CM = 0.5
 
 
@@ -53,9 +54,8 @@ def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: Mo
         found.append(
             Warned(
                 "too-few-examples",
-                f"there are only {count} examples for {primitive.dimensions} dimensions, so their likelihoods are not "
-                "meaningful, and the mixture has one normal distribution; add examples, or keep less than "
-                f"{options.spatial_share:.0%} of the variance",
+                f"there are only {count} examples for {primitive.dimensions} dimensions, so their likelihoods are "
+                f"hardly meaningful; add examples, or keep less than {options.spatial_share:.0%} of the variance",
             )
         )
     found += _of_time_components(primitive, report, options)
@@ -107,6 +107,15 @@ def _likelihood(example: ExampleReport) -> float:
 
 def _of_mixture(report: TrainingReport) -> list[Warned]:
     found = []
+    share = report.held_out_low_share
+    if share is not None and share > MANY_UNLIKELY and len(report.examples) * share > 1.0:
+        found.append(
+            Warned(
+                "likelihood-too-sure",
+                f"{share:.0%} of the examples are less likely, under a model that was trained without their takes, "
+                "than 95% of what this model expects; unseen motions differ more than the examples show, so add takes",
+            )
+        )
     slow = [candidate.components for candidate in report.candidates if not candidate.converged]
     if slow:
         found.append(

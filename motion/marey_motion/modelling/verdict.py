@@ -21,12 +21,14 @@ def verdict_of(trained: TrainedPrimitive) -> str:
     """
     report, primitive = trained.report, trained.primitive
     count = len(report.examples)
-    parts = [f"{counted(count, 'example')} in {primitive.dimensions} dimensions"]
-    kinds = len(primitive.mixture.weights)
-    parts.append(f"{counted(kinds, 'normal distribution')}")
-    error = _left_out_cm(trained)
+    takes = "" if report.takes == count else f" of {counted(report.takes, 'take')}"
+    parts = [f"{counted(count, 'example')}{takes} in {primitive.dimensions} dimensions"]
+    parts.append(distributions_text(len(primitive.mixture.weights)))
+    error, of_subject = _left_out_cm(trained), _left_out_subject_cm(trained)
     if error is not None:
-        parts.append(f"the mean error of a left-out example is {error:.1f} cm")
+        named = "example" if report.takes == count else "take"
+        others = "" if of_subject is None else f", of a left-out performer {of_subject:.1f} cm"
+        parts.append(f"the mean error of a left-out {named} is {error:.1f} cm{others}")
     feet = report.sample_feet
     if feet is not None:
         below = f"{feet.below_floor_mean_cm:.1f} cm below the floor in {feet.below_floor_share:.0%} of the frames"
@@ -36,6 +38,20 @@ def verdict_of(trained: TrainedPrimitive) -> str:
     sentence = "; ".join(parts) + "."
     noted = [warning.code for warning in trained.warnings]
     return f"{sentence} Warnings: {', '.join(noted)}." if noted else sentence
+
+
+def distributions_text(count: int) -> str:
+    """Describe the size of a mixture, in the verdict and in the figures.
+
+    Parameters
+    ----------
+    count : int    number of normal distributions
+
+    Returns
+    -------
+    str    such as "3 normal distributions"
+    """
+    return counted(count, "normal distribution")
 
 
 def headline_of(trained: TrainedPrimitive) -> Headline:
@@ -53,6 +69,8 @@ def headline_of(trained: TrainedPrimitive) -> Headline:
     durations, feet = report.training_durations, report.sample_feet
     return {
         "examples": len(report.examples),
+        "takes": report.takes,
+        "subjects": report.subjects,
         "frames": primitive.frame_count,
         "frame_rate_hz": primitive.frame_rate_hz,
         "spatial_components": primitive.spatial.count,
@@ -60,12 +78,15 @@ def headline_of(trained: TrainedPrimitive) -> Headline:
         "mixture_components": len(primitive.mixture.weights),
         "log_likelihood": report.log_likelihood,
         "held_out_log_likelihood": report.held_out_log_likelihood,
+        "held_out_low_share": report.held_out_low_share,
         "left_out_error_cm": _left_out_cm(trained),
+        "left_out_subject_error_cm": _left_out_subject_cm(trained),
         "least_duration_s": durations.least_s,
         "most_duration_s": durations.most_s,
         "feet_below_floor_share": None if feet is None else feet.below_floor_share,
         "feet_below_floor_cm": None if feet is None else feet.below_floor_mean_cm,
         "foot_slide_m_s": None if feet is None else feet.slide_m_s,
+        "example_foot_slide_m_s": None if report.training_feet is None else report.training_feet.slide_m_s,
         "warnings": len(trained.warnings),
     }
 
@@ -75,3 +96,10 @@ def _left_out_cm(trained: TrainedPrimitive) -> float | None:
     if errors is None or len(trained.report.examples) < 2:
         return None
     return float(errors.left_out_cm[min(trained.primitive.spatial.count, len(errors.components) - 1)])
+
+
+def _left_out_subject_cm(trained: TrainedPrimitive) -> float | None:
+    errors = trained.report.reconstruction
+    if errors is None or errors.left_out_subject_cm is None:
+        return None
+    return float(errors.left_out_subject_cm[min(trained.primitive.spatial.count, len(errors.components) - 1)])

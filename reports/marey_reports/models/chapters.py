@@ -10,6 +10,7 @@ from marey_motion.arrays import CM_PER_M
 from marey_motion.modelling.sample_quality import FootQuality
 from marey_motion.modelling.training import TrainedPrimitive
 from marey_motion.modelling.training_report import ExampleReport
+from marey_motion.modelling.verdict import distributions_text
 from marey_reports.drawing.drawn import DrawnFigure
 from marey_reports.drawing.markup import Content, Html, element
 from marey_reports.drawing.page import Section, shown
@@ -28,11 +29,12 @@ def headline(trained: TrainedPrimitive) -> Html:
     durations, drawn = report.training_durations, report.sample_durations
     lasting = "" if drawn is None else f"samples {drawn.least_s:.1f}–{drawn.most_s:.1f} s"
     odd = sum(example.outlier for example in report.examples)
-    normals = counted(len(primitive.mixture.weights), "normal distribution")
+    normals = distributions_text(len(primitive.mixture.weights))
     return facts(
         (
-            ("examples", str(len(report.examples)), f"{odd} unusual" if odd else "none of them unusual"),
-            ("error of a left-out example", *_unseen(trained)),
+            ("examples", str(len(report.examples)),
+             f"of {counted(report.takes, 'take')}; {f'{odd} unusual' if odd else 'none unusual'}"),
+            ("error of a left-out take", *_unseen(trained)),
             ("duration of the examples", f"{durations.least_s:.1f}–{durations.most_s:.1f} s", lasting),
             ("dimensions", str(primitive.dimensions),
              f"{primitive.spatial.count} of poses, {primitive.temporal.count} of time; {normals}"),
@@ -46,7 +48,9 @@ def _unseen(trained: TrainedPrimitive) -> tuple[str, str]:
     if errors is None or len(trained.report.examples) < 2:
         return "–", "not measured"
     at = min(kept, len(errors.components) - 1)
-    return f"{errors.left_out_cm[at]:.1f} cm", f"of a training example: {errors.training_cm[at]:.1f} cm"
+    by_subject = errors.left_out_subject_cm
+    others = "" if by_subject is None else f"of a left-out performer: {by_subject[at]:.1f} cm; "
+    return f"{errors.left_out_cm[at]:.1f} cm", f"{others}of a training example: {errors.training_cm[at]:.1f} cm"
 
 
 def _sliding(samples: FootQuality | None, examples: FootQuality | None) -> tuple[str, str]:
@@ -92,8 +96,35 @@ def motion_chapter(subject: ModelSubject, figures: Figures) -> Section:
     )
     pictures = shown(figures, "samples", "mean", "paths")
     return Section(
-        "motions", "Generated motions", (text, pictures, listing, shown(figures, "search-errors", "durations"))
+        "motions",
+        "Generated motions",
+        (text, pictures, listing, _comparison(subject), shown(figures, "search-errors", "durations")),
     )
+
+
+def _comparison(subject: ModelSubject) -> Html | None:
+    """Write the table that compares samples with examples; None without samples."""
+    found, report = subject.report.comparison, subject.report
+    if found is None:
+        return None
+    rows: list[list[Cell]] = [
+        ["distance from the nearest example, of another take for examples (cm)", number(found.nearest_cm, 1),
+         number(found.nearest_example_cm, 1)],
+        ["diversity: mean distance of two motions (cm)", number(found.diversity_cm, 1),
+         number(found.example_diversity_cm, 1)],
+        ["rotations of joints beyond the range of the examples (%)", number(100.0 * found.beyond_range_share, 1), ""],
+        ["greatest difference of the distributions of durations (%)", number(100.0 * found.duration_gap, 0), ""],
+    ]  # fmt: skip
+    if report.sample_feet is not None and report.training_feet is not None:
+        feet = [number(CM_PER_M * one.slide_m_s, 1) for one in (report.sample_feet, report.training_feet)]
+        rows.append(["sliding of planted feet (cm/s)", *feet])
+    if report.held_out_low_share is not None:
+        shares = [f"{100.0 * report.held_out_low_share:.0f} % of unseen takes"]
+        if report.held_out_subject_low_share is not None:
+            shares.append(f"{100.0 * report.held_out_subject_low_share:.0f} % of unseen performers")
+        rows.append(["less likely than 95 % of what the model expects (should be 5 %)", "5 %", ", ".join(shares)])
+    heads = ("measure", "samples", "examples")
+    return table("Samples beside examples", heads, rows, numbers=(1, 2), sortable=False)
 
 
 def _reach_row(reach: Reach) -> list[Cell]:

@@ -47,6 +47,13 @@ class AlignmentInfo(Request):
     schema_: Literal["marey/alignment@1"] = Field("marey/alignment@1", alias="schema")
     name: str = Field("", max_length=300, description="Name of the example, shown to people.")
     clip: ExampleRef | None = Field(None, description="The source clip; absent if it is not stored.")
+    take: str | None = Field(
+        None,
+        max_length=300,
+        description="The recording that the clip comes from, for example the id of the clip that it was cut from; "
+        "examples with the same value are never used to test each other.",
+    )
+    subject: str | None = Field(None, description="Performer, under a pseudonym.")
     reference: ExampleRef | None = Field(
         None,
         description="The reference example: the time of all other examples is mapped to its time, the canonical time.",

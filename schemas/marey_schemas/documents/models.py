@@ -162,6 +162,13 @@ class MotionPrimitiveDocument(Request):
         description="Lower and upper limit of the temporal function of samples: the range of the examples, "
         "slightly widened.",
     )
+    widening: float = Field(
+        1.0,
+        ge=1,
+        allow_inf_nan=False,
+        description="Factor of the covariances of `mixture` for likelihoods, so that about 5% of unseen motions are "
+        "less likely than 95% of the widened mixture; samples are drawn from the mixture itself.",
+    )
     scaling: dict[str, Any] | None = Field(
         None,
         description="Method and weights of the channels during training; the functions in this document are "

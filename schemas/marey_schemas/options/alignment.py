@@ -47,7 +47,8 @@ class AlignOptions(CostOptions):
 
     reference: Annotated[str, StringConstraints(min_length=1, max_length=64)] = Field(
         MEDOID,
-        description="Clip whose time is the canonical time. medoid: the clip nearest to all others; "
+        description="Clip whose time is the canonical time. medoid: the clip nearest to all others (of more than 200 "
+        "clips, the clip of a random sample of 200 that is nearest to all others of the sample); "
         "nearest_mean_length: the clip whose length is nearest to the mean; or the id of a clip.",
     )
     rate_hz: float | None = Field(

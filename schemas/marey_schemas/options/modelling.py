@@ -11,7 +11,8 @@ from marey_schemas.base import Options
 Scaling = Literal["jacobian", "root_max", "sfpca", "none"]
 InnerProduct = Literal["coefficients", "l2"]
 DEFAULT_INNER_PRODUCT: InnerProduct = "coefficients"
-Criterion = Literal["bic", "aic"]
+Criterion = Literal["held_out", "bic", "aic"]
+CovarianceKind = Literal["full", "tied", "diagonal"]
 FeatureKind = Literal["end_effectors", "latent"]
 
 MOST_TREE_SAMPLES = 100_000
@@ -22,12 +23,22 @@ _Share = Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)]
 class MixtureOptions(Options):
     """Options of the fit of a mixture of normal distributions to latent vectors."""
 
-    criterion: Criterion = Field("bic", description="Criterion that selects the number of mixture components.")
+    criterion: Criterion = Field(
+        "held_out",
+        description="Criterion that selects the mixture. held_out: the likelihood of examples of takes that were left "
+        "out of the fit; bic, aic: an information criterion, among the mixtures that make left-out examples more "
+        "likely than one normal distribution. Without cross-validation, held_out is replaced by bic.",
+    )
+    covariance: CovarianceKind | None = Field(
+        None,
+        description="Kind of covariance. full: one for each component, shrunk towards its diagonal; tied: one for all "
+        "components; diagonal: one variance for each component and dimension; absent: the criterion selects it.",
+    )
     most_mixture_components: int = Field(
         10,
         ge=1,
         le=100,
-        description="Greatest number of mixture components to try; n examples in d dimensions allow at most n / 2d.",
+        description="Greatest number of mixture components to try; n examples allow at most n / 5.",
     )
     mixture_components: int | None = Field(
         None, ge=1, le=100, description="Exact number of mixture components; absent: the criterion selects it."
@@ -39,11 +50,23 @@ class MixtureOptions(Options):
         allow_inf_nan=False,
         description="Regularisation added to variances, as a share of the mean variance.",
     )
+    widening: float | None = Field(
+        None,
+        ge=1,
+        le=100,
+        allow_inf_nan=False,
+        description="Factor of the covariances for likelihoods, not for samples; absent: the least factor, 1 to 4, "
+        "with which about 5% of left-out examples are less likely than 95% of the widened mixture.",
+    )
     starts: int = Field(
         5, ge=1, le=100, description="Number of starts of expectation maximisation; the best result is used."
     )
     folds: int = Field(
-        5, ge=0, le=100, description="Number of folds of the cross-validation of likelihoods; 0: no cross-validation."
+        5,
+        ge=0,
+        le=100,
+        description="Number of folds of the cross-validation of likelihoods; all examples "
+        "of a take are in the same fold. 0: no cross-validation.",
     )
 
 

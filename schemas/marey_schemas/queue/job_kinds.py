@@ -156,7 +156,7 @@ ALIGN = KindDeclaration(
     description="Aligns examples of one action with each other, in space and in time.",
     params=job_params.AlignParams,
     implementation="marey_worker.kinds.align:run",
-    version=1,
+    version=2,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The examples, all of one skeleton."),
         "annotations": InputSpec(
@@ -178,7 +178,7 @@ MODEL = KindDeclaration(
     description="Learns a generative model of one action from aligned clips.",
     params=job_params.ModelParams,
     implementation="marey_worker.kinds.model:run",
-    version=2,
+    version=3,
     inputs={
         "aligned": InputSpec(
             kind=Kind.PROCESSED, many=True, description="Clips of one action that were aligned with each other."

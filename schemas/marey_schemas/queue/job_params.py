@@ -46,10 +46,6 @@ class SuffixedResults(TaggedResults):
     suffix: NameSuffix = Field("", description="Text that is appended to the names of the results.")
 
 
-MOST_EXAMPLES = 2000
-"""Greatest number of examples that are all compared with each other; mirrored copies count."""
-
-
 class AlignParams(AlignOptions, MetricChoice, SuffixedResults):
     """Parameters of jobs of the kind `align`."""
 

@@ -156,7 +156,7 @@ def parse_model(loaded: LoadedModel) -> UsableModel:
     skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(loaded.hierarchy))
     try:
         primitive = primitive_from_tree(loaded.model, skeleton)
-        primitive.mixture.cholesky  # noqa: B018    computed here so that an impossible mixture is refused here
+        primitive.prior.cholesky  # noqa: B018    computed here so that an impossible mixture is refused here
     except MotionError as error:
         raise InvalidProblem(f"The model cannot be used: {error}", code=error.code) from error
     return UsableModel(primitive, RevisionRef.model_validate(loaded.model["skeleton"]))

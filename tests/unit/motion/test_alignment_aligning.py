@@ -10,6 +10,7 @@ import pytest
 from tests.support.alignment_examples import body_of, moved, played, sine_warp, walk, warped_walks
 
 from marey_motion.alignment import aligning
+from marey_motion.alignment import reference as references
 from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.alignment.aligning import (
     MIRRORED,
@@ -115,6 +116,21 @@ def test_the_medoid_is_nearer_to_the_others_than_an_outlier() -> None:
     strange = generate_gait(2.4, -1.0, 1.0)
     aligned = align_clips([SourceExample("a@1", "a", strange), *examples], BODY)
     assert aligned.reference != "a@1"
+
+
+def test_the_number_of_compared_pairs_does_not_grow_with_the_square_of_the_clips(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(references, "MOST_COMPARED", 4)
+    compared: list[tuple[int, int]] = []
+    for count in (8, 16):
+        examples, _ = warped_walks(count)
+        aligned = align_clips(
+            examples, BODY, progress=lambda done, total, _note: compared.append((done, int(total or 0)))
+        )
+        assert len(aligned.clips) == count
+        assert max(compared) == (6, 6)
+        assert as_bytes(align_clips(examples[::-1], BODY, threads=2)) == as_bytes(aligned)
 
 
 def test_a_reference_that_is_named_is_found_without_comparing_pairs(monkeypatch: pytest.MonkeyPatch) -> None:

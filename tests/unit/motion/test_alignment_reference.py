@@ -5,7 +5,13 @@ import pytest
 
 from marey_motion.alignment.cost import cost_points, costs_between, frame_costs
 from marey_motion.alignment.dtw import align
-from marey_motion.alignment.reference import medoid, nearest_mean_length, pairwise_totals
+from marey_motion.alignment.reference import (
+    MOST_COMPARED,
+    compared_motions,
+    medoid,
+    nearest_mean_length,
+    pairwise_totals,
+)
 from marey_motion.alignment.segments import align_sections
 from marey_motion.arrays import Floats
 from marey_schemas.options.alignment import CostOptions
@@ -39,6 +45,21 @@ def test_an_example_that_cannot_be_aligned_with_others_is_no_medoid_if_there_is_
 def test_the_nearest_to_the_mean_length_is_found_with_ties_to_the_first() -> None:
     assert nearest_mean_length([40, 53, 47, 60]) == 1
     assert nearest_mean_length([49, 51]) == 0
+
+
+@pytest.mark.parametrize("count", [201, 800, 5000])
+def test_of_many_motions_a_sample_is_compared_that_spreads_over_all(count: int) -> None:
+    places = compared_motions(count)
+    assert len(set(places)) == MOST_COMPARED
+    assert places == sorted(places) == compared_motions(count)
+    assert places[0] >= 0
+    assert places[-1] < count
+    tenths = np.histogram(places, bins=10, range=(0, count))[0]
+    assert tenths.min() >= MOST_COMPARED // 20
+
+
+def test_few_motions_are_all_compared() -> None:
+    assert compared_motions(MOST_COMPARED) == list(range(MOST_COMPARED))
 
 
 def clouds(seed: int = 0) -> list[Floats]:

@@ -363,7 +363,15 @@ def test_the_figures_of_no_samples_of_the_search_say_so() -> None:
 
 
 def test_the_check_of_searches_is_drawn_where_there_is_one(subject: ModelSubject) -> None:
-    found = SearchCheck(("walk001", "walk001"), ("left_wrist", "right_wrist"), (5, 9), np.array([2.0, 3.0]), np.ones(2))
+    found = SearchCheck(
+        ("take", "subject"),
+        ("walk001", "walk001"),
+        ("left_wrist", "right_wrist"),
+        (5, 9),
+        np.array([2.0, 3.0]),
+        np.ones(2),
+    )
     figure = drawn_of(replace(subject, check=found), "search-errors")
     assert [row["joint"] for row in rows_of(figure, "errors")] == ["left_wrist", "right_wrist"]
-    assert "hands and feet of 1 example, for a model" in figure.caption
+    assert "hands and feet of 1 example, for models trained without" in figure.caption
+    assert "1.00 cm for unseen performers" in figure.caption

@@ -115,7 +115,7 @@ def test_the_result_is_never_worse_than_the_start() -> None:
     primitive, _ = walking(mixtures=3)
     cost = posterior(primitive, WRIST, standard_joints(), 1.0)
     for start in primitive.sample(40, 9) * 2.0:
-        found = refine(on_walks(WRIST, mixtures=3), start)
+        found = refine(on_walks(WRIST, mixtures=3), start, RefineOptions(likelihood_weight=1.0))
         np.testing.assert_allclose((found.start_cost, found.cost), (cost(start), cost(found.latents)), rtol=1e-9)
         assert found.cost <= found.start_cost
 
@@ -215,3 +215,20 @@ def test_errors_too_large_to_compute_with_are_refused() -> None:
     problem = SeveralSteps.of([step], Placement(0.0, 1e200, 0.0))
     with pytest.raises(MotionError, match="too large"):
         refine(problem, walking()[0].mixture.means[0])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_by_default_the_errors_never_end_larger_than_they_began(seed: int) -> None:
+    """With a weight of 1, which was the default, the errors of a good start became larger."""
+    primitive = sliding(2)
+    start = np.random.default_rng(seed).normal(0.0, 2.0, 2)
+    # A target 0.01 mm from where the start is: nearer than the likelihood lets the result stay.
+    target = 0.1 * start[0] + 1e-5
+    constraints = (RootPositionConstraint(at="middle", target_m=(target, None), tolerance_m=0.02),)
+    problem = SeveralSteps.of([Step(primitive, constraints, {})])
+
+    def error(found: Floats) -> float:
+        return float(problem.measure(found).errors[0][0])
+
+    assert error(refine(problem, start).latents) <= error(start) + 1e-15
+    assert error(refine(problem, start, RefineOptions(likelihood_weight=1.0)).latents) > error(start)

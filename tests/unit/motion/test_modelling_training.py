@@ -1,6 +1,7 @@
 """Training of motion primitives from aligned examples, and the report of the training."""
 
 import dataclasses
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,12 +10,14 @@ from pydantic import ValidationError
 from scipy.stats import multivariate_normal
 from tests.support.modelling_examples import aligned_set, bending_chains, chain, unit_poses, walks, warps
 
-from marey_motion.alignment.aligned import AlignedClip, AlignedSet
+from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Recording
+from marey_motion.alignment.aligning import MIRRORED
 from marey_motion.alignment.signs import consistent_poses
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.modelling import reconstruction_kernels
+from marey_motion.modelling.example_groups import ExampleGroups
 from marey_motion.modelling.fpca import Keep, find_components
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.primitive_documents import trained_to_tree
@@ -153,7 +156,7 @@ def test_a_mixture_of_a_known_latent_space_is_recovered() -> None:
     assert len(mixture.weights) == 2
     drawn = primitive.sample(50, 1)
     expected = np.log(sum(
-        weight * multivariate_normal(mean, covariance).pdf(drawn)
+        weight * multivariate_normal(mean, primitive.widening * covariance).pdf(drawn)
         for weight, mean, covariance in zip(mixture.weights, mixture.means, mixture.covariances, strict=True)
     ))  # fmt: skip
     np.testing.assert_allclose(primitive.log_density(drawn), expected, rtol=1e-9)
@@ -200,6 +203,52 @@ def test_what_a_left_out_example_loses_is_what_a_model_without_it_loses() -> Non
             error = 100.0 * np.linalg.norm(reached - wanted, axis=2).mean()
             assert found.left_out_each_cm[left_out, count] == pytest.approx(error, abs=1e-6)
     assert found.left_out_cm == pytest.approx(found.left_out_each_cm.mean(axis=0))
+
+
+def test_all_examples_of_a_take_and_of_a_performer_are_left_out_together() -> None:
+    """Steps of one take are nearly the same, so a model that has seen one of them has seen the others."""
+    aligned = bending_chains(12)
+    takes, subjects = np.repeat(np.arange(6), 2), np.repeat(np.arange(3), 4)
+    fitted = fit_examples(aligned, QUICK.replace(spatial_share=1.0))
+    found = reconstruction_errors(
+        aligned.skeleton, fitted.spatial, fitted.poses, 3, groups=ExampleGroups(takes, subjects)
+    )
+    basis = fitted.spatial.functions.basis
+    frames = comparison_frames(basis)
+    coefficients = basis.fit(fitted.poses)
+
+    def error_without(left_out: Floats, example: int) -> float:
+        functions = find_components(basis, coefficients[~left_out], fitted.weights, Keep(count=2)).functions
+        made = functions.coefficients(functions.scores(coefficients[example][None]))[0]
+        reached = forward_kinematics(aligned.skeleton, unit_poses(basis.at_frames @ made)[frames])
+        wanted = forward_kinematics(aligned.skeleton, fitted.poses[example, frames])
+        return float(100.0 * np.linalg.norm(reached - wanted, axis=2).mean())
+
+    by_subject = [error_without(subjects == subjects[example], example) for example in range(12)]
+    for example in range(12):
+        expected = error_without(takes == takes[example], example)
+        assert found.left_out_each_cm[example, 2] == pytest.approx(expected, abs=1e-6)
+    assert found.left_out_subject_cm is not None
+    assert found.left_out_subject_cm[2] == pytest.approx(np.mean(by_subject), abs=1e-6)
+
+
+def test_a_report_counts_takes_and_performers_and_mirrored_copies_are_of_the_same_take() -> None:
+    aligned = bending_chains(12)
+    clips = tuple(
+        replace(
+            clip, uid=f"{clip.uid}{MIRRORED if number % 2 else ''}", recording=Recording(f"take {number // 2}", who)
+        )
+        for number, (clip, who) in enumerate(zip(aligned.clips, "aaaabbbbcccc", strict=True))
+    )
+    trained = train_primitive(replace(aligned, clips=clips))
+    report = trained.report
+    assert (report.takes, report.subjects) == (6, 3)
+    assert verdict_of(trained).startswith("12 examples of 6 takes in ")
+    assert "of a left-out performer" in verdict_of(trained)
+    assert report.held_out_subject_log_likelihood is not None
+    assert headline_of(trained)["left_out_subject_error_cm"] is not None
+    copies = tuple(replace(clip, uid=clip.uid + end) for clip in aligned.clips[:6] for end in ("", MIRRORED))
+    assert ExampleGroups.of(replace(aligned, clips=copies)).take_count == 6
 
 
 def test_more_components_lose_less_and_unseen_examples_lose_more() -> None:

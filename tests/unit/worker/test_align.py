@@ -11,9 +11,10 @@ from tests.support.project_in_memory import ProjectInMemory, add_clip
 from marey_motion import documents
 from marey_motion.alignment.aligned_documents import StoredExample, set_from_examples
 from marey_motion.gait import generate_gait
+from marey_motion.modelling.example_groups import ExampleGroups
 from marey_schemas.documents.alignments import AlignmentInfo
 from marey_schemas.documents.annotations import Annotation
-from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.documents.clips import ClipInfo, MotionDocument
 from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.job_params import AlignParams
@@ -65,6 +66,26 @@ def keyframe(frame: int, label: str = "down") -> tuple[dict[str, Any]]:
 
 def infos(project: Project) -> dict[str, AlignmentInfo]:
     return {output.item_name: AlignmentInfo.model_validate(output.parts["info"]) for output in project.staged}
+
+
+def test_examples_know_their_take_and_their_performer(project: Project) -> None:
+    """Pieces that were cut from one clip are of one take; a clip without records is a take of its own."""
+    cut = {"format": "cut", "details": {"clip": {"item": "walk", "revision": 3}, "label": "step"}}
+    for name in "ab":
+        described = ClipInfo.model_validate({"subject": "02", "source": cut})
+        project.parts[f"clip_{name}", 1, "info"] = described.model_dump(mode="json", by_alias=True)
+    numbered = ClipInfo.model_validate({"subject": "05", "take": "7"})
+    project.parts["clip_c", 1, "info"] = numbered.model_dump(mode="json", by_alias=True)
+    align.run(project, AlignParams(mirroring="add"))
+    found = {name: (info.take, info.subject) for name, info in infos(project).items() if len(name) == 1}
+    assert found == {"a": ("walk", "02"), "b": ("walk", "02"), "c": ("05 · 7", "05"), "d": ("clip_d", None)}
+    examples = [
+        StoredExample("", documents.clip_from_document(
+            MotionDocument.model_validate(output.parts["motion"]), walk().skeleton), output.parts["info"])
+        for output in project.staged
+    ]  # fmt: skip
+    groups = ExampleGroups.of(set_from_examples(examples))
+    assert (len(examples), groups.take_count, groups.subject_count) == (8, 3, 0)
 
 
 def test_every_clip_becomes_an_aligned_one_with_the_way_back(project: Project) -> None:

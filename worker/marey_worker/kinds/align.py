@@ -10,21 +10,21 @@ import numpy as np
 
 from marey_motion import documents
 from marey_motion.alignment import aligned_documents
-from marey_motion.alignment.aligned import AlignedClip, AlignedSet
+from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Recording
 from marey_motion.alignment.aligning import MIRRORED, SourceExample, align_clips, with_mirrored
 from marey_motion.alignment.segments import Cut, cuts_of
 from marey_motion.errors import MotionError
 from marey_motion.matching.body import MatchingBody
 from marey_motion.perception.metric import metric_of
 from marey_schemas.documents.annotations import Annotation
-from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.documents.clips import ClipInfo, MotionDocument
 from marey_schemas.documents.metrics import MetricIdentity
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.canonical import document_digest
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
 from marey_schemas.options.alignment import MEDOID, NEAREST_MEAN_LENGTH, AlignOptions
-from marey_schemas.queue.job_params import MOST_EXAMPLES, AlignParams
+from marey_schemas.queue.job_params import AlignParams
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.chosen_metric import read_metric
@@ -160,6 +160,7 @@ class _Job:
 
     def _examples(self, clips: Sequence[_Clip], body: MatchingBody) -> Iterator[SourceExample]:
         annotations = self._read_annotations()
+        recordings = self._recordings(clips)
         for one in clips:
             try:
                 clip = documents.clip_from_document(one.motion, body.skeleton)
@@ -167,7 +168,15 @@ class _Job:
             except MotionError as error:
                 self._refusals.add(one.pin, error)
                 continue
-            yield SourceExample(_uid(one.pin), one.pin.path, clip, cuts)
+            yield SourceExample(_uid(one.pin), one.pin.path, clip, cuts, recordings[_uid(one.pin)])
+
+    def _recordings(self, clips: Sequence[_Clip]) -> dict[str, Recording]:
+        """Return take and performer of each clip, from its part `info`; a clip without it is a take of its own."""
+        infos = self._context.documents([one.pin for one in clips], "info", required=False)
+        return {
+            _uid(pin): Recording(pin.item) if tree is None else _recording(pin, ClipInfo.model_validate(tree))
+            for pin, tree in infos
+        }
 
     def _require_examples(self, examples: Sequence[SourceExample], clips: Sequence[_Clip]) -> None:
         count = len(examples) * (2 if self._params.mirroring == "add" else 1)
@@ -176,12 +185,6 @@ class _Job:
                 "too-few-clips",
                 f"only {len(examples)} of {len(clips)} clips can be aligned, but alignment needs at least "
                 f"two{self._refusals.first}",
-            )
-        if count > MOST_EXAMPLES and self._params.reference == MEDOID:
-            raise JobRefused(
-                "too-many-clips",
-                f"the reference `medoid` compares each clip with every other, which is possible for at most "
-                f"{MOST_EXAMPLES} clips, not {count}; choose a clip or {NEAREST_MEAN_LENGTH} as reference",
             )
 
     # -- annotations --
@@ -342,6 +345,18 @@ class _Job:
             "aligned": [_row(one) for one in aligned.clips],
             "refused": self._refusals.entries,
         }
+
+
+def _recording(pin: PinnedInput, info: ClipInfo) -> Recording:
+    """Return take and performer of a clip.
+
+    Pieces that were cut from one clip have this clip as their take; otherwise the take's number in the records counts.
+    """
+    cut_from = info.source.details.get("clip") if info.source is not None and info.source.format == "cut" else None
+    item = cut_from.get("item") if isinstance(cut_from, dict) else None
+    facts = (info.subject, info.shoot_day, info.action, info.take)
+    recorded = " · ".join(str(fact) for fact in facts if fact is not None) if info.take else pin.item
+    return Recording(str(item or recorded)[:MAX_NAME_LENGTH], info.subject or "")
 
 
 def _row(one: AlignedClip) -> dict[str, Any]:

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import AlignedSet
-from marey_motion.arrays import CM_PER_M, Floats
+from marey_motion.arrays import CM_PER_M, Flags, Floats
+from marey_motion.modelling.example_groups import ExampleGroups
 from marey_motion.modelling.sample_quality import toe_positions
 from marey_motion.modelling.search.step_search import search_steps
 from marey_motion.modelling.search.steps import Step
 from marey_motion.modelling.search.tree import build_tree
 from marey_motion.modelling.training import train_primitive
 from marey_schemas.options.modelling import ModelOptions, TreeOptions
-from marey_schemas.options.searching import RefineOptions
 from marey_schemas.search_constraints import JointPositionConstraint
 
 REACHING = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
@@ -24,25 +24,26 @@ REACHING = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
 
 HELD_OUT_EVERY = 5
 LEAST_EXAMPLES = 10
+LEAST_TAKES = 2
 MOST_TARGETS = 60
 SAMPLES = 2000
-REFINING = RefineOptions(likelihood_weight=0.01)
-"""Options with little weight on likelihood, because the check measures the smallest distance that the model allows."""
 
 
 @dataclass(frozen=True, eq=False)
 class SearchCheck:
     """Errors of searches for motions in which a hand or foot reaches a position.
 
-    The positions come from examples that were left out of the training of the model.
+    The positions come from takes, and from performers, that were left out of the training of the model.
 
     Parameters
     ----------
+    left_out : (n,) "take" or "subject": what the model had not seen of the example, its take or its performer
     examples, joints : (n,) uid of the example and standard name of the joint whose position is the target
     frames : (n,) canonical frame at which the positions of that joint differ most between the examples
     searched_cm, refined_cm : (n,) error of the best sample of the tree, before and after refinement
     """
 
+    left_out: tuple[str, ...]
     examples: tuple[str, ...]
     joints: tuple[str, ...]
     frames: tuple[int, ...]
@@ -53,7 +54,9 @@ class SearchCheck:
 def check_search(
     aligned: AlignedSet, standard_joints: Mapping[str, int], options: ModelOptions, *, seed: int
 ) -> SearchCheck | None:
-    """Train a model without every fifth example, and search for the positions of hands and feet in these examples.
+    """Train a model without every fifth take, and search for the positions of hands and feet in these takes.
+
+    If three performers are known, the same is done without each performer.
 
     Parameters
     ----------
@@ -64,38 +67,62 @@ def check_search(
 
     Returns
     -------
-    SearchCheck or None    None if there are fewer than ten examples, or if hands and feet are not known
+    SearchCheck or None    None if there are fewer than ten examples or three takes, or if hands and feet are
+        not known
     """
     joints = {name: standard_joints[name] for name in REACHING if name in standard_joints}
-    if len(aligned.clips) < LEAST_EXAMPLES or not joints:
+    groups = ExampleGroups.of(aligned)
+    known = {clip.uid: number for clip, number in zip(aligned.clips, groups.takes.tolist(), strict=True)}
+    takes = [number for number in range(groups.take_count) if number != known.get(aligned.reference)]
+    if len(aligned.clips) < LEAST_EXAMPLES or len(takes) < LEAST_TAKES or not joints:
         return None
-    others = [clip for clip in aligned.clips if clip.uid != aligned.reference]
-    held_out = others[::HELD_OUT_EVERY]
-    kept = replace(aligned, clips=tuple(clip for clip in aligned.clips if clip not in held_out))
-    quick = options.replace(leave_one_out=False, folds=0, report_samples=0)
-    primitive = train_primitive(kept, quick, seed=seed).primitive
-    tree = build_tree(primitive, seed, TreeOptions(samples=SAMPLES), end_effectors=tuple(joints.values()))
-    frames = _most_varied(aligned, tuple(joints.values()))
-    places = toe_positions(aligned.skeleton, np.stack([clip.motion.poses for clip in held_out]), tuple(joints.values()))
-    wanted = [(example, place) for example in range(len(held_out)) for place in range(len(joints))][:MOST_TARGETS]
-    names, searched, refined = tuple(joints), [], []
-    for example, place in wanted:
-        x, y, z = places[example, frames[place], place].tolist()
-        step = Step(
-            primitive,
-            (JointPositionConstraint(joint=names[place], at=float(frames[place]), target_m=(x, y, z)),),
-            standard_joints,
-        )
-        found = search_steps([step], [tree], refining=REFINING)
-        searched.append(float(found.sampled.errors[0][0]))
-        refined.append(float(found.measured.errors[0][0]))
-    return SearchCheck(
-        examples=tuple(held_out[example].uid for example, _ in wanted),
-        joints=tuple(names[place] for _, place in wanted),
-        frames=tuple(int(frames[place]) for _, place in wanted),
-        searched_cm=CM_PER_M * np.array(searched),
-        refined_cm=CM_PER_M * np.array(refined),
-    )
+    checking = _Checking(aligned, joints, standard_joints, options, seed)
+    without = np.isin(groups.takes, takes[::HELD_OUT_EVERY])
+    found = [("take", *one) for one in checking.search(without, MOST_TARGETS)]
+    if groups.subjects is not None:
+        each = max(1, MOST_TARGETS // groups.subject_count)
+        for number in range(groups.subject_count):
+            found += [("subject", *one) for one in checking.search(groups.subjects == number, each)]
+    left_out, examples, names, frames, searched, refined = zip(*found, strict=True)
+    return SearchCheck(left_out, examples, names, frames, CM_PER_M * np.array(searched), CM_PER_M * np.array(refined))
+
+
+@dataclass(frozen=True, eq=False)
+class _Checking:
+    """Searches in models that were trained without some of the examples."""
+
+    aligned: AlignedSet
+    joints: Mapping[str, int]
+    standard_joints: Mapping[str, int]
+    options: ModelOptions
+    seed: int
+
+    def search(self, without: Flags, most: int) -> Iterator[tuple[str, str, int, float, float]]:
+        """Train a model without the examples `without` (m,), and search it for at most `most` of their positions.
+
+        Yields uid of the example, name of the joint, canonical frame, and the errors in metres before and after
+        refinement. Yields nothing if too few examples remain.
+        """
+        clips = np.array(self.aligned.clips, dtype=object)
+        if (~without).sum() < LEAST_EXAMPLES // 2:
+            return
+        quick = self.options.replace(leave_one_out=False, folds=0, report_samples=0)
+        primitive = train_primitive(
+            replace(self.aligned, clips=tuple(clips[~without])), quick, seed=self.seed
+        ).primitive
+        tree = build_tree(primitive, self.seed, TreeOptions(samples=SAMPLES), end_effectors=tuple(self.joints.values()))
+        frames = _most_varied(self.aligned, tuple(self.joints.values()))
+        poses = np.stack([clip.motion.poses for clip in clips[without]])
+        places = toe_positions(self.aligned.skeleton, poses, tuple(self.joints.values()))
+        todo = [(example, place) for example in range(len(poses)) for place in range(len(self.joints))]
+        for chosen in np.unique(np.linspace(0, len(todo) - 1, min(most, len(todo))).astype(np.int64)).tolist():
+            example, place = todo[chosen]
+            joint = list(self.joints)[place]
+            x, y, z = places[example, frames[place], place].tolist()
+            target = JointPositionConstraint(joint=joint, at=float(frames[place]), target_m=(x, y, z))
+            found = search_steps([Step(primitive, (target,), self.standard_joints)], [tree])
+            errors = (float(found.sampled.errors[0][0]), float(found.measured.errors[0][0]))
+            yield (clips[without][example].uid, joint, int(frames[place]), *errors)
 
 
 def _most_varied(aligned: AlignedSet, joints: tuple[int, ...]) -> NDArray[np.int64]:

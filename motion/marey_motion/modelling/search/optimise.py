@@ -18,7 +18,7 @@ import numpy as np
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.modelling.mixture import LatentMixture
-from marey_schemas.options.searching import RefineOptions
+from marey_schemas.options.searching import LIKELIHOOD_WEIGHT, RefineOptions
 
 FIRST_DAMPING = 1e-3
 SMALLEST_DAMPING, MOST_DAMPING = 1e-12, 1e12
@@ -73,6 +73,8 @@ class LeastSquares(Protocol):
 def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAULT_REFINING) -> Refined:
     """Improve latent vectors; the cost of the result is never above the cost of the start.
 
+    Without a given weight of the likelihood, the sum of the squared errors is not above that of the start, either.
+
     Parameters
     ----------
     problem : LeastSquares    residuals and priors
@@ -87,7 +89,21 @@ def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAUL
     ------
     MotionError    if the start has no finite cost
     """
-    prior = _Prior(problem.priors, options.likelihood_weight)
+    if options.likelihood_weight is not None:
+        return _minimised(problem, start, options.likelihood_weight, options.iterations)[0]
+    found, error, start_error = _minimised(problem, start, LIKELIHOOD_WEIGHT, options.iterations)
+    if error <= start_error:
+        return found
+    # Without the likelihood, the cost is the error, which no step makes larger.
+    return _minimised(problem, start, 0.0, options.iterations)[0]
+
+
+def _minimised(problem: LeastSquares, start: Floats, weight: float, most: int) -> tuple[Refined, float, float]:
+    """Minimise the cost with a weight of the likelihood, in at most `most` iterations.
+
+    Returns the result, and the sums of its squared residuals and of those of the start.
+    """
+    prior = _Prior(problem.priors, weight)
     here = np.array(start, dtype=np.float64)
     residuals, slopes = problem.linearise(here)
     cost = start_cost = _cost(residuals, prior, here)
@@ -96,8 +112,9 @@ def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAUL
             "the constraints' errors are too large to compute with; use wider tolerances or smaller weights",
             code="refining-not-finite",
         )
+    start_error = float(residuals @ residuals)
     damping, evaluations, iterations = FIRST_DAMPING, 1, 0
-    while iterations < options.iterations and damping < MOST_DAMPING:
+    while iterations < most and damping < MOST_DAMPING:
         iterations += 1
         curvature, gradient = prior.quadratic(here)
         curvature += slopes.T @ slopes
@@ -120,7 +137,7 @@ def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAUL
             if _is_still(step, here):
                 break
             damping *= TIGHTENING
-    return Refined(here, cost, start_cost, iterations, evaluations)
+    return Refined(here, cost, start_cost, iterations, evaluations), float(residuals @ residuals), start_error
 
 
 def _step(curvature: Floats, gradient: Floats) -> Floats | None:

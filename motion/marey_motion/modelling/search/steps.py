@@ -160,8 +160,8 @@ class SeveralSteps:
 
     @property
     def priors(self) -> Sequence[LatentMixture]:
-        """Mixtures of the steps' primitives."""
-        return tuple(one.objective.primitive.mixture for one in self.links)
+        """Distributions that give the likelihoods of the steps' motions."""
+        return tuple(one.objective.primitive.prior for one in self.links)
 
     def parts(self, stacked: Floats) -> tuple[Floats, ...]:
         """Split stacked latent vectors.

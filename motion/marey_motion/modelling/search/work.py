@@ -87,7 +87,8 @@ def searching_work(
     rows = 3 * sum(len(link.objective.constraints) + 1 + len(problem.joints) for link in problem.links)
     priors = sum(mixture.means.size * mixture.dimensions for mixture in problem.priors)
     products = (rows * width**2 + width**3) / _PRODUCTS_AT_ONCE
-    return searched + refining.iterations * (linearised + priors + products)
+    tries = 2 if refining.likelihood_weight is None else 1
+    return searched + tries * refining.iterations * (linearised + priors + products)
 
 
 def finishing_work(steps: Sequence[Step], found: FoundMotion) -> float:

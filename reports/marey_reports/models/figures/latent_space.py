@@ -8,6 +8,7 @@ import numpy as np
 
 from marey_motion.arrays import Floats
 from marey_motion.modelling.training_report import DEVIATION_OF_MEDIAN, OUTLIER_DEVIATIONS, ExampleReport
+from marey_motion.modelling.verdict import distributions_text
 from marey_reports.drawing.drawn import Sketch, Tables
 from marey_reports.drawing.paper import (
     COLOURS,
@@ -55,8 +56,8 @@ def draw_latent_space(subject: ModelSubject) -> Sketch | None:
     components = len(primitive.mixture.weights)
     odd = [example.name for example in subject.report.examples if example.outlier]
     caption = (
-        f"The examples and {SCATTERED_SAMPLES} samples in the latent space of the model; {_mixture(components)} "
-        f"(outlines at two standard deviations). {_odd_ones(len(odd))}"
+        f"The examples and {SCATTERED_SAMPLES} samples in the latent space of the model; samples are drawn from "
+        f"{distributions_text(components)} (outlines at two standard deviations). {_odd_ones(len(odd))}"
     )
     tables: Tables = {
         "examples": {
@@ -69,14 +70,6 @@ def draw_latent_space(subject: ModelSubject) -> Sketch | None:
         "samples": {_axis(primitive.spatial.count, place): samples[:, place] for place in range(primitive.dimensions)},
     }
     return Sketch(figure, tables, caption)
-
-
-def _mixture(components: int) -> str:
-    return (
-        "samples are drawn from one normal distribution"
-        if components == 1
-        else f"samples are drawn from {components} normal distributions"
-    )
 
 
 def _odd_ones(count: int) -> str:

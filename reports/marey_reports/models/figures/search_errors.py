@@ -24,9 +24,21 @@ def draw_search_check(subject: ModelSubject) -> Sketch | None:
     if check is None:
         return None
     examples = counted(len(set(check.examples)), "example")
-    about = f"positions of hands and feet of {examples}, for a model trained without them"
+    about = f"positions of hands and feet of {examples}, for models trained without their takes"
+    others = np.array([one == "subject" for one in check.left_out])
+    if others.any():
+        medians = [np.median(check.refined_cm[chosen]) for chosen in (~others, others)]
+        about += (
+            f" or without their performers; after refinement, the median is {medians[0]:.2f} cm for unseen takes and "
+            f"{medians[1]:.2f} cm for unseen performers"
+        )
     sketch = draw_search_errors(check.searched_cm, check.refined_cm, about=about)
-    whose = {"example": check.examples, "joint": check.joints, "canonical_frame": check.frames}
+    whose = {
+        "left_out": check.left_out,
+        "example": check.examples,
+        "joint": check.joints,
+        "canonical_frame": check.frames,
+    }
     return sketch._replace(tables={"errors": {**whose, **sketch.tables["errors"]}})
 
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from marey_motion.arrays import Floats
+from marey_motion.modelling.reconstruction import ReconstructionErrors
+from marey_motion.modelling.verdict import distributions_text
 from marey_reports.drawing.drawn import Sketch, Tables
 from marey_reports.drawing.paper import (
     COLOURS,
@@ -90,70 +92,80 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
     low, high = np.quantile(errors.left_out_each_cm, (0.1, 0.9), axis=0)
     if len(errors.left_out_each_cm) > 1:
         panel.fill_between(
-            errors.components, low, high, color=COLOURS[1], alpha=0.18, lw=0, label="80 % of left-out examples"
+            errors.components, low, high, color=COLOURS[1], alpha=0.18, lw=0, label="80 % of left-out takes"
         )
         panel.plot(errors.components, errors.left_out_cm, color=COLOURS[1], marker="s", ms=3.5, lw=1.4,
-                   label="left-out examples")  # fmt: skip
+                   label="left-out takes")  # fmt: skip
     panel.plot(errors.components, errors.training_cm, color=COLOURS[0], marker="o", ms=3.5, lw=1.4,
                label="training examples")  # fmt: skip
+    by_subject = errors.left_out_subject_cm
+    if by_subject is not None:
+        panel.plot(errors.components, by_subject, color=COLOURS[2], marker="^", ms=3.5, lw=1.4,
+                   label="left-out performers")  # fmt: skip
     panel.axvline(kept, color=QUIET, lw=0.9, ls=(0, (4, 3)))
-    top = 1.15 * max(float(curve.max()) for curve in (high, errors.left_out_cm, errors.training_cm)) or 1.0
+    curves = (high, errors.left_out_cm, errors.training_cm, *(() if by_subject is None else (by_subject,)))
+    top = 1.15 * max(float(curve.max()) for curve in curves) or 1.0
     panel.set(xlim=(-0.4, max(float(errors.components[-1]), 1.0) + 0.4), ylim=(0.0, top))
     write(panel, (kept, top), f" kept: {kept}", color=QUIET, va="top")
     tick_whole_numbers(panel.xaxis)
     add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    tables: Tables = {
+        "errors": {
+            "components": errors.components,
+            "training_cm": errors.training_cm,
+            "left_out_cm": errors.left_out_cm,
+            **({} if by_subject is None else {"left_out_subject_cm": by_subject}),
+        }
+    }
+    return Sketch(figure, tables, _reconstruction_caption(errors, kept))
+
+
+def _reconstruction_caption(errors: ReconstructionErrors, kept: int) -> str:
     at = min(kept, len(errors.components) - 1)
     caption = (
         "Error of examples that are reconstructed from the first components, by their number. With the "
         f"{counted(kept, 'kept component')}, the mean error is {errors.training_cm[at]:.1f} cm for training examples"
     )
     if len(errors.left_out_each_cm) > 1:
-        caption += f", and {errors.left_out_cm[at]:.1f} cm for examples that were left out"
-    tables: Tables = {
-        "errors": {
-            "components": errors.components,
-            "training_cm": errors.training_cm,
-            "left_out_cm": errors.left_out_cm,
-        }
-    }
-    return Sketch(figure, tables, f"{caption}.")
+        caption += f", and {errors.left_out_cm[at]:.1f} cm for examples whose take was left out"
+    if errors.left_out_subject_cm is not None:
+        caption += f" ({errors.left_out_subject_cm[at]:.1f} cm if their performer was left out)"
+    return f"{caption}."
 
 
 def draw_criterion(subject: ModelSubject) -> Sketch | None:
-    """Draw BIC and AIC over the number of mixture components; return None if the training did not compute them."""
+    """Draw held-out likelihood and BIC of the mixtures that were tried; return None if none were compared."""
     candidates = subject.report.candidates
     if not candidates:
         return None
-    chosen = len(subject.primitive.mixture.weights)
-    counts = np.array([each.components for each in candidates])
-    figure = new_figure(6.9, 3.3)
-    panel = add_panel(figure, Place(0.95, 0.65, 3.9, 2.3), x="normal distributions", y="BIC, AIC (lower is better)")
-    for name, colour, marker in (("bic", COLOURS[0], "o"), ("aic", REFERENCE, "^")):
-        values = np.array([getattr(each, name) for each in candidates])
-        panel.plot(counts, values, color=colour, marker=marker, ms=4.5, lw=1.3, label=name.upper())
-    refused = [each for each in candidates if each.refusal]
-    if refused:
-        panel.plot([each.components for each in refused], [each.bic for each in refused], ls="", marker="x", ms=9,
-                   color=COLOURS[1], label="rejected")  # fmt: skip
-    taken = next((each for each in candidates if each.components == chosen), None)
-    if taken is not None:
-        panel.plot([chosen], [taken.bic], ls="", marker="o", ms=11, mfc="none", mec=INK, label=f"used: {chosen}")
-    tick_whole_numbers(panel.xaxis)
-    panel.set_xlim(counts[0] - 0.5, counts[-1] + 0.5)
+    chosen, covariance = len(subject.primitive.mixture.weights), subject.report.mixture_covariance
+    taken = [each for each in candidates if (each.components, each.covariance) == (chosen, covariance)]
+    figure = new_figure(9.6, 3.3)
+    measured = any(each.held_out_log_likelihood is not None for each in candidates)
+    panels = [("held_out_log_likelihood", "likelihood of left-out takes (higher is better)")] if measured else []
+    panels.append(("bic", "BIC (lower is better)"))
+    for place, (name, label) in enumerate(panels):
+        panel = add_panel(figure, Place(0.95 + 3.9 * place, 0.65, 2.9, 2.3), x="normal distributions", y=label)
+        for kind, colour, marker in zip(("full", "tied", "diagonal"), COLOURS, "os^", strict=False):
+            some = [each for each in candidates if each.covariance == kind and getattr(each, name) is not None]
+            counts, values = [each.components for each in some], [getattr(each, name) for each in some]
+            panel.plot(counts, values, color=colour, marker=marker, ms=4.5, lw=1.3, label=kind)
+        values = [getattr(each, name) for each in taken if getattr(each, name) is not None]
+        panel.plot(
+            [chosen] * len(values), values, ls="", marker="o", ms=11, mfc="none", mec=INK, label=f"used: {chosen}"
+        )
+        tick_whole_numbers(panel.xaxis)
+        panel.set_xlim(0.5, max(each.components for each in candidates) + 0.5)
     add_keys(panel, loc="upper left", bbox_to_anchor=(1.02, 1.0))
-    tables: Tables = {
-        "candidates": {
-            "components": counts,
-            "bic": [each.bic for each in candidates],
-            "aic": [each.aic for each in candidates],
-            "log_likelihood": [each.log_likelihood for each in candidates],
-            "smallest_weight": [each.smallest_weight for each in candidates],
-            "refusal": [each.refusal for each in candidates],
-        }
-    }
+    columns = (
+        "components", "covariance", "held_out_log_likelihood", "bic", "aic", "log_likelihood", "smallest_weight",
+        "refusal",
+    )  # fmt: skip
+    tables: Tables = {"candidates": {name: [getattr(each, name) for each in candidates] for name in columns}}
     caption = (
-        f"Information criteria by the number of normal distributions in the mixture; the model uses {chosen}. Both "
-        "weigh the fit against the number of parameters. A number is rejected if a distribution would have too few "
-        "examples, or if it makes held-out examples no likelier than one distribution does."
+        "Mixtures that were tried, by their number of normal distributions and the kind of their covariances; the "
+        f"model uses {distributions_text(chosen)} ({covariance} covariance). Of mixtures that left-out takes do not "
+        "separate, the simplest is used, and none in which a distribution has fewer than 5 examples. BIC weighs the "
+        "fit against the number of parameters."
     )
     return Sketch(figure, tables, caption)

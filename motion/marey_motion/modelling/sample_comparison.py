@@ -1,0 +1,107 @@
+"""Comparison of samples of a model with its examples: durations, distances, diversity and ranges of the joints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from marey_motion.arrays import CM_PER_M, Floats, Ints
+from marey_motion.modelling.primitive import MotionPrimitive
+from marey_motion.modelling.sample_quality import toe_positions
+
+MOMENTS = 8
+"""Number of canonical frames at which motions are compared."""
+MOTIONS_COMPARED = 100
+
+
+@dataclass(frozen=True)
+class SampleComparison:
+    """Distributions of the samples and of the examples.
+
+    Distances of two motions are mean distances of their joints at the same canonical frames, in centimetres.
+
+    Parameters
+    ----------
+    duration_gap : greatest difference, 0 to 1, of the shares of samples and of examples up to any duration (the
+        statistic of Kolmogorov and Smirnov)
+    nearest_cm : median distance of a sample from the nearest example
+    nearest_example_cm : median distance of an example from the nearest example of another take; None for one take
+    diversity_cm, example_diversity_cm : mean distance of two samples, and of two examples
+    beyond_range_share : share of the rotations of joints in samples that are farther from the joint's mean rotation
+        than any rotation of this joint in the examples
+    """
+
+    duration_gap: float
+    nearest_cm: float
+    nearest_example_cm: float | None
+    diversity_cm: float
+    example_diversity_cm: float | None
+    beyond_range_share: float
+
+
+def compare_samples(
+    primitive: MotionPrimitive, poses: Floats, durations_s: Floats, takes: Ints, sampled: Floats
+) -> SampleComparison:
+    """Compare samples with examples.
+
+    Parameters
+    ----------
+    primitive : MotionPrimitive    the model
+    poses : (m, N, D) float64    poses of the examples, with consistent signs
+    durations_s : (m,) float64    durations of the examples
+    takes : (m,) int64    number of the take of each example
+    sampled : (n, L) float64    latent vectors of the samples, n at least 1
+
+    Returns
+    -------
+    SampleComparison    the comparison
+    """
+    frames = np.unique(np.linspace(0, primitive.frame_count - 1, MOMENTS).round().astype(np.int64))
+    chosen = np.unique(np.linspace(0, len(poses) - 1, MOTIONS_COMPARED).round().astype(np.int64))
+    some = sampled[:MOTIONS_COMPARED]
+    drawn = primitive.poses(some)[:, frames]
+    joints = tuple(range(primitive.skeleton.joint_count))
+    examples = toe_positions(primitive.skeleton, poses[:, frames], joints)
+    to_examples = _distances(toe_positions(primitive.skeleton, drawn, joints), examples)
+    among_samples = _distances(toe_positions(primitive.skeleton, drawn, joints), None)
+    among = _distances(examples[chosen], examples)
+    strangers = np.where(takes[chosen][:, None] == takes[None], np.inf, among).min(axis=1)
+    known = strangers[np.isfinite(strangers)]
+    return SampleComparison(
+        duration_gap=_greatest_gap(durations_s, primitive.durations_s(sampled)),
+        nearest_cm=float(np.median(to_examples.min(axis=1))),
+        nearest_example_cm=float(np.median(known)) if known.size else None,
+        diversity_cm=_mean_of_pairs(among_samples) or 0.0,
+        example_diversity_cm=_mean_of_pairs(among[:, chosen]),
+        beyond_range_share=_beyond_range(poses[:, frames], drawn),
+    )
+
+
+def _distances(motions: Floats, others: Floats | None) -> Floats:
+    """Compute the distances (n, m) between motions (n, T, J, 3) and others (m, T, J, 3), in centimetres."""
+    compared = motions if others is None else others
+    return CM_PER_M * np.stack([np.linalg.norm(compared - one, axis=-1).mean(axis=(1, 2)) for one in motions])
+
+
+def _mean_of_pairs(distances: Floats) -> float | None:
+    """Compute the mean of distances (n, n) without those of motions from themselves; None for one motion."""
+    count = len(distances)
+    return float(distances.sum() / (count * (count - 1))) if count > 1 else None
+
+
+def _greatest_gap(one: Floats, other: Floats) -> float:
+    """Compute the greatest difference of the cumulative distributions of two sets of numbers."""
+    at = np.concatenate((one, other))
+    shares = [np.searchsorted(np.sort(numbers), at, side="right") / len(numbers) for numbers in (one, other)]
+    return float(np.abs(shares[0] - shares[1]).max())
+
+
+def _beyond_range(examples: Floats, samples: Floats) -> float:
+    """Compute the share of rotations of samples (n, T, D) that are outside the ranges of the examples (m, T, D)."""
+    turned = [motions[..., 3:].reshape(*motions.shape[:2], -1, 4) for motions in (examples, samples)]
+    given, drawn = (one / np.linalg.norm(one, axis=-1, keepdims=True) for one in turned)
+    mean = given.mean(axis=(0, 1))
+    mean /= np.linalg.norm(mean, axis=-1, keepdims=True)
+    closeness = [np.abs(np.einsum("mfjc,jc->mfj", one, mean)) for one in (given, drawn)]
+    return float((closeness[1] < closeness[0].min(axis=(0, 1)) - 1e-9).mean())
