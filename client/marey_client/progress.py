@@ -21,13 +21,15 @@ def ignore_progress(_doing: str, _done: float, _of: float | None) -> None:
     """Ignore a report of progress."""
 
 
+def is_shown(shown: bool | None) -> bool:
+    """Return whether a progress bar is shown: by default on terminals (standard error) and in notebooks."""
+    return sys.stderr.isatty() or "ipykernel" in sys.modules if shown is None else shown
+
+
 @contextmanager
 def progress(shown: bool | None = None) -> Iterator[Advance]:
-    """Show a progress bar during the `with` block; yield a function that updates it.
-
-    By default, it is shown if standard error is a terminal, and in notebooks.
-    """
-    if shown is False or (shown is None and not (sys.stderr.isatty() or "ipykernel" in sys.modules)):
+    """Show a progress bar during the `with` block if `is_shown(shown)`; yield a function that updates it."""
+    if not is_shown(shown):
         yield ignore_progress
         return
     from rich.console import Console

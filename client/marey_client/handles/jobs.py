@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import PrivateAttr
 
 from marey_client.jobs import Jobs, OnProgress
-from marey_client.progress import progress, show_progress
+from marey_client.progress import is_shown, progress, show_progress
 from marey_client.project_items import ProjectItems
 from marey_schemas.queue.jobs import Job
 
@@ -59,7 +59,13 @@ class JobHandle(Job):
                 if on_progress is not None:
                     on_progress(now)
 
-            ended = self._jobs.wait(self.id, timeout_s=timeout_s, on_progress=note, require_success=require_success)
+            followed = is_shown(shown) or on_progress is not None
+            ended = self._jobs.wait(
+                self.id,
+                timeout_s=timeout_s,
+                on_progress=note if followed else None,  # without it, one request waits for long
+                require_success=require_success,
+            )
         return self.of(ended, self._items)
 
     def outputs(self) -> Iterator[Any]:
