@@ -168,7 +168,10 @@ class KeywordModule:
         if arguments[-1] is not Ellipsis:
             return f"tuple[{', '.join(map(self._written, arguments))}]"
         one = self._written(arguments[0])
-        return f"list[{one}] | tuple[{one}, ...]"  # not Sequence, because a text would be one
+        if one == "str":
+            return "list[str] | tuple[str, ...]"  # not Sequence, because a text would be one
+        self._imports["collections.abc"].add("Sequence")
+        return f"Sequence[{one}]"
 
     def _written_class(self, kind: Any) -> str:
         if kind is type(None):

@@ -5,7 +5,7 @@ Written by `make docs` from the declarations of the options; change them there.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypedDict
 
 from marey_schemas.kinds import Kind
@@ -71,7 +71,7 @@ class EditPreviewKeywords(TypedDict, total=False):
     """Revision of the clip; absent: the newest."""
     piece: int
     """Index of the result to return, if the commands split the clip."""
-    fields: list[Literal["motion", "positions", "findings"]] | tuple[Literal["motion", "positions", "findings"], ...]
+    fields: Sequence[Literal["motion", "positions", "findings"]]
     """Content of the answer in addition to the counts."""
 
 
@@ -82,7 +82,7 @@ class SearchKeywords(TypedDict, total=False):
     """Weight of the motion's likelihood; smaller values bring the motion closer to the targets."""
     iterations: int
     """Greatest number of iterations of the optimisation."""
-    steps: list[SearchStep | Mapping[str, Any]] | tuple[SearchStep | Mapping[str, Any], ...]
+    steps: Sequence[SearchStep | Mapping[str, Any]]
     """Several motions; each begins where the previous motion ends."""
     start: StartPlacement | Mapping[str, Any]
     candidates: int

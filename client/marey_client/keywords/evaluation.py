@@ -5,7 +5,7 @@ Written by `make docs` from the declarations of the options; change them there.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal, TypedDict
 
 from marey_schemas.options.improvement import ObjectiveOptions
@@ -48,7 +48,7 @@ class DatabaseKeywords(TypedDict, total=False):
     the root joint, for data whose root joint moves as the character does."""
     weights: FeatureWeights | FeatureWeightsKeywords
     """Weight of each group of features."""
-    horizons_s: list[float] | tuple[float, ...]
+    horizons_s: Sequence[float]
     """Times after the current frame at which trajectories are compared, in seconds, increasing."""
     extra_joints: list[str] | tuple[str, ...]
     """Standard joints to match in addition to feet and hips; with many joints the trajectory has too little weight."""
@@ -138,11 +138,11 @@ class EvaluateKeywords(TypedDict, total=False):
 
     tags: list[str] | tuple[str, ...]
     """Tags that the results get."""
-    speeds_m_s: list[float] | tuple[float, ...]
+    speeds_m_s: Sequence[float]
     """Speeds of the trials in metres per second; each is combined with each turn rate."""
-    turn_rates_deg_s: list[float] | tuple[float, ...]
+    turn_rates_deg_s: Sequence[float]
     """Turn rates of the trials in degrees per second, positive to the left."""
-    families: list[Literal["circle", "switching"]] | tuple[Literal["circle", "switching"], ...]
+    families: Sequence[Literal["circle", "switching"]]
     """Kinds of trials. circle: a circle at constant speed; switching: the speed changes on the circle."""
     approach_s: float
     """Duration of the approach in seconds: the straight path before the circle."""
@@ -247,6 +247,6 @@ class SweepKeywords(TypedDict, total=False):
 
     objective: ObjectiveOptions | ObjectiveKeywords
     """Weights of the objective: the cost of a set of clips."""
-    factors: list[float] | tuple[float, ...]
+    factors: Sequence[float]
     """Factors to try. Each setting multiplies the weight of one group of features by one factor and leaves all other
     weights unchanged."""
