@@ -48,7 +48,7 @@ def takes(tmp_path: Path) -> Path:
 
 
 def test_a_folder_becomes_clips_that_are_found_by_path_and_listed_in_a_table(lab: ProjectHandle, takes: Path) -> None:
-    report = lab.upload(takes, collection="raw", subject="ada")
+    report = lab.upload(takes, collection="raw", subject="ada", shown=True)
     assert "3 files: 2 created, 1 failed" in str(report)
     assert "broken.bvh" in str(report)
     assert "notes.txt" in report._repr_html_()
@@ -128,6 +128,8 @@ def test_arrays_are_those_of_the_library_and_only_what_is_asked_for_is_read(
     np.testing.assert_array_equal(clip.contacts(), toes)
     np.testing.assert_array_equal(clip.contacts(frames=slice(30, 45)), toes[30:45])
     assert clip.rotations(joints="Hips", frames=slice(0, 2)).shape == (2, 1, 4)
+    with pytest.raises(ValueError, match="negative bounds"):
+        clip.velocities(frames=slice(0, -5))
     with pytest.raises(NoSuchJoint, match="did you mean 'LeftHand'"):
         clip.positions(joints="lefthand")
 

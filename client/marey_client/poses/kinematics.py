@@ -18,7 +18,7 @@ from marey_client.errors import NoSuchJoint
 from marey_client.extras import room
 from marey_client.handles.skeletons import SkeletonHandle
 from marey_client.one_or_several import several
-from marey_client.poses.arrays import Joints, PosedItem
+from marey_client.poses.arrays import Joints, PosedItem, frames_text
 from marey_client.transport import Transport
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import Joint, SkeletonHierarchy
@@ -147,8 +147,9 @@ def read_contacts(clip: PosedItem, frames: slice | None) -> NDArray[np.bool_]:
 
 def _widened(clip: PosedItem, frames: slice | None, more: int) -> tuple[slice | None, slice]:
     """Return a range with `more` frames on both sides, and the place of the range in it."""
+    frames_text(frames)  # refuses other steps and negative bounds
     if frames is None:
         return None, slice(None)
     first, end = frames.start or 0, clip.frames if frames.stop is None else min(frames.stop, clip.frames)
-    start = max(0, first - more) if first >= 0 else first  # a negative bound is refused when the frames are read
-    return slice(start, end + more, frames.step), slice(first - start, end - start)
+    start = max(0, first - more)
+    return slice(start, end + more), slice(first - start, end - start)
