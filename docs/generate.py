@@ -1,4 +1,7 @@
-"""Generates reference pages and a manifest from the code: `python -m docs.generate`; `--check` only compares them."""
+"""Generates reference pages, a manifest and types of arguments from the code.
+
+`python -m docs.generate` writes the files; with `--check`, it only compares them.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from typing import Any
 
 import typer
 import yaml
+from docs.keyword_types import keyword_modules
 from docs.motion_library import library_page
 from prometheus_client.metrics import MetricWrapperBase
 from pydantic import BaseModel
@@ -39,6 +43,7 @@ from marey_server.process.worker_pools import OwnPods, WorkerPool
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = Path(__file__).parent / "reference"
+KEYWORDS = ROOT / "client" / "marey_client" / "keywords"
 POOL_MANIFEST = ROOT / "deploy" / "kubernetes" / "base" / "workers.yaml"
 UNKNOWN = "…"
 """Text in place of a value that is known only at run time."""
@@ -386,7 +391,11 @@ class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
 
 def files() -> dict[Path, str]:
     """Return the text of every generated file, by its path."""
-    return {REFERENCE / name: text for name, text in pages().items()} | {POOL_MANIFEST: pool_manifest()}
+    return {
+        **{REFERENCE / name: text for name, text in pages().items()},
+        **{KEYWORDS / name: text for name, text in keyword_modules().items()},
+        POOL_MANIFEST: pool_manifest(),
+    }
 
 
 def main() -> int:

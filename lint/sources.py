@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 PACKAGES = {
-    "schemas": "marey_schemas",
-    "versions": "marey_versions",
-    "motion": "marey_motion",
-    "reports": "marey_reports",
-    "client": "marey_client",
-    "server": "marey_server",
-    "worker": "marey_worker",
+    "schemas": ("marey_schemas",),
+    "versions": ("marey_versions",),
+    "motion": ("marey_motion",),
+    "reports": ("marey_reports",),
+    "client": ("marey", "marey_client"),
+    "server": ("marey_server",),
+    "worker": ("marey_worker",),
 }
-"""Folder of each package of the product, and its name."""
+"""Packages of the product, by the folder that contains them."""
 
 GENERATED = "<!-- Written by `make docs`"
 """Beginning of pages that are generated from texts in the code."""
@@ -107,7 +107,8 @@ def read_house(root: Path) -> House:
     """Return all modules and pages of the product in a checkout, and other files that may use names of the product."""
     modules = [
         read_module(path, root / folder)
-        for folder, package in PACKAGES.items()
+        for folder, packages in PACKAGES.items()
+        for package in packages
         for path in sorted((root / folder / package).rglob("*.py"))
     ]
     pages = [*sorted((root / "docs").rglob("*.md")), *sorted(root.glob("*.md"))]

@@ -1,12 +1,11 @@
 """Access to the server, worker and motion packages for the commands that need them, such as `serve` and `worker`.
 
-Only this module imports these packages, and only when such a command runs, so that the client can be installed alone.
+They are imported only when such a command runs, so that the client can be installed alone.
 """
 
 from __future__ import annotations
 
 import asyncio
-import importlib
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
@@ -17,13 +16,10 @@ from typing import Any
 
 from marey_client.credentials import Credential
 from marey_client.errors import MareyError
+from marey_client.extras import room
 from marey_schemas.documents.differences import Difference
 from marey_schemas.lineage import LineageGraph
 from marey_schemas.queue.comparisons import RunComparison
-
-
-class NotInstalled(MareyError):
-    """A part of Marey that the command needs is not installed on this machine."""
 
 
 def serve(**settings: Any) -> None:
@@ -158,13 +154,3 @@ def _refusals_of(commands: ModuleType) -> Iterator[None]:
 
 def _given(settings: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if value is not None}
-
-
-def room(module: str, extra: str) -> ModuleType:
-    """Import a module of another package of Marey. Raises `NotInstalled`, which names the pip extra to install."""
-    try:
-        return importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        raise NotInstalled(
-            f"this command needs the package {error.name}, which is not installed; run: pip install 'marey[{extra}]'"
-        ) from error

@@ -114,6 +114,16 @@ class SameName(MareyError):
     """Two files would get the same name."""
 
 
+class NoSuchPath(MareyError, KeyError):
+    """No item or folder of a project has the given path; the text names the nearest one."""
+
+    __str__ = Exception.__str__  # a KeyError would show the text in quotation marks
+
+
+class NoSuchJoint(MareyError):
+    """A motion has no joint with the given name; the text names the nearest one."""
+
+
 class NoAnnotations(MareyError):
     """None of the given clips has an annotation that the request needs."""
 

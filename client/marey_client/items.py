@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, Unpack
 
 from marey_client.downloads import TakenPaths, download
+from marey_client.errors import NoSuchPath, NotFound
+from marey_client.keywords.asking import DifferenceKeywords, LineageKeywords
+from marey_client.listing.paths import missing_path, require_folder
+from marey_client.listing.tables import summary_table
 from marey_client.one_or_several import several
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
@@ -112,7 +116,7 @@ class ItemHandle:
         """Return the inputs of the newest revision, and the results computed from it."""
         return self.transport.get(Lineage, f"{self.url}/lineage")
 
-    def lineage_graph(self, revision: int | None = None, **options: Any) -> LineageGraph:
+    def lineage_graph(self, revision: int | None = None, **options: Unpack[LineageKeywords]) -> LineageGraph:
         """Return the inputs and results of a revision, by default the newest, traced through all jobs.
 
         `options` are those of `LineageOptions`, such as `direction="inputs"` and `depth=1`. Raises `NotFound` if there
@@ -133,7 +137,7 @@ class ItemHandle:
         *,
         other: ItemHandle | None = None,
         plot: bool = False,
-        **options: float,
+        **options: Unpack[DifferenceKeywords],
     ) -> Difference:
         """Return how the revision `after` differs from the revision `before`; by default, the two newest revisions.
 
@@ -188,12 +192,61 @@ Handle = TypeVar("Handle", bound=ItemHandle)
 
 @dataclass(frozen=True)
 class Items(Generic[Handle]):
-    """Items of one kind in a project."""
+    """Items of one kind in a project, which can be iterated, counted by `len`, and looked up by `items[path]`."""
 
     transport: Transport
     project: str
     kind: Kind
     handle: type[Handle]
+
+    def __iter__(self) -> Iterator[Handle]:
+        return self.list(sort="name")
+
+    def __len__(self) -> int:
+        return self.count()
+
+    def __getitem__(self, name: str) -> Handle:
+        """Return the item with a path, such as `raw/walk`, or with an id.
+
+        Raises `NoSuchPath`, which names the nearest path, if there is none.
+        """
+        found = self.find(name)
+        if found is None:
+            raise NoSuchPath(missing_path(self.transport, self.project, self.kind, name))
+        return found
+
+    def __contains__(self, name: object) -> bool:
+        return isinstance(name, str) and self.find(name) is not None
+
+    def find(self, name: str) -> Handle | None:
+        """Return the item with a path or an id, or None. A path may begin with the name of the project."""
+        name = name.strip("/")
+        for path in dict.fromkeys((name, name.removeprefix(f"{self.project}/"))):
+            for found in self.list(path=path, page_size=1):
+                return found
+        if not name or "/" in name:
+            return None
+        try:
+            return self.get(name)
+        except NotFound:
+            return None
+
+    def where(self, folder: str = "", *, query: str | None = None) -> Selection[Handle]:
+        """Return the items in a folder and below it that meet a query, such as `subject = 02 and frames > 120`.
+
+        Raises `NoSuchPath`, which names the nearest folder, if there is no such folder.
+        """
+        folder = folder.strip("/")
+        if folder:
+            require_folder(self.transport, self.project, folder)
+        return Selection(self, folder, query)
+
+    def to_dataframe(self) -> Any:
+        """Return the facts that lists show about the items as a pandas table, with one row for each item.
+
+        Raises `MissingPackage` if pandas is not installed.
+        """
+        return summary_table(self)
 
     @property
     def url(self) -> str:
@@ -262,3 +315,22 @@ class Items(Generic[Handle]):
 
     def _handle(self, item: Item) -> Handle:
         return self.handle(self.transport, self.project, item)
+
+
+@dataclass(frozen=True)
+class Selection(Generic[Handle]):
+    """Items of one kind in a folder and below it that meet a query, in the order of their names."""
+
+    items: Items[Handle]
+    folder: str = ""
+    query: str | None = None
+
+    def __iter__(self) -> Iterator[Handle]:
+        return self.items.list(collection=self.folder, query=self.query, sort="name")
+
+    def __len__(self) -> int:
+        return self.items.count(collection=self.folder, filters={"query": self.query})
+
+    def to_dataframe(self) -> Any:
+        """Return the facts that lists show about the items as a pandas table; see `Items.to_dataframe`."""
+        return summary_table(self)

@@ -150,3 +150,13 @@ class Marey:
     def tokens(self) -> Tokens:
         """The caller's tokens."""
         return Tokens(self.transport)
+
+
+def connect(url: str | None = None, token: str | TokenFile | None = None) -> Marey:
+    """Return a client of a server, by default of the one that the command line uses.
+
+    Without `url`, server and token come from `MAREY_SERVER` and `MAREY_TOKEN`, from `marey login`, or from the data
+    folder of a server on this machine. `Marey` takes further options. Raises `BadAddress` if `url` is not the address
+    of a server, and `BadCredentialFile` if the stored token cannot be read.
+    """
+    return Marey(url, token)

@@ -1,4 +1,4 @@
-"""Inputs of jobs in the forms that callers can use: paths of folders, handles of items, or several of these."""
+"""Inputs of jobs in the forms that callers can use: paths, handles or ids of items, paths of folders, or several."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TypeAlias, TypeVar
 from marey_client.errors import NotFound
 from marey_client.handles.datasets import Datasets
 from marey_client.items import ItemHandle, Items
+from marey_client.listing.paths import is_folder
 from marey_schemas.datasets.commits import Entry
 from marey_schemas.items import Item
 from marey_schemas.queue.jobs import CollectionInput, DatasetInput, ExistingInput, ItemInput
@@ -15,9 +16,24 @@ from marey_schemas.queue.jobs import CollectionInput, DatasetInput, ExistingInpu
 Handle = TypeVar("Handle", bound=ItemHandle)
 
 Place: TypeAlias = str | ExistingInput | Handle
-"""Path of a folder, handle of an item, or an input of jobs."""
+"""Path of a folder or an item, id or handle of an item, or an input of jobs."""
 
 Places: TypeAlias = Place[Handle] | Sequence[Place[Handle]]
+
+
+def resolved(items: Items[Handle], places: Places[Handle]) -> list[ExistingInput | Handle]:
+    """Look up the texts among `places`: folders and items by their paths, and items by their ids.
+
+    A path of a folder and an item means the folder. Raises `NoSuchPath`, which names the nearest path.
+    """
+    return [_looked_up(items, place) if isinstance(place, str) else place for place in _as_list(places)]
+
+
+def _looked_up(items: Items[Handle], text: str) -> ExistingInput:
+    path = text.strip("/")
+    if not path or is_folder(items.transport, items.project, path):
+        return CollectionInput(collection=path)
+    return ItemInput(item=items[path].id)
 
 
 def as_inputs(places: Places[Handle]) -> tuple[ExistingInput, ...]:

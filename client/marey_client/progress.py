@@ -1,12 +1,53 @@
-"""Progress of long work with a dataset: archives, exports and copies of versions."""
+"""Progress of long work: functions that receive it, and a bar that shows it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from marey_schemas.queue.jobs import Job
 
 OnProgress = Callable[[str, int, int | None], None]
 """Function called with the current activity, the amount done, and the total amount if it is known."""
 
+Advance = Callable[[str, float, float | None], None]
+"""The same, for amounts that need not be whole numbers."""
 
-def ignore_progress(_doing: str, _done: int, _of: int | None) -> None:
+
+def ignore_progress(_doing: str, _done: float, _of: float | None) -> None:
     """Ignore a report of progress."""
+
+
+def is_shown(shown: bool | None) -> bool:
+    """Return whether a progress bar is shown: by default on terminals (standard error) and in notebooks."""
+    return sys.stderr.isatty() or "ipykernel" in sys.modules if shown is None else shown
+
+
+@contextmanager
+def progress(shown: bool | None = None) -> Iterator[Advance]:
+    """Show a progress bar during the `with` block if `is_shown(shown)`; yield a function that updates it."""
+    if not is_shown(shown):
+        yield ignore_progress
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda what, done, total: bar.update(task, description=what, completed=done, total=total)
+
+
+def show_progress(now: Job, advance: Advance, count: int | None = None, unit: str = "") -> None:
+    """Show the progress of a job. The progress of a job with tasks is counted in tasks, or scaled to `count` units."""
+    what = f"{now.kind} {now.state}"
+    if now.progress is None:
+        return advance(what, 0, None)
+    if now.size is None or now.progress.total != now.size:
+        return advance(now.progress.note or what, now.progress.done, now.progress.total)
+    if count is None:
+        return advance(what, now.progress.done, now.size)
+    return advance(unit or what, round(now.progress.done / now.size * count), count)

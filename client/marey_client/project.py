@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Unpack
 
 from marey_client.access import Members, change_quotas
@@ -15,13 +16,30 @@ from marey_client.handles.datasets import Datasets
 from marey_client.handles.edits import Commands
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.handles.invitations import Invitations
+from marey_client.handles.jobs import JobHandle
 from marey_client.handles.metrics import Metric
 from marey_client.handles.models import ModelHandle
 from marey_client.handles.pipelines import PipelineRun, submit_pipeline
 from marey_client.handles.schedules import Schedules
 from marey_client.handles.scripts import Scripts
+from marey_client.handles.skeletons import SkeletonHandle
 from marey_client.handles.webhooks import Webhooks
+from marey_client.imports import Notice, find_files
 from marey_client.jobs import Jobs, OnProgress
+from marey_client.keywords.asking import ImportKeywords
+from marey_client.keywords.evaluation import EvaluateKeywords
+from marey_client.keywords.processing import (
+    AlignKeywords,
+    AnnotateKeywords,
+    CutKeywords,
+    DistancesKeywords,
+    EditKeywords,
+    IndexKeywords,
+    ModelKeywords,
+    ModelPlanKeywords,
+    QualityKeywords,
+)
+from marey_client.progress import progress
 from marey_client.project_items import ProjectItems
 from marey_client.requests import (
     AlignedClips,
@@ -41,9 +59,11 @@ from marey_client.requests import (
     retarget_request,
 )
 from marey_client.transport import Params, as_json, read_model
+from marey_client.uploads import UploadReport, upload
 from marey_schemas.access import Project, ProjectChange, ProjectQuotaChange, ProjectQuotasInUse
 from marey_schemas.audit import AuditEntry
 from marey_schemas.datasets.naming import MAIN
+from marey_schemas.options.imports import ImportOptions
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.job_params import (
     AlignParams,
@@ -158,9 +178,27 @@ class ProjectHandle(ProjectItems):
 
     # -- jobs ----------------------------------------------------------------------------------------------------------
 
-    def submit(self, job: JobCreate) -> Job:
+    def upload(
+        self, places: str | Path | Iterable[str | Path], *, shown: bool | None = None, **options: Unpack[ImportKeywords]
+    ) -> UploadReport:
+        """Import the motion files in folders and below; return a report on each file. A refused file stops no other.
+
+        `options` are those of `ImportOptions`, for example `collection="raw"`. A progress bar is shown on terminals and
+        in notebooks; `shown` overrides this. Uploading the same files again changes nothing. Raises the errors of
+        `find_files`, and `NotFound` if there is no such project.
+        """
+        found, chosen = find_files(places), ImportOptions.model_validate(options)
+        self.read()  # a missing project is an error before any bytes are sent
+        with progress(shown) as advance:
+            return upload(self, found, chosen, advance)
+
+    def submit(self, job: JobCreate) -> JobHandle:
         """Submit a job."""
-        return Jobs(self.transport).submit(self.name, job)
+        return JobHandle.of(Jobs(self.transport).submit(self.name, job), self)
+
+    def job(self, job_id: str) -> JobHandle:
+        """Return a job of the project by its id."""
+        return JobHandle.of(Jobs(self.transport).get(job_id), self)
 
     def pipeline(self, pipeline: PipelineCreate) -> PipelineRun:
         """Submit jobs that read each other's outputs; either all jobs are submitted, or none is."""
@@ -175,31 +213,35 @@ class ProjectHandle(ProjectItems):
         priority: int = 0,
         cache: CacheMode = "use",
         commit: CommitTo = None,
-        **choices: Any,
+        options: ImportOptions | None = None,
+        layer: str | None = None,
+        notice: Notice | None = None,
+        **choices: Unpack[ModelPlanKeywords],
     ) -> PipelineRun:
         """Submit the jobs that make a model from takes: import, retarget, annotate, cut, align, model, tree.
 
-        `takes` are clips and folders of clips, or files that `find_files` found. The `choices` are arguments of
-        `requests.plan_model`, for example `skeleton={"item": id}`, `annotate={"proposal": {"method": "steps"}}`,
-        `cut={"labels": ["left"]}`. If some takes have changed, only the results that depend on these takes are
-        computed again.
+        `takes` are clips and folders of clips, or files that `find_files` found, which are imported with `options`;
+        `notice` is called during their upload. With a `layer`, clips on the server are cut along their annotations in
+        this layer, or aligned by these annotations. The `choices` are fields of `ModelPlan`, for example
+        `skeleton={"item": id}`, `annotate={"proposal": {"method": "steps"}}`, `cut={"labels": ["left"]}`. If some
+        takes have changed, only the results that depend on these takes are computed again.
         """
-        plan = plan_model(self, takes, name=name, **choices)
+        plan = plan_model(self, takes, name=name, options=options, layer=layer, notice=notice, **choices)
         to = OutputsCommit.of(commit)
         return self.pipeline(model_pipeline(plan, seed=seed, priority=priority, cache=cache, commit=to))
 
     def retarget(
         self,
         clips: Clips,
-        skeleton: str,
+        skeleton: SkeletonHandle | str,
         *,
         into: str,
         params: RetargetParams | None = None,
         priority: int = 0,
         cache: CacheMode = "use",
         commit: CommitTo = None,
-    ) -> Job:
-        """Submit a job that retargets clips, or folders given by path, to the skeleton with this id.
+    ) -> JobHandle:
+        """Submit a job that retargets clips, or folders given by path, to a skeleton given as handle, path or id.
 
         Uses the newest joint mapping of each skeleton.
         """
@@ -216,8 +258,8 @@ class ProjectHandle(ProjectItems):
         priority: int = 0,
         cache: CacheMode = "use",
         commit: CommitTo = None,
-        **options: Any,
-    ) -> Job:
+        **options: Unpack[AnnotateKeywords],
+    ) -> JobHandle:
         """Submit a job that annotates clips with the method `proposal`; the results go below the folder `into`.
 
         Methods are `steps`, `velocity_minima` and `wrist_contact`, as in `{"method": "steps", "most_turn_deg": 45}`;
@@ -236,8 +278,8 @@ class ProjectHandle(ProjectItems):
         priority: int = 0,
         cache: CacheMode = "use",
         commit: CommitTo = None,
-        **options: Any,
-    ) -> Job:
+        **options: Unpack[CutKeywords],
+    ) -> JobHandle:
         """Submit a job that cuts clips along the segments of annotations, into folders below `into`.
 
         `options` are those of `CutParams`, for example `labels=("step_left", "step_right")` or `by_label=True`.
@@ -246,7 +288,9 @@ class ProjectHandle(ProjectItems):
         chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
         return self.submit(request.model_copy(update=chosen))
 
-    def index(self, clips: Clips = "", *, priority: int = 0, cache: CacheMode = "use", **options: Any) -> Job:
+    def index(
+        self, clips: Clips = "", *, priority: int = 0, cache: CacheMode = "use", **options: Unpack[IndexKeywords]
+    ) -> JobHandle:
         """Submit a job that indexes clips or folders (default: all clips), so that `similar` finds moments of them.
 
         `options` are those of `IndexParams`. If the top folder has an index with this name, it is updated: clips at
@@ -265,8 +309,8 @@ class ProjectHandle(ProjectItems):
         priority: int = 0,
         cache: CacheMode = "use",
         commit: CommitTo = None,
-        **options: Any,
-    ) -> Job:
+        **options: Unpack[AlignKeywords],
+    ) -> JobHandle:
         """Submit a job that aligns clips of one skeleton, all of which show the same action.
 
         `options` are those of `AlignParams`, for example `rate_hz=30` or `layer="steps"`. If `options` name a layer or
@@ -286,8 +330,8 @@ class ProjectHandle(ProjectItems):
         priority: int = 0,
         cache: CacheMode = "use",
         commit: CommitTo = None,
-        **options: Any,
-    ) -> Job:
+        **options: Unpack[EditKeywords],
+    ) -> JobHandle:
         """Submit a job that edits clips, or folders given by path, with commands or with a stored edit.
 
         The results are new clips in the folder `into`, or, with the option `suffix`, in the folders of the edited
@@ -308,8 +352,8 @@ class ProjectHandle(ProjectItems):
         priority: int = 0,
         cache: CacheMode = "use",
         commit: CommitTo = None,
-        **options: Any,
-    ) -> Job:
+        **options: Unpack[EvaluateKeywords],
+    ) -> JobHandle:
         """Submit a job that evaluates clips of one skeleton, or folders of clips given by path.
 
         `options` are those of `EvaluateParams`, for example `name="walks-eval"` or `database={"mirroring": "add"}`;
@@ -327,8 +371,8 @@ class ProjectHandle(ProjectItems):
         metric: Metric | None = None,
         priority: int = 0,
         cache: CacheMode = "use",
-        **options: Any,
-    ) -> Job:
+        **options: Unpack[DistancesKeywords],
+    ) -> JobHandle:
         """Submit a job that measures how different clips look to people, by a perceptual metric.
 
         `metric` is a stored metric, its id, or the name of a built-in one, such as `published/sigmoid`; `options` are
@@ -346,8 +390,8 @@ class ProjectHandle(ProjectItems):
         seed: int = 0,
         priority: int = 0,
         cache: CacheMode = "use",
-        **options: Any,
-    ) -> Job:
+        **options: Unpack[QualityKeywords],
+    ) -> JobHandle:
         """Submit a job that measures foot skate, contacts, penetration, jitter, joint limits, speed and turn rate.
 
         `reference` are recorded clips, which are measured in the same way and shown beside the others; `contacts` are
@@ -378,7 +422,7 @@ class ProjectHandle(ProjectItems):
         cache: CacheMode = "use",
         on_progress: OnProgress | None = None,
         on_measured: OnMeasured | None = None,
-        **options: Any,
+        **options: Unpack[EvaluateKeywords],
     ) -> Crossing:
         """Find the first bad version of a dataset between `good` and `bad`: the first one whose metric exceeds a limit.
 
@@ -408,13 +452,13 @@ class ProjectHandle(ProjectItems):
         priority: int = 0,
         cache: CacheMode = "use",
         commit: CommitTo = None,
-        **options: Any,
-    ) -> Job:
+        **options: Unpack[ModelKeywords],
+    ) -> JobHandle:
         """Submit a job that trains a model on clips that were aligned with each other, given as one or several folders.
 
         `options` are those of `ModelParams`, for example `name="step"` or `spatial_share=0.98`.
         """
-        request = model_request(aligned, ModelParams.model_validate(options))
+        request = model_request(self, aligned, ModelParams.model_validate(options))
         chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
         return self.submit(request.model_copy(update={"seed": seed, **chosen}))
 
@@ -422,9 +466,9 @@ class ProjectHandle(ProjectItems):
         """Wait for a job, and return the model that it created. Raises `JobUnsuccessful` if the job failed."""
         return self.models.get(self._made_by(job, on_progress))
 
-    def jobs(self, *, filters: Params | None = None) -> Iterator[Job]:
+    def jobs(self, *, filters: Params | None = None) -> Iterator[JobHandle]:
         """List the project's jobs, newest first."""
-        return Jobs(self.transport).list(self.name, filters=filters)
+        return (JobHandle.of(job, self) for job in Jobs(self.transport).list(self.name, filters=filters))
 
     def _made_by(self, job: Job, on_progress: OnProgress | None) -> str:
         """Wait for a job and return the id of its only output."""

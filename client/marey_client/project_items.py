@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Unpack
 
 from marey_client.blobs import Blobs
 from marey_client.handles.annotations import AnnotationHandle
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.edits import EditHandle, Edits
 from marey_client.handles.evaluations import EvaluationHandle
-from marey_client.handles.metrics import MetricHandle, PerceptualMetrics
+from marey_client.handles.metrics import Metric, MetricHandle, PerceptualMetrics
 from marey_client.handles.models import ModelHandle
 from marey_client.handles.processed import ProcessedHandle
 from marey_client.handles.purges import purge_items
@@ -21,6 +21,7 @@ from marey_client.handles.studies import Studies, StudyHandle
 from marey_client.imports import Imports
 from marey_client.items import ItemHandle, Items
 from marey_client.jobs import Jobs
+from marey_client.keywords.asking import PurgeKeywords, SimilarKeywords
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
@@ -95,19 +96,26 @@ class ProjectItems:
         )  # fmt: skip
         return next((one for one in known if one.kind is kind), Items(self.transport, self.name, kind, ItemHandle))
 
-    def similar(self, clip: ClipHandle | str, frames: int | tuple[int, int], **options: Any) -> SimilarAnswer:
+    def similar(
+        self,
+        clip: ClipHandle | str,
+        frames: int | tuple[int, int],
+        *,
+        metric: Metric | None = None,
+        **options: Unpack[SimilarKeywords],
+    ) -> SimilarAnswer:
         """Find the moments of the project's clips that resemble a pose, or a window of frames, of a clip.
 
-        `clip` is a handle or an id, `frames` one frame or a half-open range. `options` are those of `SimilarOptions`;
-        `metric` may also be a handle. The project needs an index of motions, which `ProjectHandle.index` builds.
+        `clip` is a handle, a path or an id, `frames` one frame or a half-open range. `metric` is the id or the
+        handle of a stored metric, or the name of a built-in one. `options` are the others of `SimilarOptions`. The
+        project needs an index of motions, which `ProjectHandle.index` builds.
         """
-        name, revision = (clip, None) if isinstance(clip, str) else (clip.id, clip.item.revision)
+        clip = self.clips[clip] if isinstance(clip, str) else clip
         first, end = (frames, frames + 1) if isinstance(frames, int) else frames
-        if isinstance(options.get("metric"), ItemHandle):
-            options["metric"] = options["metric"].id
+        named = {} if metric is None else {"metric": metric if isinstance(metric, str) else metric.id}
         request = SimilarRequest.model_validate(
-            {"clip": name, "revision": revision, "frames": (first, end), **options}
-        )  # fmt: skip
+            {"clip": clip.id, "revision": clip.item.revision, "frames": (first, end), **named, **options}
+        )
         return self.transport.post(SimilarAnswer, f"/projects/{self.name}/similar", request)
 
     @cached_property
@@ -115,7 +123,7 @@ class ProjectItems:
         """The folders of the project."""
         return Collections(self.transport, self.name)
 
-    def purge(self, **conditions: Any) -> PurgeAnswer:
+    def purge(self, **conditions: Unpack[PurgeKeywords]) -> PurgeAnswer:
         """Delete deleted items for good, so that garbage collection frees their bytes. For owners of the project.
 
         `conditions` are the fields of `PurgeRequest`, such as `collection="raw", older_than_days=30`; with

@@ -6,7 +6,7 @@ Every request uses the newest joint mapping of each skeleton.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, Unpack
 
 from marey_client.errors import NoAnnotations
 from marey_client.handles.annotations import AnnotationHandle
@@ -15,9 +15,11 @@ from marey_client.handles.edits import Commands, EditHandle, as_edit
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.handles.metrics import Metric, metric_choice
 from marey_client.handles.processed import ProcessedHandle
+from marey_client.handles.skeletons import SkeletonHandle
 from marey_client.imports import LocalFile, Notice
 from marey_client.jobs import job_request
-from marey_client.places import Places, as_inputs, items_at
+from marey_client.keywords.processing import DistancesKeywords, EditKeywords, ModelPlanKeywords
+from marey_client.places import Places, as_inputs, items_at, resolved
 from marey_client.project_items import ProjectItems
 from marey_schemas.items import LOOP_TAG, Item
 from marey_schemas.kinds import Kind
@@ -38,7 +40,7 @@ from marey_schemas.queue.jobs import ItemInput, JobCreate
 from marey_schemas.queue.model_pipelines import ModelPlan
 
 Clips: TypeAlias = Places[ClipHandle]
-"""Clips, folders of clips given by their paths, or several of these."""
+"""Clips as handles, paths or ids; folders of clips given by their paths; or several of these."""
 
 Annotations: TypeAlias = Places[AnnotationHandle]
 AlignedClips: TypeAlias = Places[ProcessedHandle]
@@ -47,9 +49,13 @@ Takes: TypeAlias = Clips | Sequence[LocalFile]
 """Clips and folders of clips on the server, or local files as returned by `find_files`."""
 
 
-def retarget_request(project: ProjectItems, clips: Clips, skeleton: str, params: RetargetParams) -> JobCreate:
-    """Return the job request to retarget clips to the skeleton with this id."""
-    inputs: dict[str, Any] = {"clips": as_inputs(clips), "skeleton": ItemInput(item=skeleton)}
+def retarget_request(
+    project: ProjectItems, clips: Clips, skeleton: SkeletonHandle | str, params: RetargetParams
+) -> JobCreate:
+    """Return the job request to retarget clips to a skeleton, given as handle, path or id."""
+    clips = resolved(project.clips, clips)
+    target = project.skeletons[skeleton] if isinstance(skeleton, str) else skeleton
+    inputs: dict[str, Any] = {"clips": as_inputs(clips), "skeleton": ItemInput(item=target.id)}
     if edited := project.edited_rigs(items_at(project.clips, clips)):
         inputs["rigs"] = edited
     return job_request("retarget", inputs, params)
@@ -57,6 +63,7 @@ def retarget_request(project: ProjectItems, clips: Clips, skeleton: str, params:
 
 def annotate_request(project: ProjectItems, clips: Clips, params: AnnotateParams) -> JobCreate:
     """Return the job request to annotate clips."""
+    clips = resolved(project.clips, clips)
     inputs: dict[str, Any] = {"clips": as_inputs(clips)}
     if edited := project.edited_rigs(items_at(project.clips, clips)):
         inputs["rigs"] = edited
@@ -65,6 +72,7 @@ def annotate_request(project: ProjectItems, clips: Clips, params: AnnotateParams
 
 def cut_request(project: ProjectItems, annotations: Annotations, params: CutParams) -> JobCreate:
     """Return the job request to cut the annotated clips along the segments of the annotations."""
+    annotations = resolved(project.annotations, annotations)
     found = {
         one.id: one
         for one in items_at(project.annotations, annotations, sort="id")
@@ -90,6 +98,7 @@ def align_request(
     If `annotations` is None and `params` name a layer or labels, the annotations of these clips are used. If `params`
     name a layer, only annotations in this layer are used.
     """
+    clips = resolved(project.clips, clips)
     found = {item.id: item for item in items_at(project.clips, clips)}
     chosen, named = metric_choice(metric)
     params = params.model_copy(update=named)
@@ -97,17 +106,18 @@ def align_request(
     if len(edited := project.edited_rigs(found.values())) == 1:
         (inputs["rig"],) = edited
     if annotations is not None:
-        inputs["annotations"] = as_inputs(annotations)
+        inputs["annotations"] = as_inputs(resolved(project.annotations, annotations))
     elif params.layer is not None or params.labels:
         inputs["annotations"] = _annotations_of(project, found, params.layer)
     return job_request("align", inputs, params)
 
 
-def edit_request(project: ProjectItems, clips: Clips, commands: Commands, options: Mapping[str, Any]) -> JobCreate:
+def edit_request(project: ProjectItems, clips: Clips, commands: Commands, options: EditKeywords) -> JobCreate:
     """Return the job request to edit clips; further clips that the commands name become inputs, too.
 
     `options` are those of `EditParams`.
     """
+    clips = resolved(project.clips, clips)
     inputs: dict[str, Any] = {"clips": as_inputs(clips)}
     if isinstance(commands, EditHandle):
         edit = commands.document(revision=commands.item.revision)
@@ -131,12 +141,15 @@ def evaluate_request(
     metric: Metric | None = None,
 ) -> JobCreate:
     """Return the job request to evaluate clips; clips with the tag `loop` are treated as loops."""
+    clips = resolved(project.clips, clips)
     found = list(items_at(project.clips, clips))
     chosen, named = metric_choice(metric)
     params = params.model_copy(update=named)
     inputs: dict[str, Any] = {"clips": as_inputs(clips), **chosen}
-    if normaliser is not None:
-        inputs["normaliser"] = ItemInput(item=normaliser) if isinstance(normaliser, str) else normaliser.as_input()
+    if isinstance(normaliser, str):
+        inputs["normaliser"] = ItemInput(item=project.evaluations[normaliser].id)
+    elif normaliser is not None:
+        inputs["normaliser"] = normaliser.as_input()
     if len(edited := project.edited_rigs(found)) == 1:
         (inputs["rig"],) = edited
     if tagged := [item.id for item in found if LOOP_TAG in item.tags]:
@@ -145,12 +158,13 @@ def evaluate_request(
 
 
 def distances_request(
-    project: ProjectItems, clips: Clips, metric: Metric | None, options: Mapping[str, Any]
+    project: ProjectItems, clips: Clips, metric: Metric | None, options: DistancesKeywords
 ) -> JobCreate:
     """Return the job request to compare clips by a metric; clips with the tag `loop` are treated as loops.
 
     `options` are those of `DistancesParams`.
     """
+    clips = resolved(project.clips, clips)
     found = list(items_at(project.clips, clips))
     chosen, named = metric_choice(metric)
     params = DistancesParams.model_validate({**options, **named})
@@ -167,13 +181,15 @@ def quality_request(
 
     `contacts` are annotations of all clips; if they are None, contacts are detected.
     """
+    clips = resolved(project.clips, clips)
     inputs: dict[str, Any] = {"clips": as_inputs(clips)}
     found = list(items_at(project.clips, clips))
     if reference is not None:
+        reference = resolved(project.clips, reference)
         inputs["reference"] = as_inputs(reference)
         found += items_at(project.clips, reference)
     if contacts is not None:
-        inputs["contacts"] = as_inputs(contacts)
+        inputs["contacts"] = as_inputs(resolved(project.annotations, contacts))
     if edited := project.edited_rigs(found):
         inputs["rigs"] = edited
     return job_request("quality", inputs, params)
@@ -181,6 +197,7 @@ def quality_request(
 
 def index_request(project: ProjectItems, clips: Clips, params: IndexParams) -> JobCreate:
     """Return the job request to index clips; an index with the same name in the top folder is updated."""
+    clips = resolved(project.clips, clips)
     inputs: dict[str, Any] = {"clips": as_inputs(clips)}
     earlier = next(iter(project.items(Kind.INDEX).list(path=params.name, page_size=1)), None)
     if earlier is not None:
@@ -188,19 +205,20 @@ def index_request(project: ProjectItems, clips: Clips, params: IndexParams) -> J
     return job_request("index", inputs, params)
 
 
-def model_request(aligned: AlignedClips, params: ModelParams) -> JobCreate:
+def model_request(project: ProjectItems, aligned: AlignedClips, params: ModelParams) -> JobCreate:
     """Return the job request to train a model on aligned clips."""
-    return job_request("model", {"aligned": as_inputs(aligned)}, params)
+    return job_request("model", {"aligned": as_inputs(resolved(project.processed, aligned))}, params)
 
 
 def plan_model(
     project: ProjectItems,
     takes: Takes,
     *,
+    name: str,
     options: ImportOptions | None = None,
     layer: str | None = None,
     notice: Notice | None = None,
-    **choices: Any,
+    **choices: Unpack[ModelPlanKeywords],
 ) -> ModelPlan:
     """Plan the jobs that build a model from takes. Files are uploaded, and the jobs import them with `options`.
 
@@ -210,7 +228,7 @@ def plan_model(
     """
     files = [one for one in takes if isinstance(one, LocalFile)] if isinstance(takes, Sequence) else []
     known = _of_files(project, files, options, notice) if files else _of_clips(project, takes, layer)  # type: ignore[arg-type]
-    return ModelPlan.model_validate({"into": choices.get("name"), **known, **choices})
+    return ModelPlan.model_validate({"name": name, "into": name, **known, **choices})
 
 
 def _of_files(
@@ -221,6 +239,7 @@ def _of_files(
 
 
 def _of_clips(project: ProjectItems, clips: Clips, layer: str | None) -> dict[str, Any]:
+    clips = resolved(project.clips, clips)
     found = {one.id: one for one in items_at(project.clips, clips)}
     known = {"clips": as_inputs(clips), "rigs": project.edited_rigs(found.values())}
     if layer is None:

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import logging
+import os
 import ssl
 import threading
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from copy import copy
 from typing import Any, TypeVar
 from urllib.parse import quote
 
 import httpx
 from pydantic import BaseModel, ValidationError
 
-from marey_client.credentials import TokenFile, as_token, require_address
+from marey_client.credentials import TokenFile, as_token, require_address, resolve
 from marey_client.errors import RequestFailed, UnexpectedAnswer, Unreachable, error_of
 from marey_client.retries import BUSY_STATUSES, NEVER_ARRIVED, Retries, retry_after_s
 from marey_client.tracing import TracedRequest, calling
@@ -82,15 +82,14 @@ class Transport:
         self.retries = retries or Retries()
         self._reached = threading.Event()
         self._auth = BearerToken(token) if token else None
-        self._client = httpx.Client(
-            base_url=self.url + API,
-            timeout=httpx.Timeout(timeout_s, connect=10.0),
-            limits=httpx.Limits(max_connections=32, max_keepalive_connections=16),
-            headers={"User-Agent": "marey-client"},
-            verify=trusted_authorities() if self.url.startswith("https:") else True,
-            transport=http,
-            trust_env=False,  # no proxy and no .netrc comes between a token and its server
-        )
+        self._connections = _Connections(self.url, timeout_s, http)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _connected_again, (self.url,)  # a pickle must not contain a token
+
+    @property
+    def _client(self) -> httpx.Client:
+        return self._connections.client()
 
     @property
     def anonymous(self) -> bool:
@@ -119,7 +118,8 @@ class Transport:
 
     def with_retries(self, retries: Retries) -> Transport:
         """Return a transport with the same connections and token, and with other limits of retries."""
-        other = copy(self)
+        other = object.__new__(Transport)
+        other.__dict__ |= self.__dict__
         other.retries = retries
         return other
 
@@ -274,6 +274,40 @@ class Transport:
                 response.read()
             raise_for_problem(response)
             yield response
+
+
+def _connected_again(url: str) -> Transport:
+    """Return a transport to a server with the token that the command line would use."""
+    return Transport(url, resolve(url).bearer)
+
+
+class _Connections:
+    """Connections to a server. A forked process opens connections of its own instead of sharing those of its parent."""
+
+    def __init__(self, url: str, timeout_s: float, http: httpx.BaseTransport | None) -> None:
+        self._url = url
+        self._timeout_s = timeout_s
+        self._http = http
+        self._opened = (os.getpid(), self._open())
+
+    def client(self) -> httpx.Client:
+        """Return the client of this process."""
+        process, client = self._opened
+        if process != os.getpid():
+            client = self._open()
+            self._opened = (os.getpid(), client)
+        return client
+
+    def _open(self) -> httpx.Client:
+        return httpx.Client(
+            base_url=self._url + API,
+            timeout=httpx.Timeout(self._timeout_s, connect=10.0),
+            limits=httpx.Limits(max_connections=32, max_keepalive_connections=16),
+            headers={"User-Agent": "marey-client"},
+            verify=trusted_authorities() if self._url.startswith("https:") else True,
+            transport=self._http,
+            trust_env=False,  # no proxy and no .netrc comes between a token and its server
+        )
 
 
 def _quoted(path: str) -> str:

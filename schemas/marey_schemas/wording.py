@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
 
 NAMES_SHOWN = 5
 """Greatest number of names that a message lists."""
@@ -19,6 +20,13 @@ def counted(number: int, noun: str) -> str:
 def one_of(names: Sequence[str]) -> str:
     """Return the names of a choice as text: "bvh, npz or json"."""
     return " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """Return the known name that is most like a misspelt one, upper and lower case being equal; None if none is."""
+    by_lower = {one.lower(): one for one in known}
+    near = get_close_matches(name.lower(), by_lower, n=1)
+    return by_lower[near[0]] if near else None
 
 
 def without_prefix(message: str) -> str:

@@ -26,6 +26,14 @@ def problem(
     return httpx.Response(status, content=json.dumps({**document, **members}), headers=headers)
 
 
+def folder(path: str) -> httpx.Response:
+    """Return the list of folders of a project that has the folder `path`, which is how the client looks it up."""
+    now = "2026-01-01T00:00:00Z"
+    return httpx.Response(
+        200, json={"items": [{"id": "collection_1", "path": path, "created_at": now, "updated_at": now, "rev": 1}]}
+    )
+
+
 class ScriptedServer:
     """Answers that are sent one after another, the received requests, and the seconds that a real client would wait."""
 

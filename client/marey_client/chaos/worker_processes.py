@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from marey_client.embedded import NotInstalled
+from marey_client.errors import MissingPackage
 from marey_client.load.scratch import KIND, LABEL, Scratch
 from marey_schemas.queue.worker_protocol import FAULT_VARIABLE
 
@@ -112,7 +112,7 @@ class WorkerProcesses:
 def worker_processes(scratch: Scratch) -> Iterator[WorkerProcesses]:
     """Yield a place for worker processes; all of them are killed at the end of the `with` block."""
     if importlib.util.find_spec("marey_worker") is None:
-        raise NotInstalled("the test starts workers, which are not installed; run: pip install 'marey[worker]'")
+        raise MissingPackage("the test starts workers, which are not installed; run: pip install 'marey[worker]'")
     with tempfile.TemporaryDirectory(prefix="marey-chaos-") as folder:
         processes = WorkerProcesses(scratch, Path(folder))
         try:

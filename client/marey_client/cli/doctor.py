@@ -11,7 +11,8 @@ import typer
 from marey_client.cli.processes import DatabaseUrl, DataFolder
 from marey_client.cli.terminal.failures import interrupted_by_sigterm
 from marey_client.cli.terminal.invocation import AsJson, connect, credential_of, refuse_ignored
-from marey_client.cli.terminal.output import print_json, print_message, progress
+from marey_client.cli.terminal.output import print_json, print_message
+from marey_client.progress import progress
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -22,7 +22,8 @@ from marey_client.cli.revisions import require_revision
 from marey_client.cli.terminal.confirming import ask
 from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
 from marey_client.cli.terminal.invocation import AsJson, QueryText, connect
-from marey_client.cli.terminal.output import print_json, print_message, print_table, progress
+from marey_client.cli.terminal.output import print_json, print_message, print_table
+from marey_client.progress import progress
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:

@@ -11,7 +11,8 @@ from marey_client.cli.addresses import FOLDER, Address, addresses_in_one_project
 from marey_client.cli.terminal.confirming import ask
 from marey_client.cli.terminal.failures import Refused, WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, QueryText, connect
-from marey_client.cli.terminal.output import print_json, print_message, print_table, progress
+from marey_client.cli.terminal.output import print_json, print_message, print_table
+from marey_client.progress import progress
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:

@@ -224,8 +224,8 @@ def similar(
     place = Address.parse(moment.clip)
     with connect(context) as marey:
         clip = require_item(marey, place, [Kind.CLIP])
-        chosen = {} if metric is None else {"metric": _metric_of(marey, place.project, metric)}
-        found = marey.project(place.project).similar(clip, moment.frames, **params, **chosen)
+        chosen = None if metric is None else _metric_of(marey, place.project, metric)
+        found = marey.project(place.project).similar(clip, moment.frames, metric=chosen, **params)
     return print_json(found) if as_json else _print_similar(found)
 
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import ConfigDict
+from collections.abc import Iterator, Mapping
+from typing import Any, Unpack
 
 from marey_client.handles.annotations import AnnotationHandle
 from marey_client.handles.edits import Commands, preview_edit
-from marey_client.items import ItemHandle, Items
-from marey_client.one_or_several import several
+from marey_client.items import Items
+from marey_client.keywords.asking import EditPreviewKeywords
+from marey_client.poses.arrays import MotionArrays as MotionArrays
+from marey_client.poses.arrays import frames_text
+from marey_client.poses.handle import PosesHandle
 from marey_schemas.documents.annotations import Annotation
 from marey_schemas.documents.clips import ClipInfo, MotionDocument
 from marey_schemas.editing.annotation_commands import AnnotationImport
@@ -21,38 +20,8 @@ from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 
 
-class MotionArrays(MotionDocument):
-    """Poses of a clip, or of some of its frames and joints.
-
-    Metres, right-handed with Y up; quaternions w, x, y, z. Members that a newer server adds are ignored.
-    """
-
-    model_config = ConfigDict(extra="ignore")
-
-    @property
-    def root_translations(self) -> NDArray[np.float32]:
-        """(frames, 3) root positions, metres."""
-        return self.poses[:, :3]
-
-    @property
-    def rotations(self) -> NDArray[np.float32]:
-        """(frames, joints, 4) local rotations in the order of `joints`."""
-        return self.poses[:, 3:].reshape(len(self.poses), -1, 4)
-
-
-class ClipHandle(ItemHandle):
+class ClipHandle(PosesHandle):
     """Handle of a clip."""
-
-    def motion(
-        self,
-        *,
-        frames: slice | None = None,
-        joints: str | Sequence[str] | None = None,
-        revision: int | None = None,
-    ) -> MotionArrays:
-        """Return the poses as numpy arrays; only the blocks that contain `frames` and `joints` are read and sent."""
-        query = {"frames": frames_text(frames), "joints": ",".join(several(joints)) if joints is not None else None}
-        return MotionArrays.model_validate(self.part("motion", revision=revision, **query))
 
     def info(self) -> ClipInfo:
         """Return the part `info`: descriptions of the clip by users and importers."""
@@ -86,7 +55,9 @@ class ClipHandle(ItemHandle):
             collection=self.item.collection,
         )
 
-    def preview(self, commands: Commands, *, frames: slice | None = None, **options: Any) -> EditPreview:
+    def preview(
+        self, commands: Commands, *, frames: slice | None = None, **options: Unpack[EditPreviewKeywords]
+    ) -> EditPreview:
         """Apply commands to the clip without storing the result, and return frames of the result.
 
         `options` are those of `EditPreviewRequest`, such as `piece=1` or `fields=("positions",)`. Raises
@@ -94,8 +65,8 @@ class ClipHandle(ItemHandle):
         """
         frames_text(frames)
         bounds = (0, None) if frames is None else (frames.start or 0, frames.stop)
-        given = {"revision": self.item.revision, **options}
-        return preview_edit(self.transport, self.url, commands, frames=bounds, **given)
+        given: EditPreviewKeywords = {"revision": self.item.revision, **options}
+        return preview_edit(self.transport, self.url, commands, bounds, **given)
 
     def import_annotation(self, document: Mapping[str, Any], **options: Any) -> AnnotationHandle:
         """Create an annotation in the clip's folder from a document of Marey's predecessor.
@@ -105,23 +76,3 @@ class ClipHandle(ItemHandle):
         wanted = AnnotationImport.model_validate({"document": document, **options})
         made = self.transport.post(Item, f"{self.url}/annotations", wanted)
         return AnnotationHandle(self.transport, self.project, made)
-
-
-def frames_text(frames: slice | None) -> str | None:
-    """Return a slice as the query parameter `first:end`; return None for None, which means all frames.
-
-    Raises `ValueError` for a step other than 1, and for negative bounds.
-    """
-    if frames is None:
-        return None
-    if frames.step not in (None, 1):
-        raise ValueError(
-            f"frames: only ranges with a step of 1 can be requested, not {frames.step}; request "
-            "the range, then take every n-th frame of the arrays"
-        )
-    bounds: tuple[Any, Any] = (frames.start, frames.stop)
-    if any(bound is not None and bound < 0 for bound in bounds):
-        raise ValueError(
-            "frames: negative bounds are not possible, because frames are counted from the start of the clip"
-        )
-    return ":".join("" if bound is None else str(bound) for bound in bounds)

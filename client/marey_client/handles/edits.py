@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Unpack
 
 from pydantic import BaseModel
 
 from marey_client.items import ItemHandle, Items
+from marey_client.keywords.asking import EditPreviewKeywords
 from marey_client.one_or_several import several
 from marey_client.transport import BLOCKS, Transport, as_json, read_tree
 from marey_schemas.editing.edits import EditDocument
@@ -64,15 +65,25 @@ def as_edit(commands: EditDocument | Command | Sequence[Command], *, title: str 
     return EditDocument.model_validate({"title": title, "commands": several(commands)})
 
 
-def preview_edit(transport: Transport, url: str, commands: Commands, **options: Any) -> EditPreview:
+def preview_edit(
+    transport: Transport,
+    url: str,
+    commands: Commands,
+    frames: tuple[int, int | None],
+    **options: Unpack[EditPreviewKeywords],
+) -> EditPreview:
     """Apply commands to the clip at `url` without storing the result; return frames of the result.
 
     `options` are those of `EditPreviewRequest`.
     """
     if isinstance(commands, EditHandle):
-        request = EditPreviewRequest.model_validate({"edit": commands.as_input().model_dump(), **options})
+        request = EditPreviewRequest.model_validate(
+            {"edit": commands.as_input().model_dump(), "frames": frames, **options}
+        )
     else:
-        request = EditPreviewRequest.model_validate({"commands": as_edit(commands).commands, **options})
+        request = EditPreviewRequest.model_validate(
+            {"commands": as_edit(commands).commands, "frames": frames, **options}
+        )
     response = transport.send(
         "POST", f"{url}/edit-preview", content=as_json(request), headers={"Accept": BLOCKS}, repeatable=True
     )

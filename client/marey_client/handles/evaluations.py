@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,12 @@ from marey_client.handles.clips import ClipHandle
 from marey_client.handles.findings import Findings
 from marey_client.handles.metrics import Metric, metric_choice
 from marey_client.handles.reports import ReportedHandle, saved
+from marey_client.items import Items
 from marey_client.jobs import Jobs, OnProgress, job_request
-from marey_client.places import Places, as_inputs
+from marey_client.keywords.evaluation import CompareKeywords, OptimiseKeywords, SuggestKeywords, SweepKeywords
+from marey_client.places import Places, as_inputs, resolved
 from marey_schemas.documents.evaluations import COSTS
+from marey_schemas.kinds import Kind
 from marey_schemas.queue.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
 from marey_schemas.queue.jobs import JobCreate
 
@@ -75,7 +78,9 @@ class EvaluationHandle(ReportedHandle):
 
     # -- jobs on the evaluation: each method submits one and waits for it, or raises `JobUnsuccessful` --
 
-    def compare(self, after: EvaluationHandle, *, on_progress: OnProgress | None = None, **options: Any) -> Findings:
+    def compare(
+        self, after: EvaluationHandle, *, on_progress: OnProgress | None = None, **options: Unpack[CompareKeywords]
+    ) -> Findings:
         """Compare this evaluation with `after`, a later one with the same trials and the same scaling of features.
 
         `options` are those of `CompareParams`.
@@ -88,7 +93,7 @@ class EvaluationHandle(ReportedHandle):
         *,
         metric: Metric | None = None,
         on_progress: OnProgress | None = None,
-        **options: Any,
+        **options: Unpack[SuggestKeywords],
     ) -> Findings:
         """Find clips that can be removed, and `candidates` (clips or folders of clips) that fill gaps in the coverage.
 
@@ -97,7 +102,11 @@ class EvaluationHandle(ReportedHandle):
         return self._run(self.suggest_request(candidates, metric=metric, **options), on_progress)
 
     def optimise(
-        self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
+        self,
+        candidates: Places[ClipHandle] = (),
+        *,
+        on_progress: OnProgress | None = None,
+        **options: Unpack[OptimiseKeywords],
     ) -> Findings:
         """Find clips to remove and candidates to add, step by step, as long as each step lowers the objective function.
 
@@ -105,36 +114,37 @@ class EvaluationHandle(ReportedHandle):
         """
         return self._run(self.optimise_request(candidates, **options), on_progress)
 
-    def sweep(self, *, on_progress: OnProgress | None = None, **options: Any) -> Findings:
+    def sweep(self, *, on_progress: OnProgress | None = None, **options: Unpack[SweepKeywords]) -> Findings:
         """Evaluate the same trials with other weights of the features; `options` are those of `SweepParams`."""
         return self._run(self.sweep_request(**options), on_progress)
 
     # -- requests for the same jobs --
 
-    def compare_request(self, after: EvaluationHandle, **options: Any) -> JobCreate:
+    def compare_request(self, after: EvaluationHandle, **options: Unpack[CompareKeywords]) -> JobCreate:
         """Return the job request of `compare`; `options` are those of `CompareParams`."""
         inputs = {"before": self.as_input(), "after": after.as_input()}
         return job_request("compare", inputs, CompareParams.model_validate(options))
 
     def suggest_request(
-        self, candidates: Places[ClipHandle] = (), *, metric: Metric | None = None, **options: Any
+        self, candidates: Places[ClipHandle] = (), *, metric: Metric | None = None, **options: Unpack[SuggestKeywords]
     ) -> JobCreate:
         """Return the job request of `suggest`; `options` are those of `SuggestParams`."""
         chosen, named = metric_choice(metric)
         params = SuggestParams.model_validate({**options, **named})
         return job_request("suggest", {**self._with_candidates(candidates), **chosen}, params)
 
-    def optimise_request(self, candidates: Places[ClipHandle] = (), **options: Any) -> JobCreate:
+    def optimise_request(self, candidates: Places[ClipHandle] = (), **options: Unpack[OptimiseKeywords]) -> JobCreate:
         """Return the job request of `optimise`; `options` are those of `OptimiseParams`."""
         return job_request("optimise", self._with_candidates(candidates), OptimiseParams.model_validate(options))
 
-    def sweep_request(self, **options: Any) -> JobCreate:
+    def sweep_request(self, **options: Unpack[SweepKeywords]) -> JobCreate:
         """Return the job request of `sweep`; `options` are those of `SweepParams`."""
         return job_request("sweep", {"evaluation": self.as_input()}, SweepParams.model_validate(options))
 
     def _with_candidates(self, candidates: Places[ClipHandle]) -> dict[str, Any]:
         inputs: dict[str, Any] = {"evaluation": self.as_input()}
-        if places := as_inputs(candidates):
+        clips = Items(self.transport, self.project, Kind.CLIP, ClipHandle)
+        if places := as_inputs(resolved(clips, candidates)):
             inputs["candidates"] = places
         return inputs
 

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_client.handles.clips import ClipHandle, MotionArrays, frames_text
-from marey_client.items import ItemHandle
-from marey_client.one_or_several import several
+from marey_client.handles.clips import ClipHandle
+from marey_client.poses.handle import PosesHandle
 from marey_schemas.documents.alignments import AlignmentInfo
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 
 
-class ProcessedHandle(ItemHandle):
-    """Handle of an aligned clip: poses at the canonical frames of an action, and the source frame of each of them."""
+class ProcessedHandle(PosesHandle):
+    """Handle of an aligned clip: poses at the canonical frames of an action, and the source frame of each of them.
 
-    def motion(
-        self, *, frames: slice | None = None, joints: str | Sequence[str] | None = None, revision: int | None = None
-    ) -> MotionArrays:
-        """Return the poses at the canonical frames, with positions in the canonical frame of reference."""
-        query = {"frames": frames_text(frames), "joints": ",".join(several(joints)) if joints is not None else None}
-        return MotionArrays.model_validate(self.part("motion", revision=revision, **query))
+    Positions are in the canonical frame of reference.
+    """
 
     def info(self, *, revision: int | None = None) -> AlignmentInfo:
         """Return the alignment: its keyframes, cost and options, and the source frame of each canonical frame."""

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from pydantic import BaseModel
 
 from marey_client.downloads import safe_file_name, saved_atomically
 from marey_client.handles.reports import ReportedHandle
 from marey_client.jobs import Jobs, OnProgress, job_request
+from marey_client.keywords.asking import SearchKeywords
+from marey_client.keywords.processing import TreeKeywords
 from marey_client.one_or_several import several
 from marey_client.transport import BLOCKS, as_json, read_tree
 from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT
@@ -26,7 +28,7 @@ Constraints = Constraint | Sequence[Constraint]
 class SearchableHandle(ReportedHandle):
     """Handle of an item whose motions can be searched."""
 
-    def search(self, constraints: Constraints = (), **options: Any) -> SearchAnswer:
+    def search(self, constraints: Constraints = (), **options: Unpack[SearchKeywords]) -> SearchAnswer:
         """Return the motion of the model that meets `constraints` best, and the error of each constraint.
 
         `options` are those of `SearchRequest`. The option `steps` requests a sequence of motions; each step has its own
@@ -45,7 +47,7 @@ class SearchableHandle(ReportedHandle):
         *,
         format: str = DEFAULT_FORMAT,  # noqa: A002
         unit: str = DEFAULT_UNIT,
-        **options: Any,
+        **options: Unpack[SearchKeywords],
     ) -> Path:
         """Write the result of a search to a motion file (bvh, npz or predecessor), and return the path of the file."""
         response = self.transport.send(
@@ -63,7 +65,9 @@ class SearchableHandle(ReportedHandle):
             file.write(response.content)
         return target
 
-    def make_tree(self, *, seed: int = 0, on_progress: OnProgress | None = None, **options: Any) -> Job:
+    def make_tree(
+        self, *, seed: int = 0, on_progress: OnProgress | None = None, **options: Unpack[TreeKeywords]
+    ) -> Job:
         """Submit a job that builds the model's part `tree` from samples, and wait for its end.
 
         Raises `JobUnsuccessful` if the job does not succeed.
@@ -73,11 +77,11 @@ class SearchableHandle(ReportedHandle):
         request = self.tree_request(**options).model_copy(update={"seed": seed})
         return Jobs(self.transport).run(self.project, request, on_progress=on_progress)
 
-    def tree_request(self, **options: Any) -> JobCreate:
+    def tree_request(self, **options: Unpack[TreeKeywords]) -> JobCreate:
         """Return the job request of `make_tree`; `options` are those of `TreeParams`."""
         return job_request("tree", {"model": self.as_input()}, TreeParams.model_validate(options))
 
 
-def search_request(constraints: Constraints, **options: Any) -> SearchRequest:
+def search_request(constraints: Constraints, **options: Unpack[SearchKeywords]) -> SearchRequest:
     """Return a search request with the given constraints; `options` are further fields of `SearchRequest`."""
     return SearchRequest.model_validate({"constraints": several(constraints), **options})

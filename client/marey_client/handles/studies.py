@@ -7,12 +7,13 @@ import io
 from collections.abc import Iterator, Sequence
 from datetime import timedelta
 from itertools import combinations
-from typing import Any
+from typing import Any, Unpack
 
 from marey_client.handles.clips import ClipHandle
 from marey_client.handles.findings import Findings
 from marey_client.items import ItemHandle, Items
 from marey_client.jobs import Jobs, OnProgress, job_request
+from marey_client.keywords.processing import AnalyseStudyKeywords
 from marey_client.paging import pages
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.studies import StudyDocument, StudyMotion
@@ -69,12 +70,12 @@ class StudyHandle(ItemHandle):
         query = {"revision": self.item.revision if revision is None else revision}
         return pages(self.transport, JudgingParticipant, f"{self.url}/judgements", query)
 
-    def analyse(self, *, on_progress: OnProgress | None = None, **options: Any) -> Findings:
+    def analyse(self, *, on_progress: OnProgress | None = None, **options: Unpack[AnalyseStudyKeywords]) -> Findings:
         """Compute differences, order and groups of the motions, and fit metrics; `options`: `AnalyseStudyParams`."""
         request = self.analyse_request(**options)
         return Findings(self.transport, Jobs(self.transport).run(self.project, request, on_progress=on_progress))
 
-    def analyse_request(self, **options: Any) -> JobCreate:
+    def analyse_request(self, **options: Unpack[AnalyseStudyKeywords]) -> JobCreate:
         """Return the job request of `analyse`."""
         params = AnalyseStudyParams.model_validate(options)
         return job_request("analyse_study", {"study": self.as_input()}, params)

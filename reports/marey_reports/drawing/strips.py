@@ -13,8 +13,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from marey_motion.arrays import Floats, Indices
-from marey_reports.drawing.paper import COLOURS, HAIRLINE, INK, PAPER, QUIET, REFERENCE, TEXT, new_figure, write
-from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, StickFigure, runs_of
+from marey_motion.clip import Clip
+from marey_motion.errors import MotionError
+from marey_motion.kinematics import forward_directions, global_positions
+from marey_reports.drawing.paper import COLOURS, HAIRLINE, INK, PAPER, QUIET, REFERENCE, TEXT, new_figure, to_svg, write
+from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, StickFigure, body_of, runs_of
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -34,6 +37,10 @@ FLOOR_SHARE = 0.09  # of a cell's height: the floor's distance from its lower ed
 FILLED = 0.84  # of a cell's height, by the highest point
 HEAD_SHARE = 0.055  # radius of the head, of the height of the highest point
 LINE_POINTS = 1.7
+
+POSE_CELL_IN = (1.15, 1.7)
+"""Width and height of a cell in the strip of a clip, inches."""
+CAMERA_TURN_RAD = np.radians(40.0)  # from where the body faces at first to where it is seen from, to its left
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +108,34 @@ def draw_strips(
         write(axes, (middle, MOMENT - 0.10), name, ha="center", color=QUIET)
         write(axes, (middle, MOMENT - 0.26), label, ha="center", color=INK)
     return figure
+
+
+def draw_clip_strip(poses: Sequence[Clip], frames: Sequence[int], frame_rate_hz: float, *, title: str) -> str:
+    """Draw a clip at some moments as SVG.
+
+    Parameters
+    ----------
+    poses : one frame of the clip for each moment
+    frames : the numbers of these frames in the clip
+    frame_rate_hz : frames per second of the clip
+    title : title of the picture, for readers who do not see it
+    """
+    body = body_of(poses[0].skeleton)
+    points = np.concatenate([global_positions(one, end_sites=True) for one in poses]).astype(np.float64)
+    middles = points[:, body.pelvis][:, (0, 2)]
+    labels = [f"{frame / frame_rate_hz:.2f} s" for frame in frames]
+    moments = StripMoments(middles, [f"frame {frame}" for frame in frames], labels)
+    row = StripRow("", "", points[None], np.empty((0, 0, 3)))
+    figure = draw_strips(body, [row], moments, _camera_direction(points, body.facing), cell_in=POSE_CELL_IN)
+    return to_svg(figure, title)
+
+
+def _camera_direction(points: Floats, facing: tuple[tuple[int, ...], tuple[int, ...]]) -> float:
+    try:
+        ahead = forward_directions(points, *facing)[0]
+    except MotionError:
+        return float(CAMERA_TURN_RAD)
+    return float(np.arctan2(*ahead) + CAMERA_TURN_RAD)
 
 
 @dataclass(frozen=True)

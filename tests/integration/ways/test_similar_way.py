@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from tests.support.command_line import CommandLine
 
-from marey_client.errors import Conflict, Invalid, NotFound, RequestFailed
+from marey_client.errors import Conflict, Invalid, NoSuchPath, NotFound, RequestFailed
 from marey_client.imports import find_files
 from marey_client.jobs import Jobs
 from marey_client.project import ProjectHandle
@@ -98,7 +98,7 @@ def test_similar_moments_are_found_and_the_index_follows_the_project(
     with pytest.raises(Invalid, match="no built-in metric 'published/none'"):
         lab.similar(walk, (30, 60), metric="published/none")
     with pytest.raises(NotFound):
-        lab.similar(walk, (30, 60), metric=walk)
+        lab.similar(walk, (30, 60), metric=walk)  # type: ignore[arg-type]
 
     # A mirrored copy of the walk: only a mirrored search sees that it is the same.
     clip = generate_gait(1.9, 0.5, 3.0)
@@ -154,5 +154,5 @@ def test_wrong_examples_are_refused_with_the_reason(lab: ProjectHandle, run: Com
         if clip.id != walk.id:
             clip.delete()
     assert lab.similar(walk, (0, 9), leave_out="clip").moments == ()
-    with pytest.raises(NotFound):
+    with pytest.raises(NoSuchPath):
         lab.similar("clip_00000000000000000000000000", (0, 9))

@@ -9,12 +9,12 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from tests.support.scripted_server import ScriptedServer
+from tests.support.scripted_server import ScriptedServer, folder
 
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.following import show_progress
 from marey_client.cli.terminal.typed_values import read_numbers
 from marey_client.handles.evaluations import clip_rows, record_arrays, trial_rows
+from marey_client.progress import show_progress
 from marey_schemas.queue.jobs import CollectionInput, Job, Progress
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC).isoformat()
@@ -48,6 +48,11 @@ def answer(request: httpx.Request) -> httpx.Response:
     path, query = request.url.path, dict(request.url.params)
     if path.endswith("/jobs"):
         return httpx.Response(202, json=job())
+    if path.endswith("/collections"):
+        return folder(query["path"])
+    if path.endswith("/evaluations"):
+        made = clip("7")
+        return httpx.Response(200, json={"items": [{**made, "id": "evaluation_7", "kind": "evaluation"}]})
     if path.endswith("/skeletons/skeleton_1"):
         return httpx.Response(200, json=skeleton(revision=2))
     found = [clip("a"), clip("b", tags=["loop"]), clip("c")]
@@ -84,7 +89,7 @@ def test_loops_that_are_named_and_a_normaliser_are_handed_in(script: ScriptedSer
 
 def test_a_misspelt_option_is_refused_before_anything_is_sent(script: ScriptedServer) -> None:
     with pytest.raises(ValueError, match="durations_s"):
-        script.marey().project("lab").evaluate("walks", durations_s=10)
+        script.marey().project("lab").evaluate("walks", durations_s=10)  # type: ignore[call-arg]
     assert script.requests == []
 
 

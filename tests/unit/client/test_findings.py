@@ -4,7 +4,7 @@ import json
 
 import httpx
 import pytest
-from tests.support.scripted_server import ScriptedServer
+from tests.support.scripted_server import ScriptedServer, folder
 
 from marey_client.cli.improvements import OPTIMISE, _print_comparison
 from marey_client.cli.terminal.failures import WrongUsage
@@ -45,9 +45,9 @@ def answer(request: httpx.Request) -> httpx.Response:
 def test_suggestions_are_asked_for_by_the_revision_that_was_read_and_with_what_was_given(
     script: ScriptedServer,
 ) -> None:
-    script.answers = [answer] * 3
+    script.answers = [folder("others"), answer, answer, answer]
     found = evaluation(script, "first").suggest("others", removals=3)
-    assert json.loads(script.requests[0].content) == {
+    assert json.loads(script.requests[1].content) == {
         "kind": "suggest",
         "inputs": {
             "evaluation": {"item": "evaluation_first", "revision": 2},

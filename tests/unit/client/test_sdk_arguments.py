@@ -8,7 +8,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from tests.support.scripted_server import ScriptedServer
+from tests.support.scripted_server import ScriptedServer, folder
 
 from marey_client.downloads import saved_atomically
 from marey_client.handles.clips import MotionArrays
@@ -64,9 +64,10 @@ def test_poses_that_were_read_are_put_back_as_the_next_revision(script: Scripted
 
 def test_a_folder_is_retargeted_by_its_path_as_it_is_edited_and_evaluated(script: ScriptedServer) -> None:
     page = {"items": [CLIP], "next_cursor": None}
-    answers = [httpx.Response(200, json=answer) for answer in (page, SKELETON)]
-    script.answers = [*answers, httpx.Response(202, json=JOB)]
-    script.marey().project("lab").retarget("raw", "skeleton_2", into="walks")
+    target = {"items": [{**SKELETON, "id": "skeleton_2"}]}
+    answers = [httpx.Response(200, json=answer) for answer in (target, page, SKELETON)]
+    script.answers = [folder("raw"), *answers, httpx.Response(202, json=JOB)]
+    script.marey().project("lab").retarget("raw", "skeletons/mixamo", into="walks")
     asked = json.loads(script.requests[-1].content)
     assert asked["inputs"] == {"clips": [{"collection": "raw"}], "skeleton": {"item": "skeleton_2"}}
 

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import pickle
 import ssl
 from datetime import timedelta
@@ -318,3 +319,11 @@ def test_a_server_that_does_not_name_the_token_is_not_asked_to_rotate_it(script:
     with pytest.raises(errors.UnexpectedAnswer, match="upgrade"):
         script.marey().tokens.rotate()
     assert len(script.requests) == 1
+
+
+def test_a_forked_process_opens_connections_of_its_own(script: ScriptedServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    transport = script.marey().transport
+    before = transport._client
+    assert transport._client is before
+    monkeypatch.setattr(os, "getpid", lambda: -1)
+    assert transport._client is transport.with_token("marey_other")._client is not before

@@ -11,7 +11,8 @@ import typer
 from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, imported, parse, short
 from marey_client.cli.terminal.failures import Refused
 from marey_client.cli.terminal.invocation import AllowExpiredConsent, AsJson, connect
-from marey_client.cli.terminal.output import print_json, print_message, print_pairs, progress
+from marey_client.cli.terminal.output import print_json, print_message, print_pairs
+from marey_client.progress import progress
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:

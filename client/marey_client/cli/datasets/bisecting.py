@@ -11,10 +11,11 @@ import typer
 from marey_client.cli.datasets.places import DatasetPlace, parse, short
 from marey_client.cli.evaluations import EVALUATE, Loops, Normaliser, Trims, add_clip_options, evaluation_at
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.following import FINDINGS_JOB, show_progress
+from marey_client.cli.terminal.following import FINDINGS_JOB
 from marey_client.cli.terminal.invocation import AsJson, connect
-from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table, progress
+from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 from marey_client.cli.terminal.schema_options import Chosen, add_command
+from marey_client.progress import progress, show_progress
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:

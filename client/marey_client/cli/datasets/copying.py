@@ -10,7 +10,8 @@ import typer
 from marey_client.cli.datasets.places import VersionPlace, imported, parse
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, connect, connect_other
-from marey_client.cli.terminal.output import print_json, print_message, progress
+from marey_client.cli.terminal.output import print_json, print_message
+from marey_client.progress import progress
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey

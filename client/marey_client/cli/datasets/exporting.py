@@ -10,7 +10,8 @@ import typer
 from marey_client.cli.datasets.places import VersionPlace, parse, short
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import AllowExpiredConsent, AsJson, connect
-from marey_client.cli.terminal.output import print_json, print_message, progress
+from marey_client.cli.terminal.output import print_json, print_message
+from marey_client.progress import progress
 from marey_schemas.datasets.layouts import LAYOUTS
 from marey_schemas.formats import DEFAULT_FORMAT, WHOLE_FORMATS
 from marey_schemas.wording import counted, one_of

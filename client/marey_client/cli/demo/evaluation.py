@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from marey_client.cli.demo.versions import DemoVersion
-from marey_client.cli.terminal.output import Advance
 from marey_client.handles.clips import ClipHandle
+from marey_client.progress import Advance
 from marey_client.project import ProjectHandle
 
 NAME = "evaluation"

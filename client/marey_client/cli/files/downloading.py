@@ -12,7 +12,8 @@ from marey_client.cli.addresses import Address
 from marey_client.cli.revisions import find_revision, find_version
 from marey_client.cli.terminal.failures import Refused, WrongUsage
 from marey_client.cli.terminal.invocation import AllowExpiredConsent, AsJson, connect
-from marey_client.cli.terminal.output import print_json, print_message, progress
+from marey_client.cli.terminal.output import print_json, print_message
+from marey_client.progress import progress
 from marey_schemas.formats import EXPORT_FORMATS
 from marey_schemas.wording import counted, one_of
 

@@ -12,7 +12,8 @@ import typer
 from marey_client.cli.addresses import REQUESTS_AT_ONCE, Address
 from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
 from marey_client.cli.terminal.invocation import QueryText, connect
-from marey_client.cli.terminal.output import print_message, progress
+from marey_client.cli.terminal.output import print_message
+from marey_client.progress import progress
 from marey_schemas.wording import counted, without_prefix
 
 if TYPE_CHECKING:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,8 +9,9 @@ import typer
 
 from marey_client.cli.terminal.failures import Refused, WrongUsage
 from marey_client.cli.terminal.invocation import AsJson, connect
-from marey_client.cli.terminal.output import print_json, print_message, progress
+from marey_client.cli.terminal.output import print_json, print_message
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
+from marey_client.progress import progress
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 
 
 UPLOAD = OptionsOf("marey_schemas.options.imports:ImportOptions", short={"frame_rate_hz": "--fps"})
-NEW_REVISION = "new revision"
-OUTCOMES = ("created", NEW_REVISION, "unchanged", "companion", "failed")  # in the order of the summary
-
 WARNINGS_SHOWN = 2  # of each code: a folder of thousands shows what it has, not everything it has
 
 
@@ -49,6 +46,7 @@ def upload(
     export.
     """
     from marey_client.imports import find_files, left_out_texts
+    from marey_client.uploads import upload as upload_found
     from marey_schemas.options.imports import ImportOptions
 
     if left_handed:
@@ -58,26 +56,23 @@ def upload(
     found = find_files(places)
     for text in left_out_texts(found.left_out):
         print_message(text)
-    if found.unit is not None and not options.keys() & {"unit", "unit_scale_m"}:
-        options["unit"] = found.unit
     with connect(context) as marey:
         to = marey.project(project)
         to.read()  # a missing project is an error before any bytes are sent
         try:
             with progress() as advance:
-                entries = to.imports.upload(found.files, ImportOptions.model_validate(options), notice=advance)
-                restored = to.imports.restore(found, entries, notice=advance)
+                report = upload_found(to, found, ImportOptions.model_validate(options), advance)
         except KeyboardInterrupt:
             print_message(
                 "interrupted; imported files stay imported, and repeating the command sends only the missing ones"
             )
             raise
     if as_json:
-        print_json(entries)
+        print_json(report.entries)
     else:
-        _print_entries(entries)
-        _print_restored(restored, found.changed_tables, f"{project}/{options.get('collection', '')}".rstrip("/"))
-    if found.motions_left_out or any(entry.status == "failed" for entry in entries):
+        _print_entries(report.entries)
+        _print_restored(report.restored, found.changed_tables, f"{project}/{options.get('collection', '')}".rstrip("/"))
+    if found.motions_left_out or report.failed:
         raise Refused
 
 
@@ -93,6 +88,7 @@ def _print_restored(restored: int, changed_tables: Sequence[Path], place: str) -
 
 def _print_entries(entries: Sequence[ImportEntry]) -> None:
     from marey_client.imports import refusal_text
+    from marey_client.uploads import outcomes_text
 
     found: dict[str, list[str]] = {}
     for entry in entries:
@@ -105,12 +101,4 @@ def _print_entries(entries: Sequence[ImportEntry]) -> None:
         more = [f"and {counted(others, 'more file')}; --json shows all"] if others > 0 else []
         for text in [*texts[:WARNINGS_SHOWN], *more]:
             print_message(f"warning {code}: {text}")
-    counts = Counter(_outcome(entry) for entry in entries)
-    frames = sum(entry.frames or 0 for entry in entries)
-    outcomes = ", ".join(f"{counts[outcome]} {outcome}" for outcome in OUTCOMES if counts[outcome])
-    typer.echo(f"{counted(len(entries), 'file')}: {outcomes}; {counted(frames, 'frame')}")
-
-
-def _outcome(entry: ImportEntry) -> str:
-    """Return the word for the result of an import: `new revision` if an item of this name existed before."""
-    return NEW_REVISION if entry.status == "created" and (entry.revision or 1) > 1 else entry.status
+    typer.echo(outcomes_text(entries))

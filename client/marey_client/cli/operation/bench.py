@@ -8,7 +8,8 @@ import typer
 
 from marey_client.cli.terminal.failures import WrongUsage, interrupted_by_sigterm
 from marey_client.cli.terminal.invocation import AsJson, connect, refuse_ignored
-from marey_client.cli.terminal.output import print_json, print_message, print_table, progress
+from marey_client.cli.terminal.output import print_json, print_message, print_table
+from marey_client.progress import progress
 
 if TYPE_CHECKING:
     from marey_client.load.figures import RateFigures

@@ -9,7 +9,8 @@ import typer
 from marey_client.cli.operation.bench import Seed, WorkMs, bench
 from marey_client.cli.terminal.failures import WrongUsage, interrupted_by_sigterm
 from marey_client.cli.terminal.invocation import AsJson
-from marey_client.cli.terminal.output import print_json, print_pairs, print_table, progress
+from marey_client.cli.terminal.output import print_json, print_pairs, print_table
+from marey_client.progress import progress
 
 if TYPE_CHECKING:
     from marey_client.load.calibrating import Calibration

@@ -14,9 +14,10 @@ from marey_client.cli.addresses import Address, require_item
 from marey_client.cli.terminal.failures import INTERRUPTED, Refused, WrongUsage
 from marey_client.cli.terminal.following import SEEDED_JOB, clips_at, commit_text
 from marey_client.cli.terminal.invocation import AsJson, connect
-from marey_client.cli.terminal.output import print_json, print_message, print_refused, print_table, progress
+from marey_client.cli.terminal.output import print_json, print_message, print_refused, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_client.cli.terminal.typed_values import json_or_text, read_json
+from marey_client.progress import progress
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:

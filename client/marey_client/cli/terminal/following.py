@@ -12,8 +12,9 @@ import typer
 from marey_client.cli.addresses import Address
 from marey_client.cli.revisions import find_revision, find_version
 from marey_client.cli.terminal.failures import Refused, WrongUsage
-from marey_client.cli.terminal.output import Advance, print_json, print_message, print_refused, progress
+from marey_client.cli.terminal.output import print_json, print_message, print_refused
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf
+from marey_client.progress import progress, show_progress
 from marey_schemas.wording import counted, without_prefix
 
 if TYPE_CHECKING:
@@ -121,18 +122,6 @@ def follow(
             f"`marey job cancel {seen.id}` stops it"
         )
         raise
-
-
-def show_progress(now: Job, advance: Advance, count: int | None = None, unit: str = "") -> None:
-    """Show the progress of a job. The progress of a job with tasks is counted in tasks, or scaled to `count` units."""
-    what = f"{now.kind} {now.state}"
-    if now.progress is None:
-        return advance(what, 0, None)
-    if now.size is None or now.progress.total != now.size:
-        return advance(now.progress.note or what, now.progress.done, now.progress.total)
-    if count is None:
-        return advance(what, now.progress.done, now.size)
-    return advance(unit or what, round(now.progress.done / now.size * count), count)
 
 
 def print_ended(ended: Job, as_json: bool, show: Callable[[dict[str, Any]], None] | None = None) -> None:

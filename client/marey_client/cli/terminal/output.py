@@ -1,12 +1,11 @@
-"""Output of commands: tables for people, JSON for programs, progress on the error stream of a terminal."""
+"""Output of commands: tables for people, JSON for programs."""
 
 from __future__ import annotations
 
 import json
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -95,25 +94,6 @@ def print_refused(refused: Sequence[Mapping[str, Any]], *, most: int | None = No
         print_message(f"{detail if detail.startswith(name) else f'{name}: {detail}'} ({one.get('code')})")
     if most is not None and len(refused) > most:
         print_message(f"and {len(refused) - most} more")
-
-
-Advance = Callable[[str, float, float | None], None]
-"""Function called with the current activity, the amount done, and the total amount."""
-
-
-@contextmanager
-def progress() -> Iterator[Advance]:
-    """Show a progress bar during the `with` block if standard error is a terminal; yield a function that updates it."""
-    if not sys.stderr.isatty():
-        yield lambda _what, _done, _total: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=None)
-        yield lambda what, done, total: bar.update(task, description=what, completed=done, total=total)
 
 
 def _plain(value: Any) -> Any:

@@ -65,7 +65,7 @@ def test_a_tree_does_not_go_elsewhere(lab: ProjectHandle, bare: ModelHandle) -> 
 
 
 def test_a_search_comes_near_to_what_is_asked(walk: ModelHandle) -> None:
-    answer = walk.search([AHEAD], **{"lambda": 0.01})
+    answer = walk.search([AHEAD], likelihood_weight=0.01)
     (error,) = answer.errors
     assert answer.reached
     assert error.error_cm is not None
@@ -115,7 +115,7 @@ def test_the_same_question_has_the_same_answer(walk: ModelHandle) -> None:
 
 
 def test_several_steps_follow_one_another(walk: ModelHandle, bare: ModelHandle) -> None:
-    steps = [
+    steps: list[dict[str, Any]] = [
         {"constraints": [{**AHEAD, "target_m": [0.1, 1.1]}]},
         {"model": bare.id, "constraints": [{**AHEAD, "target_m": [0.3, 2.2]}]},
     ]

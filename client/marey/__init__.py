@@ -1,0 +1,40 @@
+"""Marey in Python, with one import.
+
+    import marey
+
+    lab = marey.connect().project("lab")
+    lab.upload("takes", collection="raw")
+    for clip in lab.clips:
+        print(clip.path, clip.frames, clip.positions(joints=["LeftFoot"], frames=slice(0, 120)).shape)
+
+The classes are those of `marey_client`, which also contains the parts that fewer programs need. Names are loaded when
+they are first used, so that the import takes hardly any time.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from marey_client.credentials import TokenFile as TokenFile
+    from marey_client.errors import JobUnsuccessful as JobUnsuccessful
+    from marey_client.errors import MareyError as MareyError
+    from marey_client.marey import Marey as Marey
+    from marey_client.marey import connect as connect
+    from marey_client.poses.windows import MotionWindows as MotionWindows
+
+_HOMES = {
+    "JobUnsuccessful": "marey_client.errors",
+    "Marey": "marey_client.marey",
+    "MareyError": "marey_client.errors",
+    "MotionWindows": "marey_client.poses.windows",
+    "TokenFile": "marey_client.credentials",
+    "connect": "marey_client.marey",
+}
+
+__all__ = ["JobUnsuccessful", "Marey", "MareyError", "MotionWindows", "TokenFile", "connect"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"the module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)

@@ -1,0 +1,21 @@
+"""Access to packages that only some functions need: other packages of Marey, and libraries for tables and pictures.
+
+They are imported only when such a function is called, so that the client can be installed alone.
+"""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
+from marey_client.errors import MissingPackage
+
+
+def room(module: str, extra: str) -> ModuleType:
+    """Import a module. Raises `MissingPackage`, which names the pip extra to install, if a package is missing."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise MissingPackage(
+            f"this needs the package {error.name}, which is not installed; run: pip install 'marey[{extra}]'"
+        ) from error

@@ -1,0 +1,1 @@
+"""Types of the keyword arguments of methods, for editors and type checkers."""

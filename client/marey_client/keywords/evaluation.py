@@ -1,0 +1,252 @@
+"""Keyword arguments of methods of the SDK: parameters of evaluations and of jobs that improve clips.
+
+Written by `make docs` from the declarations of the options; change them there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal, TypedDict
+
+from marey_schemas.options.improvement import ObjectiveOptions
+from marey_schemas.options.matching import ControllerOptions, DatabaseOptions, FeatureWeights
+from marey_schemas.options.verdict import VerdictLimits
+
+
+class FeatureWeightsKeywords(TypedDict, total=False):
+    """Fields of `FeatureWeights`."""
+
+    left_foot_position: float
+    """Weight of the position of the left foot in the cost of a match; 0 leaves it out."""
+    right_foot_position: float
+    """Weight of the position of the right foot in the cost of a match; 0 leaves it out."""
+    left_foot_velocity: float
+    """Weight of the velocity of the left foot in the cost of a match; 0 leaves it out."""
+    right_foot_velocity: float
+    """Weight of the velocity of the right foot in the cost of a match; 0 leaves it out."""
+    hip_velocity: float
+    """Weight of the velocity of the hips in the cost of a match; 0 leaves it out."""
+    trajectory_positions: float
+    """Weight of the positions of the trajectory ahead in the cost of a match; 0 leaves it out."""
+    trajectory_directions: float
+    """Weight of the directions of the trajectory ahead in the cost of a match; 0 leaves it out."""
+    extra_joints: float
+    """Weight of the position, and of the velocity, of each of `extra_joints` in the cost of a match; 0 leaves it
+    out."""
+
+
+class DatabaseKeywords(TypedDict, total=False):
+    """Fields of `DatabaseOptions`."""
+
+    mirroring: Literal["none", "add", "only"]
+    """add: every clip and its mirrored copy; only: the mirrored copies alone."""
+    end_policy: Literal["clamp", "trim", "loop"]
+    """Trajectory features near a clip's end. clamp: the last frame is repeated, and the last 1/3 s is not selected;
+    trim: the last second is not selected; loop: the clip's beginning follows, for clips marked as loops."""
+    root_mode: Literal["simulated", "bone"]
+    """Source of the character's motion on the ground. simulated: the smoothed position and heading of the body; bone:
+    the root joint, for data whose root joint moves as the character does."""
+    weights: FeatureWeights | FeatureWeightsKeywords
+    """Weight of each group of features."""
+    horizons_s: Sequence[float]
+    """Times after the current frame at which trajectories are compared, in seconds, increasing."""
+    extra_joints: list[str] | tuple[str, ...]
+    """Standard joints to match in addition to feet and hips; with many joints the trajectory has too little weight."""
+    rate_hz: float
+    """Rate of the features and of the simulation, in hertz."""
+    keep_rest_poses: bool
+    """Keep frames at the beginning and end of a clip that look like a calibration or a T-pose."""
+
+
+class ControllerKeywords(TypedDict, total=False):
+    """Fields of `ControllerOptions`."""
+
+    follow: Literal["time", "path", "open_loop"]
+    """Desired trajectory of the character. time: the reference at the same time; path: the reference, beginning at the
+    point nearest to the character; open_loop: only the speed and turn rate of the reference."""
+    search_every_s: float
+    """Seconds between two searches."""
+    continuing_bias: float
+    """Value added to the cost of continuing the current clip; negative values favour continuing."""
+    switch_margin: float
+    """Least reduction of the cost for which the character switches to another clip or frame."""
+    reselect_window_s: float
+    """Seconds around the current frame that a search does not select, so that the character does not tread on the spot;
+    0 allows all frames."""
+    half_life_s: float
+    """Half-life in seconds of the offset from the old motion after a switch."""
+    root_inertialisation: bool
+    """Whether the blend after a switch also includes the root's velocity."""
+    selection: Literal["features", "pose_distance"]
+    """Cost of the search. features: the weighted features; pose_distance: the published cost, the summed distance of
+    joints in metres."""
+    root_adjustment: float
+    """Rate, per second, at which the character is pulled to the reference: within a second, the distance shrinks by the
+    factor exp(-rate). This hides tracking errors."""
+    root_clamp_m: float | None
+    """Greatest distance of the character from the reference, in metres; this hides tracking errors."""
+
+
+class VerdictLimitsKeywords(TypedDict, total=False):
+    """Fields of `VerdictLimits`."""
+
+    lag_s: float
+    """Greatest mean distance from the desired position, as the time in seconds to cover it."""
+    speed_share: float
+    """Greatest error of the mean speed, as a share of the desired speed; for each speed of a switching trial, away from
+    the switches."""
+    turn_deg_s: float
+    """Greatest error of the mean turn rate, in degrees per second."""
+    heading_deg: float
+    """Greatest root mean square error of the heading, in degrees; the baseline reaches 12."""
+    speed_wobble_share: float
+    """Greatest standard deviation of the speed, as a share of the desired speed; in a switching trial away from the
+    switches, as a share of the faster speed, because the character catches up after a switch. The baseline reaches
+    0.19."""
+    turn_wobble_deg_s: float
+    """Greatest standard deviation of the turn rate, in degrees per second; the sway of the steps of the baseline
+    reaches 21."""
+    response_s: float
+    """Greatest median time to answer a switch of the speed, in seconds; switches without an answer count as longer than
+    all others."""
+    skate_m_s: float
+    """Greatest mean speed of feet in contact, in metres per second, unless `skate_ratio` allows more; by default the
+    speed up to which a foot counts as standing."""
+    skate_ratio: float
+    """Greatest ratio of this speed to that of the clips shown."""
+    sinking_m: float
+    """Depth below the floor of the clips shown that the feet keep within for 95 % of the time, in metres; the baseline
+    sinks by 0.006."""
+    step_ratio: float
+    """Greatest ratio between the contacts per metre of the trial and of the clips shown, in either direction; the ratio
+    of the baseline is between 0.97 and 1.05."""
+    steps_per_m: float
+    """Fewest contacts per metre; a sprinter has 0.4, so fewer show that the character glides."""
+    pose_cost_ratio: float
+    """Greatest ratio of the mean pose cost to the mean change of pose in the clips shown; the baseline reaches 1.5."""
+    pose_cost_p95_ratio: float
+    """Greatest ratio of the 95th percentile of the pose cost to the mean change of pose in the clips shown."""
+    transitions_per_s: float
+    """Greatest number of transitions per second; 95 % of the trials of the baseline have fewer than 5."""
+    treading_per_s: float
+    """Greatest number of transitions per second to a frame of the same clip at most 1/3 s away; the baseline has
+    none."""
+
+
+class EvaluateKeywords(TypedDict, total=False):
+    """Fields of `EvaluateParams`."""
+
+    tags: list[str] | tuple[str, ...]
+    """Tags that the results get."""
+    speeds_m_s: Sequence[float]
+    """Speeds of the trials in metres per second; each is combined with each turn rate."""
+    turn_rates_deg_s: Sequence[float]
+    """Turn rates of the trials in degrees per second, positive to the left."""
+    families: Sequence[Literal["circle", "switching"]]
+    """Kinds of trials. circle: a circle at constant speed; switching: the speed changes on the circle."""
+    approach_s: float
+    """Duration of the approach in seconds: the straight path before the circle."""
+    duration_s: float
+    """Duration of the circle in seconds, after the approach."""
+    switch_speed_m_s: float
+    """Second speed of switching trials, in metres per second; the first is one of `speeds_m_s`."""
+    switch_every_s: float
+    """Seconds that each speed of a switching trial lasts."""
+    window: Literal["circle", "all"]
+    """Part of a trial that is measured. circle: the circle only; all: also the approach."""
+    coverage_least_s: float
+    """Seconds of data that a cell of speed and turn rate needs to count as covered."""
+    literal_formulas: bool
+    """Also compute the measures by the published formulas, taken literally."""
+    database: DatabaseOptions | DatabaseKeywords
+    """Options of the database that is built from the clips."""
+    controller: ControllerOptions | ControllerKeywords
+    """Options of the motion matching controller."""
+    limits: VerdictLimits | VerdictLimitsKeywords
+    """Limits within which a trial counts as followed."""
+    name: str
+    """Name of the result."""
+    loops: list[str] | tuple[str, ...]
+    """Clips that are loops, in addition to those tagged `loop`."""
+    trims: Mapping[str, tuple[int, int]]
+    """Half-open range of frames to use, by the id of the clip."""
+    baseline: bool
+    """For comparison, also measure a set of generated clips that covers every cell."""
+    report: bool
+    """Write the report and its figures."""
+    trial_figures: list[str] | tuple[str, ...]
+    """Names of trials that get figures of their own, such as `circle v=1.25 w=-50`."""
+
+
+class CompareKeywords(TypedDict, total=False):
+    """Fields of `CompareParams`."""
+
+    title: str
+    """Title of the report; default: the names of the two evaluations."""
+    report: bool
+    """Write the report, a self-contained HTML page."""
+
+
+class ObjectiveKeywords(TypedDict, total=False):
+    """Fields of `ObjectiveOptions`."""
+
+    offset: float
+    """Weight of the mean distance between the character and its reference."""
+    abs_se_v: float
+    """Metres that a speed error of 1 m/s adds to the objective."""
+    abs_se_omega_deg: float
+    """Metres that a turn rate error of 1 degree/s adds to the objective."""
+    pose_cost: float
+    """Metres that a pose cost of 1 m adds to the objective."""
+    seconds: float
+    """Metres that each second of data adds to the objective; a clip that lowers the other terms by less is removed."""
+
+
+class SuggestKeywords(TypedDict, total=False):
+    """Fields of `SuggestParams`."""
+
+    objective: ObjectiveOptions | ObjectiveKeywords
+    """Weights of the objective: the cost of a set of clips."""
+    removals: int
+    """Number of clips whose removal is planned, in addition to the unused clips; 0: none."""
+    consider: int | None
+    """Number of clips whose removal is tried, one at a time, beginning with the clips that the fewest trials use; null:
+    all."""
+    duplicate_cm: float
+    """Greatest distance per frame between near-duplicates, in centimetres."""
+    blendable_m: float | None
+    """Greatest distance between poses that can be blended, summed over joints, in metres; absent: the median over the
+    transitions of the trials."""
+    blendable_distance: float | None
+    """With a metric, instead of `blendable_m`: greatest perceptual distance between poses that can be blended; absent:
+    the median over the transitions of the trials."""
+    lost_pose: float
+    """With a metric: metres that each second of poses that look like no pose of the remaining clips adds to the harm of
+    a removal."""
+
+
+class OptimiseKeywords(TypedDict, total=False):
+    """Fields of `OptimiseParams`."""
+
+    objective: ObjectiveOptions | ObjectiveKeywords
+    """Weights of the objective: the cost of a set of clips."""
+    least_gain: float
+    """The optimisation ends when no step lowers the objective by at least this many metres."""
+    max_steps: int
+    """Greatest number of steps."""
+    max_evaluations: int | None
+    """Greatest number of sets of clips to try; null: no limit."""
+    max_data_s: float | None
+    """Greatest duration of the set in seconds; no clip is added that would exceed this duration; null: no limit."""
+    consider: int | None
+    """Number of removals and number of additions to try in each step; null: all."""
+
+
+class SweepKeywords(TypedDict, total=False):
+    """Fields of `SweepParams`."""
+
+    objective: ObjectiveOptions | ObjectiveKeywords
+    """Weights of the objective: the cost of a set of clips."""
+    factors: Sequence[float]
+    """Factors to try. Each setting multiplies the weight of one group of features by one factor and leaves all other
+    weights unchanged."""

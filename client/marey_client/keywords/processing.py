@@ -1,0 +1,239 @@
+"""Keyword arguments of methods of the SDK: parameters of jobs that make or measure clips and models.
+
+Written by `make docs` from the declarations of the options; change them there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal, TypedDict
+
+from marey_schemas.queue.job_params import AlignParams, AnnotateParams, CutParams, ModelParams, TreeParams
+from marey_schemas.queue.jobs import ItemInput
+
+
+class AnnotateKeywords(TypedDict, total=False):
+    """Fields of `AnnotateParams`."""
+
+    tags: list[str] | tuple[str, ...]
+    """Tags that the results get."""
+    layer: str | None
+    """Name of the layer; default: the name of the method."""
+
+
+class CutKeywords(TypedDict, total=False):
+    """Fields of `CutParams`."""
+
+    tags: list[str] | tuple[str, ...]
+    """Tags that the results get."""
+    layer: str | None
+    """Layer of the annotations to use; absent: all layers."""
+    labels: list[str] | tuple[str, ...]
+    """Labels of the segments to cut out; empty: all labels."""
+    margin_before_s: float
+    """Seconds before each segment that are included, as far as the clip has them."""
+    margin_after_s: float
+    """Seconds after each segment that are included, as far as the clip has them."""
+    shortest_s: float
+    """Shortest segment to cut out, in seconds."""
+    longest_s: float | None
+    """Longest segment to cut out, in seconds."""
+    name: str
+    """Pattern of the pieces' names; {number:2} counts the segments of a label in a clip from 1, with two digits."""
+    by_label: bool
+    """Put the pieces of each label into a folder of their own."""
+
+
+class IndexKeywords(TypedDict, total=False):
+    """Fields of `IndexParams`."""
+
+    name: str
+    """Name of the index; an index with this name is replaced."""
+
+
+class AlignKeywords(TypedDict, total=False):
+    """Fields of `AlignParams`."""
+
+    tags: list[str] | tuple[str, ...]
+    """Tags that the results get."""
+    suffix: str
+    """Text that is appended to the names of the results."""
+    cost: Literal["turned", "plain"]
+    """Cost of a pair of poses. turned: the distance after the best rotation about the vertical and the best shift on
+    the ground; plain: the distance without rotation and shift."""
+    window: int
+    """Number of frames in the window around a pose, an odd number. Two poses are compared by all frames of their
+    windows; 1: by the poses alone."""
+    reference: str
+    """Clip whose time is the canonical time. medoid: the clip nearest to all others; nearest_mean_length: the clip
+    whose length is nearest to the mean; or the id of a clip."""
+    rate_hz: float | None
+    """Rate of the canonical frames, in hertz; absent: the frame rate of the reference if a clip is given as reference,
+    else the most common frame rate of the clips."""
+    slope_limit: int | None
+    """Greatest number of consecutive steps that advance only one of the clips; so one frame is matched with at most
+    this number of frames plus one. null: no limit."""
+    weights: Mapping[str, float]
+    """Weight of each joint in the cost, by its own or its standard name; default 1, and 0 for joints that move no part
+    of the body."""
+    keep_height: bool
+    """Keep the heights above the floor; false: the body begins at height 0 in every clip."""
+    layer: str | None
+    """Layer of the annotations to use; required if a clip has annotations of several layers."""
+    labels: list[str] | tuple[str, ...]
+    """Labels whose segments and keyframes cut the clips; empty: all labels."""
+    mirroring: Literal["none", "add"]
+    """add: use each clip and its mirrored copy."""
+
+
+class EditKeywords(TypedDict, total=False):
+    """Fields of `EditParams`."""
+
+    tags: list[str] | tuple[str, ...]
+    """Tags that the results get."""
+    suffix: str
+    """Text that is appended to the names of the results."""
+    in_place: bool
+    """Make each result a new revision of its clip; otherwise each result is a new clip."""
+
+
+class DistancesKeywords(TypedDict, total=False):
+    """Fields of `DistancesParams`."""
+
+    cycles: Literal["cut", "whole"]
+    """cut: cut a loop of one cycle out of each clip that is no loop, and compare the loops, as people saw them in the
+    published experiment; whole: compare the clips from their first to their last frames."""
+    loops: list[str] | tuple[str, ...]
+    """Clips that are loops, in addition to those tagged `loop`."""
+    title: str
+    """Title of the report; default: the names of the clips."""
+    report: bool
+    """Write the report, a self-contained HTML page, and its figures."""
+
+
+class QualityKeywords(TypedDict, total=False):
+    """Fields of `QualityParams`."""
+
+    rate_hz: float
+    """Frame rate in hertz at which clips are measured. Clips of a higher rate are resampled; clips of a lower rate are
+    refused."""
+    floor: Literal["planted", "zero"]
+    """Height from which the heights of feet are counted. planted: the height of the same joint while it stands on the
+    floor, which is the 5th percentile of its heights in the clip; zero: height 0, as published. Penetration is always
+    counted from height 0."""
+    weighted_height_m: float
+    """Height in metres at which the weight of the weighted foot skate has fallen to 0."""
+    near_height_m: float
+    """Height in metres below which a toe counts as near the floor, for foot skate by height."""
+    skate_speed_m_s: float
+    """Speed in metres per second above which a toe near the floor counts as skating, for the ratio."""
+    contact_height_m: float
+    """Height in metres below which a slow joint counts as touching the floor, for the consistency."""
+    contact_speed_m_s: float
+    """Speed in metres per second below which a low joint counts as touching the floor, for the consistency."""
+    knee_least_deg: float
+    """Least bend of a knee in degrees; negative: bent forwards."""
+    knee_most_deg: float
+    """Greatest bend of a knee in degrees."""
+    elbow_most_deg: float
+    """Greatest bend of an elbow in degrees."""
+    draws: int
+    """Number of times that takes are drawn with replacement, for intervals."""
+    title: str
+    """Title of the report; default: the number of clips."""
+    report: bool
+    """Write the report, a self-contained HTML page, and its figures."""
+
+
+class ModelKeywords(TypedDict, total=False):
+    """Fields of `ModelParams`."""
+
+    tags: list[str] | tuple[str, ...]
+    """Tags that the results get."""
+    criterion: Literal["bic", "aic"]
+    """Criterion that selects the number of mixture components."""
+    most_mixture_components: int
+    """Greatest number of mixture components to try; n examples in d dimensions allow at most n / 2d."""
+    mixture_components: int | None
+    """Exact number of mixture components; absent: the criterion selects it."""
+    regularisation: float
+    """Regularisation added to variances, as a share of the mean variance."""
+    starts: int
+    """Number of starts of expectation maximisation; the best result is used."""
+    folds: int
+    """Number of folds of the cross-validation of likelihoods; 0: no cross-validation."""
+    scaling: Literal["jacobian", "root_max", "sfpca", "none"]
+    """Weights of the channels. jacobian: by their effect on the body; sfpca: optimised for the positions of joints;
+    root_max: root axes scaled to a maximum of 1; none: equal weights."""
+    inner_product: Literal["coefficients", "l2"]
+    """Inner product of spatial functions. coefficients: of their spline coefficients; l2: of the functions themselves,
+    which does not depend on the knots."""
+    spatial_share: float
+    """Share of the variance that the spatial components explain."""
+    spatial_components: int | None
+    """Exact number of spatial components, instead of the share."""
+    spatial_coefficients: int | None
+    """Number of coefficients of each channel's spline; absent: a fifth of the frames, at least 7."""
+    temporal_share: float
+    """Share of the variance that the temporal components explain."""
+    most_temporal_components: int
+    """Greatest number of temporal components."""
+    temporal_coefficients: int
+    """Number of coefficients of the spline of the temporal function (the time warp)."""
+    temporal_weight: float | None
+    """Weight of temporal scores in latent vectors; absent: temporal and spatial scores get equal variance."""
+    leave_one_out: bool
+    """Measure how well a model of the other examples reconstructs each example."""
+    report_samples: int
+    """Number of samples drawn to measure foot sliding and durations."""
+    name: str
+    """Name of the model and of the action."""
+    report: bool
+    """Write the report and its figures."""
+    search_check: bool
+    """For the report, test searches: leave out every fifth example, train a model on the others, and search for
+    positions that the hands and feet of the left-out examples reached."""
+
+
+class TreeKeywords(TypedDict, total=False):
+    """Fields of `TreeParams`."""
+
+    samples: int
+    """Number of samples drawn from the model."""
+    branching: int
+    """Greatest number of children of a node."""
+    leaf_size: int
+    """Greatest number of samples in a node that is not split."""
+    depth: int
+    """Greatest number of levels below the root."""
+    features: Literal["end_effectors", "latent"]
+    """Values by which samples are grouped. end_effectors: positions of hands, feet and head at the keyframes, the
+    middle and the end; latent: the spatial scores."""
+
+
+class AnalyseStudyKeywords(TypedDict, total=False):
+    """Fields of `AnalyseStudyParams`."""
+
+    title: str
+    """Title of the report; default: the title of the study."""
+    report: bool
+    """Write the report, a self-contained HTML page."""
+    draws: int
+    """Number of times that participants are drawn with replacement, for intervals of the weights."""
+
+
+class ModelPlanKeywords(TypedDict, total=False):
+    """Fields of `ModelPlan`."""
+
+    into: str
+    """The collection of the model; everything else is stored below it."""
+    skeleton: ItemInput | Mapping[str, Any] | None
+    """The skeleton that the takes are retargeted to; absent: no retargeting."""
+    annotate: AnnotateParams | Mapping[str, Any] | None
+    """Parameters of the job that proposes annotations, if none are given."""
+    cut: CutParams | Mapping[str, Any] | None
+    """Parameters of the job that cuts out examples; absent: every take is an example."""
+    align: AlignParams | AlignKeywords
+    model: ModelParams | ModelKeywords
+    tree: TreeParams | TreeKeywords | None
+    """Parameters of the job that makes the tree; null: no tree."""

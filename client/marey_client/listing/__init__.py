@@ -1,0 +1,1 @@
+"""Lists of items: tables of what they contain, and messages about paths that do not exist."""

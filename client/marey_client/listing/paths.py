@@ -1,0 +1,54 @@
+"""Paths that do not exist: errors that name the nearest folder or item."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+from marey_client.errors import NoSuchPath
+from marey_client.paging import pages
+from marey_client.transport import Transport
+from marey_schemas.items import Collection, Item
+from marey_schemas.kinds import Kind
+from marey_schemas.wording import nearest
+
+MOST_COMPARED = 10_000
+"""Greatest number of names in a folder with which a misspelt name is compared."""
+
+
+def require_folder(transport: Transport, project: str, folder: str) -> None:
+    """Raise `NoSuchPath`, which names the nearest folder, if a project has no folder with this path."""
+    if not is_folder(transport, project, folder):
+        raise NoSuchPath(_missing_folder(transport, project, folder))
+
+
+def is_folder(transport: Transport, project: str, folder: str) -> bool:
+    """Return whether a project has a folder with this path."""
+    found = pages(transport, Collection, f"/projects/{project}/collections", {"path": folder, "limit": 1})
+    return any(one.path == folder for one in found)
+
+
+def missing_path(transport: Transport, project: str, kind: Kind, path: str) -> str:
+    """Return a message about a path at which a project has no item of a kind, with the nearest path that it has."""
+    path = path.strip("/")
+    folder, _, name = path.rpartition("/")
+    if is_folder(transport, project, path):
+        return f"{path!r} is a folder of {project}; {kind.plural}.where({path!r}) selects the {kind.plural} in it"
+    if folder and not is_folder(transport, project, folder):
+        return _missing_folder(transport, project, folder)
+    listed = pages(transport, Item, f"/projects/{project}/{kind.plural}", {"directly_in": folder, "limit": 500})
+    known = [one.name for one in islice(listed, MOST_COMPARED)]
+    near = nearest(name, known if folder else [*known, *_folders(transport, project)])
+    place = folder or project
+    hint = f"; did you mean {f'{folder}/{near}'.lstrip('/')!r}?" if near else ""
+    return f"there is no {kind} {name!r} in {place}{hint}"
+
+
+def _missing_folder(transport: Transport, project: str, folder: str) -> str:
+    known = _folders(transport, project)
+    near = nearest(folder, known)
+    hint = f"did you mean {near!r}?" if near else f"the folders are {', '.join(known[:5]) or 'none yet'}"
+    return f"there is no folder {folder!r} in {project}; {hint}"
+
+
+def _folders(transport: Transport, project: str) -> list[str]:
+    return [one.path for one in pages(transport, Collection, f"/projects/{project}/collections")]

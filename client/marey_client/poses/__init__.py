@@ -1,0 +1,1 @@
+"""Poses of stored motions: arrays, tables, pictures, and windows for training."""

@@ -1,0 +1,155 @@
+"""Positions, velocities and contacts of the joints of stored motions; computed by `marey_motion` from local rotations.
+
+For the frames and joints that are asked for, only those frames and the joints up to the root are read. Skeletons are
+read once per connection.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_client.errors import NoSuchJoint
+from marey_client.extras import room
+from marey_client.handles.skeletons import SkeletonHandle
+from marey_client.one_or_several import several
+from marey_client.poses.arrays import Joints, PosedItem, frames_text
+from marey_client.transport import Transport
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.documents.skeletons import Joint, SkeletonHierarchy
+from marey_schemas.items import Item
+from marey_schemas.kinds import Kind
+from marey_schemas.wording import nearest
+
+MOTION_EXTRA = "motion"
+DIFFERENCE_FRAMES = 2
+"""Frames before and after a range that its velocities depend on; at the ends of a motion, they are extrapolated."""
+FEET = tuple((f"{side}_toe", f"{side}_ankle") for side in ("left", "right"))
+"""Standard joints of both feet; the second one is used if the first is not mapped."""
+
+
+@dataclass(frozen=True)
+class PosedSkeleton:
+    """Skeleton of one revision, as far as positions need it."""
+
+    handle: SkeletonHandle
+    hierarchy: SkeletonHierarchy
+
+    @cached_property
+    def index(self) -> dict[str, int]:
+        """Index of each joint by its name."""
+        return {joint.name: place for place, joint in enumerate(self.hierarchy.joints)}
+
+    def chains(self, names: tuple[str, ...]) -> list[int]:
+        """Return the indices of joints and of all joints between them and the root, in the order of the skeleton."""
+        needed = {0}
+        for name in names:
+            if name not in self.index:
+                near = nearest(name, self.index)
+                hint = f"did you mean {near!r}?" if near else "`joints()` returns the names of all joints"
+                raise NoSuchJoint(f"the skeleton {self.handle.path!r} has no joint {name!r}; {hint}")
+            place = self.index[name]
+            while place not in needed:
+                needed.add(place)
+                place = self.hierarchy.joints[place].parent
+        return sorted(needed)
+
+    def part_with(self, places: list[int]) -> SkeletonHierarchy:
+        """Return the hierarchy of some joints, which include the parents of each."""
+        new = {old: place for place, old in enumerate(places)} | {-1: -1}
+        kept = [self.hierarchy.joints[place] for place in places]
+        return SkeletonHierarchy(joints=tuple(Joint(**{**dict(joint), "parent": new[joint.parent]}) for joint in kept))
+
+
+_RIGS: WeakKeyDictionary[Transport, dict[tuple[str, str, int], PosedSkeleton]] = WeakKeyDictionary()
+"""Skeletons that were read over each connection, by project, and id and revision of the skeleton or of its clip."""
+
+
+def rig_of(clip: PosedItem) -> PosedSkeleton:
+    """Return the skeleton that the handle's revision of a motion refers to."""
+    known = _RIGS.setdefault(clip.transport, {})
+    by_clip = (clip.project, clip.id, clip.item.revision)
+    if by_clip not in known:
+        reference = clip.motion(frames=slice(0, 1), revision=clip.item.revision).skeleton
+        assert isinstance(reference, RevisionRef)
+        by_skeleton = (clip.project, reference.item, reference.revision)
+        if by_skeleton not in known:
+            known[by_skeleton] = _read_rig(clip, reference)
+        known[by_clip] = known[by_skeleton]
+    return known[by_clip]
+
+
+def _read_rig(clip: PosedItem, reference: RevisionRef) -> PosedSkeleton:
+    item = clip.transport.get(Item, f"/projects/{clip.project}/{Kind.SKELETON.plural}/{reference.item}")
+    handle = SkeletonHandle(clip.transport, clip.project, item)
+    return PosedSkeleton(
+        handle, SkeletonHierarchy.model_validate(handle.part("hierarchy", revision=reference.revision))
+    )
+
+
+def read_positions(clip: PosedItem, joints: Joints, frames: slice | None) -> NDArray[np.float32]:
+    """Return the positions of joints in the world, (frames, joints, 3) in metres."""
+    motion = room("marey_motion", MOTION_EXTRA)
+    rig = rig_of(clip)
+    names = tuple(joint.name for joint in rig.hierarchy.joints) if joints is None else several(joints)
+    places = rig.chains(names)
+    chain = [rig.hierarchy.joints[place].name for place in places]
+    whole = len(chain) == len(rig.hierarchy.joints)
+    poses = clip.motion(frames=frames, joints=None if whole else chain, revision=clip.item.revision)
+    skeleton = room("marey_motion.documents", MOTION_EXTRA).skeleton_from_document(rig.part_with(places))
+    ordered = _in_order(poses.poses, poses.joints, chain)
+    found: NDArray[np.float32] = motion.forward_kinematics(
+        skeleton,
+        ordered,
+        translations=poses.translations,
+        translated_joints=[chain.index(name) for name in poses.translated_joints],
+    )
+    return found if list(names) == chain else found[:, [chain.index(name) for name in names]]
+
+
+def _in_order(poses: NDArray[np.float32], given: tuple[str, ...], wanted: list[str]) -> NDArray[np.float32]:
+    if list(given) == wanted:
+        return poses
+    turns = poses[:, 3:].reshape(len(poses), -1, 4)[:, [given.index(name) for name in wanted]]
+    return np.concatenate((poses[:, :3], turns.reshape(len(poses), -1)), axis=1)
+
+
+def read_velocities(clip: PosedItem, joints: Joints, frames: slice | None) -> NDArray[np.float32]:
+    """Return the velocities of joints in the world, (frames, joints, 3) in metres per second."""
+    wider, kept = _widened(clip, frames, DIFFERENCE_FRAMES)
+    found: NDArray[np.float32] = room("marey_motion", MOTION_EXTRA).velocities(
+        read_positions(clip, joints, wider), clip.frame_rate_hz
+    )
+    return found[kept]
+
+
+def read_contacts(clip: PosedItem, frames: slice | None) -> NDArray[np.bool_]:
+    """Return whether each foot touches the ground, (frames, 2)."""
+    motion: Any = room("marey_motion.kinematics", MOTION_EXTRA)
+    mapped = rig_of(clip).handle.mapping().joints
+    feet = [next((mapped[name] for name in names if name in mapped), None) for names in FEET]
+    if None in feet:
+        raise NoSuchJoint(
+            f"the mapping of the skeleton {rig_of(clip).handle.path!r} has no joints for both feet; add "
+            f"{FEET[0][0]} and {FEET[1][0]} to the mapping"
+        )
+    window = int(motion.CONTACT_WINDOW_S * clip.frame_rate_hz)
+    wider, kept = _widened(clip, frames, window + DIFFERENCE_FRAMES)
+    toes = read_positions(clip, [str(name) for name in feet], wider)
+    found: NDArray[np.bool_] = motion.foot_contacts(toes, clip.frame_rate_hz)
+    return found[kept]
+
+
+def _widened(clip: PosedItem, frames: slice | None, more: int) -> tuple[slice | None, slice]:
+    """Return a range with `more` frames on both sides, and the place of the range in it."""
+    frames_text(frames)  # refuses other steps and negative bounds
+    if frames is None:
+        return None, slice(None)
+    first, end = frames.start or 0, clip.frames if frames.stop is None else min(frames.stop, clip.frames)
+    start = max(0, first - more)
+    return slice(start, end + more), slice(first - start, end - start)

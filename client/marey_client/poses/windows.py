@@ -1,0 +1,122 @@
+"""Windows of stored motions for training: a dataset as the DataLoader of PyTorch takes it, without PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from marey_client.poses.arrays import Joints
+from marey_client.poses.handle import PosesHandle
+
+Content = Literal["poses", "rotations", "positions", "velocities"]
+SplitBy = Literal["subject", "take", "clip"]
+
+
+class MotionWindow(NamedTuple):
+    """Range of frames of a clip, from `first` on."""
+
+    clip: PosesHandle
+    first: int
+
+
+class MotionWindows:
+    """Windows of equal length in clips, each at the revision that was listed; a window is read when it is asked for.
+
+    Clips that are shorter than a window have none. The dataset can be sent to other processes, such as those of a
+    DataLoader: a forked process opens connections of its own, and a process that gets a pickled dataset finds the token
+    as the command line does, because tokens are not pickled.
+
+    Parameters
+    ----------
+    clips : handles of clips, such as `lab.clips` or `lab.clips.where("raw", query="subject = 02")`
+    frames : number of frames of a window
+    stride : number of frames between the beginnings of windows; default: `frames`, so that windows do not overlap
+    content : what a window contains. poses: root translation and local rotations, (frames, 3 + 4 * joints); rotations:
+        local rotations, (frames, joints, 4); positions and velocities: in the world, (frames, joints, 3)
+    joints : names of the joints, in their order; default: all joints of each clip
+    seed : seed of the order of the windows; default: in the order of the clips and of time
+    """
+
+    def __init__(
+        self,
+        clips: Iterable[PosesHandle],
+        *,
+        frames: int,
+        stride: int | None = None,
+        content: Content = "poses",
+        joints: Joints = None,
+        seed: int | None = None,
+    ) -> None:
+        stride = frames if stride is None else stride
+        if frames < 1 or stride < 1:
+            raise ValueError(f"frames and stride must be at least 1, not {frames} and {stride}")
+        if content not in Content.__args__:  # type: ignore[attr-defined]
+            raise ValueError(f"content: {content!r} is none of {', '.join(Content.__args__)}")  # type: ignore[attr-defined]
+        self.frames, self.content, self.joints, self.seed = frames, content, joints, seed
+        self.windows = [
+            MotionWindow(clip, first) for clip in clips for first in range(0, clip.frames - frames + 1, stride)
+        ]
+        if seed is not None:
+            order = np.random.default_rng(seed).permutation(len(self.windows))
+            self.windows = [self.windows[place] for place in order]
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} windows of {self.frames} frames, {self.content}>"
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+    def __getitem__(self, place: int) -> dict[str, Any]:
+        """Read one window: `motion` (an array as `content` says), the path `clip`, its `id`, and the `first` frame."""
+        clip, first = self.windows[place]
+        frames = slice(first, first + self.frames)
+        motion: Any
+        if self.content == "poses":
+            motion = clip.motion(frames=frames, joints=self.joints, revision=clip.item.revision).poses
+        else:
+            motion = getattr(clip, self.content)(frames=frames, joints=self.joints)
+        return {"motion": motion, "clip": clip.path, "id": clip.id, "first": first}
+
+    def split(self, shares: Mapping[str, float], *, by: SplitBy = "subject", seed: int = 0) -> dict[str, MotionWindows]:
+        """Divide the windows into parts, such as `{"train": 0.8, "test": 0.2}`, without a subject or take in two parts.
+
+        Groups go one after another, in an order drawn with `seed`, to the part that lacks most of its share of the
+        windows. `by="clip"` keeps only the windows of a clip together. Raises `ValueError` if a clip has no subject or
+        take, or if there are fewer groups than parts.
+        """
+        if not shares or min(shares.values()) <= 0:
+            raise ValueError(f"shares: every part needs a share above 0, not {dict(shares)}")
+        groups: dict[str, list[MotionWindow]] = {}
+        for window in self.windows:
+            groups.setdefault(_group_of(window.clip, by), []).append(window)
+        if len(groups) < len(shares):
+            raise ValueError(f"there are {len(groups)} groups by {by}, fewer than the {len(shares)} parts")
+        order = np.random.default_rng(seed).permutation(sorted(groups))
+        wanted = {name: share / sum(shares.values()) * len(self.windows) for name, share in shares.items()}
+        parts: dict[str, list[str]] = {name: [] for name in shares}
+        left = len(order)
+        for group in order:
+            empty = [name for name, members in parts.items() if not members]
+            neediest = max(empty if left <= len(empty) else parts, key=lambda name: wanted[name])
+            parts[neediest].append(str(group))
+            wanted[neediest] -= len(groups[str(group)])
+            left -= 1
+        return {
+            name: self._of({window for one in members for window in groups[one]}) for name, members in parts.items()
+        }
+
+    def _of(self, chosen: set[MotionWindow]) -> MotionWindows:
+        part = MotionWindows((), frames=self.frames, content=self.content, joints=self.joints, seed=self.seed)
+        part.windows = [window for window in self.windows if window in chosen]  # in the order of this dataset
+        return part
+
+
+def _group_of(clip: PosesHandle, by: SplitBy) -> str:
+    if by == "clip":
+        return clip.id
+    group = clip.item.summary.get(by)
+    if group is None:
+        raise ValueError(f"{clip.path!r} has no {by}; record it with `marey record`, or split by clip")
+    return str(group)

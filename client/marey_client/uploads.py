@@ -1,0 +1,85 @@
+"""Uploads of folders of motion files, with a report on each file."""
+
+from __future__ import annotations
+
+import html
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from marey_client.handles.clips import ClipHandle
+from marey_client.imports import FoundFiles, Notice, left_out_texts, refusal_text
+from marey_client.project_items import ProjectItems
+from marey_schemas.imports import ImportEntry
+from marey_schemas.options.imports import ImportOptions
+from marey_schemas.wording import counted
+
+NEW_REVISION = "new revision"
+OUTCOMES = ("created", NEW_REVISION, "unchanged", "companion", "failed")  # in the order of the summary
+
+
+@dataclass(frozen=True)
+class UploadReport:
+    """Results of an upload, one entry for each file, in order."""
+
+    project: ProjectItems = field(repr=False)
+    found: FoundFiles
+    entries: tuple[ImportEntry, ...]
+    restored: int = 0
+    """Number of clips that got the take record and the tags of an earlier export."""
+
+    @property
+    def failed(self) -> tuple[ImportEntry, ...]:
+        """Entries of the files that were refused; `error` gives the reason."""
+        return tuple(one for one in self.entries if one.status == "failed")
+
+    @property
+    def left_out(self) -> tuple[Path, ...]:
+        """Files in the folders that are not motion files."""
+        return self.found.left_out
+
+    def clips(self) -> Iterator[ClipHandle]:
+        """Yield handles of the clips that the files became, also of those that existed before."""
+        for entry in self.entries:
+            if entry.item is not None and entry.frames is not None:
+                yield self.project.clips.get(entry.item)
+
+    @property
+    def summary(self) -> str:
+        """The numbers of files by their outcomes, and the number of frames."""
+        return outcomes_text(self.entries)
+
+    def __str__(self) -> str:
+        """Return the summary, the reason for each refused file, and the files that were left out."""
+        return "\n".join([self.summary, *map(refusal_text, self.failed), *left_out_texts(self.left_out)])
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return "".join(f"<p>{html.escape(line)}</p>" for line in str(self).splitlines())
+
+
+def upload(project: ProjectItems, found: FoundFiles, options: ImportOptions, notice: Notice) -> UploadReport:
+    """Import files that were found, and restore the take records of clips that an export wrote.
+
+    `options` without a unit get the unit of the export from which all files come, if there is one.
+    """
+    if found.unit is not None and not options.model_fields_set & {"unit", "unit_scale_m"}:
+        options = ImportOptions.model_validate({**options.model_dump(exclude_unset=True), "unit": found.unit})
+    entries = project.imports.upload(found.files, options, notice=notice)
+    restored = project.imports.restore(found, entries, notice=notice)
+    return UploadReport(project, found, tuple(entries), restored)
+
+
+def outcomes_text(entries: Sequence[ImportEntry]) -> str:
+    """Return the numbers of files by their outcomes, and the number of frames, as text."""
+    counts = Counter(map(_outcome, entries))
+    outcomes = ", ".join(f"{counts[outcome]} {outcome}" for outcome in OUTCOMES if counts[outcome])
+    frames = sum(entry.frames or 0 for entry in entries)
+    return f"{counted(len(entries), 'file')}: {outcomes}; {counted(frames, 'frame')}"
+
+
+def _outcome(entry: ImportEntry) -> str:
+    """Return the word for the result of an import: `new revision` if an item of this name existed before."""
+    return NEW_REVISION if entry.status == "created" and (entry.revision or 1) > 1 else entry.status
