@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from tests.support.project_in_memory import ProjectInMemory, add_clip
 
-from marey_motion import retargeting
 from marey_motion.clip import Clip
 from marey_motion.documents import skeleton_to_document
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_motion.moved_bones import FollowedBones, follow_moved_bones
+from marey_motion.retargeting import clips
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
 from marey_schemas.queue.job_params import RetargetParams
@@ -29,7 +29,7 @@ def counted_follows(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         calls.append(clip)
         return follow_moved_bones(clip, joints)
 
-    monkeypatch.setattr(retargeting, "follow_moved_bones", follow)
+    monkeypatch.setattr(clips, "follow_moved_bones", follow)
     return calls
 
 
