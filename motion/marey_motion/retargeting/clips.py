@@ -11,6 +11,7 @@ from marey_motion.moved_bones import FollowedBones, follow_moved_bones
 from marey_motion.retargeting.planning import RetargetPlan
 from marey_motion.retargeting.soles import level_soles
 from marey_motion.retargeting.transferring import transfer
+from marey_motion.retargeting.trunk import follow_trunk
 from marey_motion.skeleton import SAME_SKELETON_M, same_hierarchy
 
 
@@ -86,7 +87,7 @@ def retarget_with_checks(clip: Clip, plan: RetargetPlan) -> RetargetedClip:
     bones = (
         FollowedBones(clip.poses[:, 3:], {}) if plan.changes_no_pose else follow_moved_bones(clip, plan.source_joints)
     )
-    made = transfer(clip, plan, bones.rotations)
-    levelled = level_soles(clip, made, plan)
-    checks = (bones.warning, levelled.warning)
+    trunk = follow_trunk(clip, plan, bones.rotations)
+    levelled = level_soles(clip, transfer(clip, plan, trunk.rotations), plan)
+    checks = (bones.warning, *trunk.checks, levelled.warning)
     return RetargetedClip(levelled.clip, tuple(check for check in checks if check is not None))

@@ -25,3 +25,12 @@ def test_the_soles_stand_on_the_floor_of_the_source(rigs: dict[str, Actor], sour
     judged = JudgedRetargeting(rigs[source], rigs[target], retarget(rigs[source].clip, plan), plan.scale)
 
     assert abs(judged.soles_off_m) < 0.015
+
+
+@pytest.mark.parametrize(("source", "target"), JUDGED)
+def test_neck_and_hip_line_point_as_in_the_source(rigs: dict[str, Actor], source: str, target: str) -> None:
+    plan = plan_between(rigs[source], rigs[target])
+    judged = JudgedRetargeting(rigs[source], rigs[target], retarget(rigs[source].clip, plan), plan.scale)
+
+    assert judged.off_deg("neck", "head") < 1.0
+    assert judged.off_deg("right_hip", "left_hip") < 2.0
