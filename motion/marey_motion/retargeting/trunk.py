@@ -44,7 +44,7 @@ class TrunkTurns:
 
 
 @dataclass(frozen=True, eq=False)
-class _Line:
+class _TrunkLine:
     """A line between two standard joints, whose direction in the target one joint determines.
 
     `direction` (3,) is the line's direction in the target, in the frame of the source's joint `turned`.
@@ -101,7 +101,7 @@ def follow_trunk(clip: Clip, plan: RetargetPlan, rotations: NDArray[np.float32])
     return TrunkTurns(local, _checks([(lines[number], largest[number]) for number in chosen], plan))
 
 
-def _lines(plan: RetargetPlan) -> list[_Line]:
+def _lines(plan: RetargetPlan) -> list[_TrunkLine]:
     """List the hip line, and the bones of spine and neck that have joints between their ends in one of the skeletons.
 
     Joints between the ends of a line are at rest in the target. If they copy rotations, there is nothing to correct.
@@ -118,7 +118,9 @@ def _lines(plan: RetargetPlan) -> list[_Line]:
         places = plan.target.rest_global_positions
         way = places[plan.target_joints[end]] - places[plan.target_joints[start]]
         own = quaternions.rotate_vectors(quaternions.conjugate(plan.target.rest_global_rotations[joint]), way)
-        lines.append(_Line(turned, start, end, np.asarray(quaternions.rotate_vectors(plan.corrections[joint], own))))
+        lines.append(
+            _TrunkLine(turned, start, end, np.asarray(quaternions.rotate_vectors(plan.corrections[joint], own)))
+        )
     return lines
 
 
@@ -128,7 +130,7 @@ def _drops(plan: RetargetPlan, start: str, end: str) -> bool:
     return any(skeleton.parents[joints[end]] != joints[start] for skeleton, joints in both)
 
 
-def _checks(turned: list[tuple[_Line, float]], plan: RetargetPlan) -> tuple[CheckWarning, ...]:
+def _checks(turned: list[tuple[_TrunkLine, float]], plan: RetargetPlan) -> tuple[CheckWarning, ...]:
     """Make the checks from the lines that were followed, with the largest angle of each in degrees."""
     pelvis = {_source_name(plan, line): most for line, most in turned if line.turned == _PELVIS}
     spine = {_source_name(plan, line): most for line, most in turned if line.turned != _PELVIS}
@@ -153,5 +155,5 @@ def _checks(turned: list[tuple[_Line, float]], plan: RetargetPlan) -> tuple[Chec
     )
 
 
-def _source_name(plan: RetargetPlan, line: _Line) -> str:
+def _source_name(plan: RetargetPlan, line: _TrunkLine) -> str:
     return plan.source.joint_names[plan.source_joints[line.turned]]
