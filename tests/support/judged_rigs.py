@@ -147,6 +147,26 @@ class JudgedRetargeting:
         return float(fastest[0]), float(fastest[1])
 
     @property
+    def upper_arm_speeds_deg_s(self) -> tuple[float, float]:
+        """Greatest speeds at which upper arms turn, in source and result."""
+        fastest = np.zeros(2)
+        for side in SIDES:
+            arms = self.way(f"{side}_shoulder", f"{side}_elbow")
+            speeds = [degrees_between(arm[1:], arm[:-1]).max() * self.source.clip.frame_rate_hz for arm in arms]
+            fastest = np.maximum(fastest, speeds)
+        return float(fastest[0]), float(fastest[1])
+
+    def hands_off_m(self, scale: float) -> float:
+        """Compute how far hands are at most from those of the source, scaled about the middle of the shoulders."""
+        (left, left_after), (right, right_after) = (self.places(f"{side}_shoulder") for side in SIDES)
+        off = []
+        for side in SIDES:
+            hand, after = self.places(f"{side}_wrist")
+            target = 0.5 * (left_after + right_after) + scale * (hand - 0.5 * (left + right))
+            off.append(np.linalg.norm(after - target, axis=1).max())
+        return float(max(off))
+
+    @property
     def _both(self) -> tuple[tuple[Actor, Clip], tuple[Actor, Clip]]:
         return (self.source, self.source.clip), (self.target, self.result)
 

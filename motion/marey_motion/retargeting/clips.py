@@ -8,11 +8,14 @@ from marey_motion.clip import Clip
 from marey_motion.errors import ClipError
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.moved_bones import FollowedBones, follow_moved_bones
+from marey_motion.retargeting.feet import keep_feet
+from marey_motion.retargeting.hands import keep_hands
 from marey_motion.retargeting.planning import RetargetPlan
 from marey_motion.retargeting.soles import level_soles
 from marey_motion.retargeting.transferring import transfer
 from marey_motion.retargeting.trunk import follow_trunk
 from marey_motion.skeleton import SAME_SKELETON_M, same_hierarchy
+from marey_schemas.options.retargeting import RetargetOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +67,14 @@ def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
     return retarget_with_checks(clip, plan).clip
 
 
-def retarget_with_checks(clip: Clip, plan: RetargetPlan) -> RetargetedClip:
+def retarget_with_checks(clip: Clip, plan: RetargetPlan, options: RetargetOptions | None = None) -> RetargetedClip:
     """Retarget a clip as `retarget` does, and report what was changed.
 
     Parameters
     ----------
     clip : Clip    motion of the plan's source skeleton
     plan : RetargetPlan    result of `plan_retarget`
+    options : RetargetOptions, optional    what is kept beside the poses: feet, hands
 
     Returns
     -------
@@ -88,6 +92,13 @@ def retarget_with_checks(clip: Clip, plan: RetargetPlan) -> RetargetedClip:
         FollowedBones(clip.poses[:, 3:], {}) if plan.changes_no_pose else follow_moved_bones(clip, plan.source_joints)
     )
     trunk = follow_trunk(clip, plan, bones.rotations)
-    levelled = level_soles(clip, transfer(clip, plan, trunk.rotations), plan)
-    checks = (bones.warning, *trunk.checks, levelled.warning)
-    return RetargetedClip(levelled.clip, tuple(check for check in checks if check is not None))
+    made = level_soles(clip, transfer(clip, plan, trunk.rotations), plan)
+    result, checks = made.clip, [bones.warning, *trunk.checks, made.warning]
+    options = options or RetargetOptions()
+    if options.keep_feet and (feet := keep_feet(clip, result, plan)) is not None:
+        result = feet.clip
+        checks.append(feet.check)
+    if options.keep_hands and (hands := keep_hands(clip, result, plan, options.hands_from)) is not None:
+        result = hands.clip
+        checks.append(hands.check)
+    return RetargetedClip(result, tuple(check for check in checks if check is not None))

@@ -60,3 +60,11 @@ def test_the_checks_of_a_result_name_the_bones_that_translations_moved(
     assert check["joints"] == ["LeftUpLeg"]
     assert len(follows) == 2, "the bones of a clip are followed once, for its check and its poses"
     assert 10.0 < check["values"]["largest_turn_deg"] < 20.0
+
+    project.staged.clear()
+    kept = retarget.run(project, RetargetParams(keep_feet=True, keep_hands=True, suffix="-kept"))
+    assert kept["warnings"] == {"bones-moved-by-translations": 1, "feet-kept": 2, "hands-kept": 2}
+    for output in project.staged:
+        checks = {check["code"]: check["values"] for check in output.parts["info"]["checks"]}
+        assert checks["feet-kept"]["slide_after_m"] < checks["feet-kept"]["slide_before_m"]
+        assert checks["hands-kept"]["missed_m"] < 0.02 < checks["hands-kept"]["moved_m"]

@@ -78,7 +78,7 @@ class _Retargeting:
         edited = self._rigs.get(used.item)
         source = Rig(used, edited.ref if edited else used)
         plan = plan_between(self._context, source, self._target, self._params.scale)
-        made = retarget_with_checks(documents.clip_from_document(motion, plan.source), plan)
+        made = retarget_with_checks(documents.clip_from_document(motion, plan.source), plan, self._params)
         checks = tuple(Check.model_validate(check.as_dict()) for check in made.checks)
         clip = made.clip
         self._warnings.update(check.code for check in checks)
