@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from marey_motion import kinematics
-from marey_motion.arrays import Floats
+from marey_motion.arrays import AnyFloats, Floats
 from marey_motion.clip import Clip
 from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb
 from marey_motion.editing.inverse_kinematics.solving import solve_two_bone
@@ -40,7 +40,7 @@ class _Arms(NamedTuple):
     wrists: Floats
 
     @classmethod
-    def of(cls, points: Floats, joints: dict[str, int]) -> _Arms:
+    def of(cls, points: AnyFloats, joints: dict[str, int]) -> _Arms:
         """Select the joints by their standard names from positions (F, J, 3)."""
         return cls(
             *(
@@ -52,7 +52,7 @@ class _Arms(NamedTuple):
     @property
     def middle(self) -> Floats:
         """Middle (F, 3) of the shoulders."""
-        return self.shoulders.mean(axis=1)
+        return np.asarray(self.shoulders.mean(axis=1))
 
     @property
     def arm_m(self) -> float:
