@@ -83,6 +83,7 @@ def retarget_with_checks(clip: Clip, plan: RetargetPlan, options: RetargetOption
     Raises
     ------
     ClipError    if the clip's skeleton differs from the plan's source skeleton
+    MappingError    if feet or hands are to be kept, but not all joints of both limbs are mapped in both skeletons
     """
     if not same_hierarchy(clip.skeleton, plan.source, tolerance_m=SAME_SKELETON_M):
         raise ClipError(
@@ -95,10 +96,10 @@ def retarget_with_checks(clip: Clip, plan: RetargetPlan, options: RetargetOption
     made = level_soles(clip, transfer(clip, plan, trunk.rotations), plan)
     result, checks = made.clip, [bones.warning, *trunk.checks, made.warning]
     options = options or RetargetOptions()
-    if options.keep_feet and (feet := keep_feet(clip, result, plan)) is not None:
-        result = feet.clip
-        checks.append(feet.check)
-    if options.keep_hands and (hands := keep_hands(clip, result, plan, options.hands_from)) is not None:
-        result = hands.clip
-        checks.append(hands.check)
+    if options.keep_feet:
+        result, check = keep_feet(clip, result, plan)
+        checks.append(check)
+    if options.keep_hands:
+        result, check = keep_hands(clip, result, plan, options.hands_from)
+        checks.append(check)
     return RetargetedClip(result, tuple(check for check in checks if check is not None))

@@ -32,7 +32,7 @@ class KeptFeet(NamedTuple):
     check: CheckWarning
 
 
-def keep_feet(source: Clip, result: Clip, plan: RetargetPlan) -> KeptFeet | None:
+def keep_feet(source: Clip, result: Clip, plan: RetargetPlan) -> KeptFeet:
     """Keep the feet of a retargeted clip in place while those of the source touch the floor.
 
     Touching soles get the height over the floor that they have in the source, times the scale. The feet are planted
@@ -46,12 +46,14 @@ def keep_feet(source: Clip, result: Clip, plan: RetargetPlan) -> KeptFeet | None
 
     Returns
     -------
-    KeptFeet or None    None if not both legs are paired
+    KeptFeet    F frames, with the feet moved
+
+    Raises
+    ------
+    MappingError    if not both legs are mapped in both skeletons
     """
-    legs = [plan.limbs.get(f"{side}_ankle") for side in SIDES]
-    if any(leg is None for leg in legs):
-        return None
-    feet = [Foot(leg, _toe(plan.target_joints, side)) for side, leg in zip(SIDES, legs, strict=True) if leg is not None]
+    legs = zip(SIDES, plan.both_limbs("ankle"), strict=True)
+    feet = [Foot(leg, _toe(plan.target_joints, side)) for side, leg in legs]
     rate = source.frame_rate_hz
     points = kinematics.global_positions(source, end_sites=True).astype(np.float64)
     contacts = [_contacts(points, plan, side, rate) for side in SIDES]

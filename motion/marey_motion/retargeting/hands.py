@@ -66,7 +66,7 @@ class _Arms(NamedTuple):
         return self.arm_m + 0.5 * float(np.linalg.norm(self.shoulders[:, 0] - self.shoulders[:, 1], axis=-1).mean())
 
 
-def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom) -> KeptHands | None:
+def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom) -> KeptHands:
     """Move the hands of a retargeted clip to the positions of the source's hands, in proportion.
 
     About the shoulders, a hand gets the vector that it has in the source from the middle of the shoulders, times a
@@ -84,11 +84,13 @@ def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom)
 
     Returns
     -------
-    KeptHands or None    None if not both arms are paired
+    KeptHands    F frames, with the hands moved
+
+    Raises
+    ------
+    MappingError    if not both arms are mapped in both skeletons
     """
-    limbs = [plan.limbs[name] for name in (f"{side}_wrist" for side in SIDES) if name in plan.limbs]
-    if len(limbs) < len(SIDES):
-        return None
+    limbs = plan.both_limbs("wrist")
     motion = Motion.of(result)
     before = _Arms.of(kinematics.global_positions(source), plan.source_joints)
     after = _Arms.of(motion.positions(plan.target), plan.target_joints)
@@ -112,7 +114,9 @@ def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom)
     return KeptHands(kept.as_clip(plan.target, source.frame_rate_hz), _check(moved, missed, scale, plan, limbs))
 
 
-def _check(moved: float, missed: float, scale: float, plan: RetargetPlan, limbs: list[TwoBoneLimb]) -> CheckWarning:
+def _check(
+    moved: float, missed: float, scale: float, plan: RetargetPlan, limbs: tuple[TwoBoneLimb, ...]
+) -> CheckWarning:
     return CheckWarning(
         "hands-kept",
         f"hands were moved by up to {100.0 * moved:.1f} cm to the positions of the source's hands, scaled by "

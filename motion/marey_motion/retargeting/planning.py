@@ -91,6 +91,33 @@ class RetargetPlan:
         turned = quaternions.angle_between(self.corrections, quaternions.identity(len(self.corrections)))
         return same_hierarchy(self.source, self.target, tolerance_m=SAME_SKELETON_M) and bool(np.all(turned < SAME_RAD))
 
+    def both_limbs(self, end: str) -> tuple[TwoBoneLimb, ...]:
+        """Find both arms or both legs of the target by their ends.
+
+        Parameters
+        ----------
+        end : str    "wrist" or "ankle"
+
+        Returns
+        -------
+        tuple of TwoBoneLimb    left and right
+
+        Raises
+        ------
+        MappingError    if not all three joints of both limbs are mapped in both skeletons
+        """
+        missing = [f"{side}_{end}" for side in SIDES if f"{side}_{end}" not in self.limbs]
+        if missing:
+            start, middle = ("hip", "knee") if end == "ankle" else ("shoulder", "elbow")
+            raise MappingError(
+                f"to keep {'feet' if end == 'ankle' else 'hands'}, {start}, {middle} and {end} of both sides must be "
+                f"mapped in both skeletons; this is not so for {' and '.join(missing)}; map these joints, or leave the "
+                "option out",
+                code="limbs-not-mapped",
+                where=missing[0],
+            )
+        return tuple(self.limbs[f"{side}_{end}"] for side in SIDES)
+
     @cached_property
     def source_joints(self) -> dict[str, int]:
         """Indices of the paired joints of the source, by standard name."""

@@ -25,6 +25,7 @@ from marey_motion.retargeting.trunk import HIP_LINE_DEG
 from marey_motion.rigs import JointAxes, map_joints
 from marey_motion.rigs.axes import bone_end
 from marey_motion.skeleton import Skeleton
+from marey_schemas.options.retargeting import RetargetOptions
 
 SIDES = ("left", "right")
 # Bones that every rig has without joints between, so that joint and child show the twist axis to the eye.
@@ -517,6 +518,31 @@ def test_too_small_a_mapping_is_refused_with_what_is_missing(studio: Actor, game
     assert "target skeleton's mapping has no left_knee" in str(error.value)
     assert "source" not in str(error.value)
     assert "Add them to the joint mappings" in str(error.value)
+
+
+@pytest.mark.parametrize(("kept", "without"), [("keep_feet", "left_knee"), ("keep_hands", "right_elbow")])
+def test_feet_or_hands_of_limbs_that_are_not_mapped_cannot_be_kept(
+    studio: Actor, game: Actor, kept: str, without: str
+) -> None:
+    joints = {standard: name for standard, name in studio.mapping.joints.items() if standard != without}
+    lacking = SimpleNamespace(
+        skeleton=studio.skeleton, mapping=replace(studio.mapping, joints=joints), axes=studio.axes
+    )
+    plan = plan_between(lacking, game, scale=1.0)
+
+    retarget(studio.clip, plan)
+    with pytest.raises(MappingError, match="map these joints, or leave the option out"):
+        retarget_with_checks(studio.clip, plan, RetargetOptions.model_validate({kept: True}))
+
+
+def test_feet_and_hands_of_a_single_frame_are_kept(mocap: Path, game: Actor) -> None:
+    dancer = Actor.of(mocap, "rigs/makehuman/dance1.bvh")
+    made = retarget_with_checks(
+        dancer.clip, plan_between(dancer, game), RetargetOptions(keep_feet=True, keep_hands=True)
+    )
+
+    assert made.clip.frame_count == 1
+    assert {"feet-kept", "hands-kept"} <= {check.code for check in made.checks}
 
 
 def test_a_mapping_without_a_pelvis_is_refused(studio: Actor, game: Actor) -> None:
