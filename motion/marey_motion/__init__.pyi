@@ -27,9 +27,11 @@ from .kinematics import global_rotations as global_rotations
 from .kinematics import headings as headings
 from .kinematics import turn_rates as turn_rates
 from .kinematics import velocities as velocities
+from .retargeting import RetargetedClip as RetargetedClip
 from .retargeting import RetargetPlan as RetargetPlan
 from .retargeting import plan_retarget as plan_retarget
 from .retargeting import retarget as retarget
+from .retargeting import retarget_with_checks as retarget_with_checks
 from .rigs import JointAxes as JointAxes
 from .rigs import JointMapping as JointMapping
 from .rigs import guess_axes as guess_axes

@@ -79,7 +79,7 @@ def follow_moved_bones(clip: Clip, joints: Mapping[str, int]) -> FollowedBones:
     still = replace(clip, translations=None, translated_joints=())
     rigid, moved = (kinematics.global_positions(one) for one in (still, clip))
     bones = [(joint, joints[end]) for name, joint in joints.items() if (end := bone_end(name, joints)) is not None]
-    turns, angles = _turns(rigid, moved, np.array(bones, np.int64).reshape(-1, 2))
+    turns, angles = turns_between(rigid, moved, np.array(bones, np.int64).reshape(-1, 2))
     largest: dict[str, float] = {}
     chosen: list[int] = []
     for bone, most in enumerate(np.degrees(angles.max(axis=1)).tolist()):
@@ -95,11 +95,18 @@ def follow_moved_bones(clip: Clip, joints: Mapping[str, int]) -> FollowedBones:
     return FollowedBones(local, largest)
 
 
-def _turns(rigid: AnyFloats, moved: AnyFloats, bones: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Compute the shortest rotations (B, F, 4) of bones from `rigid` to `moved`, and their angles (B, F) in radians.
+def turns_between(rigid: AnyFloats, moved: AnyFloats, bones: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Compute the shortest rotations of bones between two motions.
 
-    `rigid` and `moved` (F, J, 3) are positions of the joints; `bones` (B, 2) are the first and last joint of each bone.
-    A bone that has no length in `rigid` or in `moved` does not turn.
+    Parameters
+    ----------
+    rigid, moved : (F, J, 3)    positions of J points in both motions, metres
+    bones : (B, 2) int64    first and last point of each bone; a bone that has no length in `rigid` or in `moved` does
+        not turn
+
+    Returns
+    -------
+    (B, F, 4) float64, (B, F) float64    rotations from `rigid` to `moved`, and their angles in radians
     """
     from marey_motion import moved_bones_kernels as kernels
 

@@ -87,6 +87,7 @@ def plant_feet(
     feet: Sequence[Foot],
     *,
     contacts: Sequence[FootContacts] | None = None,
+    lifts: Sequence[Floats] | None = None,
     options: PlantOptions | None = None,
 ) -> PlantedMotion:
     """Fix planted feet to the ground.
@@ -98,6 +99,7 @@ def plant_feet(
     frame_rate_hz : float    frames per second
     feet : sequence of Foot    leg and toe of each foot
     contacts : sequence of FootContacts, optional    contacts of each foot; detected by speed if None
+    lifts : sequence of (F,) float64, optional    metres by which each foot is moved up before it is planted
     options : PlantOptions, optional    limits and transitions
 
     Returns
@@ -120,7 +122,11 @@ def plant_feet(
             )
     blend = max(1, round(options.blend_s * frame_rate_hz))
     spins = np.asarray(kinematics.as_global_rotations(skeleton, motion.rotations), dtype=np.float64)
-    plans = [_plan(positions, spins, foot, touching, blend) for foot, touching in zip(feet, contacts, strict=True)]
+    lifts = lifts or [np.zeros(motion.frame_count)] * len(feet)
+    plans = [
+        _plan(positions + lift[:, None, None] * (0.0, 1.0, 0.0), spins, foot, touching, blend)
+        for foot, touching, lift in zip(feet, contacts, lifts, strict=True)
+    ]
     zone = math.radians(options.knee_damping_deg)
     lowering = _lowering(positions, feet, plans, zone, blend)
     planted = motion._replace(root_translations=motion.root_translations - lowering[:, None] * (0.0, 1.0, 0.0))
@@ -189,11 +195,9 @@ def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, 
     places = toe.copy()
     for start, stop in runs(contacts.toe):
         places[start:stop] = np.median(toe[start:stop], axis=0)
-    shift = _blended(contacts.toe, places - toe, blend)
+    shift = faded(contacts.toe, places - toe, blend)
     heel = _standing_heels(contacts, blend)
-    firm_toe, firm_heel = (
-        np.clip(_blended(one, np.ones((len(toe), 1)), blend), 0.0, 1.0) for one in (contacts.toe, heel)
-    )
+    firm_toe, firm_heel = (np.clip(faded(one, np.ones((len(toe), 1)), blend), 0.0, 1.0) for one in (contacts.toe, heel))
     led, length = ankle + shift, np.linalg.norm(ankle - toe, axis=1, keepdims=True)
     own = led.copy()
     for start, stop in runs(heel):
@@ -202,7 +206,7 @@ def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, 
             touching = start + int(np.argmax(contacts.toe[start:stop]))
             place = _at_distance(place, places[touching], length[touching])
         own[start:stop] = place
-    target = led + _blended(heel, own - led, blend)
+    target = led + faded(heel, own - led, blend)
     target += firm_toe * (_at_distance(target, toe + shift, length) - target)
     turn = _turn_between(toe - ankle, toe + shift - target)
     rotation = quaternions.multiply(turn, spins[:, foot.leg.end])
@@ -222,10 +226,18 @@ def _standing_heels(contacts: FootContacts, blend: int) -> Flags:
     return heel
 
 
-def _blended(flags: Flags, values: Floats, blend: int) -> Floats:
-    """Return values (F, c) that are kept in frames with a flag, and fade to zero before and after these frames.
+def faded(flags: Flags, values: Floats, blend: int) -> Floats:
+    """Keep values in frames with a flag, and let them fade to zero before and after these frames.
 
-    `flags` (F,) mark the frames to keep. The values fade within `blend` frames; all other frames are zero.
+    Parameters
+    ----------
+    flags : (F,) bool    the frames to keep
+    values : (F, c) float64    values; only those of the frames to keep count
+    blend : int    number of frames within which the values fade; all other frames are zero
+
+    Returns
+    -------
+    (F, c) float64    the values over all frames
     """
     frames = np.flatnonzero(flags)
     blended = np.zeros_like(values)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from marey_motion.arrays import Floats
+from marey_motion.arrays import AnyFloats, Flags, Floats
 from marey_motion.editing.annotations.contacts import Stance, find_stances
 from marey_motion.editing.placement import shifted
 from marey_motion.editing.take import EditFinding, Take
 from marey_motion.importing.tracks import sole_points
 from marey_motion.kinematics import forward_kinematics
+from marey_motion.skeleton import Skeleton
 from marey_schemas.editing.commands import FindContacts, FindGround, MoveToGround
 from marey_schemas.options.annotations import ContactOptions
 
@@ -94,7 +96,7 @@ def find_contacts(take: Take, command: FindContacts) -> Take:
     """
     stances = _stances(take, command)
     if command.height_limit_m is not None:
-        heights = sole_heights(take)
+        heights = _soles_of(take)
         limit = _ground_of(heights, stances).height_m + command.height_limit_m
         stances = tuple(
             [one for one in foot if np.median(heights[one.start : one.end, side]) <= limit]
@@ -127,34 +129,45 @@ def estimate_ground(take: Take) -> Ground:
     ------
     MappingError    if the feet are not known
     """
-    return _ground_of(sole_heights(take), _stances(take, ContactOptions()))
+    return _ground_of(_soles_of(take), _stances(take, ContactOptions()))
 
 
-def sole_heights(take: Take) -> Floats:
+def sole_heights(points: AnyFloats, skeleton: Skeleton, ankles: Sequence[int]) -> Floats:
     """Compute the height of the lowest point of each foot.
 
     Parameters
     ----------
-    take : Take    F frames
+    points : (F, J + E, 3)    positions of joints and end sites, metres
+    skeleton : Skeleton    J joints
+    ankles : sequence of int    left and right ankle
 
     Returns
     -------
     (F, 2) float64    left and right, metres
-
-    Raises
-    ------
-    MappingError    if the feet are not known
     """
-    motion, skeleton = take.motion, take.skeleton
-    positions = forward_kinematics(
-        skeleton,
-        motion.poses,
-        translations=motion.translations,
-        translated_joints=motion.translated_joints,
-        end_sites=True,
-    )
-    soles = (sole_points(skeleton, foot) for foot in take.body.matching.feet)
-    return np.stack([positions[:, sole, 1].min(axis=1) for sole in soles], axis=1)
+    soles = (sole_points(skeleton, ankle) for ankle in ankles)
+    return np.stack([points[:, sole, 1].min(axis=1) for sole in soles], axis=1).astype(np.float64)
+
+
+def lower_soles_in_stance(heights: Floats, stances: Sequence[Sequence[Stance]]) -> Flags:
+    """Find the frames and feet that show where the ground is.
+
+    Parameters
+    ----------
+    heights : (F, 2) float64    heights of the soles, metres
+    stances : stances of the left and of the right foot
+
+    Returns
+    -------
+    (F, 2) bool    the lower foot of each frame, if it is in stance
+    """
+    standing = np.zeros(heights.shape, dtype=np.bool_)
+    for side, foot in enumerate(stances):
+        for one in foot:
+            standing[one.start : one.end, side] = True
+    lower = np.zeros_like(standing)
+    np.put_along_axis(lower, np.argmin(heights, axis=1)[:, None], True, axis=1)
+    return standing & lower
 
 
 def _stances(take: Take, options: ContactOptions) -> tuple[list[Stance], ...]:
@@ -163,13 +176,19 @@ def _stances(take: Take, options: ContactOptions) -> tuple[list[Stance], ...]:
 
 
 def _ground_of(heights: Floats, stances: tuple[list[Stance], ...]) -> Ground:
-    standing = np.zeros(heights.shape, dtype=np.bool_)
-    for side, foot in enumerate(stances):
-        for one in foot:
-            standing[one.start : one.end, side] = True
-    lower = np.argmin(heights, axis=1)
-    lowest = heights.min(axis=1)
-    told = lowest[np.take_along_axis(standing, lower[:, None], axis=1)[:, 0]]
+    told = heights[lower_soles_in_stance(heights, stances)]
     if told.size == 0:
-        return Ground(float(np.quantile(lowest, LOWEST_SHARE)), 0)
+        return Ground(float(np.quantile(heights.min(axis=1), LOWEST_SHARE)), 0)
     return Ground(float(np.median(told)), int(told.size))
+
+
+def _soles_of(take: Take) -> Floats:
+    motion, skeleton = take.motion, take.skeleton
+    points = forward_kinematics(
+        skeleton,
+        motion.poses,
+        translations=motion.translations,
+        translated_joints=motion.translated_joints,
+        end_sites=True,
+    )
+    return sole_heights(points, skeleton, take.body.matching.feet)

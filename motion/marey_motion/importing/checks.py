@@ -32,6 +32,12 @@ CODES = {
     "duplicate-joint-names": "Several joints have the same name; the name of the parent was added to make them unique.",
     "position-channels": "Joints below the root move relative to their parents; their translations were kept.",
     "bones-moved-by-translations": "Bones follow the positions of the source's joints instead of their rotations.",
+    "pelvis-from-hip-line": "The retargeted pelvis follows the line between the source's hips, which its pelvis joint "
+    "contradicts.",
+    "dropped-joints-followed": "Retargeted bones of spine or neck stand for joints that only one of the skeletons has.",
+    "feet-kept": "Feet of the retargeted clip were moved, so that they stay in place while those of the source do.",
+    "hands-kept": "Hands of the retargeted clip were moved to the scaled positions of those of the source.",
+    "soles-moved-to-floor": "The retargeted clip was moved up or down, because its soles were off the floor.",
     "offsets-from-positions": "The file contains no bone lengths; they were computed from the position channels.",
     "position-channels-relative": "The position channels contain displacements from the offsets instead of positions.",
     "non-unit-quaternions": "Some quaternions did not have length 1; they were normalised.",

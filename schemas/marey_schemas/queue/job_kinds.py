@@ -61,7 +61,7 @@ RETARGET = KindDeclaration(
     description="Transfers the motion of clips to another skeleton.",
     params=job_params.RetargetParams,
     implementation="marey_worker.kinds.retarget:run",
-    version=2,
+    version=3,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to retarget."),
         "skeleton": InputSpec(kind=Kind.SKELETON, description="The skeleton to retarget to."),

@@ -32,6 +32,7 @@ from marey_schemas.options.matching import FeatureWeights
 from marey_schemas.options.modelling import ModelOptions, TreeOptions
 from marey_schemas.options.perception import DistanceOptions, MetricChoice
 from marey_schemas.options.quality import QualityOptions
+from marey_schemas.options.retargeting import RetargetOptions
 
 
 class TaggedResults(Request):
@@ -317,7 +318,7 @@ class IndexParams(Request):
     name: ItemName = Field("motion-index", description="Name of the index; an index with this name is replaced.")
 
 
-class RetargetParams(SuffixedResults):
+class RetargetParams(RetargetOptions, SuffixedResults):
     """Parameters of jobs of the kind `retarget`."""
 
     scale: float | None = Field(

@@ -204,7 +204,7 @@ class CompleteRequest(Request):
     code_version: str | None = Field(
         None,
         max_length=255,
-        description="Kind and version of the code that computed the result, such as `retarget@2`. Identical jobs share "
+        description="Kind and version of the code that computed the result, such as `retarget@3`. Identical jobs share "
         "the result only if the server has the same version of the kind.",
     )
     environment: dict[str, str] = Field(default_factory=dict)

@@ -134,7 +134,10 @@ def test_the_history_of_a_clip_tells_that_its_source_has_changed(
     run("project", "create", "history")
     run("upload", takes / "walk.bvh", "--project", "history", "--collection", "raw")
     studio = target_skeleton(marey.project("history"))
-    run("retarget", "history/raw", "--to", f"history/{studio.id}", "--into", "out")
+    kept = run(
+        "retarget", "history/raw", "--to", f"history/{studio.id}", "--into", "out", "--keep-feet", "--keep-hands"
+    )
+    assert "feet-kept" in kept.stderr + kept.stdout
     assert "stale" not in run("show", "--history", "history/out/raw/walk").stdout
     (tmp_path / "walk.bvh").write_bytes(write_bvh(generate_gait(1.3, 0.3, 2.0)))
     run("upload", tmp_path / "walk.bvh", "--project", "history", "--collection", "raw")

@@ -37,7 +37,7 @@ def graph_of(*revisions: LineageRevision, links: list[tuple[int, int]], **member
         links=tuple(LineageLink(source=source, result=result, role="clips") for source, result in links),
         jobs=tuple(
             LineageJob(
-                id=job, kind="retarget", seed=3, commits=(COMMIT,), code_versions=("retarget@2",), finished_at=TIME
+                id=job, kind="retarget", seed=3, commits=(COMMIT,), code_versions=("retarget@3",), finished_at=TIME
             )
             for job in jobs
         ),
@@ -105,7 +105,7 @@ def test_hundreds_of_clips_are_one_box_that_warns_of_the_outdated_one() -> None:
         if text.text
     ]
     assert {"300 clips in raw", "300 clips in target", "1 with a newer revision", "walk report@1"} <= set(texts)
-    assert {"job_retarget", "seed 3", "retarget@2", "commit 5b130f77dd83"} <= set(texts)
+    assert {"job_retarget", "seed 3", "retarget@3", "commit 5b130f77dd83"} <= set(texts)
     assert CUT_OFF not in texts
     assert CUT_OFF in draw_lineage(GRAPHS["cut off"], "svg").decode()
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.judged_rigs import Actor, JudgedRetargeting, degrees_between, plan_between
 
 from marey_motion import kinematics, quaternions
 from marey_motion.arrays import AnyFloats, Floats
@@ -15,12 +16,16 @@ from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, MappingError, UnknownJoint
 from marey_motion.formats import read_motion
 from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
-from marey_motion.importing.checks import CODES
+from marey_motion.importing.checks import CODES, CheckWarning
 from marey_motion.moved_bones import LEAST_TURN_DEG, SHORTEST_BONE_M, follow_moved_bones
-from marey_motion.retargeting import RetargetPlan, moved_bones, plan_retarget, retarget
-from marey_motion.rigs import JointAxes, guess_axes, map_joints
+from marey_motion.retargeting import JointPair, RetargetPlan, plan_retarget, retarget, retarget_with_checks
+from marey_motion.retargeting.soles import SOLES_OFF_M
+from marey_motion.retargeting.transferring import transfer
+from marey_motion.retargeting.trunk import HIP_LINE_DEG
+from marey_motion.rigs import JointAxes, map_joints
 from marey_motion.rigs.axes import bone_end
 from marey_motion.skeleton import Skeleton
+from marey_schemas.options.retargeting import RetargetOptions
 
 SIDES = ("left", "right")
 # Bones that every rig has without joints between, so that joint and child show the twist axis to the eye.
@@ -29,25 +34,9 @@ LIMBS = [
     for side in SIDES
     for start, end in (("hip", "knee"), ("knee", "ankle"), ("ankle", "toe"), ("shoulder", "elbow"), ("elbow", "wrist"))
 ]
+MOVED_BONES, SOLES = "bones-moved-by-translations", "soles-moved-to-floor"
+HIP_LINE, DROPPED = "pelvis-from-hip-line", "dropped-joints-followed"
 FOLDERS = ("cmu-amc/16", "bandai-namco-2", "snu-mss", "game-engine")
-
-
-class Actor:
-    """Skeleton with the mapping and axes that retargeting needs, and a motion."""
-
-    def __init__(self, clip: Clip) -> None:
-        self.clip, self.skeleton = clip, clip.skeleton
-        self.mapping = map_joints(self.skeleton)
-        self.axes = guess_axes(self.skeleton, self.mapping, clip)
-
-    def joint(self, standard: str) -> int:
-        return self.skeleton.index_of(self.mapping.joints[standard])
-
-
-def plan_between(source: Actor | SimpleNamespace, target: Actor | SimpleNamespace, **options: Any) -> RetargetPlan:
-    return plan_retarget(
-        source.skeleton, source.mapping, source.axes, target.skeleton, target.mapping, target.axes, **options
-    )
 
 
 def resting(skeleton: Skeleton) -> Clip:
@@ -79,22 +68,12 @@ def game() -> Actor:
 def real(mocap: Path) -> dict[str, Actor]:
     """A take of each of four capture systems, by folder."""
 
-    def take(path: str, companion: str | None = None) -> Actor:
-        asf = (mocap / companion).read_bytes() if companion else None
-        return Actor(read_motion((mocap / path).read_bytes(), path.rsplit("/")[-1], companion=asf).clip)
-
     return {
-        "cmu-amc/16": take("cmu-amc/16/16_15.amc", "cmu-amc/16/16.asf"),
-        "bandai-namco-2": take("bandai-namco-2/dataset-2_walk-turn-left_normal_003.bvh"),
-        "snu-mss": take("rigs/snu-mss/walk_fullbody.bvh"),
-        "game-engine": take("rigs/game-engine/custom_skeleton_walk_example.bvh"),
+        "cmu-amc/16": Actor.of(mocap, "cmu-amc/16/16_15.amc"),
+        "bandai-namco-2": Actor.of(mocap, "bandai-namco-2/dataset-2_walk-turn-left_normal_003.bvh"),
+        "snu-mss": Actor.of(mocap, "rigs/snu-mss/walk_fullbody.bvh"),
+        "game-engine": Actor.of(mocap, "rigs/game-engine/custom_skeleton_walk_example.bvh"),
     }
-
-
-def degrees_between(a: AnyFloats, b: AnyFloats) -> AnyFloats:
-    """Return the angles between directions in degrees, exact for small angles."""
-    a, b = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (a.astype(float), b.astype(float)))
-    return np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
 def bone_directions(clip: Clip, start: int, end: int) -> AnyFloats:
@@ -107,6 +86,12 @@ def axis_directions(clip: Clip, joint: int, axis: tuple[float, float, float]) ->
     return quaternions.rotate_vectors(rotations[:, joint], axis)
 
 
+def pairs_as_in(clip: Clip, plan: RetargetPlan) -> list[JointPair]:
+    """List the pairs whose joints have the orientation of the source: all but those that stand for dropped joints."""
+    check = check_of(clip, plan, DROPPED)
+    return [pair for pair in plan.pairs if check is None or pair.source not in check.joints]
+
+
 def assert_bones_point_alike(
     source: Actor, target: Actor, result: Clip, plan: RetargetPlan, tolerance_deg: float = 1e-3
 ) -> None:
@@ -114,7 +99,7 @@ def assert_bones_point_alike(
         expected = bone_directions(source.clip, source.joint(start), source.joint(end))
         found = bone_directions(result, target.joint(start), target.joint(end))
         assert degrees_between(expected, found).max() < tolerance_deg, (start, end)
-    for pair in plan.pairs:
+    for pair in pairs_as_in(source.clip, plan):
         for axis in ("twist", "swing"):
             expected = axis_directions(
                 source.clip, source.skeleton.index_of(pair.source), getattr(source.axes[pair.source], axis)
@@ -129,7 +114,7 @@ def assert_no_flips_of_its_own(source: Actor, result: Clip, plan: RetargetPlan) 
     """Check that mapped joints rotate from frame to frame as in the source, and that no quaternion changes its sign."""
     before = kinematics.global_rotations(source.clip).astype(np.float64)
     after = kinematics.global_rotations(result).astype(np.float64)
-    for pair in plan.pairs:
+    for pair in pairs_as_in(source.clip, plan):
         turned, turns = (
             np.degrees(quaternions.angle_between(rotations[1:, joint], rotations[:-1, joint]))
             for rotations, joint in (
@@ -146,17 +131,29 @@ def assert_changes_nothing(plan: RetargetPlan) -> None:
     assert plan.scale == pytest.approx(1.0, rel=0, abs=1e-12)
 
 
-def assert_pelvis_travels(source: Actor, target: Actor, clip: Clip, result: Clip, plan: RetargetPlan) -> None:
-    """Check that the pelvis of the result moves like the pelvis of the source, times the scale."""
-    expected = plan.scale * kinematics.global_positions(clip)[:, source.joint("pelvis")].astype(np.float64)
-    found = kinematics.global_positions(result)[:, target.joint("pelvis")].astype(np.float64)
-    assert np.abs(found - expected).max() < 1e-6
+def check_of(clip: Clip, plan: RetargetPlan, code: str) -> CheckWarning | None:
+    """Return the check with a code that retargeting a clip gives, or None."""
+    return next((check for check in retarget_with_checks(clip, plan).checks if check.code == code), None)
 
 
-def assert_same_motion(result: Clip, expected: Clip) -> None:
+def assert_body_travels(source: Actor, target: Actor, clip: Clip, result: Clip, plan: RetargetPlan) -> None:
+    """Check that the anchor of the result moves like that of the source, times the scale, apart from the told shift."""
+    anchors = [anchor.standard for anchor in plan.anchors]
+    expected, found = (
+        kinematics.global_positions(one)[:, [actor.joint(anchor) for anchor in anchors]].astype(np.float64).mean(axis=1)
+        for actor, one in ((source, clip), (target, result))
+    )
+    check = check_of(clip, plan, SOLES)
+    moved = (0.0, 0.0 if check is None else check.values["moved_m"], 0.0)
+    assert np.abs(found - plan.scale * expected - moved).max() < 1e-6
+
+
+def assert_same_motion(result: Clip, expected: Clip, least_m: float = 1e-6) -> None:
     angles = quaternions.angle_between(result.rotations.astype(float), expected.rotations.astype(float))
     assert angles.max() < 1e-6
-    assert np.abs(result.root_translations - expected.root_translations).max() < 1e-6
+    moved = np.abs(result.root_translations - expected.root_translations)
+    assert moved.max() < least_m
+    assert moved[:, (0, 2)].max() < 1e-6
 
 
 def after_rest_pose(clip: Clip) -> Clip:
@@ -206,7 +203,7 @@ def test_the_precomputed_corrections_equal_algorithm_1_done_pose_by_pose(studio:
     for source, target in ((studio, game), (game, studio)):
         moving = SimpleNamespace(clip=tumbling(source.skeleton), skeleton=source.skeleton, axes=source.axes)
         plan = plan_between(source, target)
-        result = retarget(moving.clip, plan)
+        result = transfer(moving.clip, plan, moving.clip.poses[:, 3:])
 
         for frame in range(moving.clip.frame_count):
             expected = algorithm_1(moving, target, plan, frame)
@@ -222,7 +219,7 @@ def test_the_same_skeleton_gives_the_same_motion(studio: Actor, game: Actor) -> 
         angles = quaternions.angle_between(result.rotations.astype(float), clip.rotations.astype(float))
         assert angles.max() < 1e-6
         assert np.sum(result.rotations[0] * clip.rotations[0], axis=-1).min() > 0.0
-        assert_pelvis_travels(actor, actor, clip, result, plan)
+        assert_body_travels(actor, actor, clip, result, plan)
 
 
 def test_every_joint_of_a_copy_is_carried_along_mapped_or_not(game: Actor) -> None:
@@ -234,6 +231,16 @@ def test_every_joint_of_a_copy_is_carried_along_mapped_or_not(game: Actor) -> No
     clip = tumbling(game.skeleton)
     result = retarget(clip, plan)
     assert quaternions.angle_between(result.rotations.astype(float), clip.rotations.astype(float)).max() < 1e-6
+
+
+def test_a_clip_in_which_nothing_is_wrong_is_what_the_transfer_makes_to_the_bit(studio: Actor, game: Actor) -> None:
+    smaller = Actor(resting(studio_skeleton(1.5)))
+    for source, target in ((studio, smaller), (studio, studio)):
+        plan = plan_between(source, target)
+        made = retarget_with_checks(source.clip, plan)
+
+        assert made.checks == ()
+        assert np.array_equal(made.clip.poses, transfer(source.clip, plan, source.clip.poses[:, 3:]).poses)
 
 
 def test_bones_point_where_the_source_points_them_on_another_rig(studio: Actor, game: Actor) -> None:
@@ -274,12 +281,14 @@ def test_the_feet_of_another_body_stay_on_the_floor(studio: Actor, game: Actor) 
     assert 0.01 < heights.min() < 0.03
 
 
-def test_an_explicit_scale_is_used_for_the_travel(studio: Actor, game: Actor) -> None:
+def test_an_explicit_scale_is_used_for_the_travel_while_the_soles_stay_on_the_floor(studio: Actor, game: Actor) -> None:
     plan = plan_between(studio, game, scale=2.0)
     result = retarget(studio.clip, plan)
 
+    assert_body_travels(studio, game, studio.clip, result, plan)
     pelvis = kinematics.global_positions(result)[:, game.joint("pelvis")]
-    assert np.abs(pelvis - 2.0 * studio.clip.root_translations).max() < 1e-5
+    assert np.abs(pelvis - 2.0 * studio.clip.root_translations)[:, (0, 2)].max() < 1e-5
+    assert abs(JudgedRetargeting(studio, game, result, plan.scale).soles_off_m) < 1e-3
 
 
 def test_unmapped_joints_rest_and_the_plan_names_them(studio: Actor, game: Actor) -> None:
@@ -338,8 +347,8 @@ def test_translations_of_the_source_move_its_pelvis_but_stretch_no_bone(game: Ac
     plan = plan_between(game, studio)
     result, plain = retarget(stretched, plan), retarget(clip, plan)
 
-    assert np.array_equal(result.rotations, plain.rotations)
-    assert moved_bones(stretched, plan).warning is None
+    assert np.abs(result.rotations - plain.rotations).max() < 1e-5
+    assert check_of(stretched, plan, MOVED_BONES) is None
     expected = plan.scale * kinematics.global_positions(stretched)[:, pelvis]
     assert np.abs(result.root_translations - expected).max() < 1e-5
 
@@ -368,13 +377,50 @@ def test_bones_point_where_translations_of_the_source_point_them(studio: Actor, 
 
 def test_bones_that_translations_moved_are_told_with_their_joints(studio: Actor, game: Actor) -> None:
     clip, plan = with_moved_joints(studio, "left_elbow"), plan_between(studio, game)
-    warning = moved_bones(clip, plan).warning
+    warning = check_of(clip, plan, MOVED_BONES)
 
-    assert warning.code == "bones-moved-by-translations"
+    assert warning is not None
     assert warning.code in CODES
     assert set(warning.joints) == {studio.mapping.joints["left_shoulder"]}
     assert 5.0 < warning.values["largest_turn_deg"] < 45.0
-    assert moved_bones(studio.clip, plan).warning is None
+    assert check_of(studio.clip, plan, MOVED_BONES) is None
+
+
+@pytest.mark.parametrize("angle_deg", [8.0, 60.0, 98.0])
+def test_the_pelvis_follows_the_line_between_the_hips_where_they_disagree(
+    studio: Actor, game: Actor, angle_deg: float
+) -> None:
+    hips = [studio.joint(f"{side}_hip") for side in SIDES]
+    turn = quaternions.from_axis_angle((0.0, 1.0, 0.0), np.radians(angle_deg))
+    places = np.tile(quaternions.rotate_vectors(turn, studio.skeleton.offsets[hips]), (studio.clip.frame_count, 1, 1))
+    clip = replace(studio.clip, translations=places.astype(np.float32), translated_joints=tuple(sorted(hips)))
+    plan = plan_between(studio, game)
+    result, check = retarget(clip, plan), check_of(clip, plan, HIP_LINE)
+
+    line = bone_directions(result, game.joint("right_hip"), game.joint("left_hip"))
+    off = degrees_between(line, bone_directions(clip, studio.joint("right_hip"), studio.joint("left_hip")))
+    if angle_deg < HIP_LINE_DEG:
+        assert check is None
+        assert off == pytest.approx(angle_deg, abs=0.1)
+        return
+    assert check is not None
+    assert check.values["largest_turn_deg"] == pytest.approx(angle_deg, abs=0.1)
+    assert off.max() < 0.01
+    plain = retarget(studio.clip, plan)
+    for start, end in LIMBS:
+        legs = (bone_directions(one, game.joint(start), game.joint(end)) for one in (result, plain))
+        assert degrees_between(*legs).max() < 1e-2, "only the pelvis turns"
+
+
+def test_a_rig_whose_hips_a_dance_twists_keeps_its_legs_apart(mocap: Path, game: Actor) -> None:
+    dancer = Actor.of(mocap, "rigs/makehuman/dance1.bvh")
+    plan = plan_between(dancer, game)
+    judged = JudgedRetargeting(dancer, game, retarget(dancer.clip, plan), plan.scale)
+
+    check = check_of(dancer.clip, plan, HIP_LINE)
+    assert check is not None
+    assert check.values["largest_turn_deg"] == pytest.approx(18.9, abs=0.1)
+    assert judged.off_deg("right_hip", "left_hip") < 0.01
 
 
 def bones_followed_by_numpy(clip: Clip, joints: dict[str, int]) -> tuple[AnyFloats, dict[str, float]]:
@@ -436,7 +482,7 @@ def test_a_clip_keeps_the_translations_of_its_joints_on_its_own_skeleton(studio:
     clip, plan = with_moved_joints(studio, "left_elbow", "left_knee"), plan_between(studio, studio)
     result = retarget(clip, plan)
 
-    assert moved_bones(clip, plan).warning is None
+    assert check_of(clip, plan, MOVED_BONES) is None
     assert result.translated_joints == clip.translated_joints
     assert np.abs(kinematics.global_positions(result) - kinematics.global_positions(clip)).max() < 1e-6
     assert quaternions.angle_between(result.rotations, clip.rotations).max() < 1e-6
@@ -472,6 +518,31 @@ def test_too_small_a_mapping_is_refused_with_what_is_missing(studio: Actor, game
     assert "target skeleton's mapping has no left_knee" in str(error.value)
     assert "source" not in str(error.value)
     assert "Add them to the joint mappings" in str(error.value)
+
+
+@pytest.mark.parametrize(("kept", "without"), [("keep_feet", "left_knee"), ("keep_hands", "right_elbow")])
+def test_feet_or_hands_of_limbs_that_are_not_mapped_cannot_be_kept(
+    studio: Actor, game: Actor, kept: str, without: str
+) -> None:
+    joints = {standard: name for standard, name in studio.mapping.joints.items() if standard != without}
+    lacking = SimpleNamespace(
+        skeleton=studio.skeleton, mapping=replace(studio.mapping, joints=joints), axes=studio.axes
+    )
+    plan = plan_between(lacking, game, scale=1.0)
+
+    retarget(studio.clip, plan)
+    with pytest.raises(MappingError, match="map these joints, or leave the option out"):
+        retarget_with_checks(studio.clip, plan, RetargetOptions.model_validate({kept: True}))
+
+
+def test_feet_and_hands_of_a_single_frame_are_kept(mocap: Path, game: Actor) -> None:
+    dancer = Actor.of(mocap, "rigs/makehuman/dance1.bvh")
+    made = retarget_with_checks(
+        dancer.clip, plan_between(dancer, game), RetargetOptions(keep_feet=True, keep_hands=True)
+    )
+
+    assert made.clip.frame_count == 1
+    assert {"feet-kept", "hands-kept"} <= {check.code for check in made.checks}
 
 
 def test_a_mapping_without_a_pelvis_is_refused(studio: Actor, game: Actor) -> None:
@@ -553,7 +624,7 @@ def test_real_motion_on_its_own_skeleton_stays_as_it_is(real: dict[str, Actor], 
 
     angles = quaternions.angle_between(result.rotations.astype(float), actor.clip.rotations.astype(float))
     assert angles.max() < 1e-6
-    assert_pelvis_travels(actor, actor, actor.clip, result, plan)
+    assert_body_travels(actor, actor, actor.clip, result, plan)
 
 
 @pytest.mark.parametrize("folder", ["cmu-amc/16", "snu-mss"])
@@ -564,6 +635,7 @@ def test_a_rest_pose_that_stands_changes_no_frame_of_a_real_clip_after_it(
     assert_same_motion(
         retarget(longer.clip, plan_between(longer, game)).sliced(1, longer.clip.frame_count),
         retarget(real[folder].clip, plan_between(real[folder], game)),
+        least_m=1e-3,  # the height of the floor is a median over the clip
     )
 
 
@@ -579,20 +651,16 @@ def test_real_motion_points_all_bones_alike_on_another_rig(
     assert np.isfinite(result.poses).all()
     assert_bones_point_alike(source, target, result, plan)
     assert_no_flips_of_its_own(source, result, plan)
-    assert_pelvis_travels(source, target, source.clip, result, plan)
+    assert_body_travels(source, target, source.clip, result, plan)
 
 
 @pytest.mark.parametrize(("from_folder", "to_folder"), list(permutations(FOLDERS, 2)))
-def test_real_feet_keep_their_height_over_the_floor(real: dict[str, Actor], from_folder: str, to_folder: str) -> None:
+def test_real_soles_keep_their_height_over_the_floor(real: dict[str, Actor], from_folder: str, to_folder: str) -> None:
     source, target = real[from_folder], real[to_folder]
     plan = plan_between(source, target)
     result = retarget(source.clip, plan)
 
-    lowest = [
-        kinematics.global_positions(clip)[:, [actor.joint(f"{side}_toe") for side in SIDES], 1].min()
-        for actor, clip in ((source, source.clip), (target, result))
-    ]
-    assert lowest[1] == pytest.approx(plan.scale * lowest[0], abs=0.03)
+    assert abs(JudgedRetargeting(source, target, result, plan.scale).soles_off_m) < 0.015
 
 
 def test_the_hip_height_of_a_rig_that_lies_folded_at_rest_is_that_of_its_legs(mocap: Path, studio: Actor) -> None:
@@ -615,7 +683,7 @@ def test_real_motion_there_and_back_returns_the_mapped_joints(
     back = retarget(retarget(source.clip, plan), plan_between(target, source))
 
     before, after = (kinematics.global_rotations(clip).astype(np.float64) for clip in (source.clip, back))
-    followed = {pair.source for pair in plan.pairs}
+    followed = {pair.source for pair in pairs_as_in(source.clip, plan)}
     for name in followed:
         joint = source.skeleton.index_of(name)
         assert np.degrees(quaternions.angle_between(before[:, joint], after[:, joint]).max()) < 0.1, name
@@ -626,4 +694,5 @@ def test_real_motion_there_and_back_returns_the_mapped_joints(
             assert np.degrees(local.max()) < 0.1, name
     pelvis = source.joint("pelvis")
     moved = kinematics.global_positions(back)[:, pelvis] - kinematics.global_positions(source.clip)[:, pelvis]
-    assert np.abs(moved).max() < 1e-4
+    assert np.abs(moved[:, (0, 2)]).max() < 1e-4
+    assert np.abs(moved[:, 1]).max() < SOLES_OFF_M

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from tests.support.project_in_memory import ProjectInMemory, add_clip
 
-from marey_motion import retargeting
 from marey_motion.clip import Clip
 from marey_motion.documents import skeleton_to_document
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_motion.moved_bones import FollowedBones, follow_moved_bones
+from marey_motion.retargeting import clips
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
 from marey_schemas.queue.job_params import RetargetParams
@@ -29,7 +29,7 @@ def counted_follows(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         calls.append(clip)
         return follow_moved_bones(clip, joints)
 
-    monkeypatch.setattr(retargeting, "follow_moved_bones", follow)
+    monkeypatch.setattr(clips, "follow_moved_bones", follow)
     return calls
 
 
@@ -60,3 +60,11 @@ def test_the_checks_of_a_result_name_the_bones_that_translations_moved(
     assert check["joints"] == ["LeftUpLeg"]
     assert len(follows) == 2, "the bones of a clip are followed once, for its check and its poses"
     assert 10.0 < check["values"]["largest_turn_deg"] < 20.0
+
+    project.staged.clear()
+    kept = retarget.run(project, RetargetParams(keep_feet=True, keep_hands=True, suffix="-kept"))
+    assert kept["warnings"] == {"bones-moved-by-translations": 1, "feet-kept": 2, "hands-kept": 2}
+    for output in project.staged:
+        checks = {check["code"]: check["values"] for check in output.parts["info"]["checks"]}
+        assert checks["feet-kept"]["slide_after_m"] < checks["feet-kept"]["slide_before_m"]
+        assert checks["hands-kept"]["missed_m"] < 0.02 < checks["hands-kept"]["moved_m"]

@@ -8,7 +8,7 @@ from typing import Any
 
 from marey_motion import documents
 from marey_motion.errors import MotionError
-from marey_motion.retargeting import RetargetPlan, moved_bones, retarget
+from marey_motion.retargeting import RetargetPlan, retarget_with_checks
 from marey_schemas.documents.clips import Check, ClipInfo, ClipSource, MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.kinds import Kind
@@ -78,10 +78,9 @@ class _Retargeting:
         edited = self._rigs.get(used.item)
         source = Rig(used, edited.ref if edited else used)
         plan = plan_between(self._context, source, self._target, self._params.scale)
-        taken = documents.clip_from_document(motion, plan.source)
-        bones = moved_bones(taken, plan)
-        checks = () if bones.warning is None else (Check.model_validate(bones.warning.as_dict()),)
-        clip = retarget(taken, plan, bones)
+        made = retarget_with_checks(documents.clip_from_document(motion, plan.source), plan, self._params)
+        checks = tuple(Check.model_validate(check.as_dict()) for check in made.checks)
+        clip = made.clip
         self._warnings.update(check.code for check in checks)
         self._frames += clip.frame_count
         return StagedOutput(

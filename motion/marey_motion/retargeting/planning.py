@@ -1,32 +1,18 @@
-"""Retargeting: transfer of the motion of one skeleton to another, with any rest poses, proportions and local axes.
-
-Both skeletons give each joint two axes in its own frame: twist along the bone and swing across it (`rigs.guess_axes`).
-A target joint gets the global orientation in which its two axes coincide with the two axes of the source joint with the
-same standard name (Herrmann et al. 2019, Algorithm 1, after Monzani et al. 2000).
-
-The paper rotates twist onto twist, then swing onto swing, for every pose. As both axes are fixed in their joints, this
-is the same as one constant rotation per joint: with the axes of source and target as the columns of orthonormal
-matrices S and T, the target's global orientation is G·S·Tᵀ if the source's global orientation is G. This module differs
-from the printed algorithm in two ways. Here, the second rotation turns only about the twist axis, so it does not undo
-the first rotation. And the second rotation is applied after the first one, whereas line 12 of the printed algorithm has
-the opposite order.
-"""
+"""Plans for retargeting: which joints of two skeletons belong together, with the constant rotations between them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import quaternions
-from marey_motion.arrays import AnyFloats
-from marey_motion.clip import Clip
-from marey_motion.errors import ClipError, MappingError
-from marey_motion.moved_bones import FollowedBones, follow_moved_bones
+from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb, limb_ending_at
+from marey_motion.errors import MappingError
 from marey_motion.rigs import ESSENTIAL_JOINTS, STANDARD_JOINTS, JointAxes, JointMapping
 from marey_motion.rigs.standard import SIDES
 from marey_motion.skeleton import SAME_SKELETON_M, Skeleton, same_hierarchy
@@ -69,6 +55,10 @@ class RetargetPlan:
     sources : (K,) int32    source joint that each of the K target joints follows, -1 for none
     corrections : (K, 4) float64    constant rotation of each mapped joint as (w, x, y, z), identity for the other
         joints; the target's global orientation is the source's global orientation times this rotation
+    anchors : tuple of JointPair    the pelvis; or both hips, if the rest poses do not show how far the hips are below
+        the pelvis. The middle of these joints travels as in the source, times the scale.
+    limbs : mapping of str to TwoBoneLimb    arms and legs of the target by the standard name of wrist or ankle, if all
+        three joints of the limb follow the source
 
     Examples
     --------
@@ -92,12 +82,51 @@ class RetargetPlan:
     missing: tuple[str, ...]
     sources: NDArray[np.int32]
     corrections: NDArray[np.float64]
+    anchors: tuple[JointPair, ...]
+    limbs: Mapping[str, TwoBoneLimb]
 
     @cached_property
     def changes_no_pose(self) -> bool:
         """True if both skeletons are the same and no correction turns a joint."""
         turned = quaternions.angle_between(self.corrections, quaternions.identity(len(self.corrections)))
         return same_hierarchy(self.source, self.target, tolerance_m=SAME_SKELETON_M) and bool(np.all(turned < SAME_RAD))
+
+    def both_limbs(self, end: str) -> tuple[TwoBoneLimb, ...]:
+        """Find both arms or both legs of the target by their ends.
+
+        Parameters
+        ----------
+        end : str    "wrist" or "ankle"
+
+        Returns
+        -------
+        tuple of TwoBoneLimb    left and right
+
+        Raises
+        ------
+        MappingError    if not all three joints of both limbs are mapped in both skeletons
+        """
+        missing = [f"{side}_{end}" for side in SIDES if f"{side}_{end}" not in self.limbs]
+        if missing:
+            start, middle = ("hip", "knee") if end == "ankle" else ("shoulder", "elbow")
+            raise MappingError(
+                f"to keep {'feet' if end == 'ankle' else 'hands'}, {start}, {middle} and {end} of both sides must be "
+                f"mapped in both skeletons; this is not so for {' and '.join(missing)}; map these joints, or leave the "
+                "option out",
+                code="limbs-not-mapped",
+                where=missing[0],
+            )
+        return tuple(self.limbs[f"{side}_{end}"] for side in SIDES)
+
+    @cached_property
+    def source_joints(self) -> dict[str, int]:
+        """Indices of the paired joints of the source, by standard name."""
+        return {pair.standard: self.source.index_of(pair.source) for pair in self.pairs}
+
+    @cached_property
+    def target_joints(self) -> dict[str, int]:
+        """Indices of the paired joints of the target, by standard name."""
+        return {pair.standard: self.target.index_of(pair.target) for pair in self.pairs}
 
 
 def plan_retarget(
@@ -170,90 +199,9 @@ def plan_retarget(
         missing=tuple(name for name in STANDARD_JOINTS if name in unshared),
         sources=sources,
         corrections=corrections,
+        anchors=_anchors(pairs, source, source_axes, target, target_axes),
+        limbs=_limbs(pairs, target, target_mapping, target_axes),
     )
-
-
-def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None) -> Clip:
-    """Retarget a clip to the plan's target skeleton.
-
-    A mapped joint takes the orientation of its source joint. Any other joint keeps its rest rotation or, if both
-    skeletons are copies of one rig, copies the local rotation of the source joint with the same name. Bones keep the
-    lengths of the target. If the clip translates joints, the target's bones point in the directions of the clip's
-    translated bones; if the target is the source skeleton itself, the clip keeps its translations. The path of the
-    pelvis is the source's path times the plan's scale; a root above the pelvis moves with the pelvis without turning.
-
-    Parameters
-    ----------
-    clip : Clip    motion of the plan's source skeleton
-    plan : RetargetPlan    result of `plan_retarget`
-    bones : FollowedBones, optional    result of `moved_bones`, if already computed
-
-    Returns
-    -------
-    Clip    the motion of the target skeleton, at the same frame rate
-
-    Raises
-    ------
-    ClipError    if the clip's skeleton differs from the plan's source skeleton
-
-    Examples
-    --------
-    >>> from marey_motion import game_skeleton, generate_gait, guess_axes, map_joints, plan_retarget, retarget
-    >>> clip, target = generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.0, duration_s=2.0), game_skeleton()
-    >>> joints = map_joints(clip.skeleton), map_joints(target)
-    >>> axes = guess_axes(clip.skeleton, joints[0]), guess_axes(target, joints[1])
-    >>> result = retarget(clip, plan_retarget(clip.skeleton, joints[0], axes[0], target, joints[1], axes[1]))
-    >>> result.skeleton is target, result.poses.shape
-    (True, (120, 159))
-    """
-    from marey_motion import retargeting_kernels as kernels
-
-    if not same_hierarchy(clip.skeleton, plan.source, tolerance_m=SAME_SKELETON_M):
-        raise ClipError(
-            "the clip has a different skeleton from the source skeleton of the retargeting plan", where="skeleton"
-        )
-    target = plan.target
-    ways = np.where(plan.sources >= 0, kernels.MAPPED, kernels.AT_REST).astype(np.int8)
-    sources = plan.sources.copy()
-    for name in plan.carried:
-        joint = target.index_of(name)
-        ways[joint], sources[joint] = kernels.CARRIED, joint
-    poses = np.empty((clip.frame_count, 3 + 4 * target.joint_count), dtype=np.float32)
-    kernels.rotations(
-        (bones or moved_bones(clip, plan)).rotations,
-        plan.source.parents,
-        ways,
-        sources,
-        plan.corrections,
-        target.rest_rotations,
-        target.parents,
-        poses[:, 3:],
-    )
-    rotations = poses[:, 3:].reshape(clip.frame_count, -1, 4)
-    translations, joints = (clip.translations, clip.translated_joints) if plan.changes_no_pose else (None, ())
-    pelvis = next(pair for pair in plan.pairs if pair.standard == "pelvis")
-    travel = plan.scale * _position_in_world(clip, clip.skeleton.index_of(pelvis.source))
-    poses[:, :3] = travel - _position_from_root(
-        target, rotations, target.index_of(pelvis.target), _offsets_by_joint(translations, joints)
-    )
-    return Clip(target, clip.frame_rate_hz, poses, translations, joints)
-
-
-def moved_bones(clip: Clip, plan: RetargetPlan) -> FollowedBones:
-    """Correct the rotations of a clip so that bones keep their directions when the clip's translations are removed.
-
-    Parameters
-    ----------
-    clip : Clip    motion of the plan's source skeleton
-    plan : RetargetPlan    result of `plan_retarget`
-
-    Returns
-    -------
-    FollowedBones    rotations (F, 4·J) float32, and the largest turn of each joint in degrees
-    """
-    if plan.changes_no_pose:
-        return FollowedBones(clip.poses[:, 3:], {})
-    return follow_moved_bones(clip, {pair.standard: clip.skeleton.index_of(pair.source) for pair in plan.pairs})
 
 
 def _paired(
@@ -323,9 +271,7 @@ def _hip_height_ratio(
     not upright. If a part of the height is known for only one of the skeletons, both sums omit this part.
     """
     parts = []
-    for skeleton, axes, which in ((source, source_axes, "source"), (target, target_axes, "target")):
-        joints = {pair.standard: skeleton.index_of(getattr(pair, which)) for pair in pairs}
-        up = np.array(axes[skeleton.joint_names[joints["pelvis"]]].twist)
+    for skeleton, joints, up in _upright(pairs, source, source_axes, target, target_axes):
         parts.append(np.mean([_heights(skeleton, joints, up, side) for side in SIDES], axis=0))
     known = np.isfinite(parts[0]) & np.isfinite(parts[1])
     heights = [float(np.sum(part[known])) for part in parts]
@@ -354,13 +300,88 @@ def _heights(
     positions, pelvis = skeleton.rest_global_positions, joints["pelvis"]
     hip, knee, ankle = (positions[joints[f"{side}_{joint}"]] for joint in ("hip", "knee", "ankle"))
     leg = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
-    trunk = quaternions.rotate_vectors(skeleton.rest_global_rotations[pelvis], up / np.linalg.norm(up))
-    # Joints between pelvis and hip may be bent in any way at rest, unless that pose stands.
-    told = skeleton.parents[joints[f"{side}_hip"]] == pelvis or float((hip - ankle) @ trunk) > STANDING * leg
+    trunk = _trunk(skeleton, pelvis, up)
+    told = _shows_drop(skeleton, joints, up, side)
     drop = float((positions[pelvis] - hip) @ trunk) if told else np.nan
     toe = joints.get(f"{side}_toe")
     foot = np.nan if toe is None else FOOT_DROP * float(np.linalg.norm(positions[toe] - ankle))
     return drop, leg, foot
+
+
+class _Upright(NamedTuple):
+    """A skeleton with its paired joints by standard name, and the direction of the trunk in the pelvis' frame."""
+
+    skeleton: Skeleton
+    joints: Mapping[str, int]
+    up: NDArray[np.float64]
+
+
+def _upright(
+    pairs: tuple[JointPair, ...],
+    source: Skeleton,
+    source_axes: Mapping[str, JointAxes],
+    target: Skeleton,
+    target_axes: Mapping[str, JointAxes],
+) -> tuple[_Upright, ...]:
+    made = []
+    for skeleton, axes, which in ((source, source_axes, "source"), (target, target_axes, "target")):
+        joints = {pair.standard: skeleton.index_of(getattr(pair, which)) for pair in pairs}
+        made.append(_Upright(skeleton, joints, np.array(axes[skeleton.joint_names[joints["pelvis"]]].twist)))
+    return tuple(made)
+
+
+def _trunk(skeleton: Skeleton, pelvis: int, up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Compute the direction (3,) of the trunk at rest."""
+    rotated = quaternions.rotate_vectors(skeleton.rest_global_rotations[pelvis], up / np.linalg.norm(up))
+    return np.asarray(rotated, dtype=np.float64)
+
+
+def _shows_drop(skeleton: Skeleton, joints: Mapping[str, int], up: NDArray[np.float64], side: str) -> bool:
+    """Return whether the rest pose shows how far a hip is below the pelvis.
+
+    Joints between pelvis and hip may be bent in any way at rest, unless that pose stands.
+    """
+    pelvis, hip = joints["pelvis"], joints[f"{side}_hip"]
+    if skeleton.parents[hip] == pelvis:
+        return True
+    if not {f"{side}_knee", f"{side}_ankle"} <= joints.keys():
+        return False
+    positions = skeleton.rest_global_positions
+    knee, ankle = positions[joints[f"{side}_knee"]], positions[joints[f"{side}_ankle"]]
+    leg = float(np.linalg.norm(knee - positions[hip]) + np.linalg.norm(ankle - knee))
+    return float((positions[hip] - ankle) @ _trunk(skeleton, pelvis, up)) > STANDING * leg
+
+
+def _anchors(
+    pairs: tuple[JointPair, ...],
+    source: Skeleton,
+    source_axes: Mapping[str, JointAxes],
+    target: Skeleton,
+    target_axes: Mapping[str, JointAxes],
+) -> tuple[JointPair, ...]:
+    """Choose the joints whose middle travels as in the source.
+
+    A drop from the pelvis to the hips that a rest pose does not show is not part of the scale, so the pelvis would be
+    too high or too low by its share of that drop.
+    """
+    paired = {pair.standard: pair for pair in pairs}
+    hips = [paired[f"{side}_hip"] for side in SIDES if f"{side}_hip" in paired]
+    bodies = _upright(pairs, source, source_axes, target, target_axes)
+    if len(hips) < len(SIDES) or all(_shows_drop(*body, side) for body in bodies for side in SIDES):
+        return (paired["pelvis"],)
+    return tuple(hips)
+
+
+def _limbs(
+    pairs: tuple[JointPair, ...], target: Skeleton, mapping: JointMapping, axes: Mapping[str, JointAxes]
+) -> dict[str, TwoBoneLimb]:
+    joints = {pair.standard: target.index_of(pair.target) for pair in pairs}
+    followed, limbs = set(joints.values()), {}
+    for end in (f"{side}_{joint}" for side in SIDES for joint in ("ankle", "wrist") if f"{side}_{joint}" in joints):
+        limb = limb_ending_at(target, mapping, joints[end], axes)
+        if limb is not None and followed.issuperset(limb.joints):
+            limbs[end] = limb
+    return limbs
 
 
 def _are_same_rig(source: Skeleton, target: Skeleton) -> bool:
@@ -374,26 +395,3 @@ def _are_same_rig(source: Skeleton, target: Skeleton) -> bool:
     along = np.sum(source.offsets * target.offsets, axis=1)
     lengths = np.linalg.norm(source.offsets, axis=1) * np.linalg.norm(target.offsets, axis=1)
     return bool(np.all(turned < 1e-4) and np.all(along[1:] >= SAME_DIRECTION * lengths[1:]))
-
-
-def _position_in_world(clip: Clip, joint: int) -> AnyFloats:
-    """Compute positions (F, 3) of one joint of a clip, metres."""
-    moved = _offsets_by_joint(clip.translations, clip.translated_joints)
-    return clip.root_translations + _position_from_root(clip.skeleton, clip.rotations, joint, moved)
-
-
-def _offsets_by_joint(translations: NDArray[np.float32] | None, joints: tuple[int, ...]) -> dict[int, AnyFloats]:
-    """Return the translations (F, 3) of each of `joints`, by joint index; empty if `translations` is None."""
-    return {} if translations is None else {joint: translations[:, slot] for slot, joint in enumerate(joints)}
-
-
-def _position_from_root(
-    skeleton: Skeleton, rotations: AnyFloats, joint: int, moved: Mapping[int, AnyFloats] = MappingProxyType({})
-) -> AnyFloats:
-    """Compute vectors (F, 3) from root to joint in the world; `moved` has the offsets (F, 3) of translated joints."""
-    position: AnyFloats = np.zeros((len(rotations), 3))
-    for step in skeleton.path_to_root(joint)[:-1]:
-        offset = moved.get(step, skeleton.offsets[step])
-        rotation = rotations[:, skeleton.parents[step]].astype(np.float64)
-        position = quaternions.rotate_vectors(rotation, position + offset)
-    return position

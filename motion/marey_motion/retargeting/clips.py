@@ -1,0 +1,105 @@
+"""Retargeting of clips: the transfer of poses, and corrections of what the transfer leaves wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from marey_motion.clip import Clip
+from marey_motion.errors import ClipError
+from marey_motion.importing.checks import CheckWarning
+from marey_motion.moved_bones import FollowedBones, follow_moved_bones
+from marey_motion.retargeting.feet import keep_feet
+from marey_motion.retargeting.hands import keep_hands
+from marey_motion.retargeting.planning import RetargetPlan
+from marey_motion.retargeting.soles import level_soles
+from marey_motion.retargeting.transferring import transfer
+from marey_motion.retargeting.trunk import follow_trunk
+from marey_motion.skeleton import SAME_SKELETON_M, same_hierarchy
+from marey_schemas.options.retargeting import RetargetOptions
+
+
+@dataclass(frozen=True, eq=False)
+class RetargetedClip:
+    """A clip of the target skeleton.
+
+    Parameters
+    ----------
+    clip : Clip    the motion
+    checks : tuple of CheckWarning    what differs from the poses of the source, and how far
+    """
+
+    clip: Clip
+    checks: tuple[CheckWarning, ...]
+
+
+def retarget(clip: Clip, plan: RetargetPlan) -> Clip:
+    """Retarget a clip to the plan's target skeleton.
+
+    A mapped joint takes the orientation of its source joint. Any other joint keeps its rest rotation or, if both
+    skeletons are copies of one rig, copies the local rotation of the source joint with the same name. Bones keep the
+    lengths of the target. If the clip translates joints, the target's bones point in the directions of the clip's
+    translated bones; if the target is the source skeleton itself, the clip keeps its translations. The path of the
+    pelvis is the source's path times the plan's scale; a root above the pelvis moves with the pelvis without turning.
+
+    Parameters
+    ----------
+    clip : Clip    motion of the plan's source skeleton
+    plan : RetargetPlan    result of `plan_retarget`
+
+    Returns
+    -------
+    Clip    the motion of the target skeleton, at the same frame rate
+
+    Raises
+    ------
+    ClipError    if the clip's skeleton differs from the plan's source skeleton
+
+    Examples
+    --------
+    >>> from marey_motion import game_skeleton, generate_gait, guess_axes, map_joints, plan_retarget, retarget
+    >>> clip, target = generate_gait(speed_m_s=1.2, turn_rate_rad_s=0.0, duration_s=2.0), game_skeleton()
+    >>> joints = map_joints(clip.skeleton), map_joints(target)
+    >>> axes = guess_axes(clip.skeleton, joints[0]), guess_axes(target, joints[1])
+    >>> result = retarget(clip, plan_retarget(clip.skeleton, joints[0], axes[0], target, joints[1], axes[1]))
+    >>> result.skeleton is target, result.poses.shape
+    (True, (120, 159))
+    """
+    return retarget_with_checks(clip, plan).clip
+
+
+def retarget_with_checks(clip: Clip, plan: RetargetPlan, options: RetargetOptions | None = None) -> RetargetedClip:
+    """Retarget a clip as `retarget` does, and report what was changed.
+
+    Parameters
+    ----------
+    clip : Clip    motion of the plan's source skeleton
+    plan : RetargetPlan    result of `plan_retarget`
+    options : RetargetOptions, optional    what is kept beside the poses: feet, hands
+
+    Returns
+    -------
+    RetargetedClip    the motion of the target skeleton, with checks
+
+    Raises
+    ------
+    ClipError    if the clip's skeleton differs from the plan's source skeleton
+    MappingError    if feet or hands are to be kept, but not all joints of both limbs are mapped in both skeletons
+    """
+    if not same_hierarchy(clip.skeleton, plan.source, tolerance_m=SAME_SKELETON_M):
+        raise ClipError(
+            "the clip has a different skeleton from the source skeleton of the retargeting plan", where="skeleton"
+        )
+    bones = (
+        FollowedBones(clip.poses[:, 3:], {}) if plan.changes_no_pose else follow_moved_bones(clip, plan.source_joints)
+    )
+    trunk = follow_trunk(clip, plan, bones.rotations)
+    made = level_soles(clip, transfer(clip, plan, trunk.rotations), plan)
+    result, checks = made.clip, [bones.warning, *trunk.checks, made.warning]
+    options = options or RetargetOptions()
+    if options.keep_feet:
+        result, check = keep_feet(clip, result, plan)
+        checks.append(check)
+    if options.keep_hands:
+        result, check = keep_hands(clip, result, plan, options.hands_from)
+        checks.append(check)
+    return RetargetedClip(result, tuple(check for check in checks if check is not None))

@@ -1,0 +1,103 @@
+"""Feet of a retargeted clip: they stay in place, with their soles on the floor, while those of the source touch it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from marey_motion import kinematics
+from marey_motion.arrays import AnyFloats, Floats
+from marey_motion.clip import Clip
+from marey_motion.editing.annotations.contacts import runs
+from marey_motion.editing.foot_plants import Foot, FootContacts, PlantedMotion, faded, find_contacts, plant_feet
+from marey_motion.editing.ground import sole_heights
+from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb
+from marey_motion.importing.checks import CheckWarning
+from marey_motion.motion import Motion
+from marey_motion.retargeting.planning import RetargetPlan
+from marey_motion.rigs.standard import SIDES
+from marey_motion.skeleton import Skeleton
+from marey_schemas.editing.constraints import PlantOptions
+from marey_schemas.wording import counted
+
+_OPTIONS = PlantOptions()
+
+
+class KeptFeet(NamedTuple):
+    """A clip whose feet stay in place, and what was moved."""
+
+    clip: Clip
+    check: CheckWarning
+
+
+def keep_feet(source: Clip, result: Clip, plan: RetargetPlan) -> KeptFeet:
+    """Keep the feet of a retargeted clip in place while those of the source touch the floor.
+
+    Touching soles get the height over the floor that they have in the source, times the scale. The feet are planted
+    (`editing.foot_plants`), which lowers the root where legs are too short, and damps stretching knees.
+
+    Parameters
+    ----------
+    source : Clip    F frames of the plan's source skeleton
+    result : Clip    F frames of its target skeleton
+    plan : RetargetPlan    joints, scale and limbs
+
+    Returns
+    -------
+    KeptFeet    F frames, with the feet moved
+
+    Raises
+    ------
+    MappingError    if not both legs are mapped in both skeletons
+    """
+    legs = zip(SIDES, plan.both_limbs("ankle"), strict=True)
+    feet = [Foot(leg, _toe(plan.target_joints, side)) for side, leg in legs]
+    rate = source.frame_rate_hz
+    points = kinematics.global_positions(source, end_sites=True).astype(np.float64)
+    contacts = [_contacts(points, plan, side, rate) for side in SIDES]
+    motion, blend = Motion.of(result), max(1, round(_OPTIONS.blend_s * rate))
+    off = plan.scale * _soles(points, plan.source, plan.source_joints)
+    off -= _soles(kinematics.global_positions(result, end_sites=True), plan.target, plan.target_joints)
+    lifts = [faded(one.toe | one.heel, off[:, [side]], blend)[:, 0] for side, one in enumerate(contacts)]
+    planted = plant_feet(plan.target, motion, rate, feet, contacts=contacts, lifts=lifts, options=_OPTIONS)
+    return KeptFeet(planted.motion.as_clip(plan.target, rate), _check(planted, motion, plan, feet))
+
+
+def _toe(joints: Mapping[str, int], side: str) -> int:
+    return joints.get(f"{side}_toe", joints[f"{side}_ankle"])
+
+
+def _contacts(points: Floats, plan: RetargetPlan, side: str, rate_hz: float) -> FootContacts:
+    """Find the contacts of a foot of the source from its points (F, n, 3)."""
+    joints = plan.source_joints
+    ankle = joints[f"{side}_ankle"]
+    leg = TwoBoneLimb(joints[f"{side}_hip"], joints[f"{side}_knee"], ankle)
+    return find_contacts(points, Foot(leg, _toe(joints, side)), rate_hz, _OPTIONS)
+
+
+def _soles(points: AnyFloats, skeleton: Skeleton, joints: Mapping[str, int]) -> Floats:
+    return sole_heights(points, skeleton, [joints[f"{side}_ankle"] for side in SIDES])
+
+
+def _check(planted: PlantedMotion, before: Motion, plan: RetargetPlan, feet: Sequence[Foot]) -> CheckWarning:
+    ankles = [foot.leg.end for foot in feet]
+    moved = (one.positions(plan.target)[:, ankles] for one in (before, planted.motion))
+    most = float(np.linalg.norm(np.subtract(*moved), axis=-1).max())
+    count = sum(len(runs(one.toe | one.heel)) for one in planted.contacts)
+    slid, slides, lowered = (100.0 * one for one in (planted.slide_before_m, planted.slide_after_m, planted.lowered_m))
+    return CheckWarning(
+        "feet-kept",
+        f"feet were kept in place in {counted(count, 'contact')} and moved by at most {100.0 * most:.1f} cm; toes slid "
+        f"by {slid:.1f} cm per contact on average, now by {slides:.1f} cm; the body was lowered by at most "
+        f"{lowered:.1f} cm",
+        joints=tuple(plan.target.joint_names[ankle] for ankle in ankles),
+        values={
+            "contacts": count,
+            "moved_m": most,
+            "slide_before_m": planted.slide_before_m,
+            "slide_after_m": planted.slide_after_m,
+            "lowered_m": planted.lowered_m,
+        },
+    )

@@ -1,0 +1,126 @@
+"""Hands of a retargeted clip: they are where those of the source are, in proportion to the reach of the arms."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from marey_motion import kinematics
+from marey_motion.arrays import AnyFloats, Floats
+from marey_motion.clip import Clip
+from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb
+from marey_motion.editing.inverse_kinematics.solving import solve_two_bone
+from marey_motion.editing.inverse_kinematics.targets import PositionTarget
+from marey_motion.importing.checks import CheckWarning
+from marey_motion.motion import Motion
+from marey_motion.retargeting.planning import RetargetPlan
+from marey_motion.rigs.standard import SIDES
+
+ELBOW_DAMPING_RAD = math.radians(10.0)
+"""Angle before the full stretch of an arm at which the damping of its elbow begins."""
+
+
+HandsFrom = Literal["shoulders", "world"]
+
+
+class KeptHands(NamedTuple):
+    """A clip whose hands have the positions of the source's hands, scaled, and what was moved."""
+
+    clip: Clip
+    check: CheckWarning
+
+
+class _Arms(NamedTuple):
+    """Positions (F, 2, 3) of both shoulders, elbows and wrists, metres."""
+
+    shoulders: Floats
+    elbows: Floats
+    wrists: Floats
+
+    @classmethod
+    def of(cls, points: AnyFloats, joints: dict[str, int]) -> _Arms:
+        """Select the joints by their standard names from positions (F, J, 3)."""
+        return cls(
+            *(
+                points[:, [joints[f"{side}_{joint}"] for side in SIDES]].astype(np.float64)
+                for joint in ("shoulder", "elbow", "wrist")
+            )
+        )
+
+    @property
+    def middle(self) -> Floats:
+        """Middle (F, 3) of the shoulders."""
+        return np.asarray(self.shoulders.mean(axis=1))
+
+    @property
+    def arm_m(self) -> float:
+        """Mean length of the arms."""
+        bones = ((self.shoulders, self.elbows), (self.elbows, self.wrists))
+        return sum(float(np.linalg.norm(a - b, axis=-1).mean()) for a, b in bones)
+
+    @property
+    def reach_m(self) -> float:
+        """Distance of a hand from the middle of the shoulders when both arms are stretched out sideways."""
+        return self.arm_m + 0.5 * float(np.linalg.norm(self.shoulders[:, 0] - self.shoulders[:, 1], axis=-1).mean())
+
+
+def keep_hands(source: Clip, result: Clip, plan: RetargetPlan, about: HandsFrom) -> KeptHands:
+    """Move the hands of a retargeted clip to the positions of the source's hands, in proportion.
+
+    About the shoulders, a hand gets the vector that it has in the source from the middle of the shoulders, times a
+    constant scale. The scale is the ratio of the lengths of the arms, or that of the reaches to the side if this is
+    smaller, so that hands are within reach in front of the body and beside it. In the world, positions are scaled like
+    the path of the pelvis, and can be out of reach. Shoulders and elbows turn; hands keep their orientations in the
+    world. Stretching elbows are damped, so that they do not snap.
+
+    Parameters
+    ----------
+    source : Clip    F frames of the plan's source skeleton
+    result : Clip    F frames of its target skeleton
+    plan : RetargetPlan    joints, scale and limbs
+    about : str    point from which positions are scaled: "shoulders" or "world"
+
+    Returns
+    -------
+    KeptHands    F frames, with the hands moved
+
+    Raises
+    ------
+    MappingError    if not both arms are mapped in both skeletons
+    """
+    limbs = plan.both_limbs("wrist")
+    motion = Motion.of(result)
+    before = _Arms.of(kinematics.global_positions(source), plan.source_joints)
+    after = _Arms.of(motion.positions(plan.target), plan.target_joints)
+    if about == "world":
+        scale, targets = plan.scale, plan.scale * before.wrists
+    else:
+        scale = min(after.arm_m / before.arm_m, after.reach_m / before.reach_m)
+        targets = after.middle[:, None] + scale * (before.wrists - before.middle[:, None])
+    kept = motion
+    for side, limb in enumerate(limbs):
+        kept = solve_two_bone(
+            plan.target,
+            kept,
+            limb,
+            PositionTarget(limb.end, targets[:, side]),
+            ending="held",
+            damping_zone_rad=ELBOW_DAMPING_RAD,
+        ).motion
+    made = _Arms.of(kept.positions(plan.target), plan.target_joints)
+    moved, missed = (float(np.linalg.norm(one - made.wrists, axis=-1).max()) for one in (after.wrists, targets))
+    return KeptHands(kept.as_clip(plan.target, source.frame_rate_hz), _check(moved, missed, scale, plan, limbs))
+
+
+def _check(
+    moved: float, missed: float, scale: float, plan: RetargetPlan, limbs: tuple[TwoBoneLimb, ...]
+) -> CheckWarning:
+    return CheckWarning(
+        "hands-kept",
+        f"hands were moved by up to {100.0 * moved:.1f} cm to the positions of the source's hands, scaled by "
+        f"{scale:.2f}; they miss these positions by at most {100.0 * missed:.1f} cm",
+        joints=tuple(plan.target.joint_names[limb.end] for limb in limbs),
+        values={"moved_m": moved, "missed_m": missed, "scale": scale},
+    )

@@ -1,0 +1,28 @@
+"""Options of retargeting that move hands and feet of a result by inverse kinematics."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from marey_schemas.base import Options
+
+
+class RetargetOptions(Options):
+    """Parts of a motion that are kept beside its poses."""
+
+    keep_feet: bool = Field(
+        False,
+        description="Keep feet in place while they touch the floor in the source, with their soles on the floor.",
+    )
+    keep_hands: bool = Field(
+        False,
+        description="Keep the positions of the hands, scaled, so that hands that meet in the source meet again.",
+    )
+    hands_from: Literal["shoulders", "world"] = Field(
+        "shoulders",
+        description="Point from which keep_hands scales. shoulders: the middle of the shoulders, by the length of the "
+        "arms, which is within reach; world: the origin, by the scale of the root's path, for hands on objects or on "
+        "the floor. An arm that is too short is stretched.",
+    )
