@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,12 +13,20 @@ from marey_motion.editing.placement import shifted
 from marey_motion.editing.take import EditFinding, Take
 from marey_motion.importing.tracks import sole_points
 from marey_motion.kinematics import forward_kinematics
+from marey_motion.matching.body import MatchingBody
+from marey_motion.motion import Motion
+from marey_motion.skeleton import Skeleton
 from marey_schemas.editing.commands import FindContacts, FindGround, MoveToGround
 from marey_schemas.options.annotations import ContactOptions
 
 FEET = ("left_foot", "right_foot")
 LOWEST_SHARE = 0.05
 """Quantile of the heights of the lower sole that counts as the ground if the lower foot is never in stance."""
+
+SOLE_SHARE = 0.05
+"""Height of the joints and tips of a standing foot in a shoe, as a share of the length of the leg."""
+STANDING_SHARE = 0.9
+"""Height of the hip above the ankle, as a share of the leg's length, above which a rest pose stands."""
 
 
 class Ground(NamedTuple):
@@ -28,10 +37,12 @@ class Ground(NamedTuple):
     height_m : height of the ground, metres
     standing_frames : number of frames in which the lower foot is in stance; the height is estimated from these frames
         or, if there are none, from the frames with the lowest feet
+    sole_m : distance from the lowest joint or tip of a foot down to its sole, metres
     """
 
     height_m: float
     standing_frames: int
+    sole_m: float = 0.0
 
 
 def move_to_ground(take: Take, command: MoveToGround) -> Take:
@@ -50,20 +61,20 @@ def move_to_ground(take: Take, command: MoveToGround) -> Take:
     ------
     MappingError    if the feet are not known
     """
-    ground = estimate_ground(take) if command.height_m is None else Ground(command.height_m, 0)
+    ground = estimate_ground(take, command.sole_m) if command.height_m is None else Ground(command.height_m, 0)
     moved = take.moved(shifted(take.motion, np.array((0.0, -ground.height_m, 0.0))))
     if command.height_m is not None:
         return moved
     return moved.with_finding(EditFinding("move_to_ground", ground._asdict()))
 
 
-def find_ground(take: Take, _command: FindGround) -> Take:
+def find_ground(take: Take, command: FindGround) -> Take:
     """Find the height of the ground and record it; the motion stays as it is.
 
     Parameters
     ----------
     take : Take    F frames
-    _command : FindGround    has no parameters
+    command : FindGround    the thickness of the soles; if None, it is estimated
 
     Returns
     -------
@@ -73,7 +84,7 @@ def find_ground(take: Take, _command: FindGround) -> Take:
     ------
     MappingError    if the feet are not known
     """
-    return take.with_finding(EditFinding("find_ground", estimate_ground(take)._asdict()))
+    return take.with_finding(EditFinding("find_ground", estimate_ground(take, command.sole_m)._asdict()))
 
 
 def find_contacts(take: Take, command: FindContacts) -> Take:
@@ -110,7 +121,7 @@ def find_contacts(take: Take, command: FindContacts) -> Take:
     return take.with_finding(EditFinding("find_contacts", values))
 
 
-def estimate_ground(take: Take) -> Ground:
+def estimate_ground(take: Take, sole_m: float | None = None) -> Ground:
     """Estimate the height of the ground: the median height of the lower sole while the foot of that sole is in stance.
 
     The median is robust against a foot that is below the floor for some frames and against a kick that is held.
@@ -118,6 +129,8 @@ def estimate_ground(take: Take) -> Ground:
     Parameters
     ----------
     take : Take    F frames
+    sole_m : float, optional    distance from the lowest joint or tip of a foot down to its sole, metres; None to
+        estimate it
 
     Returns
     -------
@@ -127,7 +140,36 @@ def estimate_ground(take: Take) -> Ground:
     ------
     MappingError    if the feet are not known
     """
-    return _ground_of(sole_heights(take), _stances(take, ContactOptions()))
+    ground = _ground_of(sole_heights(take), _stances(take, ContactOptions()))
+    sole = estimate_sole(take.skeleton, take.body.matching) if sole_m is None else sole_m
+    return ground._replace(height_m=ground.height_m - sole, sole_m=sole)
+
+
+def estimate_sole(skeleton: Skeleton, body: MatchingBody) -> float:
+    """Estimate the distance from the lowest joint or tip of a foot down to its sole.
+
+    Skeletons end at joints inside the foot, and the ball of a foot in a shoe is about `SOLE_SHARE` of the leg's length
+    above the floor. Tips that hang below the joint of the toes in the rest pose are nearer to the sole by that much.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    body : MatchingBody    its feet
+
+    Returns
+    -------
+    float    metres, at least 0
+    """
+    rest = Motion(np.zeros((1, 3)), skeleton.rest_rotations[None], np.zeros((1, 0, 3)), ())
+    heights = forward_kinematics(skeleton, rest.poses, end_sites=True)[0, :, 1]
+    depths = []
+    for ankle, toe, hip in zip(body.feet, body.toes, (body.lefts[0], body.rights[0]), strict=True):
+        path = skeleton.path_to_root(ankle)
+        leg = sum(float(np.linalg.norm(skeleton.offsets[joint])) for joint in path if joint > hip)
+        stands = heights[hip] - heights[ankle] > STANDING_SHARE * leg
+        hanging = float(heights[toe] - heights[sole_points(skeleton, ankle)].min()) if stands else 0.0
+        depths.append(max(SOLE_SHARE * leg - hanging, 0.0))
+    return float(np.mean(depths))
 
 
 def sole_heights(take: Take) -> Floats:
@@ -145,7 +187,22 @@ def sole_heights(take: Take) -> Floats:
     ------
     MappingError    if the feet are not known
     """
-    motion, skeleton = take.motion, take.skeleton
+    return heights_of_soles(take.skeleton, take.motion, take.body.matching.feet)
+
+
+def heights_of_soles(skeleton: Skeleton, motion: Motion, ankles: Sequence[int]) -> Floats:
+    """Compute the height of the lowest point of each foot, from the ankle down.
+
+    Parameters
+    ----------
+    skeleton : Skeleton    J joints
+    motion : Motion    F frames
+    ankles : sequence of int    n joints
+
+    Returns
+    -------
+    (F, n) float64    metres
+    """
     positions = forward_kinematics(
         skeleton,
         motion.poses,
@@ -153,8 +210,7 @@ def sole_heights(take: Take) -> Floats:
         translated_joints=motion.translated_joints,
         end_sites=True,
     )
-    soles = (sole_points(skeleton, foot) for foot in take.body.matching.feet)
-    return np.stack([positions[:, sole, 1].min(axis=1) for sole in soles], axis=1)
+    return np.stack([positions[:, sole_points(skeleton, ankle), 1].min(axis=1) for ankle in ankles], axis=1)
 
 
 def _stances(take: Take, options: ContactOptions) -> tuple[list[Stance], ...]:
