@@ -1,7 +1,8 @@
 """Feet that keep their contacts and stay above the floor while the pose of the body is blended or smoothed.
 
-Blending rotations moves feet on paths that nobody chose: a foot that is on the ground in both poses may sink or slide in between.
-Here the ankles are blended or smoothed as points of the world, as the root is, and the legs are solved to reach them.
+Blending rotations moves feet on paths that nobody chose: a foot that is on the ground in both poses may sink or slide
+in between. Here the ankles are blended or smoothed as points of the world, as the root is, and the legs are solved to
+reach them.
 """
 
 from __future__ import annotations
