@@ -54,6 +54,8 @@ def swivel_coherently(
         jumps[start] = 0.0
         if pole is not None or np.abs(jumps[part]).max() > COHERENT_RAD:
             angles[part] = _even_swivels(wished[part], jumps[part], clear[part], reach)
+    if not angles.any():
+        return
     alone = problem.rotations.copy()
     swivel_kernels.swivel_frames(*posed, angles, lines, problem.rotations, work)
     if pole is None:
