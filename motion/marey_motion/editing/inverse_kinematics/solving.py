@@ -152,7 +152,8 @@ def _refuse_poles(targets: Sequence[Target]) -> None:
         if isinstance(target, PositionTarget) and target.pole is not None:
             raise EditError(
                 "a pole needs the two-bone solver: a wrist or ankle whose position is constrained in all axes, no "
-                "limits, and no other constraint in the same frames but an orientation of the same joint",
+                "limits, no joint above the limb that turns, and no other constraint in the same frames but an "
+                "orientation of the same joint",
                 code="solver-unfit",
                 where=f"targets[{number}].pole",
             )
